@@ -1,0 +1,265 @@
+"""Configuration: frozen models nested by stage, TOML on disk, every default in this one place."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self, TypeVar
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from schemas.enums import Fix
+from schemas.errors import BaliseError, ConfigError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Settings(BaseModel):
+    """Base of every model read from TOML: unknown keys are refused, values never change."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class StreamMapping(Settings):
+    """How one recorded topic becomes one stream (CONTRACT section 1).
+
+    `fields` maps stream column to recorded field path, `factors` multiplies (unit conversion),
+    `constants` fills columns that the log does not hold.
+    """
+
+    topic: str
+    fields: dict[str, str] = {}
+    factors: dict[str, float] = {}
+    constants: dict[str, str | float | bool] = {}
+    time: str = Field(default="log", pattern=r"^(log|publish|field:.+)$")
+    time_scale: Literal["utc", "gps"] = "utc"
+    solution: str = "primary"
+
+
+class IngestConfig(Settings):
+    """Which topics feed which stream; empty: recognised by schema name."""
+
+    gnss: tuple[StreamMapping, ...] = ()
+    odometer: tuple[StreamMapping, ...] = ()
+    satellites: tuple[StreamMapping, ...] = ()
+    reference: tuple[StreamMapping, ...] = ()
+    balise_reads: tuple[StreamMapping, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_table_or_many(cls, data: object) -> object:
+        if not isinstance(data, Mapping):
+            return data
+        return {key: [value] if isinstance(value, Mapping) else value for key, value in data.items()}
+
+
+class FixSigma(Settings):
+    """Horizontal sigma by kind of fix where the receiver gives no covariance (DOMAIN section 3)."""
+
+    autonomous_m: Positive = 2.0
+    differential_m: Positive = 1.0
+    sbas_m: Positive = 1.0
+    rtk_float_m: Positive = 0.5
+    rtk_fixed_m: Positive = 0.1
+    estimated_m: Positive = 5.0
+    vertical_factor: Positive = 1.5
+
+    def horizontal_m(self, fix: Fix) -> float | None:
+        """Sigma per horizontal axis [m], none for an epoch without fix."""
+        value: float | None = getattr(self, f"{fix.value}_m", None)
+        return value
+
+
+class MatchingConfig(Settings):
+    """Map matching (DOMAIN section 2; Newson & Krumm 2009)."""
+
+    reach_m: Positive = 50.0
+    survey_sigma_default_m: Positive = 1.0
+    bias_sigma_m: Positive = 2.0
+    ambiguity_probability: Probability = 0.99
+    heading_sigma_deg: Positive = 10.0
+    heading_min_speed_mps: Positive = 2.0
+    transition_scale_m: Positive = 5.0
+    link_tolerance_m: Positive = 2.0
+    deadband_mps: Positive = 0.3
+    orientation_distance_m: Positive = 20.0
+
+
+class AlignConfig(Settings):
+    """Odometer against GNSS (DOMAIN section 3), and the causal filter of scale and latency."""
+
+    gap_reset_s: Positive = 60.0
+    odometer_gap_s: Positive = 1.0
+    scale_prior_sigma: Positive = 0.01
+    latency_prior_sigma_s: Positive = 0.2
+    filter_period_s: Positive = 1.0
+    acceleration_window_s: Positive = 1.0
+
+
+class MonitorConfig(Settings):
+    """Monitor bank (DIAG eq. 1-17; DOMAIN section 3)."""
+
+    ewma_alphas: tuple[float, float, float] = (0.1, 0.01, 0.001)
+    false_alarm_probability: Probability = 1e-7
+    ionosphere_share: NonNegative = 0.083
+    ionosphere_tau_s: Positive = 360.0
+    troposphere_share: NonNegative = 0.014
+    troposphere_tau_s: Positive = 1800.0
+    orbit_clock_share: NonNegative = 0.150
+    orbit_clock_tau_s: Positive = 3600.0
+    user_share: NonNegative = 0.752
+    user_tau_s: Positive = 100.0
+    odometer_sigma_mps: Positive = 0.05
+    doppler_sigma_mps: Positive = 0.1
+    sigma_intercept_m: NonNegative = 0.0
+    sigma_slope: Positive = 1.0
+    channel_reference: str | None = None
+    disabled: tuple[str, ...] = ()
+
+
+class LdsConfig(Settings):
+    """Virtual and travelling virtual balises (DOMAIN section 4)."""
+
+    ci_limit_m: Positive = 14.0
+    ci_factor: Positive = 6.18
+    ci_source: Literal["sigma", "hpl"] = "sigma"
+    recovery_s: Positive = 30.0
+    init_s: Positive = 10.0
+    rearm_m: Positive = 10.0
+    odometer_fixed_m: NonNegative = 5.0
+    odometer_share: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    crossing_gap_s: Positive = 1.0
+    entry_from_unfitted_area: bool = False
+
+
+class HazardConfig(Settings):
+    """Hazard classes and budgets (DOMAIN section 5)."""
+
+    failure_limit_m: Positive = 20.0
+    shift_limit_m: Positive = 20.0
+    jump_limit_m: Positive = 20.0
+    jump_window_s: Positive = 1.0
+    failure_hold_s: NonNegative = 1.0
+    episode_end_s: NonNegative = 10.0
+    alarm_lead_s: NonNegative = 30.0
+    reaction_s: NonNegative | None = None
+    false_alarm_margin_m: NonNegative = 5.0
+    false_alarm_lookback_s: NonNegative = 300.0
+    smoothed_reference: bool = False
+    service_level: str = "egnos_observed"
+
+
+class ServiceLevel(Settings):
+    """Hazard rate of a signal-in-space service: `integrity_risk` per `exposure_s`."""
+
+    integrity_risk: Positive
+    exposure_s: Positive
+
+    @property
+    def hazard_rate_per_h(self) -> float:
+        return self.integrity_risk * 3600.0 / self.exposure_s
+
+
+class SafetyConfig(Settings):
+    """Safety budget (DOMAIN section 6)."""
+
+    thr_vb_per_h: Positive = 0.67e-9
+    service_levels: dict[str, ServiceLevel] = {
+        "npa": ServiceLevel(integrity_risk=1e-7, exposure_s=3600.0),
+        "lpv200": ServiceLevel(integrity_risk=2e-7, exposure_s=150.0),
+        "egnos_observed": ServiceLevel(integrity_risk=6e-8, exposure_s=150.0),
+        "horizontal_sis": ServiceLevel(integrity_risk=1e-9, exposure_s=150.0),
+    }
+    demands_per_hour: Positive = 1.0
+    diagnosis_hazard_rate_per_h: Positive = 1e-9
+
+    def allowed_time_to_detect_s(self, level: str) -> float:
+        """Allowed T_D [s] = THR_VB / (HR_GNSS per hour) (TVB eq. 7), per demand of the hour."""
+        rate = self.service_levels[level].hazard_rate_per_h * self.demands_per_hour
+        return self.thr_vb_per_h / rate * 3600.0
+
+
+class Configuration(Settings):
+    """The whole of a replay's configuration."""
+
+    ingest: IngestConfig = IngestConfig()
+    fix_sigma: FixSigma = FixSigma()
+    matching: MatchingConfig = MatchingConfig()
+    align: AlignConfig = AlignConfig()
+    monitors: MonitorConfig = MonitorConfig()
+    lds: LdsConfig = LdsConfig()
+    hazards: HazardConfig = HazardConfig()
+    safety: SafetyConfig = SafetyConfig()
+
+    @model_validator(mode="after")
+    def _level_exists(self) -> Self:
+        if self.hazards.service_level not in self.safety.service_levels:
+            known = ", ".join(sorted(self.safety.service_levels))
+            raise ValueError(f"hazards.service_level {self.hazards.service_level!r} is none of {known}")
+        return self
+
+    @property
+    def budget_s(self) -> float:
+        """Allowed T_D of the level that `within_budget` compares with [s]."""
+        return self.safety.allowed_time_to_detect_s(self.hazards.service_level)
+
+
+class Vehicle(Settings):
+    """A vehicle file; what is absent is not known and estimated or taken as zero (CONTRACT section 1).
+
+    `odometer_scale` is true distance over odometer distance.
+    """
+
+    gnss_antenna_ahead_m: float = 0.0
+    antenna_height_m: float = 0.0
+    odometer_scale: Positive | None = None
+    odometer_scale_sigma: NonNegative | None = None
+    gnss_latency_s: float | None = None
+    gnss_latency_sigma_s: NonNegative | None = None
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def settings_from(data: Mapping[str, object], kind: type[S], place: str) -> S:
+    """Validate a mapping; every breach is listed with its path, as one error."""
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        breaches = [
+            f"{'.'.join(str(part) for part in breach['loc']) or '(file)'}: {breach['msg']}"
+            for breach in error.errors()
+        ]
+        raise ConfigError("; ".join(breaches), place=place, remedy="See the configuration reference.") from None
+
+
+def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
+    """A TOML file as a mapping, or one error."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise kind(f"cannot be read: {error.strerror}", place=str(path)) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise kind(f"is not TOML: {error}", place=str(path)) from None
+
+
+def load_settings(path: Path | None, kind: type[S]) -> S:
+    """A settings file, or the defaults where none is given."""
+    return kind() if path is None else settings_from(read_toml(path), kind, str(path))
+
+
+def to_toml(settings: Settings) -> str:
+    """The resolved settings as TOML; keys that are not set are left out."""
+    return tomli_w.dumps(settings.model_dump(mode="json", exclude_none=True))
+
+
+def digest_of(*parts: Settings) -> str:
+    """SHA-256 over the canonical JSON of settings, independent of how they were written."""
+    text = json.dumps([part.model_dump(mode="json") for part in parts], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,137 @@
+"""Closed sets of the contract. Values are what stands in the tables."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Fix(StrEnum):
+    NONE = "none"
+    AUTONOMOUS = "autonomous"
+    DIFFERENTIAL = "differential"
+    SBAS = "sbas"
+    RTK_FLOAT = "rtk_float"
+    RTK_FIXED = "rtk_fixed"
+    ESTIMATED = "estimated"
+
+
+class Navigability(StrEnum):
+    AB = "AB"
+    BA = "BA"
+    BOTH = "both"
+    NONE = "none"
+
+
+class BaliseKind(StrEnum):
+    VIRTUAL = "virtual"
+    PHYSICAL = "physical"
+
+
+class Reaction(StrEnum):
+    NONE = "none"
+    SERVICE_BRAKE = "service_brake"
+    TRIP = "trip"
+
+
+class Hazard(StrEnum):
+    VB_JUMP_1A = "VB_JUMP_1A"
+    VB_JUMP_1B = "VB_JUMP_1B"
+    VB_SHIFT = "VB_SHIFT"
+
+
+class FailureMode(StrEnum):
+    INSERTION = "insertion"
+    DELETION = "deletion"
+    NONE = "none"
+
+
+class Timing(StrEnum):
+    EARLY = "early"
+    LATE = "late"
+    NONE = "none"
+
+
+class Evidence(StrEnum):
+    REFERENCE = "reference"
+    BALISE = "balise"
+    ODOMETER = "odometer"
+
+
+class Suspect(StrEnum):
+    GNSS = "gnss"
+    ODOMETER = "odometer"
+    MAP = "map"
+    TRACK = "track"
+    UNKNOWN = "unknown"
+
+
+class PassageStatus(StrEnum):
+    ACCEPTED = "accepted"
+    REJECTED_WINDOW = "rejected_window"
+    REJECTED_UNLINKED = "rejected_unlinked"
+    REJECTED_MONITOR = "rejected_monitor"
+    REJECTED_CONFIDENCE = "rejected_confidence"
+    REJECTED_AMBIGUOUS = "rejected_ambiguous"
+    MISSED = "missed"
+    NOT_AVAILABLE = "not_available"
+
+
+class LinkingError(StrEnum):
+    NONE = "none"
+    EARLY = "early"
+    MISSED = "missed"
+    ORDER = "order"
+
+
+class Cause(StrEnum):
+    NONE = "none"
+    POSITION = "position"
+    NO_POSITION = "no_position"
+
+
+class Verdict(StrEnum):
+    TRUE = "true"
+    FALSE = "false"
+    UNKNOWN = "unknown"
+
+
+class SigmaSource(StrEnum):
+    RECEIVER = "receiver"
+    TABLE = "table"
+
+
+class MonitorState(StrEnum):
+    """Absence of data is never health: `NOT_EVALUATED` always comes with a reason."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    NOT_EVALUATED = "not_evaluated"
+
+
+class LdsMode(StrEnum):
+    INITIALISING = "initialising"
+    LINKED = "linked"
+    ODOMETRY = "odometry"
+    FAIL_SAFE = "fail_safe"
+
+
+class LdsState(StrEnum):
+    """States of the reactive LDS (TVB section 4, Fig. 3b)."""
+
+    P0 = "P0"
+    P1 = "P1"
+    P2 = "P2"
+    P3 = "P3"
+
+
+class RunStatus(StrEnum):
+    OK = "ok"
+    PARTIAL = "partial"
+    FAILED = "failed"
+
+
+class Direction(StrEnum):
+    """Direction of travel on the matched path, and of a net element in a route."""
+
+    GROWING = "growing"
+    FALLING = "falling"

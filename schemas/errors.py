@@ -1,0 +1,75 @@
+"""The error family: one message that names the place, the finding, the expectation and the remedy.
+
+Caught at two places only: the command line, and the batch boundary that turns a failed run into a row.
+"""
+
+from __future__ import annotations
+
+
+class BaliseError(Exception):
+    """A condition the user can act on.
+
+    `place` is a file, optionally with topic or column (`gnss.parquet: column t`).
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        place: str | None = None,
+        found: str | None = None,
+        expected: str | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        self.message = message
+        self.place = place
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        text = f"{self.place}: {self.message}" if self.place else self.message
+        if self.found is not None:
+            text += f"; found {self.found}"
+        if self.expected is not None:
+            text += f"; expected {self.expected}"
+        if self.remedy is not None:
+            text += f". {self.remedy}"
+        return text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Exceptions with keyword-only arguments do not survive the way between processes otherwise.
+        state = (self.message, self.place, self.found, self.expected, self.remedy)
+        return (_rebuild, (type(self), *state))
+
+
+def _rebuild(
+    kind: type[BaliseError],
+    message: str,
+    place: str | None,
+    found: str | None,
+    expected: str | None,
+    remedy: str | None,
+) -> BaliseError:
+    return kind(message, place=place, found=found, expected=expected, remedy=remedy)
+
+
+class UsageError(BaliseError):
+    """A command called with arguments that cannot be met (exit 2)."""
+
+
+class ConfigError(BaliseError):
+    """A configuration, vehicle, scenario or fault file that breaks its contract (exit 2)."""
+
+
+class SiteError(BaliseError):
+    """A track, link, balise or route table that breaks its contract (exit 2)."""
+
+
+class InputError(BaliseError):
+    """A recorded log that breaks its contract: that run fails, others go on (exit 1)."""
+
+
+class OutputError(BaliseError):
+    """Results that cannot be written (exit 2)."""

@@ -1,0 +1,92 @@
+"""Records that pass between ingest and the stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import polars as pl
+
+Stream = Literal["gnss", "odometer", "satellites", "reference", "balise_reads", "faults"]
+STREAMS: tuple[Stream, ...] = (
+    "gnss",
+    "odometer",
+    "satellites",
+    "reference",
+    "balise_reads",
+    "faults",
+)
+
+
+@dataclass(frozen=True)
+class IngestNotes:
+    """What reading found out about the log beside its data.
+
+    `partial_until_ns` is set when the log is damaged at its end and read up to there.
+    """
+
+    partial_until_ns: int | None = None
+    damage: str | None = None
+    slow_path_messages: int = 0
+    chunks_without_crc: int = 0
+    skipped_topics: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RunLog:
+    """One recorded journey, one frame per stream as in `schemas.inputs`."""
+
+    run_id: str
+    gnss: pl.DataFrame
+    odometer: pl.DataFrame | None = None
+    satellites: pl.DataFrame | None = None
+    reference: pl.DataFrame | None = None
+    balise_reads: pl.DataFrame | None = None
+    faults: pl.DataFrame | None = None
+    notes: IngestNotes = field(default_factory=IngestNotes)
+    input_digest: str = ""
+
+    def stream(self, name: Stream) -> pl.DataFrame | None:
+        frame: pl.DataFrame | None = getattr(self, name)
+        return frame
+
+    def with_streams(self, **streams: pl.DataFrame | None) -> RunLog:
+        return replace(self, **streams)  # type: ignore[arg-type]
+
+    def solutions(self) -> list[str]:
+        """Names of the run's solutions, sorted."""
+        return sorted(self.gnss["solution"].unique().to_list())
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One remark on a site: `severity` is `error`, `warning` or `note`."""
+
+    severity: Literal["error", "warning", "note"]
+    place: str
+    message: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Site:
+    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`."""
+
+    track: pl.DataFrame
+    links: pl.DataFrame
+    balises: pl.DataFrame | None = None
+    route: pl.DataFrame | None = None
+    findings: tuple[Finding, ...] = ()
+    digest: str = ""
+
+
+@dataclass(frozen=True)
+class RunTables:
+    """The five output tables of one run (`schemas.tables`), all solutions in each."""
+
+    run_id: str
+    hazards: pl.DataFrame
+    passages: pl.DataFrame
+    alarms: pl.DataFrame
+    epochs: pl.DataFrame
+    runs: pl.DataFrame
