@@ -236,7 +236,9 @@ def settings_from(data: Mapping[str, object], kind: type[S], place: str) -> S:
             f"{'.'.join(str(part) for part in breach['loc']) or '(file)'}: {breach['msg']}"
             for breach in error.errors()
         ]
-        raise ConfigError("; ".join(breaches), place=place, remedy="See the configuration reference.") from None
+        raise ConfigError(
+            "; ".join(breaches), place=place, remedy="See the configuration reference."
+        ) from None
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:

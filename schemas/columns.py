@@ -1,0 +1,60 @@
+"""Column constructors of the table contracts: a dtype with its unit, meaning and golden-file tolerance.
+
+`metadata["unit"]` documents; `metadata["tolerance"]` is the absolute tolerance by which
+two results of the same input may differ before it counts as a change (floats only).
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+import dataframely as dy
+
+_TOLERANCE_BY_UNIT = {
+    "m": 1e-6,
+    "m2": 1e-6,
+    "m/s": 1e-6,
+    "s": 1e-6,
+    "deg": 1e-10,
+    "h": 1e-6,
+    "1/h": 1e-9,
+    "Hz": 1e-9,
+    "1": 1e-9,
+    "1/m": 1e-9,
+}
+
+
+def real(unit: str, meaning: str, **rules: Any) -> dy.Float64:
+    """A nullable float; `rules` as in dataframely (`nullable=False`, `min`, `max`)."""
+    rules.setdefault("nullable", True)
+    metadata = {"unit": unit, "tolerance": rules.pop("tolerance", _TOLERANCE_BY_UNIT[unit])}
+    return dy.Float64(description=meaning, metadata=metadata, **rules)
+
+
+def count(meaning: str, **rules: Any) -> dy.Int64:
+    """A number of things, never negative, never null unless said so."""
+    return dy.Int64(description=meaning, metadata={"unit": "1"}, min=0, **rules)
+
+
+def flag(meaning: str, **rules: Any) -> dy.Bool:
+    return dy.Bool(description=meaning, **rules)
+
+
+def text(meaning: str, **rules: Any) -> dy.String:
+    return dy.String(description=meaning, **rules)
+
+
+def texts(meaning: str, **rules: Any) -> dy.List:
+    return dy.List(dy.String(nullable=False), description=meaning, **rules)
+
+
+def one_of(kind: type[StrEnum], meaning: str, **rules: Any) -> dy.Enum:
+    return dy.Enum([member.value for member in kind], description=meaning, **rules)
+
+
+def instant(meaning: str, **rules: Any) -> dy.Datetime:
+    """GNSS time of validity, UTC, nanoseconds."""
+    return dy.Datetime(
+        time_unit="ns", time_zone="UTC", description=meaning, metadata={"unit": "UTC"}, **rules
+    )

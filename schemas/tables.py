@@ -1,0 +1,281 @@
+"""Contracts of the output tables (CONTRACT section 3), one class body each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import dataframely as dy
+
+from schemas.columns import count, flag, instant, one_of, real, text, texts
+from schemas.enums import (
+    BaliseKind,
+    Cause,
+    Direction,
+    Evidence,
+    FailureMode,
+    Hazard,
+    LdsMode,
+    LdsState,
+    LinkingError,
+    MonitorState,
+    PassageStatus,
+    Reaction,
+    RunStatus,
+    SigmaSource,
+    Suspect,
+    Timing,
+    Verdict,
+)
+
+CONTRACT_VERSION = "1.0"
+
+AXES = ("along", "cross", "up")
+SCALES = ("raw", "ewma_0p1", "ewma_0p01", "ewma_0p001")
+BANK_MONITORS: tuple[str, ...] = tuple(f"{axis}_{scale}" for axis in AXES for scale in SCALES)
+OTHER_MONITORS: tuple[str, ...] = (
+    "link_order",
+    "link_distance",
+    "along_doppler",
+    "pseudorange",
+    "channel",
+)
+MONITORS: tuple[str, ...] = BANK_MONITORS + OTHER_MONITORS
+_UNIT_OF_OTHERS = {
+    "link_order": "1",
+    "link_distance": "m",
+    "along_doppler": "m/s",
+    "pseudorange": "1",
+    "channel": "m",
+}
+
+
+def monitor_unit(monitor: str) -> str:
+    """Unit of a monitor's value and threshold."""
+    return _UNIT_OF_OTHERS.get(monitor, "m/s")
+
+
+class Hazards(dy.Schema):
+    """One row per hazard episode and class (DIAG, section Hazards; DOMAIN section 5)."""
+
+    solution = text("solution of the run")
+    hazard_id = count("0, 1, ... in time order within the solution")
+    hazard = one_of(Hazard, "hazard class")
+    failure_mode = one_of(FailureMode, "ETCS failure mode")
+    timing = one_of(Timing, "a VB offered early or late")
+    evidence = one_of(Evidence, "what served as truth")
+    suspect = one_of(Suspect, "what the replay holds to be at fault")
+    caused_by = dy.Int64(nullable=True, min=0, description="hazard_id of the row whose end made this one")
+    t_onset = instant("begin of the fault", nullable=True)
+    t_hazard = instant("the step, or the offered crossing of the first VB hit")
+    t_failure = instant("begin of the position failure", nullable=True)
+    t_detected = instant("first failing monitor from onset to the end of the episode", nullable=True)
+    t_negated = instant("detection plus reaction", nullable=True)
+    t_end = instant("end of the episode", nullable=True)
+    monitor = text("monitor that failed first", nullable=True)
+    detected = flag("a monitor failed within the episode")
+    alarm_before_onset = flag("an alarm was already standing at the onset")
+    time_to_detect_s = real("s", "T_D = t_detected - t_onset")
+    time_since_failure_s = real("s", "T_dsf = t_detected - t_failure; negative = in time")
+    hazardous_s = real("s", "max(0, t_negated - t_failure)", min=0)
+    size_m = real("m", "largest error along the track, signed, + = ahead of the train")
+    rate_mps = real("m/s", "slope of the error from onset to failure; null for a step")
+    balise_ids = texts("VBs hit, in order")
+    accepted_ids = texts("VBs of those that the LDS accepted all the same")
+    netelement_id = text("net element of the train at t_hazard", nullable=True)
+    measure_m = real("m", "measure of the train at t_hazard")
+    path_m = real("m", "path position of the train at t_hazard")
+    speed_mps = real("m/s", "speed of the train at t_hazard")
+    budget_s = real("s", "allowed T_D of the configured service level (TVB eq. 7)")
+    within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
+
+
+class Passages(dy.Schema):
+    """One row per balise and passage on the path, and per offer beyond it."""
+
+    solution = text("solution of the run")
+    balise_id = text("balise")
+    kind = one_of(BaliseKind, "virtual or physical")
+    netelement_id = text("net element of the balise")
+    measure_m = real("m", "measure of the balise")
+    path_m = real("m", "path position of the balise")
+    direction = one_of(Direction, "direction of travel on the path", nullable=True)
+    status = one_of(PassageStatus, "what the LDS made of it")
+    t_offered = instant("the raw matched position crosses the balise, interpolated", nullable=True)
+    t_true = instant("the train passes the balise by the evidence", nullable=True)
+    location_error_m = real("m", "position error at the offer; + = offered early")
+    window_open_m = real("m", "expectation window opens, odometer distance from the LRVB")
+    window_close_m = real("m", "expectation window closes, odometer distance from the LRVB")
+    odometer_distance_m = real("m", "odometer distance from the LRVB at the offer")
+    confidence_m = real("m", "half-width of the confidence interval at the offer")
+    linking_error = one_of(LinkingError, "linking error (SUBSET-026 3.16.2.3.1)")
+    reaction = one_of(Reaction, "reaction of the train")
+    failure_mode = one_of(FailureMode, "ETCS failure mode")
+    cause = one_of(Cause, "wrong position or no position")
+    suspect_after_the_fact = flag("accepted between a fault's onset and its detection")
+    hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
+
+
+class Alarms(dy.Schema):
+    """One row per alarm episode: fails of any monitor less than the recovery time apart."""
+
+    solution = text("solution of the run")
+    alarm_id = count("0, 1, ... in time order within the solution")
+    t_start = instant("first fail")
+    t_end = instant("last fail")
+    monitors = texts("monitors in order of failing")
+    peak_ratio = real("1", "largest |value| / threshold", min=0, tolerance=1e-6)
+    verdict = one_of(Verdict, "true: a fault was there; unknown without truth")
+    suspect = one_of(Suspect, "what the replay holds to be at fault")
+    hazard_id = dy.Int64(nullable=True, min=0, description="hazard that it belongs to")
+
+
+class _EpochsBeforeMonitors(dy.Schema):
+    """One row per GNSS epoch and solution."""
+
+    t = instant("time of validity")
+    solution = text("solution of the run")
+    netelement_id = text("matched net element", nullable=True)
+    measure_m = real("m", "measure on it")
+    path_m = real("m", "path position of the balise antenna by GNSS")
+    cross_track_m = real("m", "position left of growing path")
+    vertical_m = real("m", "position above the track")
+    on_track = flag("a net element of the path is within reach")
+    path_probability = real("1", "posterior probability of the path (forward-backward)", min=0, max=1)
+    odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
+    speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none")
+    sigma_along_m = real("m", "standard deviation of the position along the track", min=0)
+    sigma_cross_m = real("m", "standard deviation of the position across the track", min=0)
+    sigma_up_m = real("m", "standard deviation of the height", min=0)
+    sigma_source = one_of(SigmaSource, "where the standard deviations come from", nullable=True)
+    confidence_m = real("m", "half-width of the confidence interval along the track", min=0)
+    error_along_m = real("m", "position by GNSS minus truth in the direction of travel")
+
+
+class _EpochsAfterMonitors(dy.Schema):
+    alarm = flag("a monitor fails")
+    lds_mode = one_of(LdsMode, "mode of the location determination system")
+    lds_state = one_of(
+        LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
+    )
+    tvb = flag("the epoch is a valid travelling virtual balise")
+    lrvb_id = text("last relevant virtual balise", nullable=True)
+    distance_from_lrvb_m = real("m", "odometer distance since the LRVB")
+    doubt_over_m = real("m", "over-reading amount of the reported position", min=0)
+    doubt_under_m = real("m", "under-reading amount of the reported position", min=0)
+    exposure_s = real("s", "time since the last linked TVB or accepted VB", min=0)
+    error_cross_m = real("m", "position across the track minus truth, left positive")
+    error_up_m = real("m", "height minus truth")
+    direction = dy.Int8(
+        nullable=True, description="direction of travel along growing path: 1 or -1", metadata={"unit": "1"}
+    )
+    gate_probability = real("1", "causal probability of the path, used for detection", min=0, max=1)
+    odometer_scale = real("1", "scale in use at this epoch (true over odometer distance)")
+    latency_s = real("s", "GNSS latency in use at this epoch")
+
+
+def _monitor_columns(monitor: str) -> dict[str, dy.Column]:
+    unit = monitor_unit(monitor)
+    return {
+        f"{monitor}_value": real(unit, f"statistic of the monitor `{monitor}`"),
+        f"{monitor}_threshold": real(unit, f"threshold of the monitor `{monitor}`", min=0),
+        f"{monitor}_state": one_of(MonitorState, f"state of the monitor `{monitor}`"),
+        f"{monitor}_reason": text("why it was not evaluated", nullable=True),
+    }
+
+
+def _epochs_schema() -> type[dy.Schema]:
+    columns: dict[str, Any] = dict(_EpochsBeforeMonitors.columns())
+    for monitor in MONITORS:
+        columns |= _monitor_columns(monitor)
+    columns |= _EpochsAfterMonitors.columns()
+    return type(
+        "Epochs", (dy.Schema,), {"__doc__": _EpochsBeforeMonitors.__doc__, "__module__": __name__, **columns}
+    )
+
+
+Epochs = _epochs_schema()
+
+
+class Runs(dy.Schema):
+    """One row per run and solution; written last, so that it marks the run complete."""
+
+    solution = text("solution of the run; empty where the run failed before any was known")
+    status = one_of(RunStatus, "ok, partial (damaged input read up to the damage) or failed")
+    error = text("what went wrong", nullable=True)
+    t_start = instant("first epoch", nullable=True)
+    t_end = instant("last epoch", nullable=True)
+    partial_until = instant("the log is whole up to here", nullable=True)
+    duration_s = real("s", "last minus first epoch", min=0)
+    distance_m = real("m", "distance travelled", min=0)
+    epochs = count("GNSS epochs")
+    gnss_rate_hz = real("Hz", "nominal rate of the GNSS", min=0)
+    availability = real("1", "share of moving time with a valid TVB", min=0, max=1)
+    outages = count("stretches without a usable position")
+    longest_outage_s = real("s", "longest of them", min=0)
+    duplicates = count("epochs dropped because their time stands twice")
+    out_of_order = count("epochs that were recorded out of order")
+    evidence = one_of(Evidence, "what served as truth", nullable=True)
+    latency_s = real("s", "GNSS latency at the end of the run")
+    latency_sigma_s = real("s", "its standard deviation", min=0)
+    odometer_scale = real("1", "true distance over odometer distance")
+    odometer_scale_sigma = real("1", "its standard deviation", min=0)
+    cross_bias_m = real("m", "median cross-track residual over the run")
+    along_error_mean_m = real("m", "mean error along the track")
+    along_error_p95_m = real("m", "95 % of |error| along the track")
+    along_error_max_m = real("m", "largest |error| along the track")
+    cross_error_mean_m = real("m", "mean error across the track")
+    cross_error_p95_m = real("m", "95 % of |error| across the track")
+    cross_error_max_m = real("m", "largest |error| across the track")
+    up_error_mean_m = real("m", "mean error of height")
+    up_error_p95_m = real("m", "95 % of |error| of height")
+    up_error_max_m = real("m", "largest |error| of height")
+    balises_on_path = count("virtual balises passed")
+    balises_accepted = count("of these accepted")
+    balises_rejected = count("of these rejected")
+    balises_missed = count("of these missed")
+    balises_not_available = count("of these without a position")
+    unsafe_accepted = count("VBs accepted with a location error beyond the failure limit")
+    location_error_mean_m = real("m", "mean location error of accepted VBs")
+    location_error_p95_m = real("m", "95 % of |location error| of accepted VBs")
+    location_error_max_m = real("m", "largest |location error| of accepted VBs")
+    hazards_1a = count("hazards VB_JUMP_1A")
+    hazards_1b = count("hazards VB_JUMP_1B")
+    hazards_shift = count("hazards VB_SHIFT")
+    hazards_detected = count("hazards that a monitor detected")
+    hazards_within_budget = count("hazards negated within the budget")
+    missed_detections = count("hazards with a failure that was not negated within the budget")
+    time_to_detect_max_s = real("s", "largest T_D")
+    time_since_failure_max_s = real("s", "largest T_dsf")
+    hazardous_max_s = real("s", "longest hazardous time")
+    alarms = count("alarm episodes")
+    false_alarms = count("of these false", nullable=True)
+    false_alarm_rate_per_h = real("1/h", "false alarms per hour", min=0)
+    false_alarm_rate_low_per_h = real("1/h", "exact two-sided 95 % Poisson bound, lower", min=0)
+    false_alarm_rate_high_per_h = real("1/h", "exact two-sided 95 % Poisson bound, upper", min=0)
+    exposure_max_s = real("s", "longest exposure", min=0)
+    exposure_p99_s = real("s", "99 % of exposure", min=0)
+    share_p0 = real("1", "share of time in P0", min=0, max=1)
+    share_p1 = real("1", "share of time in P1", min=0, max=1)
+    share_p2 = real("1", "share of time in P2", min=0, max=1)
+    share_p3 = real("1", "share of time in P3", min=0, max=1)
+    stanford_nominal = count("epochs: error <= confidence <= limit")
+    stanford_misleading = count("epochs: confidence < error <= limit")
+    stanford_hazardous = count("epochs: confidence <= limit < error")
+    stanford_unavailable = count("epochs: confidence > limit")
+    mtbf_h = real("h", "mean time between outages of valid, confident, unambiguous positions", min=0)
+    continuity_15s = real("1", "exp(-15 s / MTBF) (LOC eq. 8)", min=0, max=1)
+    config_digest = text("SHA-256 of configuration and vehicle")
+    input_digest = text("SHA-256 of log and site")
+    software = text("name and version of the program")
+    contract = text("version of this contract")
+    ambiguous_stretches = count("stretches where a parallel path is as likely")
+    notes = text("what reading and matching found out about the run", nullable=True)
+
+
+TABLES: dict[str, type[dy.Schema]] = {
+    "hazards": Hazards,
+    "passages": Passages,
+    "alarms": Alarms,
+    "epochs": Epochs,
+    "runs": Runs,
+}
