@@ -1,0 +1,102 @@
+"""Recursions along time that the monitor bank is made of, vectorised.
+
+EWMA of the rates (DIAG eq. 8, with a weight that depends on the time step) and the exact variance of
+each EWMA for independent first-order Gauss-Markov errors and white odometer noise (DOMAIN section 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def linear_recurrence(decay: Array, drive: Array, initial: Array) -> Array:
+    """Solve `y[k] = decay[k] * y[k-1] + drive[k]` with `y[-1] = initial`, shapes (n, c), (n, c), (c,).
+
+    Two-level scan: blocks advance side by side from zero, then take up what the block before left.
+    Exact but for rounding, as only factors within [0, 1] are multiplied.
+    """
+    n, channels = drive.shape
+    if n == 0:
+        return drive.copy()
+    block = max(1, int(np.sqrt(n)))
+    blocks = -(-n // block)
+    pad = ((0, blocks * block - n), (0, 0))
+    y = np.pad(drive, pad).reshape(blocks, block, channels)
+    product = np.pad(np.broadcast_to(decay, drive.shape), pad).reshape(blocks, block, channels)
+    for step in range(1, block):
+        y[:, step] += product[:, step] * y[:, step - 1]
+        product[:, step] *= product[:, step - 1]
+    carry = np.asarray(initial, dtype=np.float64)
+    for index in range(blocks):
+        y[index] += product[index] * carry
+        carry = y[index, -1]
+    return y.reshape(-1, channels)[:n]
+
+
+def ewma_weight(alpha: Array, dt_s: Array) -> Array:
+    """Weight of a new sample after `dt_s`: 1 - (1 - alpha)^(dt / 1 s); shape (n, alphas)."""
+    return 1.0 - (1.0 - alpha[None, :]) ** dt_s[:, None]
+
+
+@dataclass(frozen=True)
+class GaussMarkov:
+    """Error sources of a GNSS axis: shares of its variance and correlation times [s]."""
+
+    shares: Array
+    taus_s: Array
+
+
+@dataclass(frozen=True)
+class BankState:
+    """What the recursions of one axis carry from epoch to epoch; all zero at a restart."""
+
+    ewma: Array
+    variance: Array
+    covariance: Array
+    scale_response: Array
+    latency_response: Array
+
+    @classmethod
+    def at_restart(cls, alphas: int, sources: int) -> BankState:
+        return cls(
+            np.zeros(alphas),
+            np.zeros(alphas),
+            np.zeros((alphas, sources)),
+            np.zeros(alphas),
+            np.zeros(alphas),
+        )
+
+
+def variance_of_ewma(
+    alpha: Array,
+    dt_s: Array,
+    variance_m2: Array,
+    decorrelation: Array,
+    white_m2: Array,
+    state: BankState,
+) -> tuple[Array, Array]:
+    """Variance of the EWMAs of a rate [m^2/s^2], epoch by epoch, from a restart or a carried state.
+
+    `variance_m2` (n, sources): R_j; `decorrelation` (n, sources): 1 - phi_j, given as such because it is
+    tiny at 10 Hz; `white_m2` (n,): variance of white noise on the increment. Returns the variance
+    (n, alphas) and the last covariances c_j (alphas, sources). Recursion of DOMAIN section 3, in which
+    (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R + R (1-phi^2) = R (1-phi).
+    """
+    n, sources = variance_m2.shape
+    weight = ewma_weight(alpha, dt_s)
+    keep = 1.0 - weight
+    gain = weight / dt_s[:, None]
+    step = variance_m2 * decorrelation
+    drive = (gain[:, :, None] * step[:, None, :]).reshape(n, -1)
+    decay = (keep[:, :, None] * (1.0 - decorrelation)[:, None, :]).reshape(n, -1)
+    covariance = linear_recurrence(decay, drive, state.covariance.reshape(-1)).reshape(n, -1, sources)
+    before = np.concatenate([state.covariance[None], covariance[:-1]])
+    coupling = np.einsum("kas,ks->ka", before, decorrelation)
+    fresh = gain**2 * (2.0 * step.sum(axis=1) + white_m2)[:, None] - 2.0 * gain * keep * coupling
+    variance = linear_recurrence(keep**2, fresh, state.variance)
+    return variance, covariance[-1] if n else state.covariance
