@@ -1,0 +1,90 @@
+"""How certain a figure from few events is: exact bounds on rates and shares.
+
+Rates are of a Poisson process; shares are of independent trials (events, passages, runs), never of
+epochs, whose errors are correlated. The bounds are exact in the sense of Garwood and of Clopper and
+Pearson: they hold at least as often as they claim, because events are whole numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+# The incomplete gamma and beta functions give what chi-square and beta quantiles of scipy.stats
+# give, without the second that importing scipy.stats costs every worker.
+from scipy.special import betaincinv, gammaincinv
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A measured figure with its bounds; a part is None where the data cannot say it."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+UNKNOWN = Estimate(None, None, None)
+
+
+def poisson_rate(events: int, exposure_h: float, confidence: float = CONFIDENCE) -> Estimate:
+    """Rate [1/h] with exact two-sided bounds (Garwood 1936): zero events in T h give 0 to 3.69/T.
+
+    Without exposure nothing is known.
+    """
+    _check(events, confidence)
+    if not exposure_h > 0:
+        return UNKNOWN
+    tail = (1.0 - confidence) / 2.0
+    low = float(gammaincinv(events, tail)) if events else 0.0
+    high = float(gammaincinv(events + 1, 1.0 - tail))
+    return Estimate(events / exposure_h, low / exposure_h, high / exposure_h)
+
+
+def poisson_rate_upper(events: int, exposure_h: float, confidence: float = CONFIDENCE) -> float | None:
+    """One-sided upper bound of a rate [1/h], the one a THR claim needs: zero events give 3.00/T."""
+    _check(events, confidence)
+    if not exposure_h > 0:
+        return None
+    return float(gammaincinv(events + 1, confidence)) / exposure_h
+
+
+def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> Estimate:
+    """Share of independent trials with exact two-sided bounds (Clopper and Pearson 1934)."""
+    _check(successes, confidence)
+    if trials < successes:
+        raise ValueError(f"{successes} successes out of {trials} trials")
+    if trials == 0:
+        return UNKNOWN
+    tail = (1.0 - confidence) / 2.0
+    failures = trials - successes
+    low = float(betaincinv(successes, failures + 1, tail)) if successes else 0.0
+    high = float(betaincinv(successes + 1, failures, 1.0 - tail)) if failures else 1.0
+    return Estimate(successes / trials, low, high)
+
+
+def hours_to_substantiate(rate_per_h: float, events: int = 0, confidence: float = CONFIDENCE) -> float:
+    """Total hours [h] with no more than `events` events that show a rate below `rate_per_h`.
+
+    One-sided: 0.67e-9/h needs 4.47e9 h without any event.
+    """
+    _check(events, confidence)
+    if not rate_per_h > 0:
+        raise ValueError(f"a rate of {rate_per_h} 1/h cannot be substantiated")
+    return float(gammaincinv(events + 1, confidence)) / rate_per_h
+
+
+def hours_still_needed(
+    rate_per_h: float, events: int, exposure_h: float, confidence: float = CONFIDENCE
+) -> float:
+    """Hours [h] still to be run without a further event, after `events` in `exposure_h`."""
+    return max(0.0, hours_to_substantiate(rate_per_h, events, confidence) - exposure_h)
+
+
+def _check(events: int, confidence: float) -> None:
+    if events < 0:
+        raise ValueError(f"{events} events")
+    if not 0.0 < confidence < 1.0 or math.isnan(confidence):
+        raise ValueError(f"confidence {confidence} is no probability between 0 and 1")
