@@ -44,16 +44,8 @@ def ewma_weight(alpha: Array, dt_s: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class GaussMarkov:
-    """Error sources of a GNSS axis: shares of its variance and correlation times [s]."""
-
-    shares: Array
-    taus_s: Array
-
-
-@dataclass(frozen=True)
-class BankState:
-    """What the recursions of one axis carry from epoch to epoch; all zero at a restart."""
+class AxisState:
+    """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources)."""
 
     ewma: Array
     variance: Array
@@ -62,35 +54,28 @@ class BankState:
     latency_response: Array
 
     @classmethod
-    def at_restart(cls, alphas: int, sources: int) -> BankState:
-        return cls(
-            np.zeros(alphas),
-            np.zeros(alphas),
-            np.zeros((alphas, sources)),
-            np.zeros(alphas),
-            np.zeros(alphas),
-        )
+    def at_restart(cls, alphas: int, sources: int) -> AxisState:
+        zero = np.zeros(alphas)
+        return cls(zero, zero, np.zeros((alphas, sources)), zero, zero)
 
 
 def variance_of_ewma(
-    alpha: Array,
-    dt_s: Array,
+    keep: Array,
+    gain: Array,
     variance_m2: Array,
     decorrelation: Array,
     white_m2: Array,
-    state: BankState,
+    state: AxisState,
 ) -> tuple[Array, Array]:
     """Variance of the EWMAs of a rate [m^2/s^2], epoch by epoch, from a restart or a carried state.
 
+    `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
     `variance_m2` (n, sources): R_j; `decorrelation` (n, sources): 1 - phi_j, given as such because it is
     tiny at 10 Hz; `white_m2` (n,): variance of white noise on the increment. Returns the variance
     (n, alphas) and the last covariances c_j (alphas, sources). Recursion of DOMAIN section 3, in which
     (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R + R (1-phi^2) = R (1-phi).
     """
     n, sources = variance_m2.shape
-    weight = ewma_weight(alpha, dt_s)
-    keep = 1.0 - weight
-    gain = weight / dt_s[:, None]
     step = variance_m2 * decorrelation
     drive = (gain[:, :, None] * step[:, None, :]).reshape(n, -1)
     decay = (keep[:, :, None] * (1.0 - decorrelation)[:, None, :]).reshape(n, -1)

@@ -1,0 +1,369 @@
+"""Alignment: the odometer at each GNSS epoch's time of validity, scale and latency known or learned causally.
+
+Adds to the matched epochs: `odometer_m, odometer_step_m, odometer_reason, odometer_stretch, speed_mps, direction,
+odometer_scale, scale_sigma, latency_s, latency_sigma_s, speed_step_mps`. Steps lead to an epoch from the
+usable epoch before it; a reason says why an epoch has no odometer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from scipy.stats import norm
+
+from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.monitors.recursion import Array, AxisState
+from pipeline.odometer import OdometerTrack, odometer_track, polarity
+from pipeline.odometer_filter import Estimate, FilterState, ScaleLatencyFilter, error_model, prior_of
+from schemas.config import Configuration, Vehicle
+
+Index = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+NO_ODOMETER = "no odometer"
+BEYOND_SPAN = "outside the odometer's time span"
+INTERRUPTED = "odometer interrupted or slipping"
+_BLOCK = 2048
+
+
+def threshold_factor(false_alarm_probability: float) -> float:
+    """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
+    return float(norm.isf(false_alarm_probability / 2.0))
+
+
+@dataclass(frozen=True)
+class EpochArrays:
+    """What alignment reads of the matched epochs: times [s] on the odometer's scale, positions, usability."""
+
+    t_s: Array
+    path_m: Array
+    sigma_m: Array
+    usable: Mask
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Estimates in use at each epoch; shapes (n,)."""
+
+    scale: Array
+    scale_sigma: Array
+    latency_s: Array
+    latency_sigma_s: Array
+
+    @classmethod
+    def constant(cls, estimate: Estimate, n: int) -> Learned:
+        values = (estimate.scale, estimate.scale_sigma, estimate.latency_s, estimate.latency_sigma_s)
+        return cls(*(np.full(n, value) for value in values))
+
+    def put(self, first: int, changes: list[tuple[int, Estimate]]) -> None:
+        """Set the estimates from epoch `first` on: each change holds from its epoch to the next, the last for good."""
+        begins = [max(first, epoch) for epoch, _ in changes]
+        lengths = np.diff([*begins, self.scale.size])
+        values = np.array([(e.scale, e.scale_sigma, e.latency_s, e.latency_sigma_s) for _, e in changes])
+        columns = (self.scale, self.scale_sigma, self.latency_s, self.latency_sigma_s)
+        for column, value in zip(columns, values.T, strict=True):
+            column[begins[0] :] = np.repeat(value, lengths)
+
+
+def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
+    """Matched epochs of one solution with the odometer's columns (see the module's head)."""
+    if odometer is None:
+        return _without_odometer(epochs, vehicle, config)
+    sigma_mps = config.monitors.odometer_sigma_mps
+    track = odometer_track(odometer, config.align.odometer_gap_s, sigma_mps)
+    t_s = track.seconds(epochs["t"].dt.timestamp("ns").to_numpy())
+    path_m = _floats(epochs["path_m"])
+    matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy() & np.isfinite(path_m)
+    sign = polarity(track, t_s, np.where(matched, path_m, np.nan), config.matching.orientation_distance_m)
+    track = track.oriented(sign)
+    arrays = EpochArrays(t_s, path_m, _floats(epochs["sigma_along_m"]), matched)
+    learned = _learn(arrays, track, vehicle, config)
+    return epochs.with_columns(_columns(arrays, track, learned, config))
+
+
+def _floats(series: pl.Series) -> Array:
+    """A nullable float column as an array with NaN for null."""
+    values: Array = series.to_numpy().astype(np.float64)
+    return values
+
+
+def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration) -> list[pl.Series]:
+    at = arrays.t_s - learned.latency_s
+    known = track.known_at(at)
+    inside = (at >= track.t_s[0]) & (at <= track.t_s[-1])
+    reason = np.where(inside, INTERRUPTED, BEYOND_SPAN).astype(object)
+    reason[known] = None
+    steps = _steps(np.flatnonzero(known), arrays.t_s, track, learned)
+    step = np.full(known.size, np.nan)
+    step[known] = steps.distance_m
+    speed_step = np.full(known.size, np.nan)
+    speed_step[known] = steps.speed_mps
+    speed = np.where(known, learned.scale * track.speed_at(at), np.nan)
+    total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
+    return [
+        pl.Series("odometer_m", total, nan_to_null=True),
+        pl.Series("odometer_step_m", step, nan_to_null=True),
+        pl.Series("odometer_reason", reason.tolist(), dtype=pl.String),
+        pl.Series("odometer_stretch", track.stretch_at(at)),
+        pl.Series("odometer_white_m2_per_s", np.full(known.size, track.white_rate_m2_per_s)),
+        pl.Series("speed_mps", speed, nan_to_null=True),
+        pl.Series("speed_step_mps", speed_step, nan_to_null=True),
+        pl.Series("direction", _direction(speed, config.matching.deadband_mps)),
+        pl.Series("odometer_scale", learned.scale),
+        pl.Series("scale_sigma", learned.scale_sigma),
+        pl.Series("latency_s", learned.latency_s),
+        pl.Series("latency_sigma_s", learned.latency_sigma_s),
+    ]
+
+
+def _direction(speed_mps: Array, deadband_mps: float) -> pl.Series:
+    """+1 or -1 along growing path, held inside the dead band and where the speed is not known."""
+    moving = np.where(np.abs(np.nan_to_num(speed_mps)) > deadband_mps, np.sign(np.nan_to_num(speed_mps)), 0.0)
+    signs = pl.Series(moving).replace(0.0, None).forward_fill().backward_fill().fill_null(1.0)
+    return signs.cast(pl.Int8)
+
+
+def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
+    """No odometer: speed and direction from GNSS (velocity, else positions over the second before)."""
+    nothing = pl.lit(None, pl.Float64)
+    t_s = epochs["t"].dt.timestamp("ns").to_numpy() * 1e-9
+    t_s = t_s - t_s[0]
+    valid = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
+    by_position = speed_of_positions(t_s, np.where(valid, _floats(epochs["path_m"]), np.nan))
+    by_doppler = _floats(epochs["velocity_along_mps"])
+    speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
+    latency = vehicle.gnss_latency_s
+    return epochs.with_columns(
+        odometer_m=nothing,
+        odometer_step_m=nothing,
+        odometer_reason=pl.lit(NO_ODOMETER),
+        odometer_stretch=pl.lit(0, pl.Int64),
+        odometer_white_m2_per_s=nothing,
+        speed_mps=pl.Series(speed, nan_to_null=True),
+        speed_step_mps=nothing,
+        direction=_direction(speed, config.matching.deadband_mps),
+        odometer_scale=nothing,
+        scale_sigma=nothing,
+        latency_s=pl.lit(latency, pl.Float64),
+        latency_sigma_s=pl.lit(None if latency is None else vehicle.gnss_latency_sigma_s or 0.0, pl.Float64),
+    )
+
+
+def speed_of_positions(t_s: Array, path_m: Array, window_s: float = 1.0) -> Array:
+    """Speed [m/s] from positions at least `window_s` apart, causal; NaN where there are none."""
+    speed = np.full(t_s.size, np.nan)
+    valid = np.flatnonzero(np.isfinite(path_m))
+    if valid.size < 2:
+        return speed
+    t, x = t_s[valid], path_m[valid]
+    before = np.searchsorted(t, t - window_s, side="right") - 1
+    before = np.maximum(before, 0)
+    span = t - t[before]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        speed[valid] = np.where(span > 0, (x - x[before]) / span, np.nan)
+    return speed
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Corrected odometer distance and speed change from the row before; the first row has none (zero)."""
+
+    distance_m: Array
+    speed_mps: Array
+
+
+def _steps(rows: Index, t_s: Array, track: OdometerTrack, learned: Learned) -> _Steps:
+    """Steps between consecutive rows, both ends with the estimates in use at the later one."""
+    latency, scale = learned.latency_s[rows], learned.scale[rows]
+    now = t_s[rows] - latency
+    before = np.concatenate([now[:1], t_s[rows][:-1] - latency[1:]])
+    distance = scale * (track.distance_at(now) - track.distance_at(before))
+    speed = scale * (track.speed_at(now) - track.speed_at(before))
+    return _Steps(distance, speed)
+
+
+def _learn(arrays: EpochArrays, track: OdometerTrack, vehicle: Vehicle, config: Configuration) -> Learned:
+    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only."""
+    prior = prior_of(vehicle, config.align)
+    learned = Learned.constant(prior, arrays.t_s.size)
+    if vehicle.odometer_scale is not None and vehicle.gnss_latency_s is not None:
+        return learned
+    _Learner(arrays, track, vehicle, config, learned).run(prior)
+    if vehicle.odometer_scale is not None:
+        learned.scale_sigma[:] = prior.scale_sigma
+    if vehicle.gnss_latency_s is not None:
+        learned.latency_sigma_s[:] = prior.latency_sigma_s
+    return learned
+
+
+class _Learner:
+    """Runs the filter along the run and freezes it under alarm of the along-track monitors.
+
+    Estimates in use at an epoch come from epochs before it. From the first failing epoch on they stand still until
+    the raw and fastest monitors have been quiet for `recovery_s` and GNSS minus odometer is back where it was
+    before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale.
+    """
+
+    def __init__(
+        self, arrays: EpochArrays, track: OdometerTrack, vehicle: Vehicle, config: Configuration, learned: Learned
+    ) -> None:
+        self._config = config
+        self._track = track
+        self._learned = learned
+        self._arrays = arrays
+        shares, taus_s = error_model(config.monitors)
+        self._filter = ScaleLatencyFilter(shares, taus_s, track)
+        self._alphas = np.array(config.monitors.ewma_alphas)
+        self._factor = threshold_factor(config.monitors.false_alarm_probability)
+        margin_s = 5.0 * config.align.latency_prior_sigma_s
+        known = track.known_at(arrays.t_s) & track.known_at(arrays.t_s - margin_s)
+        self._rows = np.flatnonzero(arrays.usable & known)
+        self._t_s, self._path_m, self._sigma_m = (
+            values[self._rows] for values in (arrays.t_s, arrays.path_m, arrays.sigma_m)
+        )
+        self._scale_known = vehicle.odometer_scale is not None
+        self._latency_known = vehicle.gnss_latency_s is not None
+
+    def run(self, prior: Estimate) -> None:
+        if self._rows.size == 0:
+            return
+        prior = Estimate(
+            prior.scale,
+            0.0 if self._scale_known else prior.scale_sigma,
+            prior.latency_s,
+            0.0 if self._latency_known else prior.latency_sigma_s,
+        )
+        state, position = self._start(prior), 0
+        while position < self._rows.size:
+            state, alarm = self._learn_until_alarm(state, position)
+            if alarm >= self._rows.size:
+                break
+            position = self._hold(state.estimate(), alarm)
+            if position < self._rows.size:
+                state = self._filter.restart(state, *self._observation(position)[:2])
+
+    def _observation(self, position: int) -> tuple[float, float, float]:
+        """Time [s], GNSS path position and sigma [m] at a position."""
+        return float(self._t_s[position]), float(self._path_m[position]), float(self._sigma_m[position])
+
+    def _start(self, prior: Estimate) -> FilterState:
+        t_s, path_m, _ = self._observation(0)
+        return self._filter.start(prior, t_s, path_m)
+
+    def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
+        """Learn block by block; returns the state in use at the first failing epoch, and its position."""
+        bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size)
+        position = begin
+        while position < self._rows.size:
+            end = min(position + _BLOCK, self._rows.size)
+            states = self._learn_block(state, position, end)
+            series = self._series(position, end, begin)
+            result, bank = run_axis(series, self._alphas, bank)
+            failing = np.flatnonzero((np.abs(result.value) > self._factor * result.sigma).any(axis=1) & ~series.fresh)
+            if failing.size:
+                alarm = position + int(failing[0])
+                in_use = [item for at, item in states if at < alarm]
+                state = in_use[-1] if in_use else state
+                self._learned.put(0, [(int(self._rows[alarm]), state.estimate())])
+                return state, alarm
+            state, position = states[-1][1] if states else state, end
+        return state, position
+
+    def _learn_block(self, state: FilterState, begin: int, end: int) -> list[tuple[int, FilterState]]:
+        """Updates at the filter's period; fills the estimates of the epochs after each update."""
+        period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
+        states: list[tuple[int, FilterState]] = []
+        changes = [(int(self._rows[begin]), state.estimate())]
+        position = self._next(state.t_s + period_s, begin)
+        while position < end:
+            t_s, path_m, sigma_m = self._observation(position)
+            if self._broken(state.t_s, t_s):
+                state = self._filter.restart(state, t_s, path_m)
+            state = self._filter.update(state, t_s, path_m, sigma_m)
+            states.append((position, state))
+            changes.append((int(self._rows[position]) + 1, state.estimate()))
+            position = self._next(t_s + period_s, position + 1)
+        self._learned.put(0, changes)
+        return states
+
+    def _next(self, t_s: float, at_least: int) -> int:
+        """First position at or after this time, and not before `at_least`."""
+        return max(at_least, int(np.searchsorted(self._t_s, t_s)))
+
+    def _broken(self, before_s: float, now_s: float) -> bool:
+        if now_s - before_s > self._config.align.gap_reset_s:
+            return True
+        stretches = self._track.stretch_at(np.array([before_s, now_s]))
+        return bool(stretches[0] != stretches[1])
+
+    def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
+        """Along-track increments of these positions; the one at `restart` has none before it."""
+        first = max(begin - 1, restart)
+        rows = self._rows[first:end]
+        series = along_series(
+            rows, self._arrays.t_s, self._arrays.path_m, self._arrays.sigma_m, self._track, self._learned, self._config
+        )
+        return series.between(begin - first, rows.size)
+
+    def _hold(self, estimate: Estimate, alarm: int) -> int:
+        """Position from which learning goes on after the alarm at `alarm`; the number of positions if never."""
+        config, rows = self._config, self._rows[max(alarm - 1, 0) :]
+        t_s, path_m, sigma_m = (
+            values[rows] for values in (self._arrays.t_s, self._arrays.path_m, self._arrays.sigma_m)
+        )
+        steps = _steps(rows, self._arrays.t_s, self._track, self._learned)
+        away = path_m - path_m[0] - np.cumsum(steps.distance_m)
+        series = self._series(max(alarm - 1, 0), self._rows.size, max(alarm - 1, 0))
+        state = AxisState.at_restart(self._alphas.size, self._filter.shares.size)
+        result, _ = run_axis(series, self._alphas, state)
+        beyond = np.abs(result.value[:, :2]) > self._factor * result.sigma[:, :2]
+        fast = beyond.any(axis=1) | (np.arange(rows.size) == 1)
+        last_fail = np.maximum.accumulate(np.where(fast, t_s, -np.inf))
+        quiet = t_s - last_fail >= config.lds.recovery_s
+        elapsed = t_s - t_s[0]
+        spread = np.sqrt(
+            2.0 * sigma_m**2
+            + self._track.white_rate_m2_per_s * elapsed
+            + (estimate.scale_sigma * np.cumsum(np.abs(steps.distance_m))) ** 2
+        )
+        near = np.abs(away) <= np.minimum(config.hazards.failure_limit_m, self._factor * spread)
+        may_return = self._factor * spread <= config.hazards.failure_limit_m
+        back = np.flatnonzero(quiet & near & may_return)
+        return max(alarm - 1, 0) + int(back[0]) if back.size else self._rows.size
+
+
+def along_series(
+    rows: Index,
+    t_s: Array,
+    path_m: Array,
+    sigma_m: Array,
+    track: OdometerTrack,
+    learned: Learned,
+    config: Configuration,
+) -> AxisSeries:
+    """Increments of GNSS minus odometer between consecutive rows (DIAG eq. 1-3)."""
+    steps = _steps(rows, t_s, track, learned)
+    t, x = t_s[rows], path_m[rows]
+    dt = np.diff(t, prepend=t[0] - 1.0)
+    stretch = track.stretch_at(t - learned.latency_s[rows])
+    fresh = (dt > config.align.gap_reset_s) | (np.diff(stretch, prepend=stretch[0]) != 0)
+    fresh[0] = True
+    shares, taus_s = error_model(config.monitors)
+    zero = np.zeros(rows.size)
+    distance = np.diff(x, prepend=x[0])
+    return AxisSeries(
+        epoch=rows,
+        fresh=fresh,
+        border=np.zeros(rows.size, dtype=np.bool_),
+        dt_s=dt,
+        rate_mps=(distance - steps.distance_m) / dt,
+        variance_m2=np.outer(sigma_m[rows] ** 2, shares),
+        decorrelation=-np.expm1(-dt[:, None] / taus_s),
+        white_m2=track.white_rate_m2_per_s * dt,
+        border_m2=zero,
+        scale_mps=learned.scale_sigma[rows] * steps.distance_m / dt,
+        latency_mps=learned.latency_sigma_s[rows] * steps.speed_mps / dt,
+    )

@@ -1,0 +1,84 @@
+"""Streams in order of time, without duplicated stamps; what had to be mended is counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import polars as pl
+
+from schemas.errors import InputError
+from schemas.run import STREAMS, RunLog, Stream
+
+_KEYS: dict[Stream, list[str]] = {
+    "gnss": ["solution", "t"],
+    "satellites": ["solution", "t", "sv"],
+    "balise_reads": ["t", "balise_id"],
+}
+
+
+@dataclass(frozen=True)
+class StreamCounts:
+    """Rows dropped because their key stands twice, and rows that came before an earlier one."""
+
+    duplicates: int = 0
+    out_of_order: int = 0
+
+
+@dataclass(frozen=True)
+class CleanCounts:
+    """What cleaning found, per GNSS solution and per other stream."""
+
+    solutions: dict[str, StreamCounts] = field(default_factory=dict)
+    streams: dict[str, StreamCounts] = field(default_factory=dict)
+
+
+def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
+    """The run with every stream in order and each stamp once (the first recorded one stays).
+
+    Raises `InputError` where a solution or the odometer has no two different times: nothing can be replayed.
+    """
+    streams: dict[str, pl.DataFrame | None] = {}
+    counts: dict[str, StreamCounts] = {}
+    for name in STREAMS:
+        frame = run.stream(name)
+        if frame is None or name == "faults":
+            continue
+        streams[name], counts[name] = _in_order(frame, _KEYS.get(name, ["t"]))
+    solutions = {
+        solution: _in_order(frame, ["t"])[1]
+        for (solution,), frame in run.gnss.group_by("solution", maintain_order=True)
+    }
+    _require_two_times(streams["gnss"], run.run_id, "gnss", ["solution"])
+    if streams.get("odometer") is not None:
+        _require_two_times(streams["odometer"], run.run_id, "odometer", [])
+    return run.with_streams(**streams), CleanCounts(solutions, counts)
+
+
+def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
+    late = _out_of_order(frame, [key for key in keys if key == "solution"])
+    ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
+    unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
+    return unique, StreamCounts(frame.height - unique.height, late)
+
+
+def _out_of_order(frame: pl.DataFrame, by: list[str]) -> int:
+    """Rows whose time lies before the latest time recorded so far."""
+    latest = pl.col("t").cum_max()
+    late = pl.col("t") < (latest.over(by) if by else latest)
+    return int(frame.select(late.sum()).item())
+
+
+def _require_two_times(frame: pl.DataFrame | None, run_id: str, stream: str, by: list[str]) -> None:
+    if frame is None:
+        return
+    groups = frame.group_by(by, maintain_order=True) if by else [((), frame)]
+    for key, part in groups:
+        if part.height < 2:
+            name = f" of solution {key[0]!r}" if key else ""
+            raise InputError(
+                f"only one time in the stream{name}",
+                place=f"{run_id}: {stream}, column t",
+                found=f"{part.height} distinct time",
+                expected="at least two epochs at different times",
+                remedy="Check the recorder's time stamps, or the mapping's time source.",
+            )

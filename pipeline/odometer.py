@@ -1,0 +1,117 @@
+"""The odometer as a function of time: distance along growing path, speed, and where it is not known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+_NS = 1e-9
+_GAP_IN_PERIODS = 2.5
+_SPEED_WINDOW_S = 1.0
+
+
+@dataclass(frozen=True)
+class OdometerTrack:
+    """Uncorrected odometer distance [m] over time [s since `epoch_ns`].
+
+    `stretch` counts, sample by sample, how often the distance was lost before: two times can be compared only
+    where the count is the same. `pause[i]` marks a pause of the recording between samples i and i+1, inside which
+    nothing is interpolated. `white_rate_m2_per_s` is the variance that distance gathers in a second.
+    """
+
+    epoch_ns: int
+    t_s: Array
+    distance_m: Array
+    stretch: npt.NDArray[np.int64]
+    pause: Mask
+    slip: Mask
+    white_rate_m2_per_s: float
+
+    def oriented(self, sign: int) -> OdometerTrack:
+        """The same odometer, growing with the path."""
+        return replace(self, distance_m=sign * self.distance_m)
+
+    def seconds(self, t_ns: Times) -> Array:
+        """Times on the odometer's own scale [s]."""
+        return (t_ns - self.epoch_ns) * _NS
+
+    def distance_at(self, t_s: Array) -> Array:
+        """Distance at these times [m]; outside the span the end value (see `known_at`)."""
+        return np.interp(t_s, self.t_s, self.distance_m)
+
+    def known_at(self, t_s: Array) -> Mask:
+        """True where both neighbouring samples exist, without a pause between them, and report no slip."""
+        after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
+        exact = self.t_s[after] == t_s
+        before = np.where(exact, after, np.maximum(after - 1, 0))
+        inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        paused = ~exact & self.pause[np.minimum(before, self.pause.size - 1)]
+        return inside & ~paused & ~self.slip[before] & ~self.slip[after]
+
+    def stretch_at(self, t_s: Array) -> npt.NDArray[np.int64]:
+        """Number of the stretch of unbroken distance that each time lies in."""
+        index = np.searchsorted(self.t_s, t_s, side="right") - 1
+        return self.stretch[index.clip(0, self.t_s.size - 1)]
+
+    def speed_at(self, t_s: Array) -> Array:
+        """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
+        start = np.maximum(t_s - _SPEED_WINDOW_S, self.t_s[0])
+        span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, _NS)
+        return (self.distance_at(t_s) - self.distance_at(start)) / span
+
+
+def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> OdometerTrack:
+    """Distance from the recorded distance where there is one, else from speed (trapezoids).
+
+    A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry; a cumulative distance
+    carries over it. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
+    1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
+    """
+    t_ns = odometer["t"].dt.timestamp("ns").to_numpy()
+    epoch_ns = int(t_ns[0])
+    t_s = (t_ns - epoch_ns) * _NS
+    dt = np.diff(t_s)
+    period = float(np.median(dt))
+    recorded = np.diff(odometer["distance_m"].to_numpy().astype(np.float64))
+    speed = odometer["speed_mps"].to_numpy().astype(np.float64)
+    driven = 0.5 * (speed[1:] + speed[:-1]) * dt
+    step = np.where(np.isnan(recorded), driven, recorded)
+    pause = np.isnan(step) | (dt > max(gap_s, _GAP_IN_PERIODS * period))
+    slip = odometer["slip"].fill_null(False).to_numpy()
+    lost = (pause & np.isnan(recorded)) | slip[1:]
+    step = np.where(np.isnan(step) | (pause & np.isnan(recorded)), 0.0, step)
+    declared = odometer["sigma_speed_mps"].median()
+    declared_rate = float(declared) ** 2 * period if isinstance(declared, float) else 0.0
+    return OdometerTrack(
+        epoch_ns=epoch_ns,
+        t_s=t_s,
+        distance_m=np.concatenate([[0.0], np.cumsum(step)]),
+        stretch=np.concatenate([[0], np.cumsum(lost)]),
+        pause=pause,
+        slip=slip,
+        white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
+    )
+
+
+def polarity(track: OdometerTrack, t_s: Array, path_m: Array, distance_m: float) -> int:
+    """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
+
+    `path_m` grows in the direction of that same movement (DOMAIN section 2), so GNSS decides once, over these
+    metres only. A run that never moves so far is judged by its largest movement.
+    """
+    usable = np.flatnonzero(np.isfinite(path_m) & track.known_at(t_s))
+    if usable.size < 2:
+        return 1
+    odometer = track.distance_at(t_s[usable])
+    moved = odometer - odometer[0]
+    far = np.flatnonzero(np.abs(moved) >= distance_m)
+    end = int(far[0]) if far.size else int(np.argmax(np.abs(moved)))
+    by_gnss = path_m[usable[end]] - path_m[usable[0]]
+    return -1 if moved[end] * by_gnss < 0 else 1

@@ -1,0 +1,132 @@
+"""Causal estimate of odometer scale and GNSS latency inside a run: an extended Kalman filter.
+
+Observed is the GNSS path position against the odometer's distance at the time of validity:
+
+    x(t) = offset + (1 + scale error) * (D(t - latency) - D_0) + sigma(t) * sum_j sqrt(share_j) e_j(t)
+
+with unit first-order Gauss-Markov errors e_j of the monitor bank's own model, so that the estimate's covariance
+tells what the data really say about scale and latency; the offset walks with the odometer's white noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.odometer import OdometerTrack
+from schemas.config import AlignConfig, MonitorConfig, Vehicle
+
+Array = npt.NDArray[np.float64]
+
+_OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
+_OFFSET_PRIOR_M2 = 1e6
+# Receivers show a little noise without memory beside the modelled one; it also keeps the update well conditioned.
+_WHITE_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Scale (true over odometer distance) and latency [s] with their standard deviations."""
+
+    scale: float
+    scale_sigma: float
+    latency_s: float
+    latency_sigma_s: float
+
+
+@dataclass(frozen=True)
+class FilterState:
+    """Mean and covariance of (offset, scale error, latency, e_j...), at a time and from an odometer origin."""
+
+    mean: Array
+    covariance: Array
+    t_s: float
+    origin_m: float
+
+    def estimate(self) -> Estimate:
+        return Estimate(
+            scale=1.0 + float(self.mean[_SCALE]),
+            scale_sigma=float(np.sqrt(self.covariance[_SCALE, _SCALE])),
+            latency_s=float(self.mean[_LATENCY]),
+            latency_sigma_s=float(np.sqrt(self.covariance[_LATENCY, _LATENCY])),
+        )
+
+
+@dataclass(frozen=True)
+class ScaleLatencyFilter:
+    """Model of the errors; states are passed in and out."""
+
+    shares: Array
+    taus_s: Array
+    track: OdometerTrack
+
+    def start(self, prior: Estimate, t_s: float, path_m: float) -> FilterState:
+        """A new state at this epoch: offset and GNSS errors unknown, scale and latency as in `prior`."""
+        errors = self.shares.size
+        origin_m = float(self.track.distance_at(np.array([t_s - prior.latency_s]))[0])
+        mean = np.concatenate([[path_m, prior.scale - 1.0, prior.latency_s], np.zeros(errors)])
+        variances = [_OFFSET_PRIOR_M2, prior.scale_sigma**2, prior.latency_sigma_s**2]
+        return FilterState(mean, np.diag(np.concatenate([variances, np.ones(errors)])), t_s, origin_m)
+
+    def restart(self, state: FilterState, t_s: float, path_m: float) -> FilterState:
+        """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
+        fresh = self.start(state.estimate(), t_s, path_m)
+        covariance = fresh.covariance.copy()
+        kept = slice(_SCALE, _ERRORS)
+        covariance[kept, kept] = state.covariance[kept, kept]
+        return replace(fresh, covariance=covariance)
+
+    def update(self, state: FilterState, t_s: float, path_m: float, sigma_m: float) -> FilterState:
+        """The state after the epoch at `t_s` with GNSS path position and sigma."""
+        mean, covariance = self._predict(state, t_s)
+        at = t_s - mean[_LATENCY]
+        at_lags = np.array([at - 1.0, at - 0.5, at])
+        earlier, before, distance = np.interp(at_lags, self.track.t_s, self.track.distance_m).tolist()
+        # Speed now, carried on from the two half seconds before: a lagging mean would bias the latency.
+        speed = 3.0 * (distance - before) - (before - earlier)
+        row = np.empty(mean.size)
+        row[_OFFSET] = 1.0
+        row[_SCALE] = distance - state.origin_m
+        row[_LATENCY] = -(1.0 + mean[_SCALE]) * speed
+        row[_ERRORS:] = sigma_m * np.sqrt(self.shares)
+        expected = mean[_OFFSET] + (1.0 + mean[_SCALE]) * row[_SCALE] + row[_ERRORS:] @ mean[_ERRORS:]
+        spread = covariance @ row
+        gain = spread / (row @ spread + _WHITE_SHARE * sigma_m**2)
+        return replace(
+            state,
+            mean=mean + gain * (path_m - expected),
+            covariance=covariance - np.outer(gain, spread),
+            t_s=t_s,
+        )
+
+    def _predict(self, state: FilterState, t_s: float) -> tuple[Array, Array]:
+        dt = t_s - state.t_s
+        decay = np.ones(state.mean.size)
+        decay[_ERRORS:] = np.exp(-dt / self.taus_s)
+        noise = np.zeros(state.mean.size)
+        noise[_OFFSET] = self.track.white_rate_m2_per_s * dt
+        noise[_ERRORS:] = 1.0 - decay[_ERRORS:] ** 2
+        covariance = state.covariance * np.outer(decay, decay)
+        covariance[np.diag_indices(noise.size)] += noise
+        return state.mean * decay, covariance
+
+
+def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
+    """Scale and latency as the vehicle file gives them, else the configured prior around 1 and 0."""
+    scale_known = vehicle.odometer_scale is not None
+    latency_known = vehicle.gnss_latency_s is not None
+    return Estimate(
+        scale=vehicle.odometer_scale if vehicle.odometer_scale is not None else 1.0,
+        scale_sigma=(vehicle.odometer_scale_sigma or 0.0) if scale_known else config.scale_prior_sigma,
+        latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,
+        latency_sigma_s=(vehicle.gnss_latency_sigma_s or 0.0) if latency_known else config.latency_prior_sigma_s,
+    )
+
+
+def error_model(config: MonitorConfig) -> tuple[Array, Array]:
+    """Shares of the position variance and correlation times [s] of the Gauss-Markov errors (DIAG Table 1)."""
+    shares = [config.ionosphere_share, config.troposphere_share, config.orbit_clock_share, config.user_share]
+    taus = [config.ionosphere_tau_s, config.troposphere_tau_s, config.orbit_clock_tau_s, config.user_tau_s]
+    return np.array(shares), np.array(taus)
