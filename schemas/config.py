@@ -151,6 +151,7 @@ class HazardConfig(Settings):
     reaction_s: NonNegative | None = None
     false_alarm_margin_m: NonNegative = 5.0
     false_alarm_lookback_s: NonNegative = 300.0
+    balise_read_sigma_m: Positive = 1.0
     smoothed_reference: bool = False
     service_level: str = "egnos_observed"
 
