@@ -1,0 +1,63 @@
+"""What the location determination system asks of a monitor bank."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+from scipy.stats import norm
+
+from schemas.config import Configuration
+
+
+class Bank(Protocol):
+    """Monitors of one solution, from the last restart on.
+
+    Epochs are row indices of the solution's epochs. The answers for an epoch may change with
+    `freeze` and `restart` at that epoch or before it, never through later ones.
+    """
+
+    def failed(self, epoch: int) -> bool:
+        """Any monitor of the bank fails at this epoch."""
+        ...
+
+    def fast_failed(self, epoch: int) -> bool:
+        """A raw or a fastest-EWMA monitor fails at this epoch: only these hold back recovery."""
+        ...
+
+    def along_evaluated(self, epoch: int) -> bool:
+        """The along-track monitors have a verdict (pass or fail) at this epoch."""
+        ...
+
+    def freeze(self, epoch: int) -> None:
+        """First failing epoch: what is learnt inside the run (scale, latency) learns no further."""
+        ...
+
+    def restart(self, epoch: int) -> None:
+        """The recursion starts anew; its first increment is that from this epoch to the next."""
+        ...
+
+
+@dataclass(frozen=True)
+class LdsLimits:
+    """Limits that the LDS shares with other stages.
+
+    `threshold_factor` is k_T, two-sided Gaussian for the false alarm probability per sample;
+    `odometer_sigma_mps` the odometer's noise over one second [m]; `disabled` names monitors.
+    """
+
+    ambiguity_probability: float
+    failure_limit_m: float
+    threshold_factor: float
+    odometer_sigma_mps: float
+    disabled: tuple[str, ...]
+
+    @classmethod
+    def of(cls, configuration: Configuration) -> Self:
+        return cls(
+            ambiguity_probability=configuration.matching.ambiguity_probability,
+            failure_limit_m=configuration.hazards.failure_limit_m,
+            threshold_factor=float(norm.isf(configuration.monitors.false_alarm_probability / 2)),
+            odometer_sigma_mps=configuration.monitors.odometer_sigma_mps,
+            disabled=configuration.monitors.disabled,
+        )

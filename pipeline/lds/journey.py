@@ -1,0 +1,145 @@
+"""The epochs of one solution as columns that the state machine walks along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from pipeline.lds.bank_protocol import LdsLimits
+from schemas.config import LdsConfig
+from schemas.enums import PassageStatus
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Journey:
+    """Epochs in order of time; a NaN is a value that is not known.
+
+    `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
+    count, `None` where it would. `heading`: +1/-1, known at that epoch; `travel`: the same, put
+    back to where the train turned (for labels only). `travelled_m`: way run, turns included.
+    """
+
+    t_ns: Integers
+    leg: Integers
+    path_m: Floats
+    positioned: Bools
+    placed_nowhere: Bools
+    refusal: list[PassageStatus | None]
+    sigma_m: Floats
+    confidence_m: Floats
+    odometer_m: Floats
+    scale_sigma: Floats
+    heading: Integers
+    travel: Integers
+    travelled_m: Floats
+    gap_ns: int
+
+    @property
+    def has_odometer(self) -> bool:
+        return bool(np.isfinite(self.odometer_m).any())
+
+
+def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Journey:
+    """Take the columns of matched and aligned epochs (see `run_lds`)."""
+    t_ns = epochs["t"].dt.epoch("ns").to_numpy().astype(np.int64)
+    path_m = _floats(epochs["path_m"])
+    fix_valid = epochs["fix_valid"].fill_null(False).to_numpy()
+    positioned = fix_valid & np.isfinite(path_m)
+    odometer_m = _floats(epochs["odometer_m"])
+    heading, travel = _headings(odometer_m, epochs["direction"], config.odometer_fixed_m)
+    return Journey(
+        t_ns=t_ns,
+        leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
+        path_m=path_m,
+        positioned=positioned,
+        placed_nowhere=fix_valid & ~positioned,
+        refusal=_refusals(epochs, positioned, config, limits),
+        sigma_m=_floats(epochs["sigma_along_m"].fill_null(strategy="forward")),
+        confidence_m=_floats(epochs["confidence_m"]),
+        odometer_m=odometer_m,
+        scale_sigma=np.nan_to_num(_floats(epochs["scale_sigma"])),
+        heading=heading,
+        travel=travel,
+        travelled_m=_travelled_m(odometer_m, travel),
+        gap_ns=crossing_gap_ns(t_ns, config),
+    )
+
+
+def crossing_gap_ns(t_ns: Integers, config: LdsConfig) -> int:
+    """Longest time between epochs over which a crossing is interpolated: max(1.5 periods, 1 s)."""
+    period_ns = float(np.median(np.diff(t_ns))) if t_ns.size > 1 else 0.0
+    return round(max(1.5 * period_ns, config.crossing_gap_s * 1e9))
+
+
+def _floats(column: pl.Series) -> Floats:
+    return column.cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+
+def _refusals(
+    epochs: pl.DataFrame, positioned: Bools, config: LdsConfig, limits: LdsLimits
+) -> list[PassageStatus | None]:
+    """Ambiguity before confidence; what is not known (null) is never taken as good."""
+    on_track = epochs["on_track"].fill_null(False).to_numpy()
+    probable = _floats(epochs["gate_probability"]) >= limits.ambiguity_probability
+    confident = _floats(epochs["confidence_m"]) <= config.ci_limit_m
+    refusals: list[PassageStatus | None] = [None] * len(positioned)
+    for k in np.flatnonzero(~(positioned & on_track & probable & confident)).tolist():
+        if not positioned[k]:
+            refusals[k] = PassageStatus.NOT_AVAILABLE
+        elif on_track[k] and probable[k]:
+            refusals[k] = PassageStatus.REJECTED_CONFIDENCE
+        else:
+            refusals[k] = PassageStatus.REJECTED_AMBIGUOUS
+    return refusals
+
+
+def _headings(odometer_m: Floats, direction: pl.Series, turn_m: float) -> tuple[Integers, Integers]:
+    """Direction of travel along growing path, as known at each epoch and as it was.
+
+    With an odometer the train has turned once it came back by `turn_m` (the odometer's own fixed
+    error): a wheel's jitter at standstill is no turn. Without one: the matched direction, held.
+    """
+    if not np.isfinite(odometer_m).any():
+        held = direction.replace(0, None).fill_null(strategy="forward").fill_null(1)
+        heading = held.to_numpy().astype(np.int64)
+        return heading, heading
+    known = np.flatnonzero(np.isfinite(odometer_m))
+    heading = np.ones(odometer_m.size, dtype=np.int64)
+    travel = heading.copy()
+    for turned_at, confirmed_at, sign in _turns(odometer_m[known], turn_m):
+        heading[known[confirmed_at] :] = sign
+        travel[known[turned_at] :] = sign
+    return heading, travel
+
+
+def _turns(odometer_m: Floats, turn_m: float) -> list[tuple[int, int, int]]:
+    """Turning points: index of the extreme, index where it is confirmed, new direction."""
+    turns: list[tuple[int, int, int]] = []
+    start, sign = 0, 1
+    while True:
+        way_m = sign * odometer_m[start:]
+        back_m = np.maximum.accumulate(way_m) - way_m
+        confirmed = int(np.argmax(back_m >= turn_m))
+        if back_m[confirmed] < turn_m:
+            return turns
+        extreme = int(np.argmax(way_m[: confirmed + 1]))
+        sign = -sign
+        turns.append((start + extreme, start + confirmed, sign))
+        start += confirmed
+
+
+def _travelled_m(odometer_m: Floats, travel: Integers) -> Floats:
+    """Way run since the first epoch; signed sums, so that jitter at standstill adds up to nothing."""
+    travelled_m = np.full(odometer_m.size, np.nan)
+    known = np.flatnonzero(np.isfinite(odometer_m))
+    if known.size:
+        steps_m = np.diff(odometer_m[known], prepend=odometer_m[known[0]])
+        travelled_m[known] = np.cumsum(steps_m * np.roll(travel[known], 1))
+    return travelled_m

@@ -1,0 +1,158 @@
+"""The linking monitors: order of balise identities, and GNSS against odometer distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite, sqrt
+
+import numpy as np
+import polars as pl
+
+from pipeline.lds.bank_protocol import LdsLimits
+from pipeline.lds.crossings import Crossing
+from pipeline.lds.journey import Floats, Journey
+from schemas.config import LdsConfig
+from schemas.enums import MonitorState, PassageStatus
+from schemas.tables import Epochs
+
+# Identities are counted: half a balise lies between none and one.
+ORDER_THRESHOLD = 0.5
+
+DISABLED = "disabled by configuration"
+NO_ODOMETER = "no odometer"
+NO_POSITION = "no position"
+AMBIGUOUS = "match ambiguous or off track"
+NO_REFERENCE = "no balise or validated position to measure from"
+FIRST_EPOCH = "no epoch before"
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """A position that the diagnosis stands behind: GNSS minus odometer there, and its sigma [m]."""
+
+    offset_m: float
+    sigma_m: float
+    t_ns: int
+    travelled_m: float
+
+
+def disorder(
+    offered: list[Crossing], overdue: int, journey: Journey, config: LdsConfig, limits: LdsLimits
+) -> int:
+    """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
+
+    Two or more at once, or one against the direction of travel, are out of order where the
+    odometer's step does not explain the position's; `overdue` ones, whose window has closed, always.
+    """
+    i, j = offered[0].before, offered[0].epoch
+    odometer_step_m = journey.odometer_m[j] - journey.odometer_m[i]
+    excess_m = abs(journey.path_m[j] - journey.path_m[i] - odometer_step_m)
+    noise_m = limits.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)
+    unexplained = excess_m > noise_m + config.odometer_share * abs(odometer_step_m)
+    backwards = offered[0].sense != journey.heading[j]
+    return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
+
+
+def distance_threshold_m(
+    anchor: Anchor, travelled_m: float, sigma_m: float, config: LdsConfig, limits: LdsLimits
+) -> float:
+    """Bound on (GNSS - odometer) since the anchor [m].
+
+    The odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T.
+    """
+    way_m = abs(travelled_m - anchor.travelled_m)
+    noise_m = limits.threshold_factor * sqrt(sigma_m * sigma_m + anchor.sigma_m * anchor.sigma_m)
+    return config.odometer_fixed_m + config.odometer_share * way_m + noise_m
+
+
+def relink_bound_m(
+    anchor: Anchor, k: int, journey: Journey, config: LdsConfig, limits: LdsLimits
+) -> float | None:
+    """Bound on (GNSS - odometer) minus what it was at the anchor; `None` once nothing can be told.
+
+    k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2), with the sigma of both epochs for
+    2 sigma_x^2. Beyond the failure limit a persisting failure would pass: no re-link then.
+    """
+    waited_s = (int(journey.t_ns[k]) - anchor.t_ns) * 1e-9
+    scale_m = float(journey.scale_sigma[k]) * (float(journey.travelled_m[k]) - anchor.travelled_m)
+    variance_m2 = anchor.sigma_m**2 + float(journey.sigma_m[k]) ** 2
+    variance_m2 += limits.odometer_sigma_mps**2 * waited_s + scale_m**2
+    bound_m = limits.threshold_factor * sqrt(variance_m2)
+    return bound_m if bound_m <= limits.failure_limit_m else None
+
+
+class LinkRecord:
+    """Values, thresholds and reasons of both linking monitors, epoch by epoch."""
+
+    def __init__(self, journey: Journey, limits: LdsLimits) -> None:
+        size = journey.t_ns.size
+        self._journey = journey
+        self.order_reason = _order_reasons(journey, "link_order" in limits.disabled)
+        self.order_value = [0.0 if reason is None else float("nan") for reason in self.order_reason]
+        self.distance_reason = _distance_reasons(journey, "link_distance" in limits.disabled)
+        self.distance_value = [float("nan")] * size
+        self.distance_threshold = [float("nan")] * size
+
+    def columns(self) -> dict[str, pl.Series]:
+        """`link_order_*` and `link_distance_*` as in the contract of epochs."""
+        order_threshold = [
+            ORDER_THRESHOLD if isfinite(value) else float("nan") for value in self.order_value
+        ]
+        return _columns("link_order", self.order_value, order_threshold, self.order_reason) | _columns(
+            "link_distance", self.distance_value, self.distance_threshold, self.distance_reason
+        )
+
+
+def _order_reasons(journey: Journey, disabled: bool) -> list[str | None]:
+    known = np.flatnonzero(journey.positioned)
+    before = np.full(journey.t_ns.size, -1)
+    before[known[1:]] = known[:-1]
+    odometer = np.isfinite(journey.odometer_m)
+    step_known = odometer & odometer[before]
+    masks = (
+        (np.full(odometer.size, disabled), DISABLED),
+        (~odometer, NO_ODOMETER),
+        (~journey.positioned, NO_POSITION),
+        (before < 0, FIRST_EPOCH),
+        (~step_known, NO_ODOMETER),
+    )
+    return _reasons(odometer.size, masks)
+
+
+def _distance_reasons(journey: Journey, disabled: bool) -> list[str | None]:
+    odometer = np.isfinite(journey.odometer_m)
+    ambiguous = np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in journey.refusal])
+    masks = (
+        (np.full(odometer.size, disabled), DISABLED),
+        (~odometer, NO_ODOMETER),
+        (~journey.positioned, NO_POSITION),
+        (ambiguous.astype(bool), AMBIGUOUS),
+    )
+    return _reasons(odometer.size, masks)
+
+
+def _reasons(size: int, masks: tuple[tuple[np.ndarray, str], ...]) -> list[str | None]:
+    reasons = np.full(size, None, dtype=object)
+    for mask, reason in reversed(masks):
+        reasons[mask] = reason
+    found: list[str | None] = reasons.tolist()
+    return found
+
+
+def _columns(
+    monitor: str, values: list[float], thresholds: list[float], reasons: list[str | None]
+) -> dict[str, pl.Series]:
+    value, threshold = np.array(values, dtype=np.float64), np.array(thresholds, dtype=np.float64)
+    state = np.where(np.abs(value) > threshold, MonitorState.FAIL.value, MonitorState.PASS.value)
+    state = np.where(np.isnan(value), MonitorState.NOT_EVALUATED.value, state)
+    kind = Epochs.columns()[f"{monitor}_state"].dtype
+    return {
+        f"{monitor}_value": _nullable(f"{monitor}_value", value),
+        f"{monitor}_threshold": _nullable(f"{monitor}_threshold", threshold),
+        f"{monitor}_state": pl.Series(f"{monitor}_state", state.tolist(), dtype=pl.String).cast(kind),
+        f"{monitor}_reason": pl.Series(f"{monitor}_reason", reasons, dtype=pl.String),
+    }
+
+
+def _nullable(name: str, values: Floats) -> pl.Series:
+    return pl.Series(name, values).fill_nan(None)

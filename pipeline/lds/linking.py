@@ -1,0 +1,299 @@
+"""ETCS linking: one chain of announced balises, virtual or physical, and what the train makes of each.
+
+Distances along the chain are odometer distances from the last relevant balise (LRVB or LRBG), positive
+in the direction of travel. One balise is expected at a time, in the order announced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.lds.crossings import Balise
+from pipeline.lds.windows import Window, window_after_turn_m, window_m
+from schemas.config import LdsConfig
+from schemas.enums import LinkingError, PassageStatus, Reaction
+
+_SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
+MISSED_IN_A_ROW = 2
+
+
+@dataclass(slots=True)
+class Passage:
+    """A row of `passages` in the making. `reckoned_odometer_m`: where the train passes it by linking."""
+
+    balise: Balise
+    t_ns: int
+    heading: int
+    status: PassageStatus = PassageStatus.MISSED
+    t_offered_ns: int | None = None
+    window: Window | None = None
+    odometer_distance_m: float | None = None
+    confidence_m: float | None = None
+    linking_error: LinkingError = LinkingError.NONE
+    reaction: Reaction = Reaction.NONE
+    reckoned_odometer_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A balise offered to the train: a crossing of the position, or a telegram read.
+
+    `refusal`: why it does not count as a detection, `None` where it does. `sense`: direction in
+    which the position passes the balise, `heading`: direction of travel.
+    """
+
+    balise: Balise
+    t_ns: int
+    sense: int
+    heading: int
+    odometer_m: float | None
+    travelled_m: float
+    confidence_m: float | None
+    refusal: PassageStatus | None
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The last relevant balise: where odometer and way run stood when it was detected."""
+
+    balise: Balise
+    odometer_m: float | None
+    travelled_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    distance_m: float
+    travelled_m: float
+
+
+class LinkingChain:
+    """Announced balises of one kind, the reference, and the passages so far."""
+
+    def __init__(self, balises: Sequence[Balise], config: LdsConfig) -> None:
+        self.passages: list[Passage] = []
+        self.reference: Reference | None = None
+        self._announced = [balise for balise in balises if balise.linked]
+        self._config = config
+        self._heading = 1
+        self._leg: int | None = None
+        self._turn: _Turn | None = None
+        self._ahead: list[Balise] = []
+        self._optional: set[str] = set()
+        self._missed_in_a_row = 0
+        self._closing_m = float("inf")
+        # The passage that a balise ahead already has, through an offer before its window closed ...
+        self._own: dict[str, Passage] = {}
+        # ... the same, crossed back since without an offer of its own ...
+        self._set_aside: dict[str, Passage] = {}
+        # ... and that of a balise whose window closed without any offer.
+        self._unoffered: dict[str, Passage] = {}
+
+    @property
+    def linking(self) -> bool:
+        """A reference with a known odometer reading: windows can be drawn from it."""
+        return self.reference is not None and self.reference.odometer_m is not None
+
+    def forget(self) -> None:
+        """A new initialisation: no reference, no linking."""
+        self.reference = None
+        self._look_ahead([])
+
+    def is_overdue(self, balise: Balise) -> bool:
+        """Its window has closed without any offer."""
+        return balise.balise_id in self._unoffered
+
+    def advance(
+        self, odometer_m: float, travelled_m: float, heading: int, leg: int, t_ns: int, blind: bool
+    ) -> None:
+        """The train has come to this odometer reading; `blind`: it has no means to detect just now."""
+        if not self.linking:
+            return
+        if heading != self._heading or leg != self._leg:
+            self._turn_round(odometer_m, travelled_m, heading, leg)
+        if odometer_m * self._heading > self._closing_m:
+            self._close_windows(self._distance_m(odometer_m), t_ns, blind)
+
+    def offer(self, offer: Offer) -> Passage:
+        """Judge an offered balise; its passage is written whatever comes of it."""
+        linking = self.linking and offer.odometer_m is not None
+        if linking and offer.odometer_m is not None:
+            self._close_windows(self._distance_m(offer.odometer_m), offer.t_ns, blind=False)
+        passage = self._passage_of(offer)
+        if linking and offer.odometer_m is not None:
+            passage.odometer_distance_m = self._distance_m(offer.odometer_m)
+        if offer.refusal is not None:
+            passage.status = offer.refusal
+        elif linking:
+            self._judge(passage)
+        else:
+            passage.status = PassageStatus.ACCEPTED
+        if passage.status is PassageStatus.ACCEPTED:
+            self._refer_to(offer)
+        return passage
+
+    def pass_unoffered(self, offer: Offer, status: PassageStatus) -> None:
+        """The position was on one side before a gap and on the other after it."""
+        name = offer.balise.balise_id
+        if offer.sense != offer.heading:
+            self.cross_again(offer.balise, offer.sense, offer.heading)
+        elif name in self._unoffered:
+            self._unoffered[name].status = status
+        else:
+            passage = self._new_passage(offer.balise, offer.t_ns, offer.heading)
+            passage.status = status
+            self._own[name] = passage
+
+    def cross_again(self, balise: Balise, sense: int, heading: int) -> None:
+        """Crossed once more before it was re-armed: not offered, but the position changed sides."""
+        taken, kept = (self._set_aside, self._own) if sense == heading else (self._own, self._set_aside)
+        passage = taken.pop(balise.balise_id, None)
+        if passage is not None:
+            kept[balise.balise_id] = passage
+
+    def finish(self, odometer_m: float, t_ns: int) -> None:
+        """The run ends blind: what the train has passed by its reckoning was not available."""
+        if not self.linking:
+            return
+        distance_m = self._distance_m(odometer_m)
+        for balise in self._ahead:
+            unseen = balise.balise_id not in self._own and balise.balise_id not in self._optional
+            if unseen and self._announced_m(balise) < distance_m:
+                passage = self._new_passage(balise, t_ns, self._heading)
+                passage.status = PassageStatus.NOT_AVAILABLE
+
+    def _distance_m(self, odometer_m: float) -> float:
+        assert self.reference is not None
+        assert self.reference.odometer_m is not None
+        return (odometer_m - self.reference.odometer_m) * self._heading
+
+    def _announced_m(self, balise: Balise) -> float:
+        assert self.reference is not None
+        return (balise.path_m - self.reference.balise.path_m) * self._heading
+
+    def _window(self, balise: Balise) -> Window:
+        assert self.reference is not None
+        distance_m = self._announced_m(balise)
+        reference_accuracy_m = self.reference.balise.accuracy_m
+        if self._turn is None:
+            return window_m(distance_m, balise.accuracy_m, reference_accuracy_m, self._config)
+        travelled_m = self._turn.travelled_m + abs(distance_m - self._turn.distance_m)
+        margin_m = balise.accuracy_m + reference_accuracy_m + self._config.odometer_fixed_m
+        return window_after_turn_m(distance_m, travelled_m, margin_m, self._config)
+
+    def _judge(self, passage: Passage) -> None:
+        """A detection while linking is in force (SUBSET-026 3.16.2.3.1)."""
+        balise, distance_m = passage.balise, passage.odometer_distance_m
+        assert distance_m is not None
+        if not balise.linked:
+            passage.status = PassageStatus.REJECTED_UNLINKED
+            return
+        passage.status = PassageStatus.REJECTED_WINDOW
+        position = self._position_ahead(balise)
+        if position is None:
+            return
+        expected = self._ahead[position]
+        if expected.balise_id == balise.balise_id and self._window(balise).holds(distance_m):
+            passage.status = PassageStatus.ACCEPTED
+        elif expected.balise_id != balise.balise_id and self._window(expected).holds(distance_m):
+            _blame(passage, LinkingError.ORDER, expected.reaction)
+        else:
+            _blame(passage, LinkingError.EARLY, balise.reaction)
+
+    def _position_ahead(self, balise: Balise) -> int | None:
+        """Index of the expected balise that this offer stands against, `None` where it is not ahead.
+
+        Balises near which the train turned may or may not be passed: they stand in nobody's way.
+        """
+        names = [ahead.balise_id for ahead in self._ahead]
+        if balise.balise_id not in names:
+            return None
+        position = names.index(balise.balise_id)
+        in_its_way = (i for i in range(position) if names[i] not in self._optional)
+        return next(in_its_way, position)
+
+    def _close_windows(self, distance_m: float, t_ns: int, blind: bool) -> None:
+        while self._ahead and distance_m > self._window(self._ahead[0]).close_m:
+            self._close(self._ahead[0], t_ns, blind)
+            self._look_ahead(self._ahead[1:])
+
+    def _close(self, balise: Balise, t_ns: int, blind: bool) -> None:
+        """Not found in its window; the second in a row brakes (3.16.2.7; TVB eq. 4)."""
+        if balise.balise_id in self._optional:
+            return
+        passage = self._own.pop(balise.balise_id, None)
+        if passage is None:
+            passage = self._new_passage(balise, t_ns, self._heading)
+            passage.status = PassageStatus.NOT_AVAILABLE if blind else PassageStatus.MISSED
+            self._unoffered[balise.balise_id] = passage
+        self._missed_in_a_row += 1
+        _blame(passage, LinkingError.MISSED, balise.reaction)
+        if self._missed_in_a_row >= MISSED_IN_A_ROW:
+            _blame(passage, LinkingError.MISSED, Reaction.SERVICE_BRAKE)
+
+    def _refer_to(self, offer: Offer) -> None:
+        """An accepted balise becomes the reference; what lies beyond it is expected next."""
+        balise = offer.balise
+        self.reference = Reference(balise, offer.odometer_m, offer.travelled_m)
+        self._heading, self._leg, self._turn = offer.heading, balise.leg, None
+        self._missed_in_a_row = 0
+        self._optional = set()
+        self._own.pop(balise.balise_id, None)
+        self._look_ahead([other for other in self._in_order_of_travel() if self._announced_m(other) > 0])
+
+    def _turn_round(self, odometer_m: float, travelled_m: float, heading: int, leg: int) -> None:
+        """The train goes the other way, or on another leg: expect what lies on its new way."""
+        assert self.reference is not None
+        self._heading, self._leg = heading, leg
+        self._turn = _Turn(self._distance_m(odometer_m), travelled_m - self.reference.travelled_m)
+        self._own.clear()
+        self._set_aside.clear()
+        self._unoffered.clear()
+        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel()]
+        here_m = self._turn.distance_m
+        self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
+        self._look_ahead([balise for balise, window in windows if window.close_m > here_m])
+
+    def _in_order_of_travel(self) -> list[Balise]:
+        on_leg = [balise for balise in self._announced if balise.leg == self._leg]
+        return on_leg if self._heading > 0 else on_leg[::-1]
+
+    def _look_ahead(self, ahead: list[Balise]) -> None:
+        self._ahead = ahead
+        self._closing_m = float("inf")
+        if ahead and self.reference is not None and self.reference.odometer_m is not None:
+            start_m = self.reference.odometer_m * self._heading
+            self._closing_m = start_m + self._window(ahead[0]).close_m
+
+    def _passage_of(self, offer: Offer) -> Passage:
+        """The passage that this offer belongs to: a new one, or one whose window closed before."""
+        name = offer.balise.balise_id
+        forward = offer.sense == offer.heading
+        passage = self._unoffered.pop(name, None) if forward else None
+        if passage is None:
+            passage = self._new_passage(offer.balise, offer.t_ns, offer.heading)
+            self._own.pop(name, None)
+            self._set_aside.pop(name, None)
+            if forward:
+                self._own[name] = passage
+        passage.t_offered_ns = passage.t_ns = offer.t_ns
+        passage.confidence_m = offer.confidence_m
+        return passage
+
+    def _new_passage(self, balise: Balise, t_ns: int, heading: int) -> Passage:
+        passage = Passage(balise, t_ns, heading)
+        if balise.balise_id in (ahead.balise_id for ahead in self._ahead):
+            passage.window = self._window(balise)
+        if self.reference is not None and self.reference.odometer_m is not None:
+            along_m = balise.path_m - self.reference.balise.path_m
+            passage.reckoned_odometer_m = self.reference.odometer_m + along_m
+        self.passages.append(passage)
+        return passage
+
+
+def _blame(passage: Passage, error: LinkingError, reaction: Reaction) -> None:
+    """The first linking error of a passage stays, the most severe reaction counts."""
+    if passage.linking_error is LinkingError.NONE:
+        passage.linking_error = error
+    passage.reaction = max(passage.reaction, reaction, key=_SEVERITY.index)
