@@ -30,15 +30,18 @@ class StreamMapping(Settings):
     """How one recorded topic becomes one stream (CONTRACT section 1).
 
     `fields` maps stream column to recorded field path, `factors` multiplies (unit conversion),
-    `constants` fills columns that the log does not hold.
+    `constants` fills columns that the log does not hold. `time` is `auto` (the payload's own stamp, else
+    the log time), `log`, `publish` or `field:PATH`; numbers there are nanoseconds (integers) or seconds
+    (floats) unless `factors.t` gives the seconds per unit, counted from `time_epoch`.
     """
 
     topic: str
     fields: dict[str, str] = {}
     factors: dict[str, float] = {}
     constants: dict[str, str | float | bool] = {}
-    time: str = Field(default="log", pattern=r"^(log|publish|field:.+)$")
+    time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
+    time_epoch: Literal["unix", "gps"] = "unix"
     solution: str = "primary"
 
 
@@ -50,6 +53,7 @@ class IngestConfig(Settings):
     satellites: tuple[StreamMapping, ...] = ()
     reference: tuple[StreamMapping, ...] = ()
     balise_reads: tuple[StreamMapping, ...] = ()
+    chunk_limit_mib: Positive = 128.0
 
     @model_validator(mode="before")
     @classmethod

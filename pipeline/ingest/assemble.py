@@ -1,0 +1,67 @@
+"""Decoded fields to stream frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.ingest.breaches import Breach
+from pipeline.ingest.conform import conform
+from pipeline.ingest.plan import Source
+from schemas.errors import InputError
+from schemas.run import STREAMS, Stream
+
+ORDINAL = "(ordinal)"  # place of a message in the file
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Fields of all messages of a source, one row per message, with its times and place in the file."""
+
+    source: Source
+    frame: pl.DataFrame
+
+
+def stream_frames(decoded: Sequence[Decoded], breaches: list[Breach]) -> dict[str, pl.DataFrame]:
+    """One frame per stream that has a source, rows in order of the file."""
+    frames: dict[str, pl.DataFrame] = {}
+    for stream in STREAMS:
+        parts = [part for part in decoded if part.source.stream == stream]
+        if parts:
+            frames[stream] = _stream(stream, parts, breaches)
+    return frames
+
+
+def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) -> pl.DataFrame:
+    place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
+    rows = [_rows(part) for part in parts]
+    if len(rows) == 1:
+        frame = rows[0]
+    else:
+        frame = pl.concat(rows, how="diagonal_relaxed").sort(ORDINAL, maintain_order=True)
+    return conform(frame.drop(ORDINAL), stream, place, breaches)
+
+
+def _rows(part: Decoded) -> pl.DataFrame:
+    source = part.source
+    columns = part.frame.select(
+        pl.col(ORDINAL), *(expression.alias(name) for name, expression in source.columns.items())
+    )
+    try:
+        times = [time.instants(part.frame, name) for name, time in source.times.items()]
+    except pl.exceptions.PolarsError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
+    return _named(columns.with_columns(times), source)
+
+
+def _named(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
+    """With the solution: what the messages say, else the source's."""
+    if source.solution is None:
+        return frame
+    name = pl.lit(source.solution, dtype=pl.String)
+    if "solution" in source.columns:
+        name = pl.coalesce(pl.col("solution"), name)
+    return frame.with_columns(name.alias("solution"))

@@ -1,0 +1,230 @@
+"""A recorded frame made to fit its stream's contract: lossless conversions, else a breach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import dataframely as dy
+import polars as pl
+
+from pipeline.ingest.breaches import Breach
+from schemas.inputs import STREAM_SCHEMAS
+from schemas.run import Stream
+
+DEFAULTS: dict[str, str] = {"solution": "primary"}
+NEVER_EMPTY: tuple[Stream, ...] = ("gnss", "odometer")
+_EXACT_INTEGER = 2**53  # above it not every integer is a float
+
+Convert = Callable[[pl.Series], pl.Series | str]
+
+
+def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Breach]) -> pl.DataFrame:
+    """The stream's columns with the contract's types, in the contract's order; rows are left as they stand.
+
+    Breaches are appended; the frame returned is of use only if none were.
+    """
+    columns = STREAM_SCHEMAS[stream].columns()
+    if frame.height == 0 and stream in NEVER_EMPTY:
+        breaches.append(Breach(place, "has no rows", expected="at least one", remedy="Record the stream."))
+    conformed = {
+        name: _column(frame, name, column, place, breaches)
+        for name, column in columns.items()
+        if name in frame.columns or _may_be_absent(name, column, frame, place, breaches)
+    }
+    result = pl.DataFrame({name: series for name, series in conformed.items() if series is not None})
+    if stream == "odometer":
+        _check_odometer(result, place, breaches)
+    return result
+
+
+def extra_columns(frame: pl.DataFrame, stream: Stream) -> list[str]:
+    """Recorded columns that the contract does not know."""
+    known = STREAM_SCHEMAS[stream].columns()
+    return [name for name in frame.columns if name not in known]
+
+
+def _may_be_absent(
+    name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[Breach]
+) -> bool:
+    if column.nullable or name in DEFAULTS:
+        return True
+    breaches.append(
+        Breach(
+            f"{place}: column {name}",
+            "is missing",
+            found=", ".join(frame.columns) or "no columns",
+            expected=type_name(column),
+            remedy="Add the column.",
+        )
+    )
+    return False
+
+
+def _column(
+    frame: pl.DataFrame, name: str, column: dy.Column, place: str, breaches: list[Breach]
+) -> pl.Series | None:
+    where = f"{place}: column {name}"
+    if name not in frame.columns:
+        return pl.Series(name, [DEFAULTS.get(name)], dtype=column.dtype).new_from_index(0, frame.height)
+    series = _converted(frame[name], column)
+    if isinstance(series, str):
+        breaches.append(
+            Breach(where, "has the wrong type", found=series, expected=type_name(column), remedy=_RETYPE)
+        )
+        return None
+    _check_values(series, column, where, breaches)
+    return series
+
+
+_RETYPE = "Write the column with that type."
+
+
+def type_name(column: dy.Column) -> str:
+    """The contract's type in words."""
+    if isinstance(column, dy.Enum):
+        return "one of " + " ".join(column.categories)
+    return str(column.dtype)
+
+
+def _converted(series: pl.Series, column: dy.Column) -> pl.Series | str:
+    """The series in the contract's type, or what was found where that would lose or invent something."""
+    target = column.dtype
+    if series.dtype == target:
+        return series
+    if series.null_count() == len(series):
+        return pl.Series(series.name, [None], dtype=target).new_from_index(0, len(series))
+    return _CONVERSIONS[type(column)](series, target)
+
+
+def _to_float(series: pl.Series, target: pl.DataType) -> pl.Series | str:
+    if series.dtype == pl.Float32:
+        return series.cast(target)
+    if series.dtype.is_integer():
+        low, high = series.min(), series.max()
+        if -_EXACT_INTEGER <= low and high <= _EXACT_INTEGER:  # type: ignore[operator]
+            return series.cast(target)
+        return f"{series.dtype} beyond 2^53"
+    return str(series.dtype)
+
+
+def _to_integer(series: pl.Series, target: pl.DataType) -> pl.Series | str:
+    if not series.dtype.is_numeric():
+        return str(series.dtype)
+    cast = series.cast(target, strict=False)
+    if cast.null_count() == series.null_count() and (cast.cast(series.dtype, strict=False) == series).all():
+        return cast
+    return f"{series.dtype} with values that are no 64-bit integers"
+
+
+def _to_instant(series: pl.Series, target: pl.DataType) -> pl.Series | str:
+    if not isinstance(series.dtype, pl.Datetime):
+        return str(series.dtype)
+    if series.dtype.time_zone is None:
+        return f"{series.dtype} without a time zone"
+    unit = series.dtype.time_unit
+    in_utc = series.dt.convert_time_zone("UTC")
+    factor = {"ms": 1_000_000, "us": 1_000, "ns": 1}[unit]
+    limit = (2**63 - 1) // factor
+    counts = series.to_physical()
+    if -limit <= counts.min() and counts.max() <= limit:  # type: ignore[operator]
+        return in_utc.cast(target)
+    return f"{series.dtype} beyond the years 1677 to 2262"
+
+
+def _to_enum(series: pl.Series, target: pl.DataType) -> pl.Series | str:
+    if not isinstance(series.dtype, pl.String | pl.Categorical | pl.Enum):
+        return str(series.dtype)
+    texts = series.cast(pl.String)
+    known = target.categories.to_list()  # type: ignore[attr-defined]
+    strange = sorted(set(texts.drop_nulls().unique().to_list()) - set(known))
+    return ", ".join(repr(value) for value in strange[:5]) if strange else texts.cast(target)
+
+
+def _to_text(series: pl.Series, target: pl.DataType) -> pl.Series | str:
+    if isinstance(series.dtype, pl.Categorical | pl.Enum):
+        return series.cast(target)
+    return str(series.dtype)
+
+
+def _to_flag(series: pl.Series, _: pl.DataType) -> pl.Series | str:
+    return str(series.dtype)
+
+
+_CONVERSIONS: dict[type[dy.Column], Callable[[pl.Series, pl.DataType], pl.Series | str]] = {
+    dy.Float64: _to_float,
+    dy.Int64: _to_integer,
+    dy.Datetime: _to_instant,
+    dy.Enum: _to_enum,
+    dy.String: _to_text,
+    dy.Bool: _to_flag,
+}
+
+
+def _check_values(series: pl.Series, column: dy.Column, where: str, breaches: list[Breach]) -> None:
+    if not column.nullable and series.null_count():
+        rows = rows_text(series.is_null())
+        breaches.append(
+            Breach(where, "is not complete", found=f"null in {rows}", expected="a value in every row")
+        )
+    if isinstance(column, dy.Float64) and not _all_finite(series):
+        strange = ~series.is_finite().fill_null(True)
+        value = series.filter(strange)[0]
+        breaches.append(
+            Breach(
+                where,
+                "is not a number",
+                found=f"{value} in {rows_text(strange)}",
+                expected="finite numbers, null where unknown",
+                remedy="Write nulls for unknown values.",
+            )
+        )
+    elif isinstance(column, dy.Float64 | dy.Int64):
+        _check_range(series, column, where, breaches)
+
+
+def _all_finite(series: pl.Series) -> bool:
+    total = series.sum()  # NaN and infinity survive a sum, so one pass says that all is well
+    return total is None or math.isfinite(total) or bool(series.is_finite().all())
+
+
+def _check_range(
+    series: pl.Series, column: dy.Float64 | dy.Int64, where: str, breaches: list[Breach]
+) -> None:
+    low, high = series.min(), series.max()
+    bounds = [(column.min, "at least"), (getattr(column, "min_exclusive", None), "more than")]
+    for bound, words in bounds:
+        if bound is not None and low is not None:
+            outside = low < bound if words == "at least" else low <= bound  # type: ignore[operator]
+            if outside:
+                mask = series < bound if words == "at least" else series <= bound
+                breaches.append(_out_of_range(where, low, mask, f"{words} {bound}"))
+    if column.max is not None and high is not None and high > column.max:  # type: ignore[operator]
+        breaches.append(_out_of_range(where, high, series > column.max, f"at most {column.max}"))
+
+
+def _out_of_range(where: str, value: object, mask: pl.Series, expected: str) -> Breach:
+    found = f"{value} in {rows_text(mask.fill_null(False))}"
+    return Breach(where, "is out of range", found=found, expected=expected, remedy="Correct the recording.")
+
+
+def rows_text(mask: pl.Series) -> str:
+    """Which rows are meant: the first, and how many."""
+    first, count = mask.arg_max(), int(mask.sum())
+    return f"row {first}" if count == 1 else f"{count} rows, first {first}"
+
+
+def _check_odometer(frame: pl.DataFrame, place: str, breaches: list[Breach]) -> None:
+    if not {"distance_m", "speed_mps"} <= set(frame.columns):
+        return
+    neither = frame["distance_m"].is_null() & frame["speed_mps"].is_null()
+    if neither.any():
+        breaches.append(
+            Breach(
+                f"{place}: columns distance_m, speed_mps",
+                "are both empty",
+                found=f"null in {rows_text(neither)}",
+                expected="distance or speed in every row",
+                remedy="Record one of the two, or leave the stream out.",
+            )
+        )

@@ -1,0 +1,31 @@
+"""Reading one recorded run, whatever it is stored as."""
+
+from __future__ import annotations
+
+from pipeline.ingest import files
+from pipeline.ingest.mcap_run import read_mcap
+from pipeline.ingest.parquet import read_folder
+from schemas.config import IngestConfig
+from schemas.errors import InputError
+from schemas.run import RunLog
+
+
+def read_run(path: files.Address, config: IngestConfig) -> RunLog:
+    """One run from `RUN.mcap` or a folder `RUN/` of Parquet files (CONTRACT section 1).
+
+    Every stream has exactly the contract's columns and types; rows stay in recorded order, duplicates
+    included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
+    damage and says so in `notes`.
+    """
+    if files.name_of(path).endswith(".mcap"):
+        return read_mcap(path, config)
+    if files.is_dir(path):
+        return read_folder(path)
+    if not files.exists(path):
+        raise InputError("does not exist", place=str(path), expected="RUN.mcap or a folder RUN/")
+    raise InputError(
+        "is neither an MCAP file nor a folder",
+        place=str(path),
+        expected="RUN.mcap or a folder RUN/ of Parquet files",
+        remedy="`balise convert` makes runs of receiver logs.",
+    )

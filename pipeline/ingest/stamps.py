@@ -1,0 +1,66 @@
+"""Times of validity from what messages and records hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from schemas.config import StreamMapping
+
+LOG_TIME = "(log time)"
+PUBLISH_TIME = "(publish time)"
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TimeSource:
+    """Fields of a stamp and what they count: whole `unit_s` since the epoch of `epoch` on `scale`."""
+
+    fields: tuple[str, ...]
+    types: Mapping[str, pl.DataType]
+    unit_s: float | None = None
+    scale: Literal["utc", "gps"] = "utc"
+    epoch: Literal["unix", "gps"] = "unix"
+
+    def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
+        """Times in UTC; null where a part of the stamp is null."""
+        t = frame.select(self._nanoseconds().alias(name)).to_series()
+        if self.epoch == "gps":
+            t = t + GPS_EPOCH_NS
+        if self.scale == "gps":
+            utc = pl.Series(name, utc_from_gps(t.fill_null(0).to_numpy()))
+            t = utc.set(t.is_null(), None) if t.null_count() else utc
+        return t.cast(pl.Datetime("ns", "UTC"))
+
+    def _nanoseconds(self) -> pl.Expr:
+        first = pl.col(self.fields[0])
+        if len(self.fields) == 2:
+            return first * 1_000_000_000 + pl.col(self.fields[1])
+        dtype = self.types.get(self.fields[0], pl.Int64())
+        if dtype == pl.String:
+            parsed = first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True)
+            return parsed.to_physical()
+        if dtype == pl.Int64:
+            return first * (1 if self.unit_s is None else round(self.unit_s * 1e9))
+        return (first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round().cast(pl.Int64)
+
+
+def time_source(
+    parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamMapping | None
+) -> TimeSource:
+    """How the stamp made of these fields is read."""
+    by_kind: dict[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
+    records = (LOG_TIME, PUBLISH_TIME)
+    types = {path: by_kind[kinds[path]] for path in parts if path not in records}
+    if mapping is None:
+        return TimeSource(tuple(parts), types)
+    return TimeSource(
+        tuple(parts), types, mapping.factors.get("t"), mapping.time_scale, mapping.time_epoch
+    )
