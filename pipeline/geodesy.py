@@ -1,0 +1,76 @@
+"""WGS 84 positions as metres, right over any distance a site may span.
+
+No plane serves a line of 100 km: lengths are chords of the ellipsoid, and everything beside the track is
+measured in the tangent plane of the point itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+# NIMA TR8350.2, table 3.1 and 3.3: semi-major axis [m] and first eccentricity squared of WGS 84.
+SEMI_MAJOR_AXIS_M = 6_378_137.0
+ECCENTRICITY_SQUARED = 6.694_379_990_14e-3
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points on the ellipsoid: earth-centred positions at height zero [m], unit vectors east and north."""
+
+    surface: Floats
+    east: Floats
+    north: Floats
+
+    def __len__(self) -> int:
+        return len(self.surface)
+
+    def take(self, rows: Ints) -> Points:
+        """Some of the points."""
+        return Points(self.surface[rows], self.east[rows], self.north[rows])
+
+
+def points_of(latitude_deg: Floats, longitude_deg: Floats) -> Points:
+    """The places of positions, heights left out: horizontal work needs none, and many recordings have none."""
+    sin_lat, cos_lat, sin_lon, cos_lon = _sines(latitude_deg, longitude_deg)
+    zeros = np.zeros_like(sin_lat)
+    return Points(
+        surface=_ecef(sin_lat, cos_lat, sin_lon, cos_lon, zeros),
+        east=np.column_stack([-sin_lon, cos_lon, zeros]),
+        north=np.column_stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]),
+    )
+
+
+def earth_centred_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+    """Earth-centred, earth-fixed coordinates [m], shape (n, 3)."""
+    return _ecef(*_sines(latitude_deg, longitude_deg), np.asarray(height_m, dtype=np.float64))
+
+
+def distances_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+    """Straight 3-D distances between consecutive points [m], one fewer than points."""
+    steps = np.diff(earth_centred_m(latitude_deg, longitude_deg, height_m), axis=0)
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", steps, steps)))
+
+
+def distance_m(latitude_a_deg: float, longitude_a_deg: float, latitude_b_deg: float, longitude_b_deg: float) -> float:
+    """Straight distance of two places on the ellipsoid [m]; for what is near."""
+    pair = np.array([latitude_a_deg, latitude_b_deg]), np.array([longitude_a_deg, longitude_b_deg])
+    return float(distances_m(*pair, np.zeros(2))[0])
+
+
+def _sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    return np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+
+
+def _ecef(sin_lat: Floats, cos_lat: Floats, sin_lon: Floats, cos_lon: Floats, height_m: Floats) -> Floats:
+    normal_m = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat)
+    ring_m = (normal_m + height_m) * cos_lat
+    up_m = (normal_m * (1.0 - ECCENTRICITY_SQUARED) + height_m) * sin_lat
+    return np.column_stack([ring_m * cos_lon, ring_m * sin_lon, up_m])

@@ -1,0 +1,228 @@
+"""A site folder to its tables in WGS 84: track, links, balises, route, and what is remarkable in them."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipeline.ingest.site_checks import drop_repeated_points, remarks
+from pipeline.ingest.site_geojson import Network, read_network
+from pipeline.ingest.site_tables import (
+    BALISES,
+    EPSG_WGS84,
+    LINKS,
+    ROUTE,
+    TRACK,
+    Column,
+    RawTable,
+    load_table,
+    typed_table,
+)
+from pipeline.track import geometric_measures_m, track_of
+from schemas.errors import SiteError
+from schemas.inputs import Balises, Links, Route, Track
+from schemas.run import Finding, Site
+
+_SUFFIXES = {"track": (".parquet", ".csv", ".geojson"), "links": (".parquet", ".csv")}
+_TABLES = (".parquet", ".csv")
+# GeoJSON and PROJ know these as longitude and latitude on (nearly) the ellipsoid of WGS 84.
+_SAME_AS_WGS84 = (EPSG_WGS84, 4979)
+_DIRECTIONS = {
+    "ab": "AB", "growing": "AB", "forward": "AB", "+": "AB",
+    "ba": "BA", "falling": "BA", "reverse": "BA", "backward": "BA", "-": "BA",
+}  # fmt: skip
+
+
+def read_site(path: Path | str) -> Site:
+    """The site of a folder (CONTRACT section 2), positions in WGS 84.
+
+    `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its
+    key-value metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON
+    in its `crs` member. In a projected system `longitude_deg` holds the easting and `latitude_deg` the
+    northing, or the columns are named `x_m` and `y_m`. Heights are taken as they are (ellipsoidal).
+    `measure_m` empty for a whole element: its geometric length.
+
+    Raises `SiteError` with all breaches at once; what is merely remarkable is in `Site.findings`.
+    """
+    folder = Path(path)
+    files = _files(folder)
+    breaches: list[str] = []
+    track, network, notes = _read_track(files, breaches)
+    links = _read_links(files, network, breaches)
+    balises = _read_table(files, "balises", BALISES, breaches)
+    route = _read_route(files, breaches)
+    if breaches or track is None or links is None:
+        raise _refusal(folder, breaches)
+    lengths = network.declared_length_m if network else {}
+    found = remarks(track, links, balises, route, lengths)
+    if found.breaches:
+        raise _refusal(folder, found.breaches)
+    return Site(
+        track=Track.validate(track, cast=True),
+        links=Links.validate(found.links, cast=True),
+        balises=None if balises is None else Balises.validate(balises, cast=True),
+        route=None if route is None else Route.validate(route, cast=True),
+        findings=tuple(notes + found.findings),
+        digest=_digest(files),
+    )
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    """The site's files by name; of each table there is at most one."""
+    if not folder.is_dir():
+        raise SiteError("is not a folder", place=str(folder), remedy="A site is a folder with track.parquet.")
+    names = [f"{table}{suffix}" for table in ("track", "links", "balises", "route") for suffix in
+             _SUFFIXES.get(table, _TABLES)]  # fmt: skip
+    present = [name for name in names if (folder / name).is_file()]
+    for table in ("track", "links", "balises", "route"):
+        same = [name for name in present if name.startswith(f"{table}.")]
+        if len(same) > 1:
+            raise SiteError(f"{' and '.join(same)}: only one may be there", place=str(folder))
+    if not any(name.startswith("track.") for name in present):
+        raise SiteError(
+            "has no track",
+            place=str(folder),
+            expected="track.parquet, track.csv or track.geojson",
+        )
+    try:
+        return {name: (folder / name).read_bytes() for name in present}
+    except OSError as error:
+        raise SiteError(f"cannot be read: {error.strerror}", place=str(error.filename)) from None
+
+
+def _digest(files: dict[str, bytes]) -> str:
+    """SHA-256 over names and contents."""
+    parts = [f"{name} {hashlib.sha256(data).hexdigest()}\n" for name, data in sorted(files.items())]
+    return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+
+def _refusal(folder: Path, breaches: list[str]) -> SiteError:
+    count = "1 breach" if len(breaches) == 1 else f"{len(breaches)} breaches"
+    return SiteError(
+        f"{count} of the site's contract: {'; '.join(breaches)}",
+        place=str(folder),
+        remedy="Mend the files named; `balise dictionary` lists the columns.",
+    )
+
+
+def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
+    name = next((name for name in files if name.startswith(f"{table}.")), None)
+    return None if name is None else load_table(name, files[name], breaches)
+
+
+def _read_table(
+    files: dict[str, bytes], table: str, columns: dict[str, Column], breaches: list[str]
+) -> pl.DataFrame | None:
+    raw = _load(files, table, breaches)
+    return None if raw is None else typed_table(raw, columns, breaches)
+
+
+def _read_track(
+    files: dict[str, bytes], breaches: list[str]
+) -> tuple[pl.DataFrame | None, Network | None, list[Finding]]:
+    network: Network | None = None
+    if "track.geojson" in files:
+        network = read_network("track.geojson", files["track.geojson"], breaches)
+        raw = network.track if network else None
+    else:
+        raw = _load(files, "track", breaches)
+    frame = typed_table(_in_degrees(raw), TRACK, breaches) if raw is not None else None
+    if raw is None or frame is None:
+        return None, network, []
+    if frame.is_empty():
+        breaches.append(f"{raw.file}: holds no point of any net element")
+        return None, network, []
+    frame = _to_wgs84(raw, frame, breaches)
+    frame, notes = drop_repeated_points(raw.file, frame, breaches)
+    if network and network.ignored:
+        notes.append(Finding("note", raw.file, f"{network.ignored} features are neither element nor relation"))
+    return (None if breaches else _with_measures(raw.file, frame, breaches)), network, notes
+
+
+def _read_links(files: dict[str, bytes], network: Network | None, breaches: list[str]) -> pl.DataFrame | None:
+    """Links from their own table, else from the GeoJSON; a site of one element needs none."""
+    raw = _load(files, "links", breaches)
+    if raw is None and network is not None:
+        raw = network.links
+    if raw is None:
+        return Links.create_empty()
+    return typed_table(raw, LINKS, breaches)
+
+
+def _read_route(files: dict[str, bytes], breaches: list[str]) -> pl.DataFrame | None:
+    """Directions become AB (from the element's start to its end) or BA."""
+    route = _read_table(files, "route", ROUTE, breaches)
+    if route is None:
+        return None
+    words = route["direction"].str.strip_chars().str.to_lowercase()
+    direction = words.replace_strict(_DIRECTIONS, default=None, return_dtype=pl.String)
+    if direction.null_count():
+        strange = words.filter(direction.is_null())[0]
+        breaches.append(f"route: column direction: {strange!r}; expected AB or BA (growing or falling)")
+    return route.with_columns(direction.alias("direction"))
+
+
+def _in_degrees(raw: RawTable) -> RawTable:
+    """Plane coordinates under the names of the contract; `_to_wgs84` makes degrees of them."""
+    names = {"x_m": "longitude_deg", "y_m": "latitude_deg"}
+    given = {old: new for old, new in names.items() if old in raw.frame.columns}
+    if any(new in raw.frame.columns for new in given.values()):
+        return raw
+    return RawTable(raw.file, raw.frame.rename(given), raw.epsg)
+
+
+def _to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
+    """Positions in WGS 84, checked for range."""
+    if raw.epsg not in _SAME_AS_WGS84:
+        frame = _transformed(raw, frame, breaches)
+    outside = (frame["latitude_deg"].abs() > 90) | (frame["longitude_deg"].abs() > 180)
+    if outside.any():
+        row = frame.filter(outside).row(0, named=True)
+        breaches.append(
+            f"{raw.file}: latitude {row['latitude_deg']:g}, longitude {row['longitude_deg']:g} in EPSG:{raw.epsg} "
+            "is no place on earth; latitude and longitude may be swapped, or the file does not name its EPSG code"
+        )
+    return frame
+
+
+def _transformed(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
+    import pyproj
+
+    try:
+        turn = pyproj.Transformer.from_crs(raw.epsg, EPSG_WGS84, always_xy=True)
+        x, y = frame["longitude_deg"].to_numpy(), frame["latitude_deg"].to_numpy()
+        longitude, latitude = turn.transform(x, y, errcheck=True)
+    except pyproj.exceptions.ProjError as error:
+        breaches.append(f"{raw.file}: EPSG:{raw.epsg}: {str(error).splitlines()[0]}")
+        return frame
+    if not np.isfinite(longitude).all():
+        breaches.append(f"{raw.file}: some positions lie outside what EPSG:{raw.epsg} describes")
+        return frame
+    return frame.with_columns(
+        pl.Series("latitude_deg", np.asarray(latitude)), pl.Series("longitude_deg", np.asarray(longitude))
+    )
+
+
+def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
+    """Declared measures where an element has them at every point, geometric where at none."""
+    parts = []
+    for part in frame.partition_by("netelement_id", maintain_order=True):
+        name, missing = part["netelement_id"][0], part["measure_m"].null_count()
+        if missing == part.height:
+            part = part.with_columns(pl.Series("measure_m", _geometric(part)))
+        elif missing:
+            breaches.append(f"{file}: column measure_m: element {name} has it at some points only")
+        elif not (part["measure_m"].diff().drop_nulls() > 0).all():
+            row = int((part["measure_m"].diff() <= 0).fill_null(False).arg_true()[0])
+            at = part["measure_m"][row]
+            breaches.append(f"{file}: column measure_m: element {name} does not grow at point {row} ({at:g} m)")
+        parts.append(part)
+    return pl.concat(parts)
+
+
+def _geometric(part: pl.DataFrame) -> np.ndarray:
+    track = track_of(part.with_columns(pl.lit(0.0).alias("measure_m")))
+    return geometric_measures_m(track.latitude_deg, track.longitude_deg, track.height_m)

@@ -1,0 +1,197 @@
+"""What is broken and what is remarkable in a site (findings), before any run is replayed on it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+from scipy.spatial import cKDTree
+
+from pipeline.geodesy import earth_centred_m, points_of
+from pipeline.track import GAP_COUNTS_M, Track, geometric_measures_m, track_of
+from schemas.run import Finding
+
+# Ends that a relation joins: up to `GAP_COUNTS_M` is survey noise; above, the gap is a finding and counts as
+# track; beyond this the path position would be wrong by a position failure, so the site is refused.
+GAP_LIMIT_M = 20.0
+NEAR_ENDS_M = 5.0
+SHORT_ELEMENT_M = 1.0
+LENGTH_TOLERANCE = 1e-3
+LENGTH_TOLERANCE_M = 0.5
+CHORD_ERROR_M = 0.25
+MEASURE_TOLERANCE_M = 0.5
+
+
+@dataclass
+class Remarks:
+    """Findings, fatal breaches, and the links without those to nowhere."""
+
+    links: pl.DataFrame
+    findings: list[Finding] = field(default_factory=list)
+    breaches: list[str] = field(default_factory=list)
+
+
+def remarks(
+    frame: pl.DataFrame,
+    links: pl.DataFrame,
+    balises: pl.DataFrame | None,
+    route: pl.DataFrame | None,
+    declared_length_m: dict[str, float],
+) -> Remarks:
+    """All checks over the tables of a site."""
+    track = track_of(frame)
+    known, findings = _relations_to_nowhere(track, links)
+    found = Remarks(known, findings)
+    _check_elements(track, declared_length_m, found)
+    _check_gaps(track, found)
+    found.findings += _near_misses(track, known)
+    if balises is not None:
+        _check_balises(track, balises, found)
+    if route is not None:
+        _check_route(track, route, found)
+    return found
+
+
+def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) -> tuple[pl.DataFrame, list[Finding]]:
+    """A point that repeats its predecessor adds nothing but a segment of no length: dropped, and reported."""
+    same = pl.all_horizontal(
+        (pl.col(name) == pl.col(name).shift(1)).fill_null(False).over("netelement_id")
+        for name in ("latitude_deg", "longitude_deg")
+    )
+    marked = frame.with_columns(same.alias("_repeats"))
+    counts = marked.group_by("netelement_id", maintain_order=True).agg(
+        pl.len().alias("points"), pl.col("_repeats").sum().alias("repeats")
+    )
+    notes = []
+    for name, points, repeats in counts.iter_rows():
+        if points - repeats < 2:
+            breaches.append(f"{file}: element {name} has {points - repeats} distinct point; two are needed")
+        if repeats:
+            remedy = "Remove them from the survey." if repeats > 1 else "Remove it from the survey."
+            text = f"{repeats} of {points} points repeat the one before and are left out"
+            notes.append(Finding("warning", f"{file}: element {name}", text, remedy))
+    return marked.filter(~pl.col("_repeats")).drop("_repeats"), notes
+
+
+def _relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+    ids = list(track.ids)
+    known = links["netelement_a"].is_in(ids) & links["netelement_b"].is_in(ids)
+    findings = [
+        Finding("warning", "links", f"relation {row[0]} - {row[2]} names an element that is not in the track")
+        for row in links.filter(~known).iter_rows()
+    ]
+    return links.filter(known), findings
+
+
+def _check_elements(track: Track, declared_length_m: dict[str, float], found: Remarks) -> None:
+    """Length, declared length, height and vertex spacing of each element."""
+    for element, name, part in track.elements():
+        place = f"track: element {name}"
+        latitude, longitude, height = (
+            track.latitude_deg[part],
+            track.longitude_deg[part],
+            track.height_m[part],
+        )
+        geometric = geometric_measures_m(latitude, longitude, height)
+        length = float(geometric[-1])
+        if length < SHORT_ELEMENT_M:
+            found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
+        for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
+            if abs(declared - length) > max(LENGTH_TOLERANCE_M, LENGTH_TOLERANCE * length):
+                text = f"declared {declared:.1f} m long, its geometry measures {length:.1f} m"
+                found.findings.append(Finding("warning", place, text, "Mend the measures or the geometry."))
+        error = chord_errors_m(track, part).max(initial=0.0)
+        if error > CHORD_ERROR_M:
+            spacing = float(np.diff(geometric).max())
+            text = f"vertices up to {spacing:.0f} m apart: its chords leave the curve by up to {error:.2f} m"
+            found.findings.append(Finding("note", place, text, "Survey curves with closer points."))
+    _check_heights(track, found)
+
+
+def _check_heights(track: Track, found: Remarks) -> None:
+    flat = [name for _, name, part in track.elements() if np.isnan(track.height_m[part]).any()]
+    if flat and len(flat) < len(track.ids):
+        text = (
+            f"{len(flat)} of {len(track.ids)} elements lack heights and are taken as 2-D ({', '.join(flat[:3])}, ...)"
+        )
+        found.findings.append(Finding("warning", "track: column height_m", text, "Survey all or none."))
+
+
+def chord_errors_m(track: Track, part: slice) -> np.ndarray:
+    """How far the curve may lie off each segment's chord [m]: length times turn angle over 8 (sagitta)."""
+    surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
+    steps = np.diff(surface, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    units = steps / lengths[:, None]
+    turn = np.arccos(np.clip(np.einsum("ij,ij->i", units[:-1], units[1:]), -1.0, 1.0))
+    at_ends = np.concatenate([[0.0], turn, [0.0]])
+    return np.asarray(lengths * np.maximum(at_ends[:-1], at_ends[1:]) / 8.0)
+
+
+def _end_position(track: Track, name: str, position: int) -> np.ndarray:
+    vertex = track.end(track.index[name], position)
+    height = np.nan_to_num(track.height_m[[vertex]])
+    place = earth_centred_m(track.latitude_deg[[vertex]], track.longitude_deg[[vertex]], height)
+    return np.asarray(place[0])
+
+
+def _check_gaps(track: Track, found: Remarks) -> None:
+    for a, position_a, b, position_b, _ in found.links.iter_rows():
+        gap = float(np.linalg.norm(_end_position(track, a, position_a) - _end_position(track, b, position_b)))
+        text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
+        if gap > GAP_LIMIT_M:
+            found.breaches.append(f"links: {text}; expected at most {GAP_LIMIT_M:g} m")
+        elif gap > GAP_COUNTS_M:
+            remedy = "The straight line between them counts as track; survey the missing piece."
+            found.findings.append(Finding("warning", "links", text, remedy))
+
+
+def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
+    """Ends without any relation that lie close to another element's end."""
+    ends = [(name, position) for name in track.ids for position in (0, 1)]
+    joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
+    places = np.array([_end_position(track, name, position) for name, position in ends])
+    for one, other in sorted(cKDTree(places).query_pairs(NEAR_ENDS_M)):
+        free = ends[one] not in joined or ends[other] not in joined
+        if free and ends[one][0] != ends[other][0]:
+            gap = float(np.linalg.norm(places[one] - places[other]))
+            (a, position_a), (b, position_b) = ends[one], ends[other]
+            text = f"end {position_a} of {a} and end {position_b} of {b} are {gap:.2f} m apart and not linked"
+            yield Finding("warning", "links", text, "Add the relation, if trains run there.")
+
+
+def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:
+    repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
+    if repeated:
+        found.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} stand there twice")
+    for name, element, measure in balises.select("balise_id", "netelement_id", "measure_m").iter_rows():
+        place = f"balises: {name}"
+        if element not in track.index:
+            text = f"lies on element {element}, which is not in the track: no run will pass it"
+            found.findings.append(Finding("error", place, text, "Mend netelement_id."))
+            continue
+        part = track.vertices(track.index[element])
+        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+        if not low - MEASURE_TOLERANCE_M <= measure <= high + MEASURE_TOLERANCE_M:
+            text = f"measure {measure:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"
+            found.findings.append(Finding("error", place, text, "Mend measure_m."))
+
+
+def _check_route(track: Track, route: pl.DataFrame, found: Remarks) -> None:
+    """A route must be one continuous run over elements that exist."""
+    rows = route.rows()
+    unknown = [name for name, _ in rows if name not in track.index]
+    if unknown or not rows:
+        what = f"names {', '.join(unknown[:3])}, not in the track" if unknown else "is empty"
+        found.breaches.append(f"route: {what}")
+        return
+    for (a, direction_a), (b, direction_b) in itertools.pairwise(rows):
+        end = _end_position(track, a, 1 if direction_a == "AB" else 0)
+        start = _end_position(track, b, 0 if direction_b == "AB" else 1)
+        gap = float(np.linalg.norm(end - start))
+        if gap > GAP_LIMIT_M:
+            text = f"{a} ({direction_a}) ends {gap:.0f} m from where {b} ({direction_b}) begins"
+            found.breaches.append(f"route: {text}; expected at most {GAP_LIMIT_M:g} m")

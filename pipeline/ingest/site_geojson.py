@@ -1,0 +1,153 @@
+"""RailTopoModel networks as GeoJSON: net elements are LineStrings, net relations join their ends.
+
+Read as ERA RINF exports and measurement-train networks write it: an element carries `id` or
+`netelement_id`; a relation carries `netelementA`, `positionOnA`, `netelementB`, `positionOnB` and
+`navigability`. Case and underscores of property names do not matter.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import polars as pl
+
+from pipeline.ingest.site_tables import EPSG_WGS84, RawTable
+from schemas.enums import Navigability
+
+_ID_KEYS = ("netelementid", "id", "elementid", "name")
+_LENGTH_KEYS = ("lengthm", "length")
+_A_KEYS, _B_KEYS = ("netelementa", "elementa"), ("netelementb", "elementb")
+_POSITION_A_KEYS, _POSITION_B_KEYS = ("positionona", "positiona"), ("positiononb", "positionb")
+
+
+@dataclass
+class Network:
+    """What one GeoJSON file holds; `declared_length_m` where elements state their length."""
+
+    track: RawTable
+    links: RawTable | None
+    declared_length_m: dict[str, float] = field(default_factory=dict)
+    ignored: int = 0
+
+
+def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
+    """Net elements and net relations of a FeatureCollection, or breaches."""
+    try:
+        document = json.loads(data)
+        features = document["features"]
+        epsg = _epsg(document)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
+        return None
+    points: dict[str, list[Any]] = {name: [] for name in _TRACK_COLUMNS}
+    relations: dict[str, list[Any]] = {name: [] for name in _LINK_COLUMNS}
+    lengths: dict[str, float] = {}
+    ignored = 0
+    for number, feature in enumerate(features):
+        place = f"{file}: feature {number}"
+        if not isinstance(feature, Mapping):
+            breaches.append(f"{place}: not a feature")
+            continue
+        keys = _plain_keys(feature)
+        if any(key in keys for key in _A_KEYS):
+            _add_relation(place, keys, relations, breaches)
+        elif (feature.get("geometry") or {}).get("type") in ("LineString", "MultiLineString"):
+            _add_element(place, feature["geometry"], keys, points, lengths, breaches)
+        else:
+            ignored += 1
+    track = RawTable(file, pl.DataFrame(points, schema=_TRACK_COLUMNS), epsg)
+    links = RawTable(file, pl.DataFrame(relations, schema=_LINK_COLUMNS)) if relations["netelement_a"] else None
+    return Network(track, links, lengths, ignored)
+
+
+_TRACK_COLUMNS = {
+    "netelement_id": pl.String,
+    "latitude_deg": pl.Float64,
+    "longitude_deg": pl.Float64,
+    "height_m": pl.Float64,
+}
+_LINK_COLUMNS = {
+    "netelement_a": pl.String,
+    "position_a": pl.Int64,
+    "netelement_b": pl.String,
+    "position_b": pl.Int64,
+    "navigability": pl.String,
+}
+
+
+def _plain_keys(feature: Mapping[str, Any]) -> dict[str, Any]:
+    """Properties by lower-case name without underscores; the feature's own `id` where they have none."""
+    properties = feature.get("properties") or {}
+    keys = {re.sub(r"[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
+    if feature.get("id") is not None:
+        keys.setdefault("id", feature["id"])
+    return keys
+
+
+def _first(keys: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((keys[name] for name in names if keys.get(name) is not None), None)
+
+
+def _add_element(
+    place: str,
+    geometry: Mapping[str, Any],
+    keys: Mapping[str, Any],
+    points: dict[str, list[Any]],
+    lengths: dict[str, float],
+    breaches: list[str],
+) -> None:
+    name = _first(keys, _ID_KEYS)
+    coordinates = geometry.get("coordinates") or []
+    if geometry["type"] == "MultiLineString":
+        if len(coordinates) != 1:
+            breaches.append(f"{place}: MultiLineString of {len(coordinates)} parts; a net element has one axis")
+            return
+        coordinates = coordinates[0]
+    if name is None:
+        breaches.append(f"{place}: a LineString without property id or netelement_id")
+        return
+    try:
+        triples = [(float(c[0]), float(c[1]), float(c[2]) if len(c) > 2 else None) for c in coordinates]
+    except (TypeError, ValueError, IndexError):
+        breaches.append(f"{place} ({name}): coordinates are not numbers [longitude, latitude(, height)]")
+        return
+    if str(name) in lengths:
+        breaches.append(f"{place}: net element {name} stands in the file twice")
+        return
+    declared = _first(keys, _LENGTH_KEYS)
+    lengths[str(name)] = float(declared) if isinstance(declared, int | float) else float("nan")
+    points["netelement_id"] += [str(name)] * len(triples)
+    for column, part in (("longitude_deg", 0), ("latitude_deg", 1), ("height_m", 2)):
+        points[column] += [triple[part] for triple in triples]
+
+
+def _add_relation(place: str, keys: Mapping[str, Any], relations: dict[str, list[Any]], breaches: list[str]) -> None:
+    position_a, position_b = _first(keys, _POSITION_A_KEYS), _first(keys, _POSITION_B_KEYS)
+    word = str(keys.get("navigability")).strip().lower()
+    known = {member.value.lower(): member.value for member in Navigability}
+    if word not in known:
+        breaches.append(f"{place}: navigability {word!r}; expected one of {', '.join(Navigability)}")
+    elif position_a not in (0, 1) or position_b not in (0, 1):
+        breaches.append(f"{place}: positionOnA {position_a!r}, positionOnB {position_b!r}; expected 0 or 1")
+    else:
+        row = (_first(keys, _A_KEYS), position_a, _first(keys, _B_KEYS), position_b)
+        for column, value in zip(_LINK_COLUMNS, (*row, known[word]), strict=True):
+            relations[column].append(str(value) if column.startswith("netelement") else value)
+
+
+def _epsg(document: Mapping[str, Any]) -> int:
+    """EPSG code of the `crs` member (GeoJSON 2008), WGS 84 without one (RFC 7946)."""
+    crs = document.get("crs")
+    if crs is None:
+        return int(document.get("epsg") or EPSG_WGS84)
+    name = str(crs.get("properties", {}).get("name", crs.get("properties", {}).get("code", "")))
+    if name.upper().endswith("CRS84"):
+        return EPSG_WGS84
+    code = re.search(r"(\d+)$", name)
+    if code is None:
+        raise ValueError(f"crs {name!r}: expected a name such as urn:ogc:def:crs:EPSG::31370")
+    return int(code.group(1))

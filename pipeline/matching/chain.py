@@ -1,0 +1,72 @@
+"""Sites where the path cannot be in doubt: one chain of net elements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import polars as pl
+
+from pipeline.matching.epochs import Assignment
+from pipeline.matching.fixes import Fixes
+from pipeline.matching.leg import Visit, leg_of, nearest_on_leg, path_at
+from pipeline.matching.orientation import grows_with
+from pipeline.matching.path import TravelledPath
+from pipeline.track import Track
+from schemas.config import MatchingConfig
+from schemas.enums import Navigability
+from schemas.errors import InputError
+from schemas.run import Site
+
+
+def chain_path(
+    fixes: Fixes, odometer: pl.DataFrame | None, track: Track, site: Site, config: MatchingConfig
+) -> tuple[TravelledPath, Assignment]:
+    """The part of the site's one chain that the run covers, oriented as the run began."""
+    visits = whole_chain(track, site.links)
+    if visits is None:
+        raise InputError("the track branches", place="site", expected="one chain of net elements")
+    return path_on_chain(fixes, odometer, track, visits, config)
+
+
+def path_on_chain(
+    fixes: Fixes, odometer: pl.DataFrame | None, track: Track, visits: Sequence[Visit], config: MatchingConfig
+) -> tuple[TravelledPath, Assignment]:
+    leg = leg_of(track, visits)
+    feet = nearest_on_leg(fixes.points.take(np.flatnonzero(fixes.valid)), leg)
+    near = feet.distance_m <= config.reach_m
+    if not near.any():
+        raise InputError("the run is wholly off the track", place="gnss")
+    position = np.full(len(fixes), np.nan)
+    position[fixes.valid] = np.where(near, path_at(leg, feet), np.nan)
+    used = np.unique(leg.visit[feet.segment[near]])
+    part = list(visits[int(used[0]) : int(used[-1]) + 1])
+    if not grows_with(position, fixes.t_ns, odometer, config.orientation_distance_m):
+        part = [Visit(visit.element, not visit.forward) for visit in reversed(part)]
+    ones = np.ones(len(fixes))
+    path = TravelledPath(track, (leg_of(track, part),))
+    return path, Assignment(np.zeros(len(fixes), dtype=np.int64), None, ones, ones)
+
+
+def whole_chain(track: Track, links: pl.DataFrame) -> list[Visit] | None:
+    """All elements in a row, each in its sense along the row; none where the track branches or is parted."""
+    joined: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for a, position_a, b, position_b, navigability in links.iter_rows():
+        if navigability != Navigability.NONE.value:
+            one, other = (track.index[a], int(position_a)), (track.index[b], int(position_b))
+            joined.setdefault(one, []).append(other)
+            joined.setdefault(other, []).append(one)
+    ends = [(element, position) for element in range(len(track.ids)) for position in (0, 1)]
+    if any(len(set(others)) > 1 for others in joined.values()):
+        return None
+    free = [end for end in ends if end not in joined]
+    if len(free) != 2:
+        return None
+    visits: list[Visit] = []
+    end: tuple[int, int] | None = free[0]
+    while end is not None:
+        element, position = end
+        visits.append(Visit(element, forward=position == 0))
+        onward = joined.get((element, 1 - position))
+        end = onward[0] if onward else None
+    return visits if len(visits) == len(track.ids) else None

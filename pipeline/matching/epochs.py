@@ -1,0 +1,149 @@
+"""Every epoch on the travelled path: the `epochs` frame of a match."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.geodesy import Floats, Ints
+from pipeline.matching.fixes import Fixes
+from pipeline.matching.leg import segments_at
+from pipeline.matching.path import TravelledPath
+from schemas.config import MatchingConfig, Vehicle
+from schemas.enums import SigmaSource
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What the search found per epoch: leg, a hint at the passage [m], and how sure it is.
+
+    Probabilities are NaN where the epoch was not judged.
+    """
+
+    leg: Ints
+    near_path_m: Floats | None
+    path_probability: Floats
+    gate_probability: Floats
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The track at places of the path."""
+
+    heading_deg: Floats
+    slope: Floats
+    curvature_per_m: Floats
+    interpolation_error_m: Floats
+    survey_sigma_m: Floats
+
+
+def epoch_frame(
+    fixes: Fixes,
+    solution: pl.Series,
+    path: TravelledPath,
+    found: Assignment,
+    vehicle: Vehicle,
+    config: MatchingConfig,
+) -> pl.DataFrame:
+    """The epochs on the path, positions referred to the balise antenna.
+
+    `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
+    track too (`on_track` false), and goes on straight beyond the ends of the path.
+    """
+    feet = path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
+    places = path.places(found.leg, feet, fixes.height_m)
+    path_m = places.path_m - vehicle.gnss_antenna_ahead_m
+    element, measure_m = path.locate_index(found.leg, path_m)
+    # The track's direction counts where the GNSS antenna is, not the balise antenna.
+    shape = shape_at(path, found.leg, places.path_m)
+    on_track = fixes.valid & (np.nan_to_num(places.distance_m, nan=np.inf) <= config.reach_m)
+    sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape.heading_deg)
+    source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
+    columns: dict[str, npt.NDArray[Any] | pl.Series] = {
+        "leg": pl.Series(found.leg, dtype=pl.Int32),
+        "netelement_id": _words(path.track.ids, element),
+        "measure_m": measure_m,
+        "path_m": path_m,
+        "cross_track_m": places.cross_m,
+        "vertical_m": places.vertical_m - vehicle.antenna_height_m,
+        "on_track": on_track,
+        "path_probability": np.where(on_track, found.path_probability, np.nan),
+        "gate_probability": np.where(on_track, found.gate_probability, np.nan),
+        "heading_deg": shape.heading_deg,
+        "slope": shape.slope,
+        "curvature_per_m": shape.curvature_per_m,
+        "interpolation_error_m": shape.interpolation_error_m,
+        "survey_sigma_m": shape.survey_sigma_m,
+        "sigma_along_m": sigma_along_m,
+        "sigma_cross_m": sigma_cross_m,
+        "sigma_up_m": np.sqrt(fixes.cov_uu_m2),
+        "sigma_source": _words(_SOURCES, source).cast(pl.Enum(SigmaSource)),
+        "fix_valid": fixes.valid,
+        "velocity_along_mps": velocity_along_mps(fixes, shape),
+    }
+    return _frame(fixes, solution, columns)
+
+
+def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
+    """Direction, slope, curvature and survey quality of the track at places of the path."""
+    shape = Shape(*(np.full(len(path_m), np.nan) for _ in range(5)))
+    for index, one in enumerate(path.legs):
+        rows = np.flatnonzero((leg == index) & np.isfinite(path_m))
+        segment, fraction = segments_at(one, path_m[rows])
+        held = np.clip(fraction, 0.0, 1.0)
+        length = one.path_end_m - one.path_start_m
+        before = np.concatenate([length[:1], length[:-1]])
+        after = np.concatenate([length[1:], length[-1:]])
+        curve_start = 2.0 * one.turn_start_rad / (before + length)
+        curve_end = 2.0 * one.turn_end_rad / (length + after)
+        bend = 0.5 * (np.abs(one.turn_start_rad) + np.abs(one.turn_end_rad))
+        shape.heading_deg[rows] = one.heading_deg[segment]
+        shape.slope[rows] = _slope(one.height_end_m - one.height_start_m, length)[segment]
+        shape.curvature_per_m[rows] = (curve_start[segment] * (1 - held)) + curve_end[segment] * held
+        # Sagitta of an arc: length times the angle it turns over 8.
+        shape.interpolation_error_m[rows] = (length * bend / 8.0)[segment]
+        shape.survey_sigma_m[rows] = one.sigma_m[segment]
+    return shape
+
+
+def track_sigmas_m(fixes: Fixes, heading_deg: Floats) -> tuple[Floats, Floats]:
+    """The horizontal covariance turned into the track's frame: sigma along and across [m]."""
+    sin, cos = np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))
+    ee, en, nn = fixes.cov_ee_m2, fixes.cov_en_m2, fixes.cov_nn_m2
+    along = sin * sin * ee + 2.0 * sin * cos * en + cos * cos * nn
+    cross = cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn
+    return np.sqrt(np.maximum(along, 0.0)), np.sqrt(np.maximum(cross, 0.0))
+
+
+def velocity_along_mps(fixes: Fixes, shape: Shape) -> Floats:
+    """GNSS velocity along growing path, on the slope where the track has one."""
+    heading = np.radians(shape.heading_deg)
+    level = fixes.vel_e_mps * np.sin(heading) + fixes.vel_n_mps * np.cos(heading)
+    return np.asarray(level * np.sqrt(1.0 + np.nan_to_num(shape.slope) ** 2))
+
+
+def _slope(rise_m: Floats, length_m: Floats) -> Floats:
+    """Rise over run, from rise and 3-D length; NaN without heights."""
+    run = np.sqrt(np.maximum(length_m * length_m - rise_m * rise_m, 1e-12))
+    return np.asarray(rise_m / run)
+
+
+_SOURCES = (SigmaSource.RECEIVER.value, SigmaSource.TABLE.value)
+
+
+def _words(words: Sequence[str], number: Ints) -> pl.Series:
+    """Words by their number, null for -1."""
+    rows = np.where(number < 0, len(words), number)
+    return pl.Series([*words, None], dtype=pl.String).gather(pl.Series(rows))
+
+
+def _frame(fixes: Fixes, solution: pl.Series, columns: dict[str, npt.NDArray[Any] | pl.Series]) -> pl.DataFrame:
+    """Arrays as a frame: NaN becomes null, and an epoch without a position has no leg."""
+    time = pl.Series("t", fixes.t_ns, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    frame = pl.DataFrame([time, solution.alias("solution"), *(pl.Series(k, v) for k, v in columns.items())])
+    return frame.with_columns(pl.col(pl.Float64).fill_nan(None), leg=pl.when(pl.col("fix_valid")).then(pl.col("leg")))

@@ -1,0 +1,99 @@
+"""One solution's positions as arrays, with their covariance or a table's sigma in its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
+from schemas.config import FixSigma
+from schemas.enums import Fix
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """Epochs of one solution in order; NaN where not known.
+
+    `valid` has a position and a fix; `from_receiver` says that the (co)variances [m2] are the receiver's.
+    """
+
+    t_ns: Ints
+    valid: Bools
+    points: Points
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    cov_ee_m2: Floats
+    cov_en_m2: Floats
+    cov_nn_m2: Floats
+    cov_uu_m2: Floats
+    from_receiver: Bools
+    vel_e_mps: Floats
+    vel_n_mps: Floats
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def t_s(self) -> Floats:
+        """Seconds since the first epoch."""
+        return np.asarray((self.t_ns - self.t_ns[:1]) * 1e-9, dtype=np.float64)
+
+
+def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
+    """Arrays of a `gnss` stream of one solution.
+
+    A receiver's covariance counts where both horizontal variances are positive (zero means not known in
+    many logs); else the configuration's sigma by kind of fix stands in (DOMAIN section 3).
+    """
+    column = {name: _floats(frame, name) for name in _NUMBERS}
+    fix = frame["fix"].cast(pl.String)
+    horizontal_m = _table_sigma_m(fix, sigma)
+    valid = np.isfinite(column["latitude_deg"]) & np.isfinite(column["longitude_deg"])
+    valid &= (fix != Fix.NONE.value).to_numpy()
+    with np.errstate(invalid="ignore"):
+        receiver = valid & (column["cov_ee_m2"] > 0) & (column["cov_nn_m2"] > 0)
+        height_known = receiver & (column["cov_uu_m2"] > 0)
+    table = np.where(valid, horizontal_m**2, np.nan)
+    ee = np.where(receiver, column["cov_ee_m2"], table)
+    nn = np.where(receiver, column["cov_nn_m2"], table)
+    up = np.where(height_known, column["cov_uu_m2"], 0.5 * (ee + nn) * sigma.vertical_factor**2)
+    latitude = np.where(valid, column["latitude_deg"], np.nan)
+    longitude = np.where(valid, column["longitude_deg"], np.nan)
+    return Fixes(
+        t_ns=frame["t"].to_physical().to_numpy(),
+        valid=valid,
+        points=points_of(latitude, longitude),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=np.where(valid, column["height_m"], np.nan),
+        cov_ee_m2=ee,
+        cov_en_m2=np.where(receiver, np.nan_to_num(column["cov_en_m2"]), np.where(valid, 0.0, np.nan)),
+        cov_nn_m2=nn,
+        cov_uu_m2=up,
+        from_receiver=receiver,
+        vel_e_mps=column["vel_e_mps"],
+        vel_n_mps=column["vel_n_mps"],
+    )
+
+
+_NUMBERS = (
+    *("latitude_deg", "longitude_deg", "height_m"),
+    *("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "cov_uu_m2", "vel_e_mps", "vel_n_mps"),
+)
+
+
+def _floats(frame: pl.DataFrame, name: str) -> Floats:
+    """A column with null as NaN; an optional column that is absent is not known."""
+    if name not in frame.columns:
+        return np.full(frame.height, np.nan)
+    values = frame[name]
+    return values.fill_null(float("nan")).to_numpy() if values.null_count() else values.to_numpy()
+
+
+def _table_sigma_m(fix: pl.Series, sigma: FixSigma) -> Floats:
+    table = {kind.value: sigma.horizontal_m(kind) for kind in Fix}
+    values = fix.replace_strict(table, return_dtype=pl.Float64)
+    return values.fill_null(float("nan")).to_numpy()

@@ -1,0 +1,193 @@
+"""A chain of net elements as one polyline with one path position."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pipeline.geodesy import Floats, Ints, Points, points_of
+from pipeline.matching.segments import Feet, Polyline, downhill, nearest, on_segments, polyline_of
+from pipeline.track import GAP_COUNTS_M, Track
+
+# A hint further than this from the nearest place may mean another passage of the same place,
+# if the track of that passage lies within the second distance of the first.
+HINT_WINDOW_M = 300.0
+SAME_PLACE_M = 10.0
+
+
+@dataclass(frozen=True)
+class Visit:
+    """One net element on the path; `forward` when its measure grows with the path position."""
+
+    element: int
+    forward: bool
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A chain of net elements on which `path_m` is one to one; arrays are per segment, in order.
+
+    `turn_start_rad`, `turn_end_rad`: change of heading at the segment's ends, positive to the left.
+    """
+
+    visits: tuple[Visit, ...]
+    line: Polyline
+    visit: Ints
+    path_start_m: Floats
+    path_end_m: Floats
+    measure_start_m: Floats
+    measure_end_m: Floats
+    height_start_m: Floats
+    height_end_m: Floats
+    sigma_m: Floats
+    heading_deg: Floats
+    turn_start_rad: Floats
+    turn_end_rad: Floats
+
+    @property
+    def start_m(self) -> float:
+        return float(self.path_start_m[0])
+
+    @property
+    def end_m(self) -> float:
+        return float(self.path_end_m[-1])
+
+    def visit_start_m(self, number: int) -> float:
+        """Path position where a visit begins."""
+        return float(self.path_start_m[np.searchsorted(self.visit, number)])
+
+
+def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
+    """A leg over oriented elements, `path_m` beginning at `start_m`.
+
+    Gaps that the site check let pass count as straight track, so that path and odometer agree.
+    """
+    parts: list[_Part] = []
+    position = start_m
+    for number, visit in enumerate(visits):
+        part = _element(track, visit, number, position)
+        if parts:
+            bridge = _bridge(parts[-1], part, position)
+            if bridge is not None:
+                parts.append(bridge)
+                position = float(bridge.path_end_m[-1])
+                part = _element(track, visit, number, position)
+        parts.append(part)
+        position = float(part.path_end_m[-1])
+    joined = {item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(_Part)}
+    start, end = joined.pop("start"), joined.pop("end")
+    heading, turn = _headings(start, end, joined.pop("east"), joined.pop("north"))
+    return Leg(
+        visits=tuple(visits),
+        line=polyline_of(start, end),
+        heading_deg=np.degrees(heading) % 360.0,
+        turn_start_rad=np.concatenate([[0.0], turn]),
+        turn_end_rad=np.concatenate([turn, [0.0]]),
+        **joined,
+    )
+
+
+def nearest_on_leg(points: Points, leg: Leg, near_path_m: Floats | None = None) -> Feet:
+    """The nearest place on a leg; of several passages of that place the one close to the hint."""
+    feet = nearest(points, leg.line)
+    if near_path_m is None:
+        return feet
+    away = np.abs(path_at(leg, feet) - near_path_m) > HINT_WINDOW_M
+    for row in np.flatnonzero(away):
+        _prefer_hint(points.take(np.array([row])), leg, float(near_path_m[row]), int(row), feet)
+    return feet
+
+
+def path_at(leg: Leg, feet: Feet) -> Floats:
+    """Path position of places on a leg [m]."""
+    start = leg.path_start_m[feet.segment]
+    return start + feet.fraction * (leg.path_end_m[feet.segment] - start)
+
+
+def segments_at(leg: Leg, path_m: Floats) -> tuple[Ints, Floats]:
+    """Segment and fraction along it of path positions; beyond the leg's ends the fraction leaves 0..1."""
+    segment = np.searchsorted(leg.path_start_m, path_m, side="right") - 1
+    segment = np.clip(segment, 0, len(leg.visit) - 1)
+    return segment, (path_m - leg.path_start_m[segment]) / (leg.path_end_m - leg.path_start_m)[segment]
+
+
+def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -> None:
+    inside = np.flatnonzero((leg.path_end_m >= hint_m - HINT_WINDOW_M) & (leg.path_start_m <= hint_m + HINT_WINDOW_M))
+    if len(inside) == 0:
+        return
+    trial = on_segments(point.take(np.zeros(len(inside), dtype=np.int64)), leg.line, inside)
+    foot = downhill(point, leg.line, inside[[int(np.argmin(trial.distance_m))]])
+    if foot.distance_m[0] <= feet.distance_m[row] + SAME_PLACE_M:
+        feet.put(np.array([row]), foot)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Segments of one element, or of one gap between two."""
+
+    start: Floats
+    end: Floats
+    east: Floats
+    north: Floats
+    visit: Ints
+    path_start_m: Floats
+    path_end_m: Floats
+    measure_start_m: Floats
+    measure_end_m: Floats
+    height_start_m: Floats
+    height_end_m: Floats
+    sigma_m: Floats
+
+
+def _element(track: Track, visit: Visit, number: int, position_m: float) -> _Part:
+    part = track.vertices(visit.element)
+    step = 1 if visit.forward else -1
+    places = points_of(track.latitude_deg[part][::step], track.longitude_deg[part][::step])
+    measure, height = track.measure_m[part][::step], track.height_m[part][::step]
+    sigma = track.sigma_m[part][::step]
+    path = position_m + np.abs(measure - measure[0])
+    return _Part(
+        start=places.surface[:-1],
+        end=places.surface[1:],
+        east=places.east[:-1],
+        north=places.north[:-1],
+        visit=np.full(len(path) - 1, number),
+        path_start_m=path[:-1],
+        path_end_m=path[1:],
+        measure_start_m=measure[:-1],
+        measure_end_m=measure[1:],
+        height_start_m=height[:-1],
+        height_end_m=height[1:],
+        sigma_m=np.fmax(sigma[:-1], sigma[1:]),
+    )
+
+
+def _bridge(before: _Part, after: _Part, position_m: float) -> _Part | None:
+    """The straight line over a gap, belonging to the element after it; none where there is no gap."""
+    gap = float(np.linalg.norm(after.start[0] - before.end[-1]))
+    if gap <= GAP_COUNTS_M:
+        return None
+    return _Part(
+        start=before.end[-1:],
+        end=after.start[:1],
+        east=after.east[:1],
+        north=after.north[:1],
+        visit=after.visit[:1],
+        path_start_m=np.array([position_m]),
+        path_end_m=np.array([position_m + gap]),
+        measure_start_m=after.measure_start_m[:1],
+        measure_end_m=after.measure_start_m[:1],
+        height_start_m=before.height_end_m[-1:],
+        height_end_m=after.height_start_m[:1],
+        sigma_m=after.sigma_m[:1],
+    )
+
+
+def _headings(start: Floats, end: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
+    """Heading of each segment, clockwise from north, and the left turn between neighbours [rad]."""
+    along = end - start
+    heading = np.arctan2(np.einsum("ij,ij->i", along, east), np.einsum("ij,ij->i", along, north))
+    turn = -np.diff(heading)
+    return heading, np.asarray((turn + np.pi) % (2.0 * np.pi) - np.pi)

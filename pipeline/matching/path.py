@@ -1,0 +1,180 @@
+"""The path that a run travelled: legs of net elements sharing one path position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.matching.leg import Leg, nearest_on_leg, path_at, segments_at
+from pipeline.matching.segments import Feet, no_feet
+from pipeline.track import Track
+
+Objects = npt.NDArray[np.object_]
+MEASURE_TOLERANCE_M = 0.5
+BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
+    "leg": pl.Int32,
+    "balise_id": pl.String,
+    "kind": pl.String,
+    "netelement_id": pl.String,
+    "measure_m": pl.Float64,
+    "path_m": pl.Float64,
+    "location_accuracy_m": pl.Float64,
+    "linked": pl.Boolean,
+    "link_reaction": pl.String,
+}
+
+
+@dataclass(frozen=True)
+class Places:
+    """Positions on the path, one per point asked for, NaN where the point is not known.
+
+    `cross_m` is positive left of growing path; `vertical_m` is height over the track (NaN without heights);
+    `distance_m` is the horizontal distance to the path itself, which matters beyond its ends, where
+    `path_m` goes on straight.
+    """
+
+    leg: Ints
+    path_m: Floats
+    cross_m: Floats
+    vertical_m: Floats
+    distance_m: Floats
+
+
+@dataclass(frozen=True)
+class TravelledPath:
+    """The legs of a run in order of time; `path_m` is 0 at the start of the first net element."""
+
+    track: Track
+    legs: tuple[Leg, ...]
+
+    def elements(self) -> list[str]:
+        """Net elements in order of growing path, leg by leg; one on both sides of a leg change stands once."""
+        names: list[str] = []
+        for leg in self.legs:
+            for visit in leg.visits:
+                name = self.track.ids[visit.element]
+                if not names or names[-1] != name:
+                    names.append(name)
+        return names
+
+    def locate(self, leg: npt.ArrayLike, path_m: npt.ArrayLike) -> tuple[Objects, Floats]:
+        """Net element and measure [m] of path positions; beyond the path's ends the measure goes on.
+
+        None and NaN where the position is not known.
+        """
+        position = _column(path_m)
+        number = np.broadcast_to(np.asarray(leg, dtype=np.int64), position.shape)
+        element, measure = self.locate_index(number, position)
+        return np.array([*self.track.ids, None], dtype=object)[element], measure
+
+    def locate_index(self, leg: Ints, path_m: Floats) -> tuple[Ints, Floats]:
+        """As `locate`, the net element as its number in the track (-1: not known)."""
+        element = np.full(len(path_m), -1, dtype=np.int64)
+        measure = np.full(len(path_m), np.nan)
+        for index, one in enumerate(self.legs):
+            rows = np.flatnonzero((leg == index) & np.isfinite(path_m))
+            segment, fraction = segments_at(one, path_m[rows])
+            span = one.measure_end_m[segment] - one.measure_start_m[segment]
+            element[rows] = np.array([visit.element for visit in one.visits])[one.visit[segment]]
+            measure[rows] = one.measure_start_m[segment] + fraction * span
+        return element, measure
+
+    def project(
+        self,
+        latitude_deg: npt.ArrayLike,
+        longitude_deg: npt.ArrayLike,
+        height_m: npt.ArrayLike | None = None,
+        leg: npt.ArrayLike | None = None,
+        near_path_m: npt.ArrayLike | None = None,
+    ) -> Places:
+        """Positions [deg, m] on the path.
+
+        `leg` says on which leg each point lies (none: the nearest). `near_path_m` tells passages of the
+        same place apart; it never moves a point that has only one, so jumps stay what they are.
+        """
+        latitude, longitude = _column(latitude_deg), _column(longitude_deg)
+        height = np.full(len(latitude), np.nan) if height_m is None else _column(height_m)
+        near = None if near_path_m is None else np.broadcast_to(_column(near_path_m), latitude.shape)
+        known = np.isfinite(latitude) & np.isfinite(longitude)
+        points = points_of(latitude, longitude)
+        if leg is None:
+            number = self._nearest_leg(points, known)
+        else:
+            number = np.broadcast_to(np.asarray(leg, dtype=np.int64), latitude.shape)
+        return self.places(number, self.feet(points, number, known, near), height)
+
+    def feet(self, points: Points, leg: Ints, known: Bools, near_path_m: Floats | None = None) -> Feet:
+        """The nearest place of each known point on its leg."""
+        feet = no_feet(len(points))
+        for index, one in enumerate(self.legs):
+            rows = np.flatnonzero((leg == index) & known)
+            near = None if near_path_m is None else near_path_m[rows]
+            feet.put(rows, nearest_on_leg(points.take(rows), one, near))
+        return feet
+
+    def places(self, leg: Ints, feet: Feet, height_m: Floats) -> Places:
+        """Feet on the legs as path positions."""
+        path_m, vertical_m = np.full((2, len(leg)), np.nan)
+        for index, one in enumerate(self.legs):
+            rows = np.flatnonzero((leg == index) & np.isfinite(feet.fraction))
+            part = feet.take(rows)
+            rise = one.height_end_m[part.segment] - one.height_start_m[part.segment]
+            path_m[rows] = path_at(one, part)
+            vertical_m[rows] = height_m[rows] - one.height_start_m[part.segment] - part.fraction * rise
+        return Places(leg, path_m, feet.offset_m, vertical_m, feet.distance_m)
+
+    def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
+        """Balises on the path with their path position, in order of leg and path position.
+
+        A place that two legs share is given once, on the first; an element passed twice gives its balises
+        twice. A balise off its element is on no path (the site's findings name it).
+        """
+        rows: dict[tuple[str, float], tuple[object, ...]] = {}
+        if balises is not None:
+            groups = balises.partition_by("netelement_id", as_dict=True, maintain_order=True)
+            for number, leg in enumerate(self.legs):
+                for row in _balises_on(self.track, number, leg, groups):
+                    rows.setdefault((str(row[1]), round(float(str(row[5])), 3)), row)
+        frame = pl.DataFrame(list(rows.values()), schema=BALISE_COLUMNS, orient="row")
+        return frame.sort("leg", "path_m", "balise_id")
+
+    def _nearest_leg(self, points: Points, known: Bools) -> Ints:
+        distance = np.array(
+            [self.feet(points, np.full(len(points), index), known).distance_m for index in range(len(self.legs))]
+        )
+        return np.asarray(np.argmin(np.nan_to_num(distance), axis=0))
+
+
+def _balises_on(
+    track: Track, number: int, leg: Leg, groups: dict[tuple[object, ...], pl.DataFrame]
+) -> list[tuple[object, ...]]:
+    rows: list[tuple[object, ...]] = []
+    for index, visit in enumerate(leg.visits):
+        name = track.ids[visit.element]
+        group = groups.get((name,))
+        if group is None:
+            continue
+        measures = track.measure_m[track.vertices(visit.element)]
+        origin = float(measures[0] if visit.forward else measures[-1])
+        start = _entry_m(leg, index)
+        for row in group.iter_rows(named=True):
+            if not measures[0] - MEASURE_TOLERANCE_M <= row["measure_m"] <= measures[-1] + MEASURE_TOLERANCE_M:
+                continue
+            path_m = start + abs(row["measure_m"] - origin)
+            values = (row["balise_id"], row["kind"], name, row["measure_m"], path_m)
+            rows.append((number, *values, row["location_accuracy_m"], row["linked"], row["link_reaction"]))
+    return rows
+
+
+def _entry_m(leg: Leg, visit: int) -> float:
+    """Path position where an element is entered, a gap before it left behind."""
+    own = np.flatnonzero((leg.visit == visit) & (leg.measure_start_m != leg.measure_end_m))
+    return float(leg.path_start_m[own[0]])
+
+
+def _column(values: npt.ArrayLike) -> Floats:
+    return np.atleast_1d(np.asarray(values, dtype=np.float64))

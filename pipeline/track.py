@@ -1,0 +1,79 @@
+"""The surveyed track as arrays: net elements with their vertices, measures and lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.geodesy import Floats, Ints, distances_m
+
+# A gap between linked ends that is more than survey noise [m]; it counts as straight track.
+GAP_COUNTS_M = 0.5
+
+
+@dataclass(frozen=True)
+class Track:
+    """Net elements, each a run of vertices `first[e] : first[e + 1]`, in the order of the survey.
+
+    Degrees, metres; `height_m` is NaN on a 2-D element (as a whole), `sigma_m` NaN where not known.
+    """
+
+    ids: tuple[str, ...]
+    index: dict[str, int]
+    first: Ints
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    measure_m: Floats
+    sigma_m: Floats
+    length_m: Floats
+
+    def vertices(self, element: int) -> slice:
+        return slice(int(self.first[element]), int(self.first[element + 1]))
+
+    def end(self, element: int, position: int) -> int:
+        """Vertex at an end of an element: 0 its start, 1 its end."""
+        return int(self.first[element]) if position == 0 else int(self.first[element + 1]) - 1
+
+    def elements(self) -> Iterator[tuple[int, str, slice]]:
+        for element, name in enumerate(self.ids):
+            yield element, name, self.vertices(element)
+
+
+def track_of(frame: pl.DataFrame) -> Track:
+    """The track of a site's `track` table; points of an element stay in their order."""
+    names = frame["netelement_id"].to_list()
+    index: dict[str, int] = {}
+    for name in names:
+        index.setdefault(name, len(index))
+    codes = np.fromiter((index[name] for name in names), dtype=np.int64, count=len(names))
+    order = np.argsort(codes, kind="stable")
+    first = np.searchsorted(codes[order], np.arange(len(index) + 1))
+    columns = {name: _floats(frame, name)[order] for name in _NUMBERS}
+    columns["height_m"] = _all_or_none(columns["height_m"], first)
+    length_m = columns["measure_m"][first[1:] - 1] - columns["measure_m"][first[:-1]]
+    return Track(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
+
+
+def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+    """Distance from the first point along one element [m]: 3-D where every height is known."""
+    flat = np.zeros_like(latitude_deg)
+    heights = flat if np.isnan(height_m).any() else height_m
+    return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
+
+
+_NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")
+
+
+def _floats(frame: pl.DataFrame, column: str) -> Floats:
+    """A column with null as NaN."""
+    return frame[column].cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
+
+
+def _all_or_none(height_m: Floats, first: Ints) -> Floats:
+    """Heights of an element only where all of its points have one: half a profile is no profile."""
+    unknown = np.add.reduceat(np.isnan(height_m).astype(np.int64), first[:-1]) > 0
+    return np.where(np.repeat(unknown, np.diff(first)), np.nan, height_m)
