@@ -1,0 +1,235 @@
+"""The faults that can be injected, and what each does to positions and odometer.
+
+Sizes are signed: an along-track fault is positive ahead of the train, a cross-track fault to its left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Self
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from pydantic import Field, model_validator
+
+from schemas.config import NonNegative, Positive, Settings
+from schemas.inputs import Faults
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+NS_PER_S = 1_000_000_000
+
+
+class FaultKind(StrEnum):
+    STEP = "step"
+    BIAS = "bias"
+    RAMP = "ramp"
+    NOISE = "noise"
+    OUTAGE = "outage"
+    LATENCY = "latency"
+    SLIP = "slip"
+    SLIDE = "slide"
+    SCALE = "scale"
+
+
+_NEEDS = {
+    FaultKind.STEP: "size_m",
+    FaultKind.BIAS: "size_m",
+    FaultKind.RAMP: "rate_mps",
+    FaultKind.NOISE: "sigma_m",
+    FaultKind.OUTAGE: None,
+    FaultKind.LATENCY: "latency_s",
+    FaultKind.SLIP: "rate_mps",
+    FaultKind.SLIDE: "rate_mps",
+    FaultKind.SCALE: "scale",
+}
+_QUANTITIES = ("size_m", "rate_mps", "sigma_m", "latency_s", "scale")
+_ON_ODOMETER = (FaultKind.SLIP, FaultKind.SLIDE, FaultKind.SCALE)
+_TARGET = r"^(along|cross|up|east|north|position|odometer|[A-Z][0-9]{2})$"
+
+
+class FaultSpec(Settings):
+    """One fault, from `start_s` after the first epoch of the run on; without `duration_s` to the end of the run.
+
+    `target`: `along`, `cross`, `up`, `east`, `north` displace the position, `position` serves outage and
+    latency, `odometer` slip, slide, scale and outage, and a satellite (`G08`) its range.
+    A ramp grows by `rate_mps` for its duration and then stays, unless it `returns`.
+    Slip adds `rate_mps` to the odometer's speed, slide takes it off (wheels never turn backwards);
+    `scale` multiplies the odometer's increments. `solution` limits the fault to one solution.
+    """
+
+    kind: FaultKind
+    target: Annotated[str, Field(pattern=_TARGET)] = ""
+    start_s: NonNegative | None = None
+    duration_s: Positive | None = None
+    size_m: float | None = None
+    rate_mps: float | None = None
+    sigma_m: Positive | None = None
+    latency_s: Positive | None = None
+    scale: Positive | None = None
+    returns: bool = False
+    solution: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual_target(cls, data: object) -> object:
+        if isinstance(data, dict) and "target" not in data:
+            return {**data, "target": _usual_target_of(str(data.get("kind")))}
+        return data
+
+    @model_validator(mode="after")
+    def _says_how_much(self) -> Self:
+        needed = _NEEDS[self.kind]
+        given = [name for name in _QUANTITIES if getattr(self, name) is not None]
+        if given != ([needed] if needed else []):
+            raise ValueError(f"a fault of kind {self.kind.value} takes {needed or 'no size'}, not {given}")
+        allowed = _allowed_targets(self.kind)
+        if self.target not in allowed and not (self.hits_satellite and "satellite" in allowed):
+            raise ValueError(f"a fault of kind {self.kind.value} has target {' or '.join(allowed)}")
+        return self
+
+    @property
+    def hits_satellite(self) -> bool:
+        return len(self.target) == 3 and self.target[0].isupper()
+
+    @property
+    def hits_odometer(self) -> bool:
+        return self.target == "odometer"
+
+    def begins_s(self) -> float:
+        return self.start_s or 0.0
+
+
+class PlacedFault(FaultSpec):
+    """A fault of a scenario: it may begin where the train first reaches chainage `at_m`."""
+
+    at_m: NonNegative | None = None
+
+    @model_validator(mode="after")
+    def _begins_somewhere(self) -> Self:
+        if (self.at_m is None) == (self.start_s is None):
+            raise ValueError("a fault has either start_s or at_m")
+        return self
+
+
+@dataclass(frozen=True)
+class PositionEffect:
+    """What faults do to the positions of one solution, per epoch."""
+
+    along_m: Floats
+    cross_m: Floats
+    up_m: Floats
+    east_m: Floats
+    north_m: Floats
+    latency_s: Floats
+    lost: Bools
+
+
+def position_effect(faults: Sequence[FaultSpec], t_s: Floats, rng: np.random.Generator) -> PositionEffect:
+    """Sum the position faults over epochs `t_s` (seconds after the first epoch)."""
+    offsets = {axis: np.zeros(t_s.size) for axis in ("along", "cross", "up", "east", "north")}
+    latency, lost = np.zeros(t_s.size), np.zeros(t_s.size, dtype=np.bool_)
+    for fault in faults:
+        if fault.target in offsets:
+            offsets[fault.target] += offset_m(fault, t_s, rng)
+        elif fault.target == "position" and fault.kind is FaultKind.LATENCY:
+            latency += np.where(active(fault, t_s), fault.latency_s or 0.0, 0.0)
+        elif fault.target == "position":
+            lost |= active(fault, t_s)
+    return PositionEffect(**{f"{axis}_m": value for axis, value in offsets.items()}, latency_s=latency, lost=lost)
+
+
+def offset_m(fault: FaultSpec, t_s: Floats, rng: np.random.Generator) -> Floats:
+    """A step, bias, ramp or noise burst over time [m]."""
+    now = active(fault, t_s)
+    if fault.kind is FaultKind.RAMP:
+        limit = np.inf if fault.duration_s is None else fault.duration_s
+        grown = (fault.rate_mps or 0.0) * np.clip(t_s - fault.begins_s(), 0.0, limit)
+        return np.where(now, grown, 0.0) if fault.returns else grown
+    if fault.kind is FaultKind.NOISE:
+        return np.where(now, (fault.sigma_m or 0.0) * rng.standard_normal(t_s.size), 0.0)
+    return np.where(now, fault.size_m or 0.0, 0.0)
+
+
+def active(fault: FaultSpec, t_s: Floats) -> Bools:
+    """From the start of the fault on, its end excluded."""
+    t_ns, begin_ns = np.round(t_s * NS_PER_S), round(fault.begins_s() * NS_PER_S)
+    end_ns = np.inf if fault.duration_s is None else begin_ns + round(fault.duration_s * NS_PER_S)
+    now: Bools = (t_ns >= begin_ns) & (t_ns < end_ns)
+    return now
+
+
+def odometer_increments(faults: Sequence[FaultSpec], t_s: Floats, increments_m: Floats) -> Floats:
+    """Odometer increments under slip, slide and scale faults; increment k ends at `t_s[k]`."""
+    step_s = np.diff(t_s, prepend=t_s[0])
+    result = increments_m.copy()
+    for fault in faults:
+        if not fault.hits_odometer or fault.kind not in _ON_ODOMETER:
+            continue
+        now = active(fault, t_s)
+        change = (fault.rate_mps or 0.0) * step_s
+        sense = np.where(result < 0.0, -1.0, 1.0)
+        if fault.kind is FaultKind.SCALE:
+            result[now] *= fault.scale or 1.0
+        elif fault.kind is FaultKind.SLIP:
+            result[now] += (sense * change)[now]
+        else:
+            result[now] = (sense * np.maximum(np.abs(result) - change, 0.0))[now]
+    return result
+
+
+def faults_table(faults: Sequence[FaultSpec], first_ns: int, last_ns: int) -> pl.DataFrame:
+    """The `faults` stream: what was injected, when, how much (`size` in the unit of the kind, `rate` per second).
+
+    A ramp that stays, like a fault without end, lasts to the end of the run.
+    """
+    rows = []
+    for fault in faults:
+        begin = first_ns + round(fault.begins_s() * NS_PER_S)
+        stays = fault.duration_s is None or (fault.kind is FaultKind.RAMP and not fault.returns)
+        end = last_ns if stays else min(begin + round((fault.duration_s or 0.0) * NS_PER_S), last_ns)
+        size = _size(fault, (last_ns - begin) / NS_PER_S)
+        rows.append((begin, end, fault.kind.value, fault.target, size, fault.rate_mps))
+    rows.sort(key=lambda row: (row[0], row[3], row[2]))
+    table = pl.DataFrame(rows, schema=_FAULTS, orient="row")
+    instants = [pl.col(name).cast(pl.Datetime("ns", "UTC")) for name in ("t_start", "t_end")]
+    return Faults.validate(table.with_columns(instants), cast=True)
+
+
+_FAULTS = {
+    "t_start": pl.Int64,
+    "t_end": pl.Int64,
+    "kind": pl.String,
+    "target": pl.String,
+    "size": pl.Float64,
+    "rate": pl.Float64,
+}
+
+
+def _size(fault: FaultSpec, to_end_s: float) -> float | None:
+    """The quantity of the kind; of a ramp, slip or slide what it has grown to at its end [m]."""
+    if fault.rate_mps is not None:
+        return fault.rate_mps * (to_end_s if fault.duration_s is None else min(fault.duration_s, to_end_s))
+    needed = _NEEDS[fault.kind]
+    value: float | None = getattr(fault, needed) if needed else None
+    return value
+
+
+def _usual_target_of(kind: str) -> str:
+    if kind in (FaultKind.OUTAGE, FaultKind.LATENCY):
+        return "position"
+    return "odometer" if kind in _ON_ODOMETER else "along"
+
+
+def _allowed_targets(kind: FaultKind) -> tuple[str, ...]:
+    if kind in _ON_ODOMETER:
+        return ("odometer",)
+    if kind is FaultKind.OUTAGE:
+        return ("position", "odometer", "satellite")
+    if kind is FaultKind.LATENCY:
+        return ("position",)
+    return ("along", "cross", "up", "east", "north", "satellite")

@@ -1,0 +1,138 @@
+"""A scenario becomes a trial: a site and runs, in memory or on disk.
+
+Every random number hangs on the scenario's seed, the run's name and what is drawn, never on the order of work:
+one run written alone has the bytes that it has in the whole trial.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from datasets.faults import FaultSpec, PlacedFault, faults_table
+from datasets.line import Line, balises_table, build_line, links_table, track_table
+from datasets.motion import Motion, build_motion
+from datasets.odometer import odometer_stream
+from datasets.receiver import Journey, gnss_stream, reference_stream
+from datasets.scenario import RunSpec, Scenario
+from schemas.config import Vehicle, to_toml
+from schemas.errors import OutputError
+from schemas.run import STREAMS, RunLog, Site
+
+# Runs of a trial start one hour after the other.
+_RUN_SPACING = timedelta(hours=1)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial in memory."""
+
+    scenario: Scenario
+    site: Site
+    runs: tuple[RunLog, ...]
+
+
+def build_trial(scenario: Scenario) -> Trial:
+    """Simulate the site and all runs."""
+    line = build_line(scenario.line)
+    return Trial(scenario, build_site(scenario, line), tuple(build_run(scenario, run, line) for run in scenario.runs))
+
+
+def build_site(scenario: Scenario, line: Line | None = None) -> Site:
+    """The surveyed site of a scenario."""
+    line = line or build_line(scenario.line)
+    balises = balises_table(scenario.line) if scenario.line.balises else None
+    return Site(track_table(line, _rng(scenario, "site", "survey")), links_table(scenario.line), balises)
+
+
+def build_run(scenario: Scenario, spec: RunSpec, line: Line | None = None) -> RunLog:
+    """Simulate one run."""
+    journey = Journey(line or build_line(scenario.line), build_motion(spec.motion), scenario.vehicle or Vehicle())
+    first_ns = _start_ns(scenario, spec)
+    faults = [placed(fault, journey.motion, spec.gnss.rate_hz) for fault in spec.faults]
+
+    def rng(purpose: str) -> np.random.Generator:
+        return _rng(scenario, spec.id, purpose)
+
+    gnss = gnss_stream(spec.gnss, journey, faults, first_ns, rng("gnss"))
+    last_ns = first_ns + round(journey.motion.duration_s * 1e9)
+    odometer = reference = None
+    if spec.odometer:
+        odometer = odometer_stream(spec.odometer, journey.motion, faults, first_ns, rng("odometer"))
+    if spec.reference:
+        reference = reference_stream(spec.reference, journey, first_ns, rng("reference"))
+    truth = faults_table(faults, first_ns, last_ns) if faults else None
+    return RunLog(spec.id, gnss, odometer=odometer, reference=reference, faults=truth)
+
+
+def placed(fault: PlacedFault, motion: Motion, rate_hz: float) -> FaultSpec:
+    """A fault with its start in time: the first GNSS epoch once the train is at its place."""
+    start_s = motion.time_at(fault.at_m) if fault.at_m is not None else fault.begins_s()
+    epoch_s = np.ceil(start_s * rate_hz - 1e-9) / rate_hz
+    return FaultSpec(**fault.model_dump(exclude={"at_m", "start_s"}), start_s=float(epoch_s))
+
+
+def write_trial(scenario: Scenario, out: Path, done: Callable[[str], None] | None = None) -> list[Path]:
+    """Write `site/`, `runs/`, `vehicle.toml` and the resolved `scenario.toml`; returns the runs' paths.
+
+    One scenario always gives the same bytes. `done` is told the name of each run written.
+    """
+    line = build_line(scenario.line)
+    try:
+        write_site(build_site(scenario, line), out / "site")
+        (out / "scenario.toml").write_text(to_toml(scenario), encoding="utf-8")
+        if scenario.vehicle is not None:
+            (out / "vehicle.toml").write_text(to_toml(scenario.vehicle), encoding="utf-8")
+        paths = []
+        for spec in scenario.runs:
+            paths.append(write_run_log(build_run(scenario, spec, line), out / "runs", spec.log))
+            if done is not None:
+                done(spec.id)
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(error.filename or out)) from None
+    return paths
+
+
+def write_site(site: Site, folder: Path) -> None:
+    """The tables of a site as Parquet (CONTRACT section 2)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("track", "links", "balises", "route"):
+        table: pl.DataFrame | None = getattr(site, name)
+        if table is not None:
+            table.write_parquet(folder / f"{name}.parquet")
+
+
+def write_run_log(run: RunLog, folder: Path, log: str = "parquet") -> Path:
+    """One run as a folder of Parquet files, or as an MCAP log in the encoding `json`, `protobuf` or `cdr`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if log != "parquet":
+        from pipeline.ingest.mcap_writer import write_mcap
+
+        path = folder / f"{run.run_id}.mcap"
+        write_mcap(run, path, encoding=log)
+        return path
+    path = folder / run.run_id
+    path.mkdir(exist_ok=True)
+    for name in STREAMS:
+        table = run.stream(name)
+        if table is not None:
+            table.write_parquet(path / f"{name}.parquet")
+    return path
+
+
+def _start_ns(scenario: Scenario, spec: RunSpec) -> int:
+    """Start of a run [ns]; the hour follows its place in the scenario."""
+    place = [run.id for run in scenario.runs].index(spec.id)
+    start = scenario.start + place * _RUN_SPACING
+    return int(start.timestamp()) * 1_000_000_000 + start.microsecond * 1000
+
+
+def _rng(scenario: Scenario, owner: str, purpose: str) -> np.random.Generator:
+    """Independent random numbers by name; CRC-32 serves as a stable number of a name."""
+    return np.random.default_rng([scenario.seed, zlib.crc32(owner.encode()), zlib.crc32(purpose.encode())])
