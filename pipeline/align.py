@@ -17,7 +17,7 @@ from scipy.stats import norm
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import Array, AxisState
 from pipeline.odometer import OdometerTrack, odometer_track, polarity
-from pipeline.odometer_filter import Estimate, FilterState, ScaleLatencyFilter, error_model, prior_of
+from pipeline.odometer_filter import SPEED_SPAN_S, Estimate, FilterState, ScaleLatencyFilter, error_model, prior_of
 from schemas.config import Configuration, Vehicle
 
 Index = npt.NDArray[np.int64]
@@ -265,7 +265,7 @@ class _Learner:
             failing = np.flatnonzero((np.abs(result.value) > self._factor * result.sigma).any(axis=1) & ~series.fresh)
             if failing.size:
                 alarm = position + int(failing[0])
-                in_use = [item for at, item in states if at < alarm]
+                in_use = [item for effective, item in states if effective <= alarm]
                 state = in_use[-1] if in_use else state
                 self._learned.put(0, [(int(self._rows[alarm]), state.estimate())])
                 return state, alarm
@@ -283,11 +283,16 @@ class _Learner:
             if self._broken(state.t_s, t_s):
                 state = self._filter.restart(state, t_s, path_m)
             state = self._filter.update(state, t_s, path_m, sigma_m)
-            states.append((position, state))
-            changes.append((int(self._rows[position]) + 1, state.estimate()))
+            effective = self._next(t_s + SPEED_SPAN_S, position + 1)
+            states.append((effective, state))
+            changes.append((self._epoch(effective), state.estimate()))
             position = self._next(t_s + period_s, position + 1)
         self._learned.put(0, changes)
         return states
+
+    def _epoch(self, position: int) -> int:
+        """Index among all epochs; the end for a position past the last."""
+        return int(self._rows[position]) if position < self._rows.size else int(self._learned.scale.size)
 
     def _next(self, t_s: float, at_least: int) -> int:
         """First position at or after this time, and not before `at_least`."""
@@ -310,17 +315,16 @@ class _Learner:
 
     def _hold(self, estimate: Estimate, alarm: int) -> int:
         """Position from which learning goes on after the alarm at `alarm`; the number of positions if never."""
-        config, rows = self._config, self._rows[max(alarm - 1, 0) :]
-        t_s, path_m, sigma_m = (
-            values[rows] for values in (self._arrays.t_s, self._arrays.path_m, self._arrays.sigma_m)
-        )
+        begin = max(alarm - 1, 0)
+        config, rows = self._config, self._rows[begin:]
+        t_s, path_m, sigma_m = self._t_s[begin:], self._path_m[begin:], self._sigma_m[begin:]
         steps = _steps(rows, self._arrays.t_s, self._track, self._learned)
         away = path_m - path_m[0] - np.cumsum(steps.distance_m)
-        series = self._series(max(alarm - 1, 0), self._rows.size, max(alarm - 1, 0))
+        series = self._series(begin, self._rows.size, begin)
         state = AxisState.at_restart(self._alphas.size, self._filter.shares.size)
         result, _ = run_axis(series, self._alphas, state)
         beyond = np.abs(result.value[:, :2]) > self._factor * result.sigma[:, :2]
-        fast = beyond.any(axis=1) | (np.arange(rows.size) == 1)
+        fast = beyond.any(axis=1) | (np.arange(rows.size) <= 1)
         last_fail = np.maximum.accumulate(np.where(fast, t_s, -np.inf))
         quiet = t_s - last_fail >= config.lds.recovery_s
         elapsed = t_s - t_s[0]
@@ -332,7 +336,7 @@ class _Learner:
         near = np.abs(away) <= np.minimum(config.hazards.failure_limit_m, self._factor * spread)
         may_return = self._factor * spread <= config.hazards.failure_limit_m
         back = np.flatnonzero(quiet & near & may_return)
-        return max(alarm - 1, 0) + int(back[0]) if back.size else self._rows.size
+        return begin + int(back[0]) if back.size else self._rows.size
 
 
 def along_series(

@@ -40,7 +40,7 @@ class OdometerTrack:
 
     def seconds(self, t_ns: Times) -> Array:
         """Times on the odometer's own scale [s]."""
-        return (t_ns - self.epoch_ns) * _NS
+        return ((t_ns - self.epoch_ns) * _NS).astype(np.float64)
 
     def distance_at(self, t_s: Array) -> Array:
         """Distance at these times [m]; outside the span the end value (see `known_at`)."""
@@ -53,18 +53,21 @@ class OdometerTrack:
         before = np.where(exact, after, np.maximum(after - 1, 0))
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
         paused = ~exact & self.pause[np.minimum(before, self.pause.size - 1)]
-        return inside & ~paused & ~self.slip[before] & ~self.slip[after]
+        known: Mask = inside & ~paused & ~self.slip[before] & ~self.slip[after]
+        return known
 
     def stretch_at(self, t_s: Array) -> npt.NDArray[np.int64]:
         """Number of the stretch of unbroken distance that each time lies in."""
         index = np.searchsorted(self.t_s, t_s, side="right") - 1
-        return self.stretch[index.clip(0, self.t_s.size - 1)]
+        stretch: npt.NDArray[np.int64] = self.stretch[index.clip(0, self.t_s.size - 1)]
+        return stretch
 
     def speed_at(self, t_s: Array) -> Array:
         """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
         start = np.maximum(t_s - _SPEED_WINDOW_S, self.t_s[0])
         span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, _NS)
-        return (self.distance_at(t_s) - self.distance_at(start)) / span
+        speed: Array = (self.distance_at(t_s) - self.distance_at(start)) / span
+        return speed
 
 
 def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> OdometerTrack:

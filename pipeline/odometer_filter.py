@@ -24,6 +24,8 @@ _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
 # Receivers show a little noise without memory beside the modelled one; it also keeps the update well conditioned.
 _WHITE_SHARE = 0.01
+# An update reads the odometer up to this long after its epoch, so its result may be used only after that.
+SPEED_SPAN_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -82,10 +84,10 @@ class ScaleLatencyFilter:
         """The state after the epoch at `t_s` with GNSS path position and sigma."""
         mean, covariance = self._predict(state, t_s)
         at = t_s - mean[_LATENCY]
-        at_lags = np.array([at - 1.0, at - 0.5, at])
-        earlier, before, distance = np.interp(at_lags, self.track.t_s, self.track.distance_m).tolist()
-        # Speed now, carried on from the two half seconds before: a lagging mean would bias the latency.
-        speed = 3.0 * (distance - before) - (before - earlier)
+        around = at + np.array([-SPEED_SPAN_S, 0.0, SPEED_SPAN_S])
+        before, distance, after = np.interp(around, self.track.t_s, self.track.distance_m).tolist()
+        # Centred, as a speed from the same odometer noise as the innovation would bias the latency upwards.
+        speed = (after - before) / (2.0 * SPEED_SPAN_S)
         row = np.empty(mean.size)
         row[_OFFSET] = 1.0
         row[_SCALE] = distance - state.origin_m

@@ -75,4 +75,5 @@ def _raw_variance(series: AxisSeries) -> Array:
     """Variance of the raw rate (DIAG eq. 4-7 with correlated GNSS errors) [m^2/s^2]."""
     gnss = 2.0 * (series.variance_m2 * series.decorrelation).sum(axis=1)
     border = np.where(series.border, series.border_m2, 0.0)
-    return (gnss + series.white_m2 + border) / series.dt_s**2 + series.scale_mps**2 + series.latency_mps**2
+    noise: Array = (gnss + series.white_m2 + border) / series.dt_s**2
+    return noise + series.scale_mps**2 + series.latency_mps**2

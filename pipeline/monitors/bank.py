@@ -1,0 +1,170 @@
+"""The monitor bank of one solution: evaluated from a restart on, as far as it is asked, and restarted at will."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.monitors.recursion import Array, AxisState
+from pipeline.monitors.series import DISABLED, FIRST_EPOCH, Axis, axes_of
+from schemas.config import Configuration
+from schemas.enums import MonitorState
+from schemas.tables import SCALES
+
+STATES = [state.value for state in MonitorState]
+_PASS, _FAIL, _NOT_EVALUATED = (STATES.index(state) for state in ("pass", "fail", "not_evaluated"))
+_FIRST_BLOCK = 2048
+
+
+class _AxisBank:
+    """One axis of the bank over all epochs of a solution; results are filled up to `_done` rows."""
+
+    def __init__(self, axis: Axis, epochs: int, alphas: Array, factor: float, enabled: list[bool]) -> None:
+        self.axis = axis
+        self._alphas = alphas
+        self._factor = factor
+        self._enabled = np.array(enabled)
+        width = len(SCALES)
+        self.value = np.full((epochs, width), np.nan)
+        self.threshold = np.full((epochs, width), np.nan)
+        self.state = np.full((epochs, width), _NOT_EVALUATED, dtype=np.int8)
+        self._series = axis.series
+        self._done = 0
+        self._block = max(axis.series.epoch.size, 1)
+        self._carry = self._zero()
+
+    def _zero(self) -> AxisState:
+        return AxisState.at_restart(self._alphas.size, self._series.variance_m2.shape[1])
+
+    def advance(self, epoch: int) -> int:
+        """Evaluate up to this epoch at least; returns the last epoch that is evaluated now."""
+        rows = self._series.epoch
+        while self._done < rows.size and rows[self._done] <= epoch:
+            end = min(self._done + self._block, rows.size)
+            part = self._series.between(self._done, end)
+            result, self._carry = run_axis(part, self._alphas, self._carry)
+            self._store(part, result.value, self._factor * result.sigma)
+            self._done, self._block = end, 2 * self._block
+        return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
+
+    def _store(self, part: AxisSeries, value: Array, threshold: Array) -> None:
+        evaluated = ~part.fresh[:, None] & self._enabled[None, :]
+        failing = np.abs(value) > threshold
+        self.state[part.epoch] = np.where(evaluated, np.where(failing, _FAIL, _PASS), _NOT_EVALUATED)
+        self.value[part.epoch] = np.where(evaluated, value, np.nan)
+        self.threshold[part.epoch] = np.where(evaluated, threshold, np.nan)
+
+    def restart(self, epoch: int) -> None:
+        """Forget all before this epoch; the first increment is from the first usable epoch here to the next."""
+        row = int(np.searchsorted(self._series.epoch, epoch))
+        if row < self._series.epoch.size:
+            fresh = self._series.fresh.copy()
+            fresh[row] = True
+            self._series = replace(self._series, fresh=fresh)
+        self._done = row
+        self._carry = self._zero()
+        self._block = _FIRST_BLOCK
+
+    def columns(self) -> list[pl.Series]:
+        """Value, threshold, state and reason of each monitor of the axis."""
+        columns: list[pl.Series] = []
+        for index, scale in enumerate(SCALES):
+            name = f"{self.axis.name}_{scale}"
+            state = self.state[:, index]
+            columns += [
+                pl.Series(f"{name}_value", self.value[:, index], nan_to_null=True),
+                pl.Series(f"{name}_threshold", self.threshold[:, index], nan_to_null=True),
+                _state_series(f"{name}_state", state),
+                self._reasons(state, bool(self._enabled[index])).alias(f"{name}_reason"),
+            ]
+        return columns
+
+    def _reasons(self, state: npt.NDArray[np.int8], enabled: bool) -> pl.Series:
+        without = pl.Series(state == _NOT_EVALUATED)
+        known = self.axis.reasons.fill_null(FIRST_EPOCH if enabled else DISABLED)
+        return pl.select(pl.when(without).then(known)).to_series()
+
+
+def _state_series(name: str, codes: npt.NDArray[np.int8]) -> pl.Series:
+    return pl.Series(name, STATES, dtype=pl.Enum(STATES)).gather(pl.Series(codes.astype(np.uint32)))
+
+
+class MonitorBank:
+    """The bank as the location determination system sees it.
+
+    `single` are monitors without memory beyond an epoch, evaluated beforehand: frames `value, threshold, state,
+    reason` by monitor name. A fail of any monitor at an epoch is an alarm.
+    """
+
+    def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration, factor: float):
+        count = epochs.height
+        alphas = np.array(config.monitors.ewma_alphas)
+        disabled = config.monitors.disabled
+        self._axes = tuple(
+            _AxisBank(axis, count, alphas, factor, [f"{axis.name}_{scale}" not in disabled for scale in SCALES])
+            for axis in axes_of(epochs, config)
+        )
+        self._single = {name: frame for name, frame in single.items() if name not in disabled}
+        self._switched_off = [name for name in single if name in disabled]
+        self._single_fails = np.zeros(count, dtype=np.bool_)
+        for frame in self._single.values():
+            self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
+        self._any = np.zeros(count, dtype=np.bool_)
+        self._fast = np.zeros(count, dtype=np.bool_)
+        self._along = np.zeros(count, dtype=np.bool_)
+        self._known_to = -1
+
+    def _look(self, epoch: int) -> None:
+        if epoch <= self._known_to:
+            return
+        begin = self._known_to + 1
+        self._known_to = min(axis.advance(epoch) for axis in self._axes)
+        part = slice(begin, self._known_to + 1)
+        fails = [axis.state[part] == _FAIL for axis in self._axes]
+        self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
+        self._fast[part] = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
+        self._along[part] = (self._axes[0].state[part] != _NOT_EVALUATED).any(axis=1)
+
+    def failed(self, epoch: int) -> bool:
+        """Any monitor fails at this epoch."""
+        self._look(epoch)
+        return bool(self._any[epoch])
+
+    def fast_failed(self, epoch: int) -> bool:
+        """A raw or fastest-EWMA monitor fails at this epoch: only these hold back recovery."""
+        self._look(epoch)
+        return bool(self._fast[epoch])
+
+    def along_evaluated(self, epoch: int) -> bool:
+        """The along-track monitors have a verdict at this epoch."""
+        self._look(epoch)
+        return bool(self._along[epoch])
+
+    def restart(self, epoch: int) -> None:
+        """All recursions start anew at this epoch; their first increment is from it to the next."""
+        for axis in self._axes:
+            axis.restart(epoch)
+        self._known_to = epoch - 1
+
+    def columns(self) -> list[pl.Series]:
+        """All monitor columns of the epochs table but those of the linking monitors."""
+        if self._any.size:
+            self._look(self._any.size - 1)
+        columns = [column for axis in self._axes for column in axis.columns()]
+        for name, frame in self._single.items():
+            columns += [frame[part].alias(f"{name}_{part}") for part in ("value", "threshold", "state", "reason")]
+        for name in self._switched_off:
+            columns += not_evaluated(name, DISABLED, self._any.size)
+        return columns
+
+
+def not_evaluated(name: str, reason: str, count: int) -> list[pl.Series]:
+    """Columns of a monitor that has nothing to look at, with the reason."""
+    nothing = pl.Series([None] * count, dtype=pl.Float64)
+    state = _state_series(f"{name}_state", np.full(count, _NOT_EVALUATED, dtype=np.int8))
+    why = pl.Series(f"{name}_reason", [reason] * count, dtype=pl.String)
+    return [nothing.alias(f"{name}_value"), nothing.alias(f"{name}_threshold"), state, why]

@@ -1,0 +1,165 @@
+"""The three axes of the bank from aligned epochs: which epochs are usable, and what leads from one to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.monitors.axis import AxisSeries, Mask
+from pipeline.monitors.recursion import Array
+from pipeline.odometer_filter import error_model
+from schemas.config import Configuration
+
+NO_POSITION = "no position"
+NO_SIGMA = "no standard deviation of the position"
+OFF_TRACK = "off track"
+NO_HEIGHT = "no height in the position or the survey"
+FIRST_EPOCH = "first epoch after a restart"
+DISABLED = "disabled by configuration"
+REASONS: tuple[str, ...] = (NO_POSITION, NO_SIGMA, OFF_TRACK, NO_HEIGHT, FIRST_EPOCH, DISABLED)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis: its increments, and per epoch why there is none (empty where there is)."""
+
+    name: str
+    series: AxisSeries
+    reasons: pl.Series
+
+
+def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Axis]:
+    """Along, cross and up (DIAG eq. 1-3 and 10-15) from aligned epochs of one solution."""
+    t_ns = epochs["t"].dt.timestamp("ns").to_numpy()
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    matched = _match_reasons(epochs)
+    along_reasons = _first_of(matched, epochs["odometer_reason"])
+    up_reasons = _first_of(matched, _where(epochs["vertical_m"].is_null(), NO_HEIGHT))
+    builder = _Builder(epochs, t_s, config)
+    return (
+        Axis("along", builder.along(along_reasons), along_reasons),
+        Axis("cross", builder.across(matched, "cross_track_m", "sigma_cross_m"), matched),
+        Axis("up", builder.across(up_reasons, "vertical_m", "sigma_up_m"), up_reasons),
+    )
+
+
+def _where(mask: pl.Series, reason: str) -> pl.Series:
+    """The reason where the mask holds, null elsewhere."""
+    return pl.select(pl.when(mask).then(pl.lit(reason, pl.String))).to_series()
+
+
+def _first_of(*reasons: pl.Series) -> pl.Series:
+    return pl.select(pl.coalesce([pl.lit(series) for series in reasons])).to_series()
+
+
+def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
+    """Why the match gives no position that the bank could use."""
+    no_sigma = epochs["sigma_along_m"].is_null() | epochs["sigma_cross_m"].is_null()
+    return _first_of(
+        _where(~epochs["fix_valid"], NO_POSITION),
+        _where(~epochs["on_track"], OFF_TRACK),
+        _where(epochs["path_m"].is_null(), NO_POSITION),
+        _where(no_sigma, NO_SIGMA),
+    )
+
+
+class _Builder:
+    """Increments of an axis between consecutive epochs without a reason against it."""
+
+    def __init__(self, epochs: pl.DataFrame, t_s: Array, config: Configuration) -> None:
+        self._epochs = epochs
+        self._t_s = t_s
+        self._gap_reset_s = config.align.gap_reset_s
+        self._survey_default_m = config.matching.survey_sigma_default_m
+        self._shares, self._taus_s = error_model(config.monitors)
+        self._intercept_m, self._slope = config.monitors.sigma_intercept_m, config.monitors.sigma_slope
+
+    def _column(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
+        values: Array = self._epochs[name].to_numpy().astype(np.float64)[rows]
+        return values
+
+    def _variance(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
+        """Position variance of the axis [m^2]; `calibrate` may have fitted sigma = a + b sigma_receiver."""
+        return (self._intercept_m + self._slope * self._column(name, rows)) ** 2
+
+    def along(self, reasons: pl.Series) -> AxisSeries:
+        rows = np.flatnonzero(reasons.is_null().to_numpy())
+        if rows.size == 0:
+            return _empty(self._shares.size)
+        dt, fresh = self._time_steps(rows)
+        stretch = self._epochs["odometer_stretch"].to_numpy()[rows]
+        fresh |= _changes(stretch)
+        odometer = _steps(self._column("odometer_m", rows))
+        speed = _steps(self._column("speed_mps", rows))
+        white = self._column("odometer_white_m2_per_s", rows) * dt
+        return AxisSeries(
+            epoch=rows,
+            fresh=fresh,
+            border=np.zeros(rows.size, dtype=np.bool_),
+            dt_s=dt,
+            rate_mps=(_steps(self._column("path_m", rows)) - odometer) / dt,
+            variance_m2=np.outer(self._variance("sigma_along_m", rows), self._shares),
+            decorrelation=-np.expm1(-dt[:, None] / self._taus_s),
+            white_m2=white,
+            border_m2=np.zeros(rows.size),
+            scale_mps=self._column("scale_sigma", rows) * odometer / dt,
+            latency_mps=self._column("latency_sigma_s", rows) * speed / dt,
+        )
+
+    def across(self, reasons: pl.Series, position: str, sigma: str) -> AxisSeries:
+        """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""
+        rows = np.flatnonzero(reasons.is_null().to_numpy())
+        if rows.size == 0:
+            return _empty(self._shares.size + 1)
+        dt, fresh = self._time_steps(rows)
+        border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
+        survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
+        shares = np.outer(self._variance(sigma, rows), self._shares)
+        chord, chord_decorrelation = self._chord_error(rows, dt)
+        zero = np.zeros(rows.size)
+        return AxisSeries(
+            epoch=rows,
+            fresh=fresh,
+            border=border,
+            dt_s=dt,
+            rate_mps=_steps(self._column(position, rows)) / dt,
+            variance_m2=np.column_stack([shares, chord]),
+            decorrelation=np.column_stack([-np.expm1(-dt[:, None] / self._taus_s), chord_decorrelation]),
+            white_m2=zero,
+            border_m2=2.0 * survey**2,
+            scale_mps=zero,
+            latency_mps=zero,
+        )
+
+    def _chord_error(self, rows: npt.NDArray[np.int64], dt: Array) -> tuple[Array, Array]:
+        """Variance of the polyline's chord error [m^2] and its decorrelation over the way of each step."""
+        error = np.nan_to_num(self._column("interpolation_error_m", rows))
+        length = np.maximum(np.nan_to_num(self._column("segment_length_m", rows), nan=1.0), 1e-3)
+        way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
+        return error**2, -np.expm1(-way / length)
+
+    def _time_steps(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Mask]:
+        """Time since the row before [s] (1 s stands in where there is none) and rows that nothing leads to."""
+        dt = np.diff(self._t_s[rows], prepend=self._t_s[rows[0]] - 1.0)
+        fresh = dt > self._gap_reset_s
+        fresh[0] = True
+        return dt, fresh
+
+
+def _steps(values: Array) -> Array:
+    return np.diff(values, prepend=values[0])
+
+
+def _changes(values: npt.NDArray[np.generic]) -> Mask:
+    changed = np.zeros(values.size, dtype=np.bool_)
+    changed[1:] = values[1:] != values[:-1]
+    return changed
+
+
+def _empty(sources: int) -> AxisSeries:
+    none, many = np.zeros(0), np.zeros((0, sources))
+    no, index = np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.int64)
+    return AxisSeries(index, no, no, none, none, many, many, none, none, none, none)
