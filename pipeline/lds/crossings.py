@@ -106,7 +106,7 @@ def _crossing(journey: Journey, balise: Balise, i: int, j: int, sense: int) -> C
     if t_j - t_i > journey.gap_ns:
         seen = Seen.UNPLACED if journey.placed_nowhere[i + 1 : j].any() else Seen.IN_GAP
         return Crossing(balise, i, j, sense, seen, t_j, _known(journey.odometer_m, j))
-    share = (balise.path_m - journey.path_m[i]) / (journey.path_m[j] - journey.path_m[i])
+    share = float((balise.path_m - journey.path_m[i]) / (journey.path_m[j] - journey.path_m[i]))
     odometer_m = journey.odometer_m[i] + share * (journey.odometer_m[j] - journey.odometer_m[i])
     return Crossing(
         balise,

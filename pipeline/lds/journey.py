@@ -24,6 +24,7 @@ class Journey:
     `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
     count, `None` where it would. `heading`: +1/-1, known at that epoch; `travel`: the same, put
     back to where the train turned (for labels only). `travelled_m`: way run, turns included.
+    `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
     """
 
     t_ns: Integers
@@ -39,6 +40,7 @@ class Journey:
     heading: Integers
     travel: Integers
     travelled_m: Floats
+    blind: Bools
     gap_ns: int
 
     @property
@@ -54,6 +56,7 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
     positioned = fix_valid & np.isfinite(path_m)
     odometer_m = _floats(epochs["odometer_m"])
     heading, travel = _headings(odometer_m, epochs["direction"], config.odometer_fixed_m)
+    gap_ns = crossing_gap_ns(t_ns, config)
     return Journey(
         t_ns=t_ns,
         leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
@@ -68,7 +71,8 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
         heading=heading,
         travel=travel,
         travelled_m=_travelled_m(odometer_m, travel),
-        gap_ns=crossing_gap_ns(t_ns, config),
+        blind=_blind(t_ns, positioned, gap_ns),
+        gap_ns=gap_ns,
     )
 
 
@@ -76,6 +80,14 @@ def crossing_gap_ns(t_ns: Integers, config: LdsConfig) -> int:
     """Longest time between epochs over which a crossing is interpolated: max(1.5 periods, 1 s)."""
     period_ns = float(np.median(np.diff(t_ns))) if t_ns.size > 1 else 0.0
     return round(max(1.5 * period_ns, config.crossing_gap_s * 1e9))
+
+
+def _blind(t_ns: Integers, positioned: Bools, gap_ns: int) -> Bools:
+    last_ns = np.maximum.accumulate(np.where(positioned, t_ns, np.iinfo(np.int64).min))
+    first = np.argmax(positioned) if positioned.any() else t_ns.size
+    blind: Bools = t_ns - np.maximum(last_ns, t_ns[0] - gap_ns) > gap_ns
+    blind[:first] = True
+    return blind
 
 
 def _floats(column: pl.Series) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import sqrt
 
 import numpy as np
 import polars as pl
@@ -17,6 +17,7 @@ from schemas.tables import Epochs
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
+_STRETCH = 512
 
 DISABLED = "disabled by configuration"
 NO_ODOMETER = "no odometer"
@@ -36,9 +37,7 @@ class Anchor:
     travelled_m: float
 
 
-def disorder(
-    offered: list[Crossing], overdue: int, journey: Journey, config: LdsConfig, limits: LdsLimits
-) -> int:
+def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: LdsConfig, limits: LdsLimits) -> int:
     """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
 
     Two or more at once, or one against the direction of travel, are out of order where the
@@ -53,21 +52,7 @@ def disorder(
     return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
 
 
-def distance_threshold_m(
-    anchor: Anchor, travelled_m: float, sigma_m: float, config: LdsConfig, limits: LdsLimits
-) -> float:
-    """Bound on (GNSS - odometer) since the anchor [m].
-
-    The odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T.
-    """
-    way_m = abs(travelled_m - anchor.travelled_m)
-    noise_m = limits.threshold_factor * sqrt(sigma_m * sigma_m + anchor.sigma_m * anchor.sigma_m)
-    return config.odometer_fixed_m + config.odometer_share * way_m + noise_m
-
-
-def relink_bound_m(
-    anchor: Anchor, k: int, journey: Journey, config: LdsConfig, limits: LdsLimits
-) -> float | None:
+def relink_bound_m(anchor: Anchor, k: int, journey: Journey, config: LdsConfig, limits: LdsLimits) -> float | None:
     """Bound on (GNSS - odometer) minus what it was at the anchor; `None` once nothing can be told.
 
     k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2), with the sigma of both epochs for
@@ -81,26 +66,75 @@ def relink_bound_m(
     return bound_m if bound_m <= limits.failure_limit_m else None
 
 
-class LinkRecord:
-    """Values, thresholds and reasons of both linking monitors, epoch by epoch."""
+class LinkOrder:
+    """Order of balise identities, step by step."""
 
     def __init__(self, journey: Journey, limits: LdsLimits) -> None:
-        size = journey.t_ns.size
-        self._journey = journey
-        self.order_reason = _order_reasons(journey, "link_order" in limits.disabled)
-        self.order_value = [0.0 if reason is None else float("nan") for reason in self.order_reason]
-        self.distance_reason = _distance_reasons(journey, "link_distance" in limits.disabled)
-        self.distance_value = [float("nan")] * size
-        self.distance_threshold = [float("nan")] * size
+        self._reason = _order_reasons(journey, "link_order" in limits.disabled)
+        self._value = np.array([0.0 if reason is None else np.nan for reason in self._reason])
+
+    def is_evaluated(self, k: int) -> bool:
+        return self._reason[k] is None
+
+    def note(self, k: int, out_of_order: int) -> None:
+        self._value[k] = out_of_order
 
     def columns(self) -> dict[str, pl.Series]:
-        """`link_order_*` and `link_distance_*` as in the contract of epochs."""
-        order_threshold = [
-            ORDER_THRESHOLD if isfinite(value) else float("nan") for value in self.order_value
-        ]
-        return _columns("link_order", self.order_value, order_threshold, self.order_reason) | _columns(
-            "link_distance", self.distance_value, self.distance_threshold, self.distance_reason
-        )
+        """`link_order_*` as in the contract of epochs."""
+        threshold = np.where(np.isnan(self._value), np.nan, ORDER_THRESHOLD)
+        return _columns("link_order", self._value, threshold, self._reason)
+
+
+class LinkDistance:
+    """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
+
+    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T.
+    """
+
+    def __init__(self, journey: Journey, config: LdsConfig, limits: LdsLimits) -> None:
+        self._journey, self._config, self._limits = journey, config, limits
+        self._reason = _distance_reasons(journey, "link_distance" in limits.disabled)
+        self._possible = np.array([reason is None for reason in self._reason], dtype=bool)
+        self._offset_m = journey.path_m - journey.odometer_m
+        self._value = np.full(journey.t_ns.size, np.nan)
+        self._threshold = np.full(journey.t_ns.size, np.nan)
+        self._fails = [False] * journey.t_ns.size
+        self._anchor: Anchor | None = None
+        self._done = 0
+
+    def measure_from(self, anchor: Anchor | None, k: int) -> None:
+        """From epoch `k` on the distance counts from this anchor."""
+        self._anchor, self._done = anchor, k
+
+    def fails(self, k: int) -> bool:
+        if self._anchor is None:
+            return False
+        if k >= self._done:
+            self._evaluate(self._anchor, k)
+        return self._fails[k]
+
+    def _evaluate(self, anchor: Anchor, k: int) -> None:
+        """A stretch ahead at once: elementwise, so every epoch still knows only its own past."""
+        self._done = min(k + _STRETCH, len(self._fails))
+        ahead = slice(k, self._done)
+        way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
+        noise_m = self._limits.threshold_factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
+        threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
+        possible = self._possible[ahead]
+        self._value[ahead] = np.where(possible, self._offset_m[ahead] - anchor.offset_m, np.nan)
+        self._threshold[ahead] = np.where(possible, threshold_m, np.nan)
+        self._fails[ahead] = (np.abs(self._value[ahead]) > self._threshold[ahead]).tolist()
+
+    def forget(self, k: int) -> None:
+        """From epoch `k` on there is nothing to measure from."""
+        self.measure_from(None, k)
+        self._value[k:] = self._threshold[k:] = np.nan
+
+    def columns(self) -> dict[str, pl.Series]:
+        """`link_distance_*` as in the contract of epochs."""
+        unknown = np.isnan(self._value).tolist()
+        reason = [why or (NO_REFERENCE if x else None) for why, x in zip(self._reason, unknown, strict=True)]
+        return _columns("link_distance", self._value, self._threshold, reason)
 
 
 def _order_reasons(journey: Journey, disabled: bool) -> list[str | None]:
@@ -139,10 +173,7 @@ def _reasons(size: int, masks: tuple[tuple[np.ndarray, str], ...]) -> list[str |
     return found
 
 
-def _columns(
-    monitor: str, values: list[float], thresholds: list[float], reasons: list[str | None]
-) -> dict[str, pl.Series]:
-    value, threshold = np.array(values, dtype=np.float64), np.array(thresholds, dtype=np.float64)
+def _columns(monitor: str, value: Floats, threshold: Floats, reasons: list[str | None]) -> dict[str, pl.Series]:
     state = np.where(np.abs(value) > threshold, MonitorState.FAIL.value, MonitorState.PASS.value)
     state = np.where(np.isnan(value), MonitorState.NOT_EVALUATED.value, state)
     kind = Epochs.columns()[f"{monitor}_state"].dtype

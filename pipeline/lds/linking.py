@@ -69,7 +69,10 @@ class _Turn:
 
 
 class LinkingChain:
-    """Announced balises of one kind, the reference, and the passages so far."""
+    """Announced balises of one kind, the reference, and the passages so far.
+
+    `closing_m`: odometer reading, times direction of travel, at which the open window closes.
+    """
 
     def __init__(self, balises: Sequence[Balise], config: LdsConfig) -> None:
         self.passages: list[Passage] = []
@@ -82,7 +85,7 @@ class LinkingChain:
         self._ahead: list[Balise] = []
         self._optional: set[str] = set()
         self._missed_in_a_row = 0
-        self._closing_m = float("inf")
+        self.closing_m = float("inf")
         # The passage that a balise ahead already has, through an offer before its window closed ...
         self._own: dict[str, Passage] = {}
         # ... the same, crossed back since without an offer of its own ...
@@ -99,21 +102,20 @@ class LinkingChain:
         """A new initialisation: no reference, no linking."""
         self.reference = None
         self._look_ahead([])
+        for kept in (self._own, self._set_aside, self._unoffered):
+            kept.clear()
 
     def is_overdue(self, balise: Balise) -> bool:
         """Its window has closed without any offer."""
         return balise.balise_id in self._unoffered
 
-    def advance(
-        self, odometer_m: float, travelled_m: float, heading: int, leg: int, t_ns: int, blind: bool
-    ) -> None:
+    def advance(self, odometer_m: float, travelled_m: float, heading: int, leg: int, t_ns: int, blind: bool) -> None:
         """The train has come to this odometer reading; `blind`: it has no means to detect just now."""
         if not self.linking:
             return
         if heading != self._heading or leg != self._leg:
             self._turn_round(odometer_m, travelled_m, heading, leg)
-        if odometer_m * self._heading > self._closing_m:
-            self._close_windows(self._distance_m(odometer_m), t_ns, blind)
+        self._close_windows(self._distance_m(odometer_m), t_ns, blind)
 
     def offer(self, offer: Offer) -> Passage:
         """Judge an offered balise; its passage is written whatever comes of it."""
@@ -261,10 +263,10 @@ class LinkingChain:
 
     def _look_ahead(self, ahead: list[Balise]) -> None:
         self._ahead = ahead
-        self._closing_m = float("inf")
+        self.closing_m = float("inf")
         if ahead and self.reference is not None and self.reference.odometer_m is not None:
             start_m = self.reference.odometer_m * self._heading
-            self._closing_m = start_m + self._window(ahead[0]).close_m
+            self.closing_m = start_m + self._window(ahead[0]).close_m
 
     def _passage_of(self, offer: Offer) -> Passage:
         """The passage that this offer belongs to: a new one, or one whose window closed before."""

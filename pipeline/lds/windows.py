@@ -21,9 +21,7 @@ class Window(NamedTuple):
         return self.open_m <= distance_m <= self.close_m
 
 
-def window_m(
-    distance_m: float, accuracy_m: float, reference_accuracy_m: float, config: LdsConfig = DEFAULTS
-) -> Window:
+def window_m(distance_m: float, accuracy_m: float, reference_accuracy_m: float, config: LdsConfig = DEFAULTS) -> Window:
     """Window of a balise announced `distance_m` beyond the reference (SUBSET-026 3.4.4.4.3, 3.6.4.1).
 
     The odometer's reading d is true to 5 m + 5 % of d (SUBSET-041 5.3.1.1), so the window is
@@ -36,9 +34,7 @@ def window_m(
     )
 
 
-def window_after_turn_m(
-    distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS
-) -> Window:
+def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS) -> Window:
     """Window of a balise where the train turned round since the reference.
 
     The odometer's 5 % then counts on the whole way run (`travelled_m`), not on the net distance;
@@ -75,9 +71,7 @@ def overlapping_windows(balises: pl.DataFrame, config: LdsConfig = DEFAULTS) -> 
         for direction, ordered in (("growing", points), ("falling", points[::-1])):
             for three in zip(ordered, ordered[1:], ordered[2:], strict=False):
                 rows.append((str(kind), str(where), direction, *_overlap(*three, config)))
-    return pl.DataFrame(rows, schema=_OVERLAP_SCHEMA, orient="row").filter(
-        pl.col("next_open_m") <= pl.col("close_m")
-    )
+    return pl.DataFrame(rows, schema=_OVERLAP_SCHEMA, orient="row").filter(pl.col("next_open_m") <= pl.col("close_m"))
 
 
 _Point = tuple[str, float, float]
