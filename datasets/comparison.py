@@ -1,0 +1,176 @@
+"""What was injected beside what a replay found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import timedelta
+
+import polars as pl
+
+from datasets.expectation import ExpectedHazard, ExpectedRun
+from datasets.scenario import RunSpec
+from schemas.errors import ConfigError
+from schemas.run import RunLog, RunTables
+
+_NOTHING = "none"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the comparison."""
+
+    run_id: str
+    title: str
+    injected: str
+    check: str
+    expected: str
+    found: str
+
+    @property
+    def agrees(self) -> bool:
+        return self.expected == self.found
+
+
+def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[Check]:
+    """Each expectation of a run against its tables: hazards, their onset, balises, alarms, odometer scale."""
+    if spec.expected is None:
+        raise ConfigError("says nothing of what has to be found", place=f"scenario: run {spec.id}")
+    injected = describe_faults(run.faults)
+    pairs = [
+        ("status", "ok", _one_of(tables.runs["status"].to_list())),
+        *_hazards(spec.expected, tables.hazards),
+        *_onsets(spec, run, tables.hazards),
+        *_balises(spec.expected, tables.passages),
+        *_alarms(spec.expected, tables.alarms),
+        *_scale(spec.expected, tables.runs),
+    ]
+    return [Check(spec.id, spec.title, injected, *pair) for pair in pairs]
+
+
+def checks_table(checks: Iterable[Check]) -> pl.DataFrame:
+    """The comparison as a table: `run_id, title, injected, check, expected, found, agrees`."""
+    names = ("run_id", "title", "injected", "check", "expected", "found", "agrees")
+    schema = {name: pl.Boolean if name == "agrees" else pl.String for name in names}
+    return pl.DataFrame([[getattr(c, name) for name in names] for c in checks], schema=schema, orient="row")
+
+
+def describe_faults(faults: pl.DataFrame | None) -> str:
+    """Faults in words: kind, target, size, rate, duration."""
+    if faults is None or faults.is_empty():
+        return _NOTHING
+    parts = []
+    for row in faults.iter_rows(named=True):
+        size = "" if row["size"] is None else f" {row['size']:+g}"
+        rate = "" if row["rate"] is None else f" at {row['rate']:+g} m/s"
+        lasts = (row["t_end"] - row["t_start"]).total_seconds()
+        parts.append(f"{row['kind']} {row['target']}{size}{rate} for {lasts:g} s")
+    return ", ".join(parts)
+
+
+Pair = tuple[str, str, str]
+
+
+def _hazards(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    rows = found.sort("hazard_id").to_dicts()
+    pairs = [
+        (
+            f"hazard {i}",
+            _hazard_text(expected.hazards[i]) if i < len(expected.hazards) else _NOTHING,
+            _row_text(rows[i], expected.hazards[i] if i < len(expected.hazards) else None)
+            if i < len(rows)
+            else _NOTHING,
+        )
+        for i in range(max(len(expected.hazards), len(rows)))
+    ]
+    return pairs or [("hazards", _NOTHING, _NOTHING)]
+
+
+def _hazard_text(hazard: ExpectedHazard) -> str:
+    text = _words(
+        hazard.hazard.value,
+        hazard.failure_mode.value,
+        hazard.timing.value,
+        hazard.balise_ids,
+        hazard.accepted_ids,
+        hazard.detected,
+    )
+    if hazard.before_failure is not None:
+        text += ", before the failure" if hazard.before_failure else ", behind the failure"
+    return text if hazard.caused_by is None else f"{text}, caused by {hazard.caused_by}"
+
+
+def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
+    names = ("hazard", "failure_mode", "timing", "balise_ids", "accepted_ids", "detected")
+    text = _words(*(row[name] for name in names))
+    early_s = row["time_since_failure_s"]
+    if expected is not None and expected.before_failure is not None and isinstance(early_s, float):
+        text += ", before the failure" if early_s < 0.0 else ", behind the failure"
+    return text if row["caused_by"] is None else f"{text}, caused by {row['caused_by']}"
+
+
+def _words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
+    lists = [" ".join(ids) or "-" if isinstance(ids, list | tuple) else "-" for ids in (hit, accepted)]
+    seen = "detected" if detected else "not detected"
+    return f"{hazard} {mode} {timing}: {lists[0]}, accepted {lists[1]}, {seen}"
+
+
+def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:
+    """The first hazard begins with the fault, within one epoch."""
+    if spec.expected is None or not spec.expected.hazards or run.faults is None or found.is_empty():
+        return []
+    begin = run.faults.filter(pl.col("target") != "odometer")["t_start"].min()
+    onset = found.sort("hazard_id")["t_onset"][0]
+    if begin is None or onset is None:
+        return [("onset", "known", "unknown")]
+    late_s = (onset - begin) / timedelta(seconds=1)
+    near = abs(late_s) <= 1.0 / spec.gnss.rate_hz + 1e-6
+    return [("onset", "within one epoch", "within one epoch" if near else f"{late_s:+.3f} s")]
+
+
+def _balises(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """The status that all rows of a balise have, and for some balises that there is one row only."""
+    statuses = {
+        str(balise): _one_of(rows["status"].to_list())
+        for (balise,), rows in found.group_by(["balise_id"], maintain_order=True)
+    }
+    balises = sorted({*expected.passages, *statuses})
+    pairs = [(b, str(expected.passages.get(b, _NOTHING)), statuses.get(b, _NOTHING)) for b in balises]
+    many = found["balise_id"].value_counts().filter(pl.col("count") > 1)["balise_id"].to_list()
+    repeated = sorted(set(many) & set(expected.once))
+    if expected.once:
+        pairs.append(("one passage each", "yes", "yes" if not repeated else f"no: {' '.join(repeated)}"))
+    return _merged(pairs)
+
+
+def _merged(pairs: list[Pair]) -> list[Pair]:
+    """Balises that agree in one line per status, the others one by one."""
+    lines: dict[str, list[str]] = {}
+    rest = []
+    for name, expected, found in pairs:
+        if expected == found and name != "one passage each":
+            lines.setdefault(expected, []).append(name)
+        else:
+            rest.append((name, expected, found))
+    return [(" ".join(names), status, status) for status, names in lines.items()] + rest
+
+
+def _alarms(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    pairs = [("alarms", expected.alarms, _one_of(found["verdict"].to_list()))]
+    if expected.suspect is not None:
+        pairs.append(("suspect", expected.suspect, _one_of(found["suspect"].to_list())))
+    return pairs
+
+
+def _scale(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    if expected.odometer_scale is None:
+        return []
+    text = f"{expected.odometer_scale:g} ± {expected.odometer_scale_tolerance:g}"
+    scale = found["odometer_scale"][0]
+    near = scale is not None and abs(scale - expected.odometer_scale) <= expected.odometer_scale_tolerance
+    return [("odometer scale", text, text if near else str(scale))]
+
+
+def _one_of(values: list[str]) -> str:
+    """The value that all have, or all values that occur."""
+    return " ".join(sorted(set(values))) or _NOTHING
