@@ -58,9 +58,9 @@ class Learned:
         values = (estimate.scale, estimate.scale_sigma, estimate.latency_s, estimate.latency_sigma_s)
         return cls(*(np.full(n, value) for value in values))
 
-    def put(self, first: int, changes: list[tuple[int, Estimate]]) -> None:
-        """Set the estimates from epoch `first` on: each change holds from its epoch to the next, the last for good."""
-        begins = [max(first, epoch) for epoch, _ in changes]
+    def put(self, changes: list[tuple[int, Estimate]]) -> None:
+        """Set estimates: each change holds from its epoch to the next, the last for good."""
+        begins = [epoch for epoch, _ in changes]
         lengths = np.diff([*begins, self.scale.size])
         values = np.array([(e.scale, e.scale_sigma, e.latency_s, e.latency_sigma_s) for _, e in changes])
         columns = (self.scale, self.scale_sigma, self.latency_s, self.latency_sigma_s)
@@ -256,53 +256,57 @@ class _Learner:
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
         bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size)
+        history = [(begin, state)]
         position = begin
         while position < self._rows.size:
             end = min(position + _BLOCK, self._rows.size)
-            states = self._learn_block(state, position, end)
+            history += self._updates(history[-1][1], position, end)
+            self._put(history, position)
             series = self._series(position, end, begin)
             result, bank = run_axis(series, self._alphas, bank)
-            failing = np.flatnonzero((np.abs(result.value) > self._factor * result.sigma).any(axis=1) & ~series.fresh)
+            beyond = np.abs(result.value) > self._factor * result.sigma
+            failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
             if failing.size:
                 alarm = position + int(failing[0])
-                in_use = [item for effective, item in states if effective <= alarm]
-                state = in_use[-1] if in_use else state
-                self._learned.put(0, [(int(self._rows[alarm]), state.estimate())])
-                return state, alarm
-            state, position = states[-1][1] if states else state, end
-        return state, position
+                in_use = [item for effective, item in history if effective <= alarm][-1]
+                self._learned.put([(self._epoch(alarm), in_use.estimate())])
+                return in_use, alarm
+            position = end
+        return history[-1][1], position
 
-    def _learn_block(self, state: FilterState, begin: int, end: int) -> list[tuple[int, FilterState]]:
-        """Updates at the filter's period; fills the estimates of the epochs after each update."""
+    def _updates(self, state: FilterState, begin: int, end: int) -> list[tuple[int, FilterState]]:
+        """States of the filter's updates in these positions, each with the position from which it may be used."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
         states: list[tuple[int, FilterState]] = []
-        changes = [(int(self._rows[begin]), state.estimate())]
         position = self._next(state.t_s + period_s, begin)
         while position < end:
             t_s, path_m, sigma_m = self._observation(position)
             if self._broken(state.t_s, t_s):
                 state = self._filter.restart(state, t_s, path_m)
             state = self._filter.update(state, t_s, path_m, sigma_m)
-            effective = self._next(t_s + SPEED_SPAN_S, position + 1)
-            states.append((effective, state))
-            changes.append((self._epoch(effective), state.estimate()))
+            states.append((self._next(t_s + SPEED_SPAN_S, position + 1), state))
             position = self._next(t_s + period_s, position + 1)
-        self._learned.put(0, changes)
         return states
+
+    def _put(self, history: list[tuple[int, FilterState]], begin: int) -> None:
+        """Fill the estimates in use from position `begin` on."""
+        current = max(index for index, (effective, _) in enumerate(history) if effective <= begin)
+        changes = [(max(effective, begin), state) for effective, state in history[current:]]
+        self._learned.put([(self._epoch(effective), state.estimate()) for effective, state in changes])
 
     def _epoch(self, position: int) -> int:
         """Index among all epochs; the end for a position past the last."""
         return int(self._rows[position]) if position < self._rows.size else int(self._learned.scale.size)
-
-    def _next(self, t_s: float, at_least: int) -> int:
-        """First position at or after this time, and not before `at_least`."""
-        return max(at_least, int(np.searchsorted(self._t_s, t_s)))
 
     def _broken(self, before_s: float, now_s: float) -> bool:
         if now_s - before_s > self._config.align.gap_reset_s:
             return True
         stretches = self._track.stretch_at(np.array([before_s, now_s]))
         return bool(stretches[0] != stretches[1])
+
+    def _next(self, t_s: float, at_least: int) -> int:
+        """First position at or after this time, and not before `at_least`."""
+        return max(at_least, int(np.searchsorted(self._t_s, t_s)))
 
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
         """Along-track increments of these positions; the one at `restart` has none before it."""
