@@ -1,0 +1,6 @@
+"""Hazards after the fact: evidence, episodes, classes, verdicts on alarms, suspects (DOMAIN section 5)."""
+
+from pipeline.hazards.classify import HazardResult, Locate, classify
+from pipeline.hazards.truth import establish_truth
+
+__all__ = ["HazardResult", "Locate", "classify", "establish_truth"]

@@ -1,0 +1,76 @@
+"""The `alarms` table: episodes, their verdict against the truth, and whom they point at (DOMAIN section 5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.arrays import NS_PER_S, Bools
+from pipeline.hazards.fails import AlarmSpan, Fails
+from pipeline.hazards.rows import Judged
+from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
+from schemas.config import HazardConfig
+from schemas.enums import Verdict
+from schemas.tables import Alarms
+
+
+def alarms_table(
+    fails: Fails, judged: list[Judged], solution: str, witnesses: Witnesses, config: HazardConfig
+) -> pl.DataFrame:
+    """One row per alarm episode in order of time."""
+    rows = [
+        {"solution": solution, "alarm_id": number, **_row(span, judged, witnesses, config)}
+        for number, span in enumerate(fails.alarms)
+    ]
+    frame = pl.DataFrame(rows, schema=Alarms.create_empty().schema)
+    return Alarms.validate(frame, cast=True)
+
+
+def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: HazardConfig) -> dict[str, Any]:
+    hazard_id = hazard_of(span, judged)
+    verdict = Verdict.TRUE if hazard_id is not None else verdict_of(span, witnesses, config)
+    if hazard_id is not None:
+        suspect = judged[hazard_id].suspect
+    else:
+        left = verdict is Verdict.TRUE
+        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, left)
+    return {
+        "t_start": span.start_ns,
+        "t_end": span.end_ns,
+        "monitors": list(span.monitors),
+        "peak_ratio": span.peak_ratio,
+        "verdict": verdict.value,
+        "suspect": suspect.value,
+        "hazard_id": hazard_id,
+    }
+
+
+def hazard_of(span: AlarmSpan, judged: list[Judged]) -> int | None:
+    """The first hazard whose episode the alarm falls into, or that it detected."""
+    for number, item in enumerate(judged):
+        timing = item.timing
+        inside = span.start_ns <= timing.end_ns and span.end_ns >= timing.onset_ns
+        detected = timing.detected_ns is not None and span.start_ns <= timing.detected_ns <= span.end_ns
+        if inside or detected:
+            return number
+    return None
+
+
+def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
+    """False when |e| stayed below max(5 m, 3 sigma) from 300 s before the alarm to its end.
+
+    Epochs with a position but no truth, or an error that the evidence cannot resolve, leave it unknown.
+    """
+    since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
+    part = slice(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
+    error, position = np.abs(w.error_m[part]), np.isfinite(w.path_m[part])
+    tolerated = np.fmax(config.false_alarm_margin_m, w.noise_m[part])
+    with np.errstate(invalid="ignore"):
+        beyond: Bools = error >= tolerated
+        proved = beyond & (error > w.bound_m[part])
+    if proved.any():
+        return Verdict.TRUE
+    unknown = beyond.any() or bool((position & ~np.isfinite(error)).any()) or not np.isfinite(error).any()
+    return Verdict.UNKNOWN if unknown else Verdict.FALSE

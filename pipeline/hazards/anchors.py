@@ -1,0 +1,139 @@
+"""Known places carried on by the odometer: physical balise reads, accepted virtual balises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.travel import Travel
+from schemas.config import LdsConfig
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Instants at which the train was at a known path position, in order of time."""
+
+    at_ns: Ints
+    path_m: Floats
+
+    @classmethod
+    def of(cls, at_ns: Ints, path_m: Floats) -> Anchors:
+        known = np.isfinite(path_m)
+        order = np.argsort(at_ns[known], kind="stable")
+        return cls(at_ns[known][order], path_m[known][order])
+
+    def with_others(self, others: Anchors) -> Anchors:
+        return Anchors.of(np.concatenate((self.at_ns, others.at_ns)), np.concatenate((self.path_m, others.path_m)))
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Position by the nearest anchor and the odometer [m]; NaN where no anchor reaches.
+
+    `confidence_m` is the odometer's half-width (SUBSET-041 5.3.1.1), `mismatch_m` by how much two
+    anchors contradict the odometer between them beyond that.
+    """
+
+    path_m: Floats
+    sigma_m: Floats
+    confidence_m: Floats
+    mismatch_m: Floats
+
+
+def carry(anchors: Anchors, travel: Travel, at_ns: Ints, lds: LdsConfig, *, both_ways: bool) -> Carried:
+    """Carry anchors on to every epoch of their odometer stretch.
+
+    With `both_ways` an epoch between two anchors takes its place from both, the difference shared out
+    by distance, and epochs before the first anchor are reached backwards.
+    """
+    reader = _AnchorReader.of(anchors, travel)
+    before = np.searchsorted(reader.at_ns, at_ns, side="right") - 1
+    forward = reader.reach(before, travel, lds)
+    if not both_ways:
+        return Carried(*forward, np.zeros(at_ns.size))
+    backward = reader.reach(before + 1, travel, lds)
+    return _between(forward, backward, reader, before, travel)
+
+
+@dataclass(frozen=True)
+class _AnchorReader:
+    """Anchors with the odometer at their instants."""
+
+    at_ns: Ints
+    path_m: Floats
+    distance_m: Floats
+    stretch: Ints
+
+    @classmethod
+    def of(cls, anchors: Anchors, travel: Travel) -> _AnchorReader:
+        known = np.flatnonzero(np.isfinite(travel.distance_m))
+        if known.size == 0 or anchors.at_ns.size == 0:
+            return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
+        stamps = travel.at_ns[known]
+        right = np.clip(np.searchsorted(stamps, anchors.at_ns), 0, known.size - 1)
+        left = np.where(stamps[right] > anchors.at_ns, np.maximum(right - 1, 0), right)
+        stretch = travel.stretch[known]
+        near = np.minimum(np.abs(stamps[right] - anchors.at_ns), np.abs(stamps[left] - anchors.at_ns)) <= NS_PER_S
+        inside = (stamps[0] <= anchors.at_ns) & (anchors.at_ns <= stamps[-1])
+        usable = (stretch[left] == stretch[right]) & (near | inside)
+        distance = np.interp(anchors.at_ns, stamps, travel.distance_m[known])
+        return cls(anchors.at_ns[usable], anchors.path_m[usable], distance[usable], stretch[right][usable])
+
+    def reach(self, index: Ints, travel: Travel, lds: LdsConfig) -> tuple[Floats, Floats, Floats]:
+        """Position, its sigma and the odometer's confidence by the anchor `index` of each epoch."""
+        if self.at_ns.size == 0:
+            nothing = np.full(index.size, np.nan)
+            return nothing, nothing, nothing
+        safe = np.clip(index, 0, self.at_ns.size - 1)
+        reached: Bools = (index == safe) & (self.stretch[safe] == travel.stretch)
+        moved = np.where(reached, travel.distance_m - self.distance_m[safe], np.nan)
+        elapsed_s = np.abs(travel.at_ns - self.at_ns[safe]) / NS_PER_S
+        variance = travel.white_m2_per_s * elapsed_s + (travel.scale_sigma * moved) ** 2
+        confidence = lds.odometer_fixed_m + lds.odometer_share * np.abs(moved)
+        return self.path_m[safe] + moved, np.sqrt(variance), confidence
+
+
+def _between(
+    forward: tuple[Floats, Floats, Floats],
+    backward: tuple[Floats, Floats, Floats],
+    reader: _AnchorReader,
+    before: Ints,
+    travel: Travel,
+) -> Carried:
+    ahead, behind = np.isfinite(forward[0]), np.isfinite(backward[0])
+    both = ahead & behind
+    share = np.where(both, _share_of_way(reader, before, travel), np.where(ahead, 0.0, 1.0))
+
+    def blend(a: Floats, b: Floats) -> Floats:
+        return np.where(both, a * (1.0 - share) + b * share, np.where(ahead, a, b))
+
+    def smaller(a: Floats, b: Floats) -> Floats:
+        return np.where(both, np.minimum(a, b), np.where(ahead, a, b))
+
+    difference = np.where(both, np.abs(np.nan_to_num(forward[0]) - np.nan_to_num(backward[0])), 0.0)
+    allowed = np.where(both, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]), np.inf)
+    return Carried(
+        path_m=blend(forward[0], backward[0]),
+        sigma_m=smaller(forward[1], backward[1]),
+        confidence_m=smaller(forward[2], backward[2]),
+        mismatch_m=np.where(difference > allowed, difference, 0.0),
+    )
+
+
+def _share_of_way(reader: _AnchorReader, before: Ints, travel: Travel) -> Floats:
+    """How far each epoch is from the anchor before to the one behind, 0 to 1, by distance.
+
+    By time where the train stood or turned back between the anchors.
+    """
+    if reader.at_ns.size < 2:
+        return np.zeros(before.size)
+    a = np.clip(before, 0, reader.at_ns.size - 2)
+    length = reader.distance_m[a + 1] - reader.distance_m[a]
+    span = np.maximum(reader.at_ns[a + 1] - reader.at_ns[a], 1)
+    by_time = (travel.at_ns - reader.at_ns[a]) / span
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_way = (travel.distance_m - reader.distance_m[a]) / length
+    monotone = (np.abs(length) > 1.0) & (by_way >= 0.0) & (by_way <= 1.0)
+    return np.clip(np.where(monotone, by_way, by_time), 0.0, 1.0)

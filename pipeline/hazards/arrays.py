@@ -1,0 +1,66 @@
+"""Columns of frames as numpy arrays, and the few array operations that several stages of this area share."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+NS_PER_S = 1_000_000_000
+
+
+def floats(frame: pl.DataFrame, column: str) -> Floats:
+    """A nullable numeric column, null as NaN."""
+    series = frame[column].cast(pl.Float64)
+    return series.fill_null(float("nan")).to_numpy() if series.null_count() else series.to_numpy()
+
+
+def times_ns(frame: pl.DataFrame, column: str = "t") -> Ints:
+    """A time column without nulls as int64 nanoseconds."""
+    return frame[column].dt.timestamp("ns").to_numpy()
+
+
+def flags(frame: pl.DataFrame, column: str) -> Bools:
+    """A nullable boolean column, null as false."""
+    series = frame[column]
+    return (series.fill_null(False) if series.null_count() else series).to_numpy().astype(np.bool_, copy=False)
+
+
+def nominal_period_s(t_ns: Ints) -> float:
+    """Median step between epochs [s]; 1 s where there is but one epoch."""
+    return float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else 1.0
+
+
+def linking_gap_s(period_s: float, crossing_gap_s: float = 1.0) -> float:
+    """Longest gap between epochs over which a movement is interpolated (DOMAIN section 4)."""
+    return max(1.5 * period_s, crossing_gap_s)
+
+
+def runs_of(mask: Bools) -> tuple[Ints, Ints]:
+    """First and last index of each stretch of true values."""
+    padded = np.concatenate(([False], mask, [False])).astype(np.int8)
+    edges = np.diff(padded)
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+
+
+def interpolate_known(at: Floats, x: Floats, y: Floats, gap: float) -> Floats:
+    """Linear interpolation of `y(x)`, NaN beyond the ends and between samples more than `gap` apart.
+
+    `x` does not fall; samples with unknown `y` are left out.
+    """
+    known = np.isfinite(y)
+    x, y = x[known], y[known]
+    result = np.full(at.size, np.nan)
+    if x.size == 0:
+        return result
+    right = np.searchsorted(x, at, side="left")
+    inside = (right < x.size) & ((right > 0) | (at == x[0]))
+    right = np.clip(right, 0, x.size - 1)
+    left = np.maximum(right - 1, 0)
+    near = inside & ((x[right] - x[left] <= gap) | (at == x[right]))
+    result[near] = np.interp(at[near], x, y)
+    return result

@@ -1,0 +1,136 @@
+"""From monitored epochs and truth to hazards, alarms and judged passages (DOMAIN section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.alarms import alarms_table
+from pipeline.hazards.arrays import Bools, Floats, linking_gap_s
+from pipeline.hazards.crossings import beacons_by_leg
+from pipeline.hazards.episodes import Draft, find_episodes
+from pipeline.hazards.fails import Fails, fails_of
+from pipeline.hazards.passages import (
+    Links,
+    beyond_window,
+    judge_passages,
+    link_passages,
+    link_unoffered,
+    positions_at,
+    suspicious_passages,
+)
+from pipeline.hazards.passing import true_passings
+from pipeline.hazards.rows import Judged, Locate, hazards_table
+from pipeline.hazards.series import Series, series_of
+from pipeline.hazards.states import errors_of, lds_states
+from pipeline.hazards.suspect import Witnesses, suspect_of_error, witnesses_of
+from pipeline.hazards.timing import Timing, time_hazard
+from schemas.config import Configuration
+from schemas.enums import PassageStatus, Suspect
+
+__all__ = ["HazardResult", "Locate", "classify"]
+
+
+@dataclass(frozen=True)
+class HazardResult:
+    """`hazards`, `alarms` and `passages` by the contract; `epochs_columns`: `error_along_m,
+    error_cross_m, error_up_m, lds_state`, one row per epoch.
+    """
+
+    hazards: pl.DataFrame
+    alarms: pl.DataFrame
+    passages: pl.DataFrame
+    epochs_columns: pl.DataFrame
+
+
+def classify(
+    solution: str,
+    epochs: pl.DataFrame,
+    truth: pl.DataFrame,
+    passages: pl.DataFrame,
+    balises: pl.DataFrame,
+    faults: pl.DataFrame | None,
+    locate: Locate,
+    config: Configuration,
+) -> HazardResult:
+    """Judge one solution after the fact.
+
+    `epochs`: matched, aligned and monitored, with the LDS columns; `truth`: from `establish_truth`, row by
+    row; `passages`: of the LDS; `balises`: `leg, balise_id, kind, path_m` on the path; `faults`: what was
+    injected, where known; `locate(leg, path_m)`: net element and measure.
+    """
+    errors = errors_of(epochs, truth)
+    series = series_of(epochs, truth, config.lds)
+    fails = fails_of(epochs, config.lds.recovery_s)
+    witnesses = witnesses_of(epochs, truth, errors, config.matching.ambiguity_probability)
+    judged = _judge(series, fails, witnesses, truth, passages, balises, faults, config)
+    hazards = hazards_table(judged, solution, epochs, series, locate, config.budget_s)
+    alarms = alarms_table(fails, judged, solution, witnesses, config.hazards)
+    seen = _passages(series, judged, epochs, truth, passages, balises, config)
+    return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, config))
+
+
+def _judge(
+    series: Series,
+    fails: Fails,
+    witnesses: Witnesses,
+    truth: pl.DataFrame,
+    passages: pl.DataFrame,
+    balises: pl.DataFrame,
+    faults: pl.DataFrame | None,
+    config: Configuration,
+) -> list[Judged]:
+    drafts, jumps = find_episodes(series, beacons_by_leg(balises), config.hazards)
+    judged = []
+    for draft in drafts:
+        timing = time_hazard(draft, series, jumps, fails, faults, config.hazards)
+        first, last = int(series.row[timing.onset_epoch]), int(series.row[min(draft.end, series.size - 1)])
+        suspect = suspect_of_error(witnesses, min(first, last), max(first, last))
+        if suspect is Suspect.ODOMETER:
+            continue
+        evidence = str(truth["evidence"][int(series.row[draft.first_epoch])])
+        judged.append(_with_passages(draft, timing, evidence, suspect, passages, series))
+    return judged
+
+
+def _with_passages(
+    draft: Draft, timing: Timing, evidence: str, suspect: Suspect, passages: pl.DataFrame, series: Series
+) -> Judged:
+    alone = Judged(draft, timing, evidence, suspect, False, ())
+    own = link_passages(passages, [alone], series).hazard == 0
+    accepted = passages.filter(own & (passages["status"] == PassageStatus.ACCEPTED.value).to_numpy())
+    late = bool((beyond_window(passages) & own).any())
+    return Judged(draft, timing, evidence, suspect, late, tuple(accepted["balise_id"].to_list()))
+
+
+def _passages(
+    series: Series,
+    judged: list[Judged],
+    epochs: pl.DataFrame,
+    truth: pl.DataFrame,
+    passages: pl.DataFrame,
+    balises: pl.DataFrame,
+    config: Configuration,
+) -> pl.DataFrame:
+    passings = true_passings(epochs, truth, balises)
+    t_true = passings.assign(passages)
+    links: Links = link_unoffered(passages, t_true, judged, link_passages(passages, judged, series))
+    spans = [(j.timing.onset_ns, j.timing.detected_ns or np.iinfo(np.int64).max) for j in judged]
+    suspicious: Bools = suspicious_passages(passages, spans)
+    gap_s = linking_gap_s(series.period_s, config.lds.crossing_gap_s)
+    positioned = positions_at(epochs, t_true, gap_s)
+    return judge_passages(passages, series, passings, links, suspicious, positioned, config.hazards)
+
+
+def _epochs(
+    epochs: pl.DataFrame,
+    truth: pl.DataFrame,
+    passages: pl.DataFrame,
+    errors: dict[str, Floats],
+    config: Configuration,
+) -> pl.DataFrame:
+    columns = [pl.Series(f"error_{axis}_m", values, nan_to_null=True) for axis, values in errors.items()]
+    state = lds_states(epochs, truth, passages, errors["along"], config.hazards, config.lds)
+    return pl.DataFrame([*columns, state])

@@ -1,0 +1,161 @@
+"""What the truth says about each passage (CONTRACT section 3): when the train passed, how wrong the offer was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from pipeline.hazards.passing import TruePassings
+from pipeline.hazards.rows import Judged
+from pipeline.hazards.series import Series
+from schemas.config import HazardConfig
+from schemas.enums import Cause, FailureMode, PassageStatus
+from schemas.tables import Passages
+
+_MODES = pl.Enum([member.value for member in FailureMode])
+_CAUSES = pl.Enum([member.value for member in Cause])
+
+
+@dataclass(frozen=True)
+class Links:
+    """Per passage: hazard it belongs to (-1 none), whether a jump of it crossed the balise."""
+
+    hazard: Ints
+    jumped: Bools
+
+
+def judge_passages(
+    passages: pl.DataFrame,
+    series: Series,
+    passings: TruePassings,
+    links: Links,
+    suspicious: Bools,
+    positioned: Bools,
+    config: HazardConfig,
+) -> pl.DataFrame:
+    """Passages with the columns of the truth filled in. `positioned`: a position was there when the train passed."""
+    error = location_errors(passages, series)
+    t_true = passings.assign(passages)
+    mode, cause = _modes(passages, error, links, positioned, config)
+    filled = passages.with_columns(
+        pl.Series("t_true", t_true, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
+        pl.Series("location_error_m", error, nan_to_null=True),
+        pl.Series("failure_mode", mode, dtype=_MODES),
+        pl.Series("cause", cause, dtype=_CAUSES),
+        pl.Series("suspect_after_the_fact", suspicious),
+        pl.Series("hazard_id", [None if h < 0 else h for h in links.hazard.tolist()], dtype=pl.Int64),
+    )
+    return Passages.validate(filled.select(list(Passages.columns())), cast=True)
+
+
+def location_errors(passages: pl.DataFrame, series: Series) -> Floats:
+    """Error of the position at each offer [m], + = offered early; NaN without offer or truth."""
+    offered = passages["t_offered"].dt.timestamp("ns")
+    known = offered.is_not_null().to_numpy()
+    error = np.full(passages.height, np.nan)
+    if series.size < 2 or not known.any():
+        return error
+    at = offered.drop_nulls().to_numpy()
+    right = np.clip(np.searchsorted(series.t_ns, at), 1, series.size - 1)
+    span = series.t_ns[right] - series.t_ns[right - 1]
+    share = (at - series.t_ns[right - 1]) / span
+    value = series.error_m[right - 1] + share * (series.error_m[right] - series.error_m[right - 1])
+    inside = (share >= 0.0) & (share <= 1.0) & (series.linked[right] | (share == 0.0) | (share == 1.0))
+    error[known] = np.where(inside, value, np.nan)
+    return error
+
+
+def link_passages(passages: pl.DataFrame, judged: list[Judged], series: Series) -> Links:
+    """The hazard of each passage: the one whose crossing it is, else one that hit the balise meanwhile."""
+    hazard = np.full(passages.height, -1, dtype=np.int64)
+    jumped = np.zeros(passages.height, dtype=np.bool_)
+    if not judged:
+        return Links(hazard, jumped)
+    balises = passages["balise_id"].to_list()
+    offered = passages["t_offered"].dt.timestamp("ns").to_list()
+    slack_ns = round(0.5 * series.period_s * NS_PER_S)
+    for row, (balise, t_ns) in enumerate(zip(balises, offered, strict=True)):
+        if t_ns is None:
+            continue
+        for number, item in enumerate(judged):
+            own = [hit for hit in item.draft.hits if hit.balise_id == balise and abs(hit.t_ns - t_ns) <= slack_ns]
+            if own:
+                hazard[row] = number
+                jumped[row] = item.draft.jump is not None and any(hit in item.draft.jump.crossed for hit in own)
+                break
+    return Links(hazard, jumped)
+
+
+def link_unoffered(passages: pl.DataFrame, t_true: list[int | None], judged: list[Judged], links: Links) -> Links:
+    """Passages without an offer of their own belong to the hazard that hit their balise while it lasted."""
+    hazard = links.hazard.copy()
+    offered = passages["t_offered"].is_not_null().to_list()
+    for row, balise in enumerate(passages["balise_id"].to_list()):
+        t_ns = t_true[row]
+        if offered[row] or t_ns is None or hazard[row] >= 0:
+            continue
+        for number, item in enumerate(judged):
+            lasts = item.timing.onset_ns <= t_ns <= item.timing.end_ns
+            if lasts and any(hit.balise_id == balise for hit in item.draft.hits):
+                hazard[row] = number
+                break
+    return Links(hazard, links.jumped)
+
+
+def suspicious_passages(passages: pl.DataFrame, spans: list[tuple[int, int]]) -> Bools:
+    """Accepted in `onset <= t < detection` of a fault."""
+    accepted = (passages["status"] == PassageStatus.ACCEPTED.value).to_numpy()
+    offered = passages["t_offered"].dt.timestamp("ns").fill_null(-1).to_numpy()
+    inside = np.zeros(passages.height, dtype=np.bool_)
+    for onset_ns, until_ns in spans:
+        inside |= (offered >= onset_ns) & (offered < until_ns)
+    return accepted & inside
+
+
+def positions_at(epochs: pl.DataFrame, t_true: list[int | None], gap_s: float) -> Bools:
+    """Whether usable positions lie on both sides of each instant, no further apart than `gap_s`."""
+    stamps = times_ns(epochs)[flags(epochs, "fix_valid") & np.isfinite(floats(epochs, "path_m"))]
+    result = np.zeros(len(t_true), dtype=np.bool_)
+    for row, t_ns in enumerate(t_true):
+        if t_ns is None or stamps.size < 2:
+            continue
+        right = int(np.searchsorted(stamps, t_ns))
+        if 0 < right < stamps.size:
+            result[row] = stamps[right] - stamps[right - 1] <= gap_s * NS_PER_S
+    return result
+
+
+def _modes(
+    passages: pl.DataFrame, error: Floats, links: Links, positioned: Bools, config: HazardConfig
+) -> tuple[list[str], list[str]]:
+    """ETCS failure mode and its cause: insertion where offered early or by a jump, deletion where not
+    offered inside its window or before it.
+    """
+    status = passages["status"].cast(pl.String).to_list()
+    offered = passages["t_offered"].is_not_null().to_list()
+    late = beyond_window(passages)
+    modes, causes = [], []
+    for row in range(passages.height):
+        mode, cause = FailureMode.NONE, Cause.NONE
+        wrong = bool(abs(error[row]) > config.shift_limit_m)
+        if links.jumped[row] or (wrong and error[row] > 0):
+            mode, cause = FailureMode.INSERTION, Cause.POSITION
+        elif status[row] == PassageStatus.NOT_AVAILABLE.value:
+            mode, cause = FailureMode.DELETION, Cause.NO_POSITION
+        elif not offered[row]:
+            mode = FailureMode.DELETION
+            cause = Cause.POSITION if positioned[row] else Cause.NO_POSITION
+        elif late[row]:
+            mode, cause = FailureMode.DELETION, Cause.POSITION if wrong else Cause.NONE
+        modes.append(mode.value)
+        causes.append(cause.value)
+    return modes, causes
+
+
+def beyond_window(passages: pl.DataFrame) -> Bools:
+    """Offered after its expectation window closed (SUBSET-026 3.4.4.4.3)."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(floats(passages, "odometer_distance_m")) > floats(passages, "window_close_m")

@@ -1,0 +1,103 @@
+"""When the train passed each balise by the evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from pipeline.hazards.truth import valid_ns
+
+# A hole in the epochs over which the train's speed at both ends gives the passage between them.
+_HOLE_S = 120.0
+# Crossings of one balise without this much movement between them are one passage (noise at standstill).
+_AGAIN_M = 10.0
+
+
+@dataclass(frozen=True)
+class TruePassings:
+    """Instants at which the train passed each balise, in order of time."""
+
+    by_balise: dict[str, tuple[int, ...]]
+
+    def assign(self, passages: pl.DataFrame) -> list[int | None]:
+        """The true passage of each row: the nearest to its offer, or to where the odometer reckons it.
+
+        Rows with neither take in order of time what no other row took.
+        """
+        balises = passages["balise_id"].to_list()
+        about = _about_when(passages)
+        result: list[int | None] = [None] * len(balises)
+        taken: set[tuple[str, int]] = set()
+        for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
+            candidates = self.by_balise.get(balise, ())
+            if t_ns is not None and candidates:
+                nearest = min(candidates, key=lambda t, at=t_ns: (abs(t - at), t))  # type: ignore[misc]
+                result[row] = nearest
+                taken.add((balise, nearest))
+        for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
+            free = [t for t in self.by_balise.get(balise, ()) if (balise, t) not in taken]
+            if t_ns is None and free:
+                result[row] = free[0]
+                taken.add((balise, free[0]))
+        return result
+
+
+def _about_when(passages: pl.DataFrame) -> list[int | None]:
+    instants = passages["t_offered"]
+    if "t_reckoned" in passages.columns:
+        instants = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series()
+    return instants.dt.timestamp("ns").to_list()
+
+
+def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFrame) -> TruePassings:
+    """Crossings of the true position over every balise on the path."""
+    place = floats(truth, "truth_path_m")
+    rows = np.flatnonzero(np.isfinite(place))
+    found: dict[str, tuple[int, ...]] = {}
+    if rows.size < 2 or balises.height == 0:
+        return TruePassings(found)
+    at_ns, x = valid_ns(epochs)[rows], place[rows]
+    speed = floats(epochs, "speed_mps")[rows]
+    leg = epochs["leg"].cast(pl.Int64).fill_null(strategy="forward").fill_null(strategy="backward").fill_null(-1)
+    legs = leg.to_numpy()[rows]
+    passed_legs = balises["leg"].cast(pl.Int64).to_list()
+    places = balises["path_m"].to_list()
+    for balise, beacon_leg, beacon_m in zip(balises["balise_id"].to_list(), passed_legs, places, strict=True):
+        instants = _instants(at_ns, x, speed, legs == beacon_leg, beacon_m)
+        found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))
+    return TruePassings(found)
+
+
+def _instants(at_ns: Ints, x: Floats, speed: Floats, here: Bools, beacon_m: float) -> list[int]:
+    passed = x >= beacon_m
+    changes = np.flatnonzero((passed[1:] != passed[:-1]) & here[1:]) + 1
+    instants: list[int] = []
+    previous = -1
+    for index in changes.tolist():
+        span_s = float(at_ns[index] - at_ns[index - 1]) / NS_PER_S
+        if span_s > _HOLE_S:
+            continue
+        away = previous < 0 or float(np.abs(x[previous:index] - beacon_m).max()) >= _AGAIN_M
+        previous = index
+        if away:
+            share = _share(x[index - 1 : index + 1], speed[index - 1 : index + 1], span_s, beacon_m)
+            instants.append(int(at_ns[index - 1]) + round(share * span_s * NS_PER_S))
+    return instants
+
+
+def _share(x: Floats, speed: Floats, span_s: float, beacon_m: float) -> float:
+    """Share of the interval at which a cubic through both ends with their speeds meets the balise.
+
+    Exact for constant acceleration; straight line where a speed is not known or the cubic turns back.
+    """
+    linear = float((beacon_m - x[0]) / (x[1] - x[0]))
+    if not np.isfinite(speed).all() or span_s < 1.5:
+        return linear
+    m0, m1, d = speed[0] * span_s, speed[1] * span_s, x[1] - x[0]
+    roots = np.roots([m0 + m1 - 2.0 * d, 3.0 * d - 2.0 * m0 - m1, m0, x[0] - beacon_m])
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    inside = real[(real >= 0.0) & (real <= 1.0)]
+    return float(inside[0]) if inside.size == 1 else linear

@@ -1,0 +1,75 @@
+"""Errors per epoch, and the state of the reactive LDS (DOMAIN section 4; TVB section 4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.arrays import Bools, Floats, flags, floats, times_ns
+from pipeline.hazards.series import direction_of
+from schemas.config import HazardConfig, LdsConfig
+from schemas.enums import LdsState, PassageStatus
+
+_STATES = pl.Enum([member.value for member in LdsState])
+
+
+def errors_of(epochs: pl.DataFrame, truth: pl.DataFrame) -> dict[str, Floats]:
+    """Position by GNSS minus truth per axis [m]; along in the direction of travel, across left of
+    growing path; NaN where either is missing.
+    """
+    along = (floats(epochs, "path_m") - floats(truth, "truth_path_m")) * direction_of(epochs)
+    fixed = flags(epochs, "fix_valid")
+    cross = floats(epochs, "cross_track_m") - floats(truth, "truth_cross_m")
+    up = floats(epochs, "vertical_m") - floats(truth, "truth_up_m")
+    return {
+        "along": np.where(fixed, along, np.nan),
+        "cross": np.where(fixed, cross, np.nan),
+        "up": np.where(fixed, up, np.nan),
+    }
+
+
+def lds_states(
+    epochs: pl.DataFrame,
+    truth: pl.DataFrame,
+    passages: pl.DataFrame,
+    error_along_m: Floats,
+    config: HazardConfig,
+    lds: LdsConfig,
+) -> pl.Series:
+    """P2 negated; P3 diagnosis faulty; P1 error beyond the failure limit; P0. Null without a truth."""
+    state = np.full(epochs.height, None, dtype=object)
+    known = np.isfinite(error_along_m)
+    state[known] = LdsState.P0.value
+    state[known & (np.abs(error_along_m) > config.failure_limit_m)] = LdsState.P1.value
+    faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(epochs, truth, passages, lds)
+    state[faulty] = LdsState.P3.value
+    state[flags(epochs, "negated")] = LdsState.P2.value
+    return pl.Series("lds_state", state.tolist(), dtype=_STATES)
+
+
+def odometer_beyond_confidence(
+    epochs: pl.DataFrame, truth: pl.DataFrame, passages: pl.DataFrame, lds: LdsConfig
+) -> Bools:
+    """The distance counted since the LRVB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
+
+    Only a reference or balise reads can say so; false where they are missing.
+    """
+    t_ns = times_ns(epochs)
+    travelled, place = floats(epochs, "odometer_m"), floats(truth, "truth_path_m")
+    accepted = passages.filter(
+        (pl.col("status") == PassageStatus.ACCEPTED.value) & pl.col("t_offered").is_not_null()
+    ).sort("t_offered")
+    beyond = np.zeros(t_ns.size, dtype=np.bool_)
+    known = np.isfinite(travelled) & np.isfinite(place) & (truth["evidence"] != "odometer").fill_null(False).to_numpy()
+    if accepted.height == 0 or not known.any():
+        return beyond
+    at_ns = times_ns(accepted, "t_offered")
+    rows = np.flatnonzero(known)
+    odometer_at = np.interp(at_ns, t_ns[rows], travelled[rows])
+    truth_at = np.interp(at_ns, t_ns[rows], place[rows])
+    last = np.searchsorted(at_ns, t_ns[rows], side="right") - 1
+    rows, last = rows[last >= 0], last[last >= 0]
+    counted = travelled[rows] - odometer_at[last]
+    moved = place[rows] - truth_at[last]
+    beyond[rows] = np.abs(counted - moved) > lds.odometer_fixed_m + lds.odometer_share * np.abs(counted)
+    return beyond

@@ -1,0 +1,181 @@
+"""What is at fault: the position, the odometer, the map or the track (DOMAIN section 5, Suspect)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from schemas.enums import Evidence, Suspect
+
+# How far back an alarm's cause may lie: a raw monitor answers at once, the slowest EWMA after minutes.
+_LOOKBACKS_S = (1.0, 30.0, 300.0)
+_ACROSS = ("cross_", "up_")
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """Per epoch, all epochs: truth, position, odometer and GNSS velocity, NaN where not known."""
+
+    t_ns: Ints
+    path_m: Floats
+    error_m: Floats
+    noise_m: Floats
+    bound_m: Floats
+    error_cross_m: Floats
+    noise_cross_m: Floats
+    error_up_m: Floats
+    noise_up_m: Floats
+    truth_m: Floats
+    odometer_m: Floats
+    stretch: Ints
+    scale_sigma: Floats
+    white_m2_per_s: Floats
+    velocity_mps: Floats
+    by_reference: Bools
+    doubtful_track: Bools
+
+
+def witnesses_of(
+    epochs: pl.DataFrame, truth: pl.DataFrame, errors: dict[str, Floats], ambiguity_probability: float
+) -> Witnesses:
+    """Everything that can speak for or against the position."""
+    reference = truth["evidence"] == Evidence.REFERENCE.value
+    truth_sigma = floats(truth, "truth_sigma_m")
+    gate = floats(epochs, "gate_probability")
+    has_path = np.isfinite(floats(epochs, "path_m"))
+    doubtful = (gate < ambiguity_probability) | (flags(epochs, "fix_valid") & ~flags(epochs, "on_track") & has_path)
+    return Witnesses(
+        t_ns=times_ns(epochs),
+        path_m=np.where(flags(epochs, "fix_valid"), floats(epochs, "path_m"), np.nan),
+        error_m=errors["along"],
+        noise_m=3.0 * np.hypot(floats(epochs, "sigma_along_m"), truth_sigma),
+        bound_m=floats(truth, "truth_bound_m"),
+        error_cross_m=errors["cross"],
+        noise_cross_m=3.0 * np.hypot(floats(epochs, "sigma_cross_m"), truth_sigma),
+        error_up_m=errors["up"],
+        noise_up_m=3.0 * np.hypot(floats(epochs, "sigma_up_m"), truth_sigma),
+        truth_m=floats(truth, "truth_path_m"),
+        odometer_m=floats(epochs, "odometer_m"),
+        stretch=epochs["odometer_stretch"].fill_null(-1).cast(pl.Int64).to_numpy(),
+        scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
+        white_m2_per_s=np.nan_to_num(floats(epochs, "odometer_white_m2_per_s")),
+        velocity_mps=floats(epochs, "velocity_along_mps"),
+        by_reference=reference.fill_null(False).to_numpy(),
+        doubtful_track=doubtful,
+    )
+
+
+def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, ...], left_truth: bool) -> Suspect:
+    """Who caused the alarm over epochs `first..last`; `left_truth`: the position was wrong by the verdict."""
+    if w.doubtful_track[first : last + 1].any():
+        return Suspect.TRACK
+    if left_truth:
+        return suspect_of_error(w, first, last, monitors)
+    if odometer_left_truth(w, first, last) or doppler_sides_with_position(w, first, last):
+        return Suspect.ODOMETER
+    if _beyond(w.error_cross_m, w.noise_cross_m, first, last) or _beyond(w.error_up_m, w.noise_up_m, first, last):
+        return Suspect.GNSS
+    across = all(name.startswith(_ACROSS) for name in monitors)
+    if across and w.by_reference[first : last + 1].all():
+        # The reference clears the position and no along-track monitor failed: what is left is the map.
+        return Suspect.MAP
+    return Suspect.UNKNOWN
+
+
+def suspect_of_error(w: Witnesses, first: int, last: int, monitors: tuple[str, ...] = ()) -> Suspect:
+    """Who is behind a difference between position and truth over epochs `first..last`.
+
+    Against a reference it is the position. Where the odometer carries the truth, the Doppler velocity
+    decides between the two; without it monitors across the track speak against the position.
+    """
+    part = slice(first, last + 1)
+    if w.doubtful_track[part].any():
+        return Suspect.TRACK
+    known = np.isfinite(w.error_m[part])
+    if known.any() and w.by_reference[part][known].all():
+        return Suspect.GNSS
+    sides = doppler_vote(w, first, last)
+    if sides is not None:
+        return sides
+    return Suspect.GNSS if any(name.startswith(_ACROSS) for name in monitors) else Suspect.UNKNOWN
+
+
+def odometer_left_truth(w: Witnesses, first: int, last: int) -> bool:
+    """Odometer minus truth moved by more than 3 of its sigma around the alarm (needs the reference)."""
+    for lookback_s in _LOOKBACKS_S:
+        begin = int(np.searchsorted(w.t_ns, w.t_ns[first] - round(lookback_s * NS_PER_S)))
+        rows = np.arange(begin, last + 1)
+        rows = rows[w.by_reference[rows] & np.isfinite(w.odometer_m[rows]) & (w.stretch[rows] == w.stretch[first])]
+        if rows.size < 2:
+            continue
+        drift = (w.odometer_m[rows] - w.truth_m[rows]) - (w.odometer_m[rows[0]] - w.truth_m[rows[0]])
+        variance = _odometer_variance(w, rows) + 2.0 * _truth_variance(w, rows)
+        if (np.abs(drift) > 3.0 * np.sqrt(variance))[1:].any():
+            return True
+    return False
+
+
+def _odometer_variance(w: Witnesses, rows: Ints) -> Floats:
+    """Variance of the odometer's distance from the first of the rows on [m2]."""
+    elapsed_s = (w.t_ns[rows] - w.t_ns[rows[0]]) / NS_PER_S
+    moved = w.odometer_m[rows] - w.odometer_m[rows[0]]
+    variance: Floats = w.white_m2_per_s[rows] * elapsed_s + (w.scale_sigma[rows] * moved) ** 2
+    return variance
+
+
+def _truth_variance(w: Witnesses, rows: Ints) -> float:
+    """Noise of the reference between epochs, from its own second differences [m2]: its stated sigma
+    also holds what is constant over an alarm.
+    """
+    if rows.size < 4:
+        return 0.0
+    rough = np.diff(w.truth_m[rows], 2)
+    return float((1.4826 * np.median(np.abs(rough - np.median(rough)))) ** 2 / 6.0)
+
+
+def doppler_sides_with_position(w: Witnesses, first: int, last: int) -> bool:
+    return doppler_vote(w, first, last) is Suspect.ODOMETER
+
+
+def doppler_vote(w: Witnesses, first: int, last: int) -> Suspect | None:
+    """Position, Doppler velocity and odometer over the alarm: the one that stands against the other two.
+
+    None where one of them is missing or no two of them part by more than their noise.
+    """
+    for lookback_s in _LOOKBACKS_S:
+        begin = int(np.searchsorted(w.t_ns, w.t_ns[first] - round(lookback_s * NS_PER_S)))
+        rows = np.arange(begin, last + 1)
+        known = np.isfinite(w.path_m[rows]) & np.isfinite(w.velocity_mps[rows]) & np.isfinite(w.odometer_m[rows])
+        rows = rows[known & (w.stretch[rows] == w.stretch[first])]
+        vote = _vote(w, rows) if rows.size > 1 else None
+        if vote is not None:
+            return vote
+    return None
+
+
+def _vote(w: Witnesses, rows: Ints) -> Suspect | None:
+    """The epoch of the largest difference between position and odometer decides."""
+    dt_s = np.diff(w.t_ns[rows]) / NS_PER_S
+    velocity = w.velocity_mps[rows]
+    by_doppler = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * dt_s)))
+    by_position = w.path_m[rows] - w.path_m[rows[0]]
+    by_odometer = w.odometer_m[rows] - w.odometer_m[rows[0]]
+    at = int(np.argmax(np.abs(by_position - by_odometer)))
+    noise_m = float(np.nan_to_num(w.noise_m[rows[at]], nan=0.0))
+    odometer_m = 3.0 * float(np.sqrt(_odometer_variance(w, rows)[at]))
+    apart = abs(by_position[at] - by_odometer[at])
+    if apart <= noise_m + odometer_m:
+        return None
+    to_position, to_odometer = abs(by_doppler[at] - by_position[at]), abs(by_doppler[at] - by_odometer[at])
+    if to_position < 0.5 * apart and to_odometer > to_position:
+        return Suspect.ODOMETER
+    return Suspect.GNSS if to_odometer < 0.5 * apart else None
+
+
+def _beyond(error: Floats, noise: Floats, first: int, last: int) -> bool:
+    part = slice(first, last + 1)
+    with np.errstate(invalid="ignore"):
+        return bool((np.abs(error[part]) > noise[part]).any())

@@ -1,0 +1,151 @@
+"""Where the train was: the ladder of evidence (DOMAIN section 5).
+
+The reference stream; else physical balise reads carried on by the odometer; else the odometer since
+the LRVB, where only what exceeds its confidence counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.anchors import Anchors, Carried, carry
+from pipeline.hazards.arrays import (
+    NS_PER_S,
+    Floats,
+    Ints,
+    flags,
+    floats,
+    interpolate_known,
+    linking_gap_s,
+    nominal_period_s,
+    times_ns,
+)
+from pipeline.hazards.travel import Travel, odometer_travel
+from schemas.config import HazardConfig, LdsConfig
+from schemas.enums import Evidence
+
+_EVIDENCE = pl.Enum([member.value for member in Evidence])
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One kind of evidence per epoch; NaN where it does not reach. `bound_m` must be exceeded by a hazard."""
+
+    evidence: Evidence
+    path_m: Floats
+    sigma_m: Floats
+    bound_m: Floats
+    cross_m: Floats
+    up_m: Floats
+
+
+def establish_truth(
+    epochs: pl.DataFrame,
+    reference: pl.DataFrame | None,
+    balise_reads: pl.DataFrame | None,
+    passages: pl.DataFrame | None,
+    config: HazardConfig,
+    lds: LdsConfig,
+) -> pl.DataFrame:
+    """Truth of one solution's epochs, at the time that each position is of: `t - latency`.
+
+    `epochs`: `t, path_m, fix_valid, direction, latency_s` and the aligned odometer (`odometer_m,
+    odometer_stretch, scale_sigma, odometer_white_m2_per_s`, and `velocity_along_mps` where known).
+    `reference`: `t, path_m, cross_track_m, vertical_m, sigma_m` on the same path;
+    `balise_reads`: `t, path_m` of physical balises; `passages`: `status, path_m, t_offered` of the
+    LDS, whose accepted VBs anchor the odometer.
+    Yields per epoch `t, evidence, truth_path_m, truth_sigma_m, truth_bound_m, truth_cross_m,
+    truth_up_m, truth_travel_m, truth_stretch`: `truth_bound_m` is what an error has to exceed before
+    it is called a hazard, differences of `truth_travel_m` within one `truth_stretch` are true
+    movements free of the steps that a new anchor makes.
+    """
+    at_ns = valid_ns(epochs)
+    travel = odometer_travel(epochs, at_ns)
+    rungs = []
+    if reference is not None and reference.height:
+        rungs.append(_reference_rung(at_ns, reference))
+    if balise_reads is not None and balise_reads.height:
+        anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"))
+        rungs.append(_balise_rung(carry(anchors, travel, at_ns, lds, both_ways=True), config))
+    rungs.append(_odometer_rung(epochs, passages, travel, at_ns, lds))
+    return _ladder(epochs["t"], rungs, travel)
+
+
+def valid_ns(epochs: pl.DataFrame) -> Ints:
+    """Instant that each position is of: its stamp less the latency in use."""
+    latency_ns = np.round(np.nan_to_num(floats(epochs, "latency_s")) * NS_PER_S).astype(np.int64)
+    return times_ns(epochs) - latency_ns
+
+
+def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
+    stamps = times_ns(reference)
+    origin = stamps[0]
+    x, at = (stamps - origin) / NS_PER_S, (at_ns - origin) / NS_PER_S
+    gap = linking_gap_s(nominal_period_s(stamps))
+
+    def column(name: str) -> Floats:
+        return interpolate_known(at, x, floats(reference, name), gap)
+
+    path = column("path_m")
+    sigma = np.nan_to_num(column("sigma_m"))
+    cross, up = column("cross_track_m"), column("vertical_m")
+    return Rung(Evidence.REFERENCE, path, sigma, np.zeros(path.size), cross, up)
+
+
+def _balise_rung(carried: Carried, config: HazardConfig) -> Rung:
+    """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard."""
+    nothing = np.full(carried.path_m.size, np.nan)
+    sigma = np.hypot(config.balise_read_sigma_m, carried.sigma_m)
+    bound = np.maximum(np.minimum(3.0 * sigma, carried.confidence_m), carried.mismatch_m)
+    return Rung(Evidence.BALISE, carried.path_m, sigma, bound, nothing, nothing)
+
+
+def _odometer_rung(
+    epochs: pl.DataFrame, passages: pl.DataFrame | None, travel: Travel, at_ns: Ints, lds: LdsConfig
+) -> Rung:
+    anchors = _initial_anchors(epochs, travel, at_ns, lds.init_s)
+    if passages is not None and passages.height:
+        accepted = passages.filter((pl.col("status") == "accepted") & pl.col("t_offered").is_not_null()).sort(
+            "t_offered"
+        )
+        offered = times_ns(accepted, "t_offered")
+        latency = np.interp(offered, times_ns(epochs), times_ns(epochs) - at_ns)
+        path = floats(accepted, "path_m")
+        anchors = anchors.with_others(Anchors.of((offered - latency).astype(np.int64), path))
+    carried = carry(anchors, travel, at_ns, lds, both_ways=False)
+    nothing = np.full(carried.path_m.size, np.nan)
+    return Rung(Evidence.ODOMETER, carried.path_m, carried.sigma_m, carried.confidence_m, nothing, nothing)
+
+
+def _initial_anchors(epochs: pl.DataFrame, travel: Travel, at_ns: Ints, init_s: float) -> Anchors:
+    """Where no VB was accepted yet: the median of GNSS minus odometer over a stretch's first `init_s`."""
+    offset = np.where(flags(epochs, "fix_valid"), floats(epochs, "path_m"), np.nan) - travel.distance_m
+    known = np.flatnonzero(np.isfinite(offset))
+    instants: list[int] = []
+    places: list[float] = []
+    for stretch in np.unique(travel.stretch[known]):
+        rows = known[travel.stretch[known] == stretch]
+        first = rows[at_ns[rows] <= at_ns[rows[0]] + init_s * NS_PER_S]
+        instants.append(int(at_ns[rows[0]]))
+        places.append(float(np.median(offset[first]) + travel.distance_m[rows[0]]))
+    return Anchors.of(np.array(instants, dtype=np.int64), np.array(places, dtype=np.float64))
+
+
+def _ladder(t: pl.Series, rungs: list[Rung], travel: Travel) -> pl.DataFrame:
+    names = ("path_m", "sigma_m", "bound_m", "cross_m", "up_m")
+    best = {name: np.full(t.len(), np.nan) for name in names}
+    evidence = np.full(t.len(), None, dtype=object)
+    for rung in rungs:
+        free = ~np.isfinite(best["path_m"]) & np.isfinite(rung.path_m)
+        for name in names:
+            best[name][free] = getattr(rung, name)[free]
+        evidence[free] = rung.evidence.value
+    by_reference = np.where(evidence == Evidence.REFERENCE.value, best["path_m"], np.nan)
+    distance_m, stretch = travel.joined_with(by_reference)
+    columns = {f"truth_{name}": pl.Series(best[name], nan_to_null=True) for name in names}
+    return pl.DataFrame({"t": t, "evidence": pl.Series(evidence.tolist(), dtype=_EVIDENCE), **columns}).with_columns(
+        truth_travel_m=pl.Series(distance_m, nan_to_null=True), truth_stretch=pl.Series(stretch)
+    )
