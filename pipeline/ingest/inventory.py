@@ -36,7 +36,7 @@ def _children(value: Any) -> list[tuple[str, Any]] | None:
     descriptor = getattr(value, "DESCRIPTOR", None)
     if descriptor is not None:
         return [(field.name, _protobuf_child(value, field)) for field in descriptor.fields]
-    if hasattr(value, "__slots__") or type(value).__module__ == "types" or hasattr(value, "__dict__"):
+    if hasattr(value, "__dict__"):
         return [(name, getattr(value, name)) for name in _attributes(value)]
     if isinstance(value, str | bytes) or not hasattr(value, "__len__"):
         return None
@@ -51,7 +51,8 @@ def _protobuf_child(message: Any, field: Any) -> Any:
 
 
 def _attributes(value: Any) -> list[str]:
-    return [name for name in vars(value) if not name.startswith("_")]
+    names = getattr(type(value), "__slots__", None) or vars(value)
+    return [name for name in names if not name.startswith("_")]
 
 
 def _kind(value: Any) -> str:

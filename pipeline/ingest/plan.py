@@ -184,14 +184,19 @@ def _source(
             columns[name] = expression
         elif (not contract[name].nullable and name != "solution") or (mapping and name in mapping.fields):
             breaches.append(_missing_field(sample, name, absent))
-    times = {
-        column: _time(sample, path, mapping) for column, path in (recipe.stamps or {"t": ""}).items()
-    }
+    times = _times(sample, recipe, mapping)
     types = {path: recipe.type_of(path) for name in columns for path in recipe.fields_of(name)}
     for time in times.values():
         types |= time.types
     solution = mapping.solution if mapping else None
     return Source(sample.channel, recipe, columns, times, types, solution)
+
+
+def _times(sample: Sample, recipe: Recipe, mapping: StreamMapping | None) -> dict[str, TimeSource]:
+    """The time of validity, and further times (end of a fault), which look like it and may be absent."""
+    (column, path), *others = (recipe.stamps or {"t": ""}).items()
+    first = _time(sample, path, mapping)
+    return {column: first} | {name: first.of_field(path, other) for name, other in others}
 
 
 def _missing_field(sample: Sample, column: str, absent: Sequence[str]) -> Breach:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -28,6 +28,12 @@ class TimeSource:
     unit_s: float | None = None
     scale: Literal["utc", "gps"] = "utc"
     epoch: Literal["unix", "gps"] = "unix"
+
+    def of_field(self, path: str, other: str) -> TimeSource:
+        """The same kind of stamp in another field of the message."""
+        fields = tuple(other + name.removeprefix(path) for name in self.fields)
+        types = dict(zip(fields, (self.types.get(name, pl.Int64()) for name in self.fields), strict=True))
+        return replace(self, fields=fields, types=types)
 
     def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
         """Times in UTC; null where a part of the stamp is null."""
