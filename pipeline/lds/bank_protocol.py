@@ -14,7 +14,7 @@ class Bank(Protocol):
     """Monitors of one solution, from the last restart on.
 
     Epochs are row indices of the solution's epochs. The answers for an epoch may change with
-    `freeze` and `restart` at that epoch or before it, never through later ones.
+    `restart` at that epoch or before it, never through later ones.
     """
 
     def failed(self, epoch: int) -> bool:
@@ -27,10 +27,6 @@ class Bank(Protocol):
 
     def along_evaluated(self, epoch: int) -> bool:
         """The along-track monitors have a verdict (pass or fail) at this epoch."""
-        ...
-
-    def freeze(self, epoch: int) -> None:
-        """First failing epoch: what is learnt inside the run (scale, latency) learns no further."""
         ...
 
     def restart(self, epoch: int) -> None:

@@ -268,7 +268,6 @@ class LocationSystem:
         self.negated[k] = True
         self._fast_failed_at_ns = self._evaluated_at_ns = self._t_ns[k]
         self._consistent_since_ns = self._read_anchor = None
-        self._bank.freeze(k)
 
     def _seek_return(self, k: int, disordered: bool) -> None:
         """Recovery: `recovery_s` seen without a fast failure, then the re-link test."""

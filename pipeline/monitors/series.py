@@ -19,7 +19,7 @@ OFF_TRACK = "off track"
 NO_HEIGHT = "no height in the position or the survey"
 FIRST_EPOCH = "first epoch after a restart"
 DISABLED = "disabled by configuration"
-REASONS: tuple[str, ...] = (NO_POSITION, NO_SIGMA, OFF_TRACK, NO_HEIGHT, FIRST_EPOCH, DISABLED)
+_STRAIGHT_PER_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,10 @@ class _Builder:
     def _chord_error(self, rows: npt.NDArray[np.int64], dt: Array) -> tuple[Array, Array]:
         """Variance of the polyline's chord error [m^2] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
-        length = np.maximum(np.nan_to_num(self._column("segment_length_m", rows), nan=1.0), 1e-3)
+        curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))
+        length = np.sqrt(8.0 * error / np.maximum(curvature, _STRAIGHT_PER_M))  # chord of an arc with this sagitta
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
-        return error**2, -np.expm1(-way / length)
+        return error**2, -np.expm1(-way / np.maximum(length, 1.0))
 
     def _time_steps(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Mask]:
         """Time since the row before [s] (1 s stands in where there is none) and rows that nothing leads to."""

@@ -1,0 +1,138 @@
+"""Monitors that look at one epoch, or at the second before it, without memory: Doppler and channel comparison.
+
+Each yields a frame `value, threshold, state, reason`, row for row with the epochs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
+from schemas.config import Configuration
+from schemas.enums import MonitorState
+
+Array = npt.NDArray[np.float64]
+
+NO_VELOCITY = "no GNSS velocity"
+NO_RANGES = "no satellites stream"
+NO_OTHER_SOLUTION = "no other solution configured to compare with"
+NO_OTHER_EPOCH = "the other solution has no position at this epoch"
+_WINDOW_S = 1.0
+_STATES = pl.Enum([state.value for state in MonitorState])
+
+
+def judged(value: Array, threshold: Array, reasons: pl.Series) -> pl.DataFrame:
+    """States of a monitor: where a reason stands it is not evaluated, else |value| against the threshold."""
+    frame = pl.DataFrame(
+        {
+            "value": pl.Series(value, nan_to_null=True),
+            "threshold": pl.Series(threshold, nan_to_null=True),
+            "reason": reasons.cast(pl.String),
+        }
+    )
+    evaluated = pl.col("reason").is_null()
+    state = (
+        pl.when(~evaluated)
+        .then(pl.lit(MonitorState.NOT_EVALUATED.value))
+        .when(pl.col("value").abs() > pl.col("threshold"))
+        .then(pl.lit(MonitorState.FAIL.value))
+        .otherwise(pl.lit(MonitorState.PASS.value))
+    )
+    return frame.select(
+        pl.when(evaluated).then(pl.col("value")).alias("value"),
+        pl.when(evaluated).then(pl.col("threshold")).alias("threshold"),
+        state.cast(_STATES).alias("state"),
+        "reason",
+    )
+
+
+def blind_monitor(epochs: int, reason: str) -> pl.DataFrame:
+    """A monitor that has nothing to look at in the whole run."""
+    nothing = np.full(epochs, np.nan)
+    return judged(nothing, nothing, pl.Series([reason] * epochs, dtype=pl.String))
+
+
+def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) -> pl.DataFrame:
+    """GNSS velocity along track against odometer speed, both over the second before [m/s].
+
+    Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
+    """
+    t_s = (epochs["t"].dt.timestamp("ns") - epochs["t"].dt.timestamp("ns")[0]).to_numpy() * 1e-9
+    velocity = _floats(epochs["velocity_along_mps"])
+    usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
+    first, span = _window(t_s, usable, epochs["odometer_stretch"].to_numpy())
+    total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
+    by_doppler = (total - total[first]) / span
+    odometer = _floats(epochs["odometer_m"])
+    by_odometer = (odometer - odometer[first]) / span
+    speed = np.abs(_floats(epochs["speed_mps"]))
+    change = np.abs(velocity - velocity[first])
+    variance = (
+        config.monitors.doppler_sigma_mps**2
+        + _floats(epochs["odometer_white_m2_per_s"]) / span
+        + (_floats(epochs["scale_sigma"]) * speed) ** 2
+        + ((_floats(epochs["latency_sigma_s"]) + np.abs(_floats(epochs["latency_s"]))) * change / span) ** 2
+    )
+    reasons = pl.select(
+        pl.when(pl.Series(usable & np.isfinite(span)))
+        .then(pl.lit(None, pl.String))
+        .when(pl.Series(~np.isfinite(velocity)))
+        .then(pl.lit(NO_VELOCITY))
+        .when(epochs["odometer_reason"].is_not_null())
+        .then(epochs["odometer_reason"])
+        .when(~epochs["fix_valid"])
+        .then(pl.lit(NO_POSITION))
+        .otherwise(pl.lit(FIRST_EPOCH))
+    ).to_series()
+    return judged(by_doppler - by_odometer, factor * np.sqrt(variance), reasons)
+
+
+def channel_monitor(epochs: pl.DataFrame, other: pl.DataFrame | None, factor: float) -> pl.DataFrame:
+    """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
+
+    `other`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path. Errors that
+    both share (troposphere) make the threshold larger than it need be.
+    """
+    if other is None:
+        return blind_monitor(epochs.height, NO_OTHER_SOLUTION)
+    usable = other.filter("fix_valid", "on_track").select(
+        "t", path_other_m="path_m", sigma_other_m="sigma_along_m"
+    )
+    both = epochs.select("t", "path_m", "sigma_along_m", "fix_valid", "on_track").join(
+        usable, on="t", how="left", maintain_order="left"
+    )
+    value = _floats(both["path_m"]) - _floats(both["path_other_m"])
+    threshold = factor * np.hypot(_floats(both["sigma_along_m"]), _floats(both["sigma_other_m"]))
+    reasons = both.select(
+        pl.when(~pl.col("fix_valid") | ~pl.col("on_track") | pl.col("sigma_along_m").is_null())
+        .then(pl.lit(NO_POSITION))
+        .when(pl.col("path_other_m").is_null() | pl.col("sigma_other_m").is_null())
+        .then(pl.lit(NO_OTHER_EPOCH))
+    ).to_series()
+    return judged(value, threshold, reasons)
+
+
+def _floats(series: pl.Series) -> Array:
+    values: Array = series.cast(pl.Float64).to_numpy()
+    return values.astype(np.float64)
+
+
+def _window(
+    t_s: Array, usable: npt.NDArray[np.bool_], stretch: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], Array]:
+    """Epoch at least a second before, and the time since; NaN unless all in between are usable and connected."""
+    first = np.maximum(np.searchsorted(t_s, t_s - _WINDOW_S * (1.0 - 1e-6), side="right") - 1, 0)
+    bad = np.concatenate([[0], np.cumsum(~usable)])
+    clean = bad[np.arange(t_s.size) + 1] == bad[first]
+    span = t_s - t_s[first]
+    connected = clean & (span >= _WINDOW_S * (1.0 - 1e-6)) & (span <= 2.5 * _WINDOW_S)
+    connected &= stretch == stretch[first]
+    return first, np.where(connected, span, np.nan)
+
+
+def _way(t_s: Array, velocity: Array) -> Array:
+    """Way of each step by trapezoids [m], zero where a velocity is missing; as many as epochs."""
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t_s)
+    return np.concatenate([np.nan_to_num(steps), [0.0]])

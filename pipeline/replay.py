@@ -1,0 +1,195 @@
+"""The main job: one run on one site, from its frames to the five tables."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import dataframely as dy
+import polars as pl
+
+from pipeline.align import align, threshold_factor
+from pipeline.clean import CleanCounts, clean
+from pipeline.hazards import HazardResult, classify, establish_truth
+from pipeline.lds.bank_protocol import LdsLimits
+from pipeline.lds.run import LdsResult, run_lds
+from pipeline.matching import Match, TravelledPath, match
+from pipeline.monitors.bank import MonitorBank
+from pipeline.monitors.single import NO_RANGES, blind_monitor, channel_monitor, doppler_monitor
+from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
+from schemas.config import Configuration, Vehicle, digest_of
+from schemas.enums import Evidence
+from schemas.run import RunLog, RunTables, Site
+from schemas.tables import TABLES
+from schemas.version import SOFTWARE
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Tables of one solution."""
+
+    epochs: pl.DataFrame
+    result: HazardResult
+    summary: pl.DataFrame
+
+
+@dataclass(frozen=True)
+class _Context:
+    """What every solution of a run shares."""
+
+    run: RunLog
+    site: Site
+    vehicle: Vehicle
+    config: Configuration
+    counts: CleanCounts
+    factor: float
+
+
+def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
+    """Replay one recorded run: match, align, monitor, detect balises, classify hazards, summarise.
+
+    `run` as `pipeline.ingest.read_run` yields it, `site` as `read_site` does. Raises `InputError` where the log
+    cannot be replayed at all.
+    """
+    config = config or Configuration()
+    cleaned, counts = clean(run)
+    factor = threshold_factor(config.monitors.false_alarm_probability)
+    context = _Context(cleaned, site, vehicle or Vehicle(), config, counts, factor)
+    matches = {name: _match(context, name) for name in cleaned.solutions()}
+    return _tables(run.run_id, [_replay_solution(context, name, matches) for name in matches])
+
+
+def _match(context: _Context, solution: str) -> Match:
+    run = context.run
+    return match(
+        run.gnss.filter(pl.col("solution") == solution),
+        run.odometer,
+        context.site,
+        context.vehicle,
+        context.config.matching,
+        context.config.fix_sigma,
+        run.balise_reads,
+    )
+
+
+def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Solution:
+    run, config, vehicle, found = context.run, context.config, context.vehicle, matches[solution]
+    balises = found.path.balises(context.site.balises)
+    aligned = align(found.epochs, run.odometer, context.vehicle, config).with_columns(_confidence(context, solution))
+    bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
+    lds = run_lds(aligned, bank, balises, run.balise_reads, config.lds, LdsLimits.of(config), solution)
+    monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
+    reference = _reference_on_path(context, found.path)
+    reads = _reads_on_path(run.balise_reads, balises)
+    truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
+    result = classify(
+        solution, monitored, truth, lds.passages, balises, run.faults, found.path.locate, config
+    )
+    epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
+    results = SolutionResults(
+        solution=solution,
+        epochs=epochs,
+        passages=result.passages,
+        hazards=result.hazards,
+        alarms=result.alarms,
+        evidence=_evidence(truth),
+        alignment=_alignment(aligned),
+        counts=context.counts.solutions[solution],
+        ingest=run.notes,
+        ambiguous_stretches=found.ambiguous.height,
+        notes=_notes(found, lds),
+    )
+    return _Solution(epochs, result, summarise(results, config, provenance(context.run, context.site, vehicle, config)))
+
+
+def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
+    """Digests of what a result is made from, and the program that makes it."""
+    inputs = hashlib.sha256(f"{run.input_digest}:{site.digest}".encode()).hexdigest()
+    return Provenance(digest_of(config, vehicle), inputs, SOFTWARE)
+
+
+def _evidence(truth: pl.DataFrame) -> Evidence | None:
+    """The kind of evidence that most epochs rest on."""
+    kinds = truth["evidence"].drop_nulls().value_counts(sort=True)
+    return Evidence(kinds["evidence"][0]) if kinds.height else None
+
+
+def _alignment(aligned: pl.DataFrame) -> Alignment:
+    """Scale and latency as they stand at the end of the run."""
+    names = ("latency_s", "latency_sigma_s", "odometer_scale", "scale_sigma")
+    return Alignment(*(aligned[name][-1] for name in names))
+
+
+def _notes(found: Match, lds: LdsResult) -> tuple[str, ...]:
+    """What the reader of the `runs` row should know beside its figures."""
+    notes = []
+    if found.ambiguous.height:
+        stretches = [
+            f"{row['netelement_id']} or {row['other_netelement_id']} from {row['t_start']:%H:%M:%S} to {row['t_end']:%H:%M:%S}"
+            for row in found.ambiguous.iter_rows(named=True)
+        ]
+        notes.append("ambiguous: " + ", ".join(stretches))
+    if lds.unknown_reads.height:
+        names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
+        notes.append("reads of balises that are not on the path: " + ", ".join(names))
+    return tuple(notes)
+
+
+def _confidence(context: _Context, solution: str) -> pl.Series | pl.Expr:
+    """Half-width of the confidence interval along the track: K sigma, or the receiver's HPL (DOMAIN section 4)."""
+    lds = context.config.lds
+    if lds.ci_source == "sigma":
+        return (lds.ci_factor * pl.col("sigma_along_m")).alias("confidence_m")
+    fixes = context.run.gnss.filter(pl.col("solution") == solution)
+    return fixes["hpl_m"].alias("confidence_m")
+
+
+def _single_monitors(
+    context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
+) -> dict[str, pl.DataFrame]:
+    other = context.config.monitors.channel_reference
+    compared = matches[other].epochs if other in matches and other != solution else None
+    return {
+        "along_doppler": doppler_monitor(aligned, context.config, context.factor),
+        "channel": channel_monitor(aligned, compared, context.factor),
+        "pseudorange": blind_monitor(aligned.height, NO_RANGES),
+    }
+
+
+def _reference_on_path(context: _Context, path: TravelledPath) -> pl.DataFrame | None:
+    """The reference stream as path positions of the balise antenna, as the epochs are."""
+    reference = context.run.reference
+    if reference is None:
+        return None
+    places = path.project(reference["latitude_deg"], reference["longitude_deg"], reference["height_m"])
+    return reference.select(
+        "t",
+        pl.Series("path_m", places.path_m - context.vehicle.gnss_antenna_ahead_m, nan_to_null=True),
+        pl.Series("cross_track_m", places.cross_m, nan_to_null=True),
+        pl.Series("vertical_m", places.vertical_m - context.vehicle.antenna_height_m, nan_to_null=True),
+        "sigma_m",
+    )
+
+
+def _reads_on_path(reads: pl.DataFrame | None, balises: pl.DataFrame) -> pl.DataFrame | None:
+    if reads is None:
+        return None
+    return reads.join(balises.select("balise_id", "path_m"), on="balise_id", how="inner", maintain_order="left")
+
+
+def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:
+    return RunTables(
+        run_id=run_id,
+        hazards=_table("hazards", [part.result.hazards for part in solutions]),
+        passages=_table("passages", [part.result.passages for part in solutions]),
+        alarms=_table("alarms", [part.result.alarms for part in solutions]),
+        epochs=_table("epochs", [part.epochs for part in solutions]),
+        runs=_table("runs", [part.summary for part in solutions]),
+    )
+
+
+def _table(name: str, parts: list[pl.DataFrame]) -> pl.DataFrame:
+    """Rows of all solutions, by the contract."""
+    schema: type[dy.Schema] = TABLES[name]
+    columns = schema.column_names()
+    return schema.validate(pl.concat([part.select(columns) for part in parts]), cast=True)
