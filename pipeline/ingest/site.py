@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipeline.ingest.files import is_dir, join, list_dir, read_bytes
 from pipeline.ingest.site_checks import drop_repeated_points, remarks
 from pipeline.ingest.site_geojson import Network, read_network
 from pipeline.ingest.site_tables import (
@@ -22,10 +23,11 @@ from pipeline.ingest.site_tables import (
     typed_table,
 )
 from pipeline.track import geometric_measures_m, track_of
-from schemas.errors import SiteError
+from schemas.errors import InputError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site
 
+_NAMES = ("track", "links", "balises", "route")
 _SUFFIXES = {"track": (".parquet", ".csv", ".geojson"), "links": (".parquet", ".csv")}
 _TABLES = (".parquet", ".csv")
 # GeoJSON and PROJ know these as longitude and latitude on (nearly) the ellipsoid of WGS 84.
@@ -47,19 +49,18 @@ def read_site(path: Path | str) -> Site:
 
     Raises `SiteError` with all breaches at once; what is merely remarkable is in `Site.findings`.
     """
-    folder = Path(path)
-    files = _files(folder)
+    files = _files(path)
     breaches: list[str] = []
     track, network, notes = _read_track(files, breaches)
     links = _read_links(files, network, breaches)
     balises = _read_table(files, "balises", BALISES, breaches)
     route = _read_route(files, breaches)
     if breaches or track is None or links is None:
-        raise _refusal(folder, breaches)
+        raise _refusal(path, breaches)
     lengths = network.declared_length_m if network else {}
     found = remarks(track, links, balises, route, lengths)
     if found.breaches:
-        raise _refusal(folder, found.breaches)
+        raise _refusal(path, found.breaches)
     return Site(
         track=Track.validate(track, cast=True),
         links=Links.validate(found.links, cast=True),
@@ -70,27 +71,23 @@ def read_site(path: Path | str) -> Site:
     )
 
 
-def _files(folder: Path) -> dict[str, bytes]:
+def _files(folder: Path | str) -> dict[str, bytes]:
     """The site's files by name; of each table there is at most one."""
-    if not folder.is_dir():
-        raise SiteError("is not a folder", place=str(folder), remedy="A site is a folder with track.parquet.")
-    names = [f"{table}{suffix}" for table in ("track", "links", "balises", "route") for suffix in
-             _SUFFIXES.get(table, _TABLES)]  # fmt: skip
-    present = [name for name in names if (folder / name).is_file()]
-    for table in ("track", "links", "balises", "route"):
-        same = [name for name in present if name.startswith(f"{table}.")]
-        if len(same) > 1:
-            raise SiteError(f"{' and '.join(same)}: only one may be there", place=str(folder))
-    if not any(name.startswith("track.") for name in present):
-        raise SiteError(
-            "has no track",
-            place=str(folder),
-            expected="track.parquet, track.csv or track.geojson",
-        )
+    if not is_dir(folder):
+        raise SiteError("is not a folder", place=str(folder), remedy="A site is a folder that holds a track.")
+    names = [table + suffix for table in _NAMES for suffix in _SUFFIXES.get(table, _TABLES)]
     try:
-        return {name: (folder / name).read_bytes() for name in present}
-    except OSError as error:
-        raise SiteError(f"cannot be read: {error.strerror}", place=str(error.filename)) from None
+        present = [name for name in list_dir(folder) if name in names]
+        for table in _NAMES:
+            same = [name for name in present if name.startswith(f"{table}.")]
+            if len(same) > 1:
+                raise SiteError(f"{' and '.join(same)}: only one may be there", place=str(folder))
+        if not any(name.startswith("track.") for name in present):
+            expected = "track.parquet, track.csv or track.geojson"
+            raise SiteError("has no track", place=str(folder), expected=expected)
+        return {name: read_bytes(join(folder, name)) for name in present}
+    except InputError as error:
+        raise SiteError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
 
 
 def _digest(files: dict[str, bytes]) -> str:
@@ -99,13 +96,10 @@ def _digest(files: dict[str, bytes]) -> str:
     return hashlib.sha256("".join(parts).encode()).hexdigest()
 
 
-def _refusal(folder: Path, breaches: list[str]) -> SiteError:
-    count = "1 breach" if len(breaches) == 1 else f"{len(breaches)} breaches"
-    return SiteError(
-        f"{count} of the site's contract: {'; '.join(breaches)}",
-        place=str(folder),
-        remedy="Mend the files named; `balise dictionary` lists the columns.",
-    )
+def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
+    listed = breaches[0] if len(breaches) == 1 else "\n  ".join([f"{len(breaches)} breaches", *breaches]) + "\n"
+    remedy = "Mend what is named; `balise dictionary` lists the columns of a site."
+    return SiteError(listed, place=str(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
