@@ -130,7 +130,7 @@ class _Walk:
 
     def take(self, event: Jump | Crossing) -> None:
         epoch = event.first if isinstance(event, Jump) else event.epoch
-        if self._open is not None and epoch >= self._open.calm:
+        if self._open is not None and epoch > self._open.calm:
             self._close(self._open.calm)
         if isinstance(event, Crossing):
             self._offer(event)

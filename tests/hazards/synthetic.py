@@ -120,7 +120,9 @@ class Journey:
             columns[f"{name}_value"] = np.where(fails, 3.0, 0.0)
             columns[f"{name}_threshold"] = np.full(size, 2.0)
         frame = pl.DataFrame(columns)
-        return frame.with_columns(pl.col(f"{name}_state").cast(pl.Enum(["pass", "fail", "not_evaluated"])) for name in MONITORS)
+        return frame.with_columns(
+            pl.col(f"{name}_state").cast(pl.Enum(["pass", "fail", "not_evaluated"])) for name in MONITORS
+        )
 
     def balises(self):
         size = len(self.balises_m)
