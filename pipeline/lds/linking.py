@@ -242,7 +242,8 @@ class LinkingChain:
         self._missed_in_a_row = 0
         self._optional = set()
         self._own.pop(balise.balise_id, None)
-        self._look_ahead([other for other in self._in_order_of_travel() if self._announced_m(other) > 0])
+        beyond = [other for other in self._in_order_of_travel() if self._announced_m(other) > 0]
+        self._look_ahead(beyond if self.linking else [])
 
     def _turn_round(self, odometer_m: float, travelled_m: float, heading: int, leg: int) -> None:
         """The train goes the other way, or on another leg: expect what lies on its new way."""

@@ -320,7 +320,9 @@ class LocationSystem:
         self.negated[k] = False
         self._bank.restart(k)
         self.restarts.append(k)
+        # What still rang at this epoch belonged to the fault that is over.
         self.evaluated[k] = self._bank.along_evaluated(k)
+        self.alarm[k] = self._bank.failed(k)
 
     def _stand(self, k: int) -> None:
         self.standings.append(Standing(k, self.virtual.reference, self._chain_from is not None))

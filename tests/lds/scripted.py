@@ -1,0 +1,122 @@
+"""Journeys of a few rows, and a bank that fails where the script says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import polars as pl
+
+from pipeline.lds import LdsLimits, LdsResult, run_lds
+from schemas.config import Configuration, LdsConfig
+
+LIMITS = LdsLimits.of(Configuration())
+INSTANT = pl.Datetime("ns", "UTC")
+
+
+class ScriptedBank:
+    """Fails at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
+
+    def __init__(
+        self,
+        fails: Iterable[int] = (),
+        fast: Iterable[int] | None = None,
+        rings: Iterable[int] = (),
+        blind: Iterable[int] = (),
+    ) -> None:
+        self.fails, self.rings, self.blind = set(fails), set(rings), set(blind)
+        self.fast = self.fails if fast is None else set(fast)
+        self.started = 0
+        self.restarted: list[int] = []
+
+    def failed(self, epoch: int) -> bool:
+        return epoch in self.fails or (epoch in self.rings and not self.restarted)
+
+    def fast_failed(self, epoch: int) -> bool:
+        return epoch in self.fast
+
+    def along_evaluated(self, epoch: int) -> bool:
+        return epoch > self.started and epoch not in self.blind
+
+    def restart(self, epoch: int) -> None:
+        self.restarted.append(epoch)
+        self.started = epoch
+
+
+def epochs_of(
+    path_m: Sequence[float | None],
+    odometer_m: Sequence[float | None] | None = None,
+    t_s: Sequence[float] | None = None,
+    **columns: Any,
+) -> pl.DataFrame:
+    """One epoch a second unless `t_s`; the odometer reads the path unless given."""
+    size = len(path_m)
+    times = range(size) if t_s is None else t_s
+    path = pl.Series("path_m", path_m, dtype=pl.Float64)
+    odometer = path if odometer_m is None else pl.Series(odometer_m, dtype=pl.Float64)
+    frame = pl.DataFrame(
+        {"t": pl.Series([round(t * 1e9) for t in times], dtype=pl.Int64).cast(INSTANT), "path_m": path}
+    ).with_columns(
+        leg=pl.lit(0, pl.Int32),
+        on_track=pl.lit(True),
+        fix_valid=path.is_not_null(),
+        gate_probability=pl.lit(1.0),
+        sigma_along_m=pl.lit(1.0),
+        confidence_m=pl.lit(6.18),
+        odometer_m=odometer,
+        direction=pl.lit(1, pl.Int8),
+        scale_sigma=pl.lit(1e-4),
+    )
+    series = [
+        value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()
+    ]
+    return frame.with_columns(series)
+
+
+def balises_at(places: dict[str, float], **columns: Any) -> pl.DataFrame:
+    """Virtual, linked, 12 m, service brake, unless `columns` say otherwise (a value or a list)."""
+    size = len(places)
+    values: dict[str, Any] = {
+        "leg": 0,
+        "kind": "virtual",
+        "netelement_id": "E",
+        "location_accuracy_m": 12.0,
+        "linked": True,
+        "link_reaction": "service_brake",
+    } | columns
+    spread = {name: value if isinstance(value, list) else [value] * size for name, value in values.items()}
+    frame = pl.DataFrame({"balise_id": list(places), "path_m": list(places.values())} | spread)
+    return frame.with_columns(measure_m="path_m", leg=pl.col("leg").cast(pl.Int32))
+
+
+def reads_at(reads: Sequence[tuple[float, str]]) -> pl.DataFrame:
+    """Telegrams: seconds and identity."""
+    return pl.DataFrame(
+        {"t": [round(t * 1e9) for t, _ in reads], "balise_id": [name for _, name in reads]},
+        schema={"t": pl.Int64, "balise_id": pl.String},
+    ).with_columns(pl.col("t").cast(INSTANT))
+
+
+def run(
+    epochs: pl.DataFrame,
+    balises: pl.DataFrame,
+    bank: ScriptedBank | None = None,
+    reads: pl.DataFrame | None = None,
+    limits: LdsLimits = LIMITS,
+    **config: Any,
+) -> LdsResult:
+    return run_lds(epochs, bank or ScriptedBank(), balises, reads, LdsConfig(**config), limits)
+
+
+def told(result: LdsResult, *columns: str) -> list[tuple[Any, ...]]:
+    """Passages as tuples of the named columns, times in seconds, enums as text."""
+    frame = result.passages.select(columns)
+    times = [i for i, kind in enumerate(frame.dtypes) if kind == INSTANT]
+    rows = frame.with_columns(pl.col(pl.Datetime).dt.epoch("ns")).rows()
+    return [
+        tuple(value / 1e9 if i in times and value is not None else value for i, value in enumerate(row)) for row in rows
+    ]
+
+
+def steps(start_m: float, step_m: float, count: int) -> list[float]:
+    return [start_m + step_m * k for k in range(count)]
