@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from math import sqrt
+from typing import Any
 
 import polars as pl
 import pytest
@@ -253,7 +254,7 @@ def test_link_distance_bounds() -> None:
     ],
 )
 def test_linking_monitors_say_why_they_were_not_evaluated(
-    columns: dict[str, object], order_reason: str | None, distance_reason: str | None
+    columns: dict[str, Any], order_reason: str | None, distance_reason: str | None
 ) -> None:
     last = run(epochs_of(steps(0.0, 20.0, 10), **columns), balises_at(V1)).epochs.row(-1, named=True)
     assert (last["link_order_reason"], last["link_distance_reason"]) == (order_reason, distance_reason)
