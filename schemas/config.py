@@ -93,6 +93,13 @@ class MatchingConfig(Settings):
     link_tolerance_m: Positive = 2.0
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
+    noise_tau_s: Positive = 100.0
+    survey_correlation_m: Positive = 200.0
+    outlier_probability: Probability = 1e-4
+    outlier_scale_m: Positive = 10.0
+    step_distance_m: Positive = 10.0
+    step_time_s: Positive = 10.0
+    jump_hold_s: Positive = 30.0
 
 
 class AlignConfig(Settings):
