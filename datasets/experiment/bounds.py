@@ -1,0 +1,51 @@
+"""Exact bounds on expectations and medians of simulated times (shares have theirs in `pipeline.statistics`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import binom
+
+from pipeline.statistics import CONFIDENCE
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Mean with its standard error and bounds that hold for any distribution on the known range."""
+
+    mean: float
+    standard_error: float
+    low: float
+    high: float
+    median: float
+    median_low: float
+    median_high: float
+
+
+def expected(values: Array, least: float, greatest: float, confidence: float = CONFIDENCE) -> Expected | None:
+    """Mean and median of independent values known to lie within [least, greatest]; none without values.
+
+    Mean: empirical Bernstein bound, two-sided (Maurer and Pontil 2009, theorem 4), finite-sample.
+    Median: order statistics with binomial coverage.
+    """
+    n = values.size
+    if n < 2:
+        return None
+    mean, variance = float(values.mean()), float(values.var(ddof=1))
+    log = float(np.log(4.0 / (1.0 - confidence)))
+    half = np.sqrt(2.0 * variance * log / n) + 7.0 * (greatest - least) * log / (3.0 * (n - 1))
+    ordered = np.sort(values)
+    below = int(binom.ppf((1.0 - confidence) / 2.0, n, 0.5))
+    return Expected(
+        mean=mean,
+        standard_error=float(np.sqrt(variance / n)),
+        low=max(least, mean - float(half)),
+        high=min(greatest, mean + float(half)),
+        median=float(np.median(values)),
+        median_low=float(ordered[max(below - 1, 0)]),
+        median_high=float(ordered[min(n - below, n - 1)]),
+    )

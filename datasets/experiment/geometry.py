@@ -1,0 +1,154 @@
+"""Satellite geometries of the experiment: rows, weights, and the 3-D errors that range errors become.
+
+Place, time and skyplot of the paper are lost, so the geometry is our choice, said here: nominal
+constellations above two European places, satellite 8 (slot B4 of GPS) faulty and above the mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles
+from pipeline.monitors.sight import clock_columns, line_of_sight_rows
+
+Array = npt.NDArray[np.float64]
+Constellation = Literal["gps", "gps_galileo"]
+
+CONSTELLATIONS: tuple[Constellation, ...] = ("gps", "gps_galileo")
+FAULTY_SATELLITE = "G08"
+MASK_DEG = 5.0
+SOURCES: tuple[str, ...] = ("ionosphere", "troposphere", "orbit_clock", "user")
+# DIAG Table 1: correlation times [s] and, where they do not depend on elevation, variances [m^2].
+TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
+_ORBIT_CLOCK_M2 = 0.3
+_USER_M2 = 1.5
+# DO-229 appendix A.4.4.10.4 (obliquity) and A.4.2.4 (troposphere); 0.3 m at zenith stands for the lost value.
+_EARTH_RADIUS_KM = 6378.1363
+_IONOSPHERE_HEIGHT_KM = 350.0
+_ZENITH_IONOSPHERE_M = 0.3
+_ZENITH_TROPOSPHERE_M = 0.12
+
+
+@dataclass(frozen=True)
+class Place:
+    name: str
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+
+BRUSSELS = Place("brussels", 50.85, 4.35, 100.0)
+MADRID = Place("madrid", 40.42, -3.70, 650.0)
+PLACES: tuple[Place, ...] = (BRUSSELS, MADRID)
+_DAY_NS = int(datetime(2024, 3, 20, tzinfo=UTC).timestamp()) * 1_000_000_000
+# The default epoch: satellite 8 at 25 to 45 degrees, eight or nine GPS satellites, so that neither a
+# lucky nor a hopeless sky speaks for all; `experiment findings` gives the shares over the whole day.
+_DEFAULT_SECOND_OF_DAY = 0
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A fixed sky: satellites with azimuth and elevation [deg], range error variances R_ij [m^2] by source."""
+
+    place: str
+    t_ns: int
+    constellation: Constellation
+    svs: tuple[str, ...]
+    azimuth_deg: Array
+    elevation_deg: Array
+    range_variance_m2: Array
+    faulty: int
+
+    @property
+    def gain(self) -> Array:
+        """Range errors to east, north, up errors of the weighted least squares position, shape (3, n)."""
+        design = np.hstack([line_of_sight_rows(self.azimuth_deg, self.elevation_deg), clock_columns(self.svs)])
+        weight = 1.0 / self.range_variance_m2.sum(axis=1)
+        normal = design.T @ (weight[:, None] * design)
+        solved: Array = np.linalg.solve(normal, design.T * weight)[:3]
+        return solved
+
+    @property
+    def source_covariances_m2(self) -> Array:
+        """Covariance of the position error by source, shape (sources, 3, 3): S diag(R_j) S'."""
+        gain = self.gain
+        return np.einsum("ai,ij,bi->jab", gain, self.range_variance_m2, gain)
+
+    @property
+    def ramp_direction(self) -> Array:
+        """East, north, up error per metre of range error of the faulty satellite."""
+        direction: Array = self.gain[:, self.faulty]
+        return direction
+
+    def axes(self, heading_deg: float) -> Array:
+        """Unit vectors along, cross (left) and up, rows; heading 0 is towards the faulty satellite."""
+        course = np.radians(self.azimuth_deg[self.faulty] + heading_deg)
+        east, north = np.sin(course), np.cos(course)
+        return np.array([[east, north, 0.0], [-north, east, 0.0], [0.0, 0.0, 1.0]])
+
+
+def range_variances_m2(elevation_deg: Array) -> Array:
+    """Variances of the four range errors by elevation [m^2], shape (n, 4) (DIAG Table 1; DO-229)."""
+    elevation = np.radians(elevation_deg)
+    ratio = _EARTH_RADIUS_KM * np.cos(elevation) / (_EARTH_RADIUS_KM + _IONOSPHERE_HEIGHT_KM)
+    ionosphere = _ZENITH_IONOSPHERE_M**2 / (1.0 - ratio**2)
+    troposphere = (_ZENITH_TROPOSPHERE_M * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
+    return np.column_stack(
+        [
+            ionosphere,
+            troposphere,
+            np.full_like(elevation, _ORBIT_CLOCK_M2),
+            np.full_like(elevation, _USER_M2),
+        ]
+    )
+
+
+def geometry_at(place: Place, t_ns: int, constellation: Constellation, mask_deg: float = MASK_DEG) -> Geometry:
+    """The sky of a place; the faulty satellite must stand in it."""
+    slots = GPS if constellation == "gps" else GPS + GALILEO
+    azimuth, elevation = look_angles(
+        slots, np.array([t_ns]), place.latitude_deg, place.longitude_deg, place.height_m
+    )
+    shown = np.flatnonzero(elevation[0] >= mask_deg)
+    svs = tuple(slots[index].sv for index in shown)
+    if FAULTY_SATELLITE not in svs:
+        raise ValueError(f"{FAULTY_SATELLITE} is below the mask at {place.name}, {t_ns}")
+    return Geometry(
+        place.name,
+        t_ns,
+        constellation,
+        svs,
+        azimuth[0, shown],
+        elevation[0, shown],
+        range_variances_m2(elevation[0, shown]),
+        svs.index(FAULTY_SATELLITE),
+    )
+
+
+def epochs_of_day(place: Place, count: int, mask_deg: float = MASK_DEG) -> list[int]:
+    """`count` epochs, evenly over that part of a sidereal day in which the faulty satellite is visible."""
+    minutes = _DAY_NS + (np.arange(0.0, SIDEREAL_DAY_S, 60.0) * 1e9).astype(np.int64)
+    faulty = [slot for slot in GPS if slot.sv == FAULTY_SATELLITE]
+    _, elevation = look_angles(faulty, minutes, place.latitude_deg, place.longitude_deg, place.height_m)
+    visible = minutes[elevation[:, 0] >= mask_deg]
+    picked = ((np.arange(count) + 0.5) / count * visible.size).astype(np.int64)
+    return [int(instant) for instant in visible[picked]]
+
+
+def default_geometry(constellation: Constellation) -> Geometry:
+    """The geometry of the experiment at its own size."""
+    return geometry_at(BRUSSELS, _DAY_NS + _DEFAULT_SECOND_OF_DAY * 1_000_000_000, constellation)
+
+
+def geometries_of_day(constellation: Constellation, per_place: int = 20) -> list[Geometry]:
+    """Geometries for the shares: `per_place` epochs at each of the two places."""
+    return [
+        geometry_at(place, t_ns, constellation) for place in PLACES for t_ns in epochs_of_day(place, per_place)
+    ]
+
+

@@ -1,0 +1,196 @@
+"""What is simulated and what is asked: the grid of the experiment, and its monitors as linear forms.
+
+All that the monitors see is linear in the noise, so a monitor is a row over the basis (EWMAs of six
+signals, and the horizontal position): value = row . basis. Everything that depends on heading, reading and
+satellite geometry is in the rows; the noise path is drawn once for all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.experiment.geometry import TAUS_S, Geometry
+from datasets.experiment.sigmas import bank_sigmas
+from pipeline.align import threshold_factor
+
+Array = npt.NDArray[np.float64]
+Reading = Literal["increments", "position"]
+Sensors = Literal["odometer", "odometer_and_track"]
+
+READINGS: tuple[Reading, ...] = ("increments", "position")
+SENSORS: tuple[Sensors, ...] = ("odometer", "odometer_and_track")
+RATES_MPS: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+HEADINGS_DEG: tuple[float, ...] = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
+# The two readings of the odometer's noise and the slowest EWMA that goes with each (DOMAIN section 7).
+BANKS: dict[Reading, tuple[float, ...]] = {
+    "increments": (1.0, 0.1, 0.01, 0.001),
+    "position": (1.0, 0.1, 0.01, 0.002),
+}
+SIGNALS: tuple[str, ...] = ("east", "north", "up", "map_cross", "odometer_increments", "odometer_position")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The grid. `span_s` epochs at 1 Hz, ramp from `onset_s`, failure beyond `failure_limit_m` along the track."""
+
+    geometry: Geometry
+    headings_deg: tuple[float, ...] = HEADINGS_DEG
+    rates_mps: tuple[float, ...] = RATES_MPS
+    readings: tuple[Reading, ...] = READINGS
+    sensors: tuple[Sensors, ...] = SENSORS
+    banks: dict[Reading, tuple[float, ...]] = field(default_factory=lambda: dict(BANKS))
+    span_s: int = 15_000
+    onset_s: int = 5_000
+    failure_limit_m: float = 20.0
+    odometer_m: float = 0.05
+    map_m: float = 1.0
+    false_alarm_probability: float = 1e-7
+
+    @cached_property
+    def alphas(self) -> Array:
+        """Every EWMA weight that some reading uses; the first is the raw monitor."""
+        return np.array(sorted({alpha for bank in self.banks.values() for alpha in bank}, reverse=True))
+
+    @cached_property
+    def questions(self) -> tuple[tuple[Reading, float, Sensors], ...]:
+        """Combinations that share a noise path, in the order of the results' first axis."""
+        return tuple((r, h, s) for r in self.readings for h in self.headings_deg for s in self.sensors)
+
+    @property
+    def basis_size(self) -> int:
+        return len(SIGNALS) * self.alphas.size + 2
+
+
+@dataclass(frozen=True)
+class Forms:
+    """Monitors as linear forms; shapes (monitors, basis), (monitors, alpha index), ...
+
+    `threshold` (span, monitors) is k_T times the exact sigma at each epoch, transient included;
+    `slope` (monitors,) the final response of the EWMA to a ramp of 1 m/s; each form is turned so that
+    the ramp raises it. `members` (questions, monitors) says which monitors answer which question.
+    """
+
+    rows: Array
+    alpha: npt.NDArray[np.int64]
+    threshold: Array
+    slope: Array
+    members: npt.NDArray[np.bool_]
+    names: tuple[str, ...]
+
+
+def bank_forms(plan: Plan) -> Forms:
+    """All monitors of all headings and readings (DIAG eq. 1-3, 8, 10-16)."""
+    builder = _Builder(plan)
+    for heading in plan.headings_deg:
+        for reading in plan.readings:
+            builder.along(heading, reading)
+        if "odometer_and_track" in plan.sensors:
+            builder.cross(heading)
+    if "odometer_and_track" in plan.sensors:
+        builder.up()
+    return builder.forms()
+
+
+def failure_forms(plan: Plan) -> Forms:
+    """The along-track error itself, by heading, in units of the failure limit."""
+    count = len(plan.headings_deg)
+    rows = np.zeros((count, plan.basis_size))
+    slope = np.zeros(count)
+    for index, heading in enumerate(plan.headings_deg):
+        along = plan.geometry.axes(heading)[0]
+        towards = _towards(along @ plan.geometry.ramp_direction)
+        rows[index, -2:] = towards * along[:2]
+        slope[index] = towards * (along @ plan.geometry.ramp_direction)
+    return Forms(
+        rows,
+        np.zeros(count, dtype=np.int64),
+        np.full((1, count), plan.failure_limit_m),
+        slope,
+        np.eye(count, dtype=np.bool_),
+        tuple(f"failure_{heading:g}" for heading in plan.headings_deg),
+    )
+
+
+def _towards(slope: float) -> float:
+    return -1.0 if slope < 0 else 1.0
+
+
+class _Builder:
+    """Collects forms; the basis is [alpha, signal] with the position at the end."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._rows: list[Array] = []
+        self._alpha: list[int] = []
+        self._sigma: list[Array] = []
+        self._slope: list[float] = []
+        self._members: list[list[bool]] = []
+        self._names: list[str] = []
+
+    def along(self, heading: float, reading: Reading) -> None:
+        axis = self._plan.geometry.axes(heading)[0]
+        white = self._plan.odometer_m if reading == "increments" else 0.0
+        position = self._plan.odometer_m if reading == "position" else 0.0
+        members = [(r, h) == (reading, heading) for r, h, _ in self._plan.questions]
+        for alpha in self._plan.banks[reading]:
+            signals = {"east": axis[0], "north": axis[1], f"odometer_{reading}": -self._plan.odometer_m}
+            self._add(f"along_{reading}_{heading:g}", axis, alpha, signals, white, position, members)
+
+    def cross(self, heading: float) -> None:
+        axis = self._plan.geometry.axes(heading)[1]
+        for alpha in self._plan.alphas:
+            members = [
+                h == heading and s == "odometer_and_track" and alpha in self._plan.banks[r]
+                for r, h, s in self._plan.questions
+            ]
+            signals = {"east": axis[0], "north": axis[1], "map_cross": -self._plan.map_m}
+            self._add(f"cross_{heading:g}", axis, alpha, signals, 0.0, self._plan.map_m, members)
+
+    def up(self) -> None:
+        axis = np.array([0.0, 0.0, 1.0])
+        for alpha in self._plan.alphas:
+            members = [
+                s == "odometer_and_track" and alpha in self._plan.banks[r] for r, _, s in self._plan.questions
+            ]
+            self._add("up", axis, alpha, {"up": 1.0}, 0.0, self._plan.map_m, members)
+
+    def _add(
+        self,
+        name: str,
+        axis: Array,
+        alpha: float,
+        signals: dict[str, float],
+        white_m: float,
+        position_m: float,
+        members: list[bool],
+    ) -> None:
+        plan = self._plan
+        index = int(np.flatnonzero(plan.alphas == alpha)[0])
+        slope = float(axis @ plan.geometry.ramp_direction)
+        row = np.zeros(plan.basis_size)
+        for signal, factor in signals.items():
+            row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _towards(slope)
+        variances = np.einsum("a,jab,b->j", axis, plan.geometry.source_covariances_m2, axis)
+        sigma = bank_sigmas(np.array([alpha]), plan.span_s, variances, TAUS_S, white_m, position_m)[:, 0]
+        self._rows.append(row)
+        self._alpha.append(index)
+        self._sigma.append(sigma)
+        self._slope.append(abs(slope))
+        self._members.append(members)
+        self._names.append(f"{name}_{'raw' if alpha == 1.0 else f'{alpha:g}'}")
+
+    def forms(self) -> Forms:
+        factor = threshold_factor(self._plan.false_alarm_probability)
+        return Forms(
+            np.array(self._rows),
+            np.array(self._alpha),
+            factor * np.column_stack(self._sigma),
+            np.array(self._slope),
+            np.array(self._members).T,
+            tuple(self._names),
+        )

@@ -1,0 +1,58 @@
+"""Exact standard deviations of EWMA monitors at a constant rate, from the recursion of the replay's own bank."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.monitors.recursion import AxisState, ewma_weight, variance_of_ewma
+
+Array = npt.NDArray[np.float64]
+
+
+def bank_sigmas(
+    alphas: Array,
+    epochs: int,
+    variances_m2: Array,
+    taus_s: Array,
+    white_m: float,
+    position_white_m: float,
+    rate_hz: float = 1.0,
+) -> Array:
+    """Sigma of the EWMAs of a rate [m/s], epochs after a restart by alphas (DOMAIN section 3).
+
+    `variances_m2`, `taus_s`: Gauss-Markov errors of the position along the axis. `white_m`: white noise on
+    increments over 1 s, growing with the root of the step; `position_white_m`: white noise on position,
+    which is a Gauss-Markov error with no memory. Alpha 1 is the raw monitor.
+    """
+    dt_s = np.full(epochs, 1.0 / rate_hz)
+    weight = ewma_weight(alphas, dt_s)
+    variance = np.append(variances_m2, position_white_m**2)
+    decorrelation = np.append(-np.expm1(-1.0 / (rate_hz * taus_s)), 1.0)
+    result, _ = variance_of_ewma(
+        1.0 - weight,
+        weight / dt_s[:, None],
+        np.broadcast_to(variance, (epochs, variance.size)),
+        np.broadcast_to(decorrelation, (epochs, variance.size)),
+        np.full(epochs, white_m**2 / rate_hz),
+        AxisState.at_restart(alphas.size, variance.size),
+    )
+    return np.sqrt(result)
+
+
+def limit_sigmas(
+    alphas: Array,
+    variances_m2: Array,
+    taus_s: Array,
+    white_m: float,
+    position_white_m: float,
+    rate_hz: float = 1.0,
+) -> Array:
+    """The same long after the restart: the closed form of DOMAIN section 3, for any alpha in (0, 1]."""
+    alpha = 1.0 - (1.0 - alphas) ** (1.0 / rate_hz)
+    keep = 1.0 - alpha[:, None]
+    variance = np.append(variances_m2, position_white_m**2)
+    loss = np.append(-np.expm1(-1.0 / (rate_hz * taus_s)), 1.0)
+    sources = 2.0 * variance * loss - 2.0 * variance * loss**2 * keep / (1.0 - keep * (1.0 - loss))
+    total = sources.sum(axis=1) + white_m**2 / rate_hz
+    return np.asarray(np.sqrt(rate_hz**2 * alpha / (2.0 - alpha) * total))

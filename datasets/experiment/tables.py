@@ -1,0 +1,27 @@
+"""Results of an experiment on disk: one Parquet per table and the settings that made them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import polars as pl
+
+from schemas.errors import OutputError
+
+
+def write_tables(out: Path, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, object]) -> list[Path]:
+    """`NAME.parquet` for every table and `settings.json`; the same content gives the same bytes."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        written = []
+        for name, frame in tables.items():
+            path = out / f"{name}.parquet"
+            frame.write_parquet(path, compression="zstd", statistics=False)
+            written.append(path)
+        path = out / "settings.json"
+        path.write_text(json.dumps(dict(settings), indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(out)) from None
+    return [*written, path]
