@@ -76,9 +76,7 @@ def hours_to_substantiate(rate_per_h: float, events: int = 0, confidence: float 
     return float(gammaincinv(events + 1, confidence)) / rate_per_h
 
 
-def hours_still_needed(
-    rate_per_h: float, events: int, exposure_h: float, confidence: float = CONFIDENCE
-) -> float:
+def hours_still_needed(rate_per_h: float, events: int, exposure_h: float, confidence: float = CONFIDENCE) -> float:
     """Hours [h] still to be run without a further event, after `events` in `exposure_h`."""
     return max(0.0, hours_to_substantiate(rate_per_h, events, confidence) - exposure_h)
 

@@ -1,5 +1,7 @@
 """Bounds against printed values, against scipy.stats, and by their coverage of a known truth."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -70,8 +72,8 @@ def test_all_or_none_of_the_trials() -> None:
 
 
 @pytest.mark.parametrize("call", [lambda: poisson_rate(-1, 1.0), lambda: clopper_pearson(3, 2)])
-def test_impossible_counts_are_refused(call) -> None:
-    with pytest.raises(ValueError, match="events|successes"):
+def test_impossible_counts_are_refused(call: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match=r"events|successes"):
         call()
 
 

@@ -1,0 +1,62 @@
+"""Small tables that meet their contract, from the columns a test is about."""
+
+from typing import Any
+
+import dataframely as dy
+import polars as pl
+
+from schemas.tables import Alarms, Epochs, Hazards, Passages
+
+_DEFAULTS: dict[type, Any] = {dy.Bool: False, dy.String: "x", dy.List: [], dy.Int64: 0}
+NS = 1_000_000_000
+
+
+def table(schema: type[dy.Schema], height: int, **columns: Any) -> pl.DataFrame:
+    """`height` rows; a column not given is null, or the plainest value where it must not be null."""
+    unknown = columns.keys() - schema.columns().keys()
+    assert not unknown, unknown
+    values = {}
+    for name, column in schema.columns().items():
+        given = columns.get(name, None if column.nullable else _plain(column))
+        whole = isinstance(given, list) and not (isinstance(column, dy.List) and name not in columns)
+        values[name] = given if whole else [given] * height
+    dtypes = {name: column.dtype for name, column in schema.columns().items()}
+    return schema.validate(pl.DataFrame(values, schema=dtypes))
+
+
+def _plain(column: dy.Column) -> Any:
+    if isinstance(column, dy.Enum):
+        return next(iter(column.categories))
+    if isinstance(column, dy.Datetime):
+        return 0
+    return next(value for kind, value in _DEFAULTS.items() if isinstance(column, kind))
+
+
+def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
+    """Epochs on the track with all in order, unless said otherwise."""
+    good: dict[str, Any] = {
+        "t": [round(t * NS) for t in t_s],
+        "path_m": [20.0 * t for t in t_s],
+        "odometer_m": [20.0 * t for t in t_s],
+        "speed_mps": 20.0,
+        "direction": 1,
+        "on_track": True,
+        "gate_probability": 1.0,
+        "confidence_m": 8.0,
+        "error_along_m": 0.0,
+        "tvb": True,
+        "lds_state": "P0",
+    }
+    return table(Epochs, len(t_s), **(good | columns))
+
+
+def passages(height: int = 0, **columns: Any) -> pl.DataFrame:
+    return table(Passages, height, **columns)
+
+
+def hazards(height: int = 0, **columns: Any) -> pl.DataFrame:
+    return table(Hazards, height, **columns)
+
+
+def alarms(height: int = 0, **columns: Any) -> pl.DataFrame:
+    return table(Alarms, height, **columns)

@@ -1,0 +1,367 @@
+"""The `runs` row from small tables whose figures are worked by hand."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.clean import StreamCounts
+from pipeline.summary import Alignment, Provenance, SolutionResults, failed_row, summarise
+from schemas.config import Configuration, HazardConfig, LdsConfig
+from schemas.enums import Evidence
+from schemas.run import IngestNotes
+from schemas.tables import CONTRACT_VERSION, Runs
+from tests.summary.tables import NS, alarms, epochs, hazards, passages
+
+PROVENANCE = Provenance("c" * 64, "i" * 64, "balise 0.1.0")
+CONFIG = Configuration()
+
+
+def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
+    empty = SolutionResults("primary", frame, passages(), hazards(), alarms(), evidence=Evidence.REFERENCE)
+    return replace(empty, **fields)
+
+
+def row(frame: pl.DataFrame, config: Configuration = CONFIG, **fields: Any) -> dict[str, Any]:
+    summary = summarise(results(frame, **fields), config, PROVENANCE)
+    assert summary.height == 1
+    return summary.row(0, named=True)
+
+
+def seconds(count: int) -> list[float]:
+    return [float(k) for k in range(count)]
+
+
+def test_columns_are_those_of_the_contract_in_order() -> None:
+    summary = summarise(results(epochs(seconds(3))), CONFIG, PROVENANCE)
+    assert summary.columns == list(Runs.columns())
+    assert summary.schema == failed_row("x", PROVENANCE).schema
+
+
+def test_a_clean_minute() -> None:
+    found = row(epochs(seconds(61), cross_track_m=0.4))
+    assert found["status"] == "ok"
+    assert (found["duration_s"], found["distance_m"], found["epochs"]) == (60.0, 1200.0, 61)
+    assert (found["gnss_rate_hz"], found["availability"], found["outages"]) == (1.0, 1.0, 0)
+    assert (found["longest_outage_s"], found["cross_bias_m"]) == (0.0, 0.4)
+    assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (0, 0.0)
+    assert found["false_alarm_rate_high_per_h"] == pytest.approx(3.6889 * 60, rel=1e-4)
+    assert [found[f"share_p{k}"] for k in range(4)] == [1.0, 0.0, 0.0, 0.0]
+    assert (found["mtbf_h"], found["continuity_15s"]) == (None, None)
+    assert (found["config_digest"], found["input_digest"]) == ("c" * 64, "i" * 64)
+    assert (found["software"], found["contract"]) == ("balise 0.1.0", CONTRACT_VERSION)
+
+
+def test_nothing_at_all_is_a_row_without_figures() -> None:
+    found = row(epochs([]), evidence=None)
+    numbers = {name for name, column in Runs.columns().items() if column.dtype == pl.Float64}
+    assert {name for name in numbers if found[name] is not None} == set()
+    assert found["epochs"] == found["outages"] == found["alarms"] == 0
+    assert found["t_start"] is None
+
+
+def test_one_epoch() -> None:
+    found = row(epochs([5.0]))
+    assert (found["duration_s"], found["gnss_rate_hz"], found["availability"]) == (0.0, None, None)
+    assert found["false_alarm_rate_per_h"] is None
+
+
+def test_a_failed_run() -> None:
+    found = failed_row("run.mcap: no topic /gnss", PROVENANCE).row(0, named=True)
+    assert (found["status"], found["error"], found["solution"]) == ("failed", "run.mcap: no topic /gnss", "")
+    assert (found["epochs"], found["missed_detections"], found["false_alarms"]) == (0, 0, None)
+    assert found["availability"] is None
+
+
+def test_damaged_input_is_partial() -> None:
+    notes = IngestNotes(partial_until_ns=42 * NS, damage="chunk 7 is cut off", skipped_topics=("/diag",))
+    found = row(epochs(seconds(3)), ingest=notes, notes=("map 12 m off",))
+    assert (found["status"], found["error"]) == ("partial", "chunk 7 is cut off")
+    assert found["partial_until"].timestamp() == 42.0
+    assert found["notes"] == "topics not used: /diag; map 12 m off"
+
+
+def test_what_cleaning_and_alignment_found() -> None:
+    found = row(
+        epochs(seconds(3)),
+        counts=StreamCounts(duplicates=4, out_of_order=2),
+        alignment=Alignment(0.08, 0.01, 1.004, 2e-4),
+        ambiguous_stretches=3,
+    )
+    assert (found["duplicates"], found["out_of_order"], found["ambiguous_stretches"]) == (4, 2, 3)
+    assert (found["latency_s"], found["latency_sigma_s"]) == (0.08, 0.01)
+    assert (found["odometer_scale"], found["odometer_scale_sigma"]) == (1.004, 2e-4)
+
+
+class TestOutages:
+    def test_missing_epochs(self) -> None:
+        found = row(epochs([0, 1, 2, 5, 6, 7, 27, 28]))
+        assert (found["outages"], found["longest_outage_s"]) == (2, 20.0)
+
+    def test_epochs_without_a_position_or_off_the_track(self) -> None:
+        path: list[Any] = [20.0 * t for t in range(10)]
+        path[3:5] = [None, None]
+        on_track = [True] * 7 + [False] + [True] * 2
+        found = row(epochs(seconds(10), path_m=path, on_track=on_track))
+        assert (found["outages"], found["longest_outage_s"]) == (2, 3.0)
+
+    def test_from_the_first_epoch_and_to_the_last(self) -> None:
+        path = [None, None, None, 60.0, 80.0, None, None]
+        found = row(epochs(seconds(7), path_m=path))
+        assert (found["outages"], found["longest_outage_s"]) == (2, 3.0)
+
+    def test_all_the_run(self) -> None:
+        found = row(epochs(seconds(11), path_m=[None] * 11, tvb=False))
+        assert (found["outages"], found["longest_outage_s"], found["availability"]) == (1, 10.0, 0.0)
+
+    @pytest.mark.parametrize(("gap_s", "expected"), [(0.3, 0), (1.0, 0), (1.1, 1)])
+    def test_limit_at_ten_hertz_is_one_second(self, gap_s: float, expected: int) -> None:
+        t = [k / 10 for k in range(20)]
+        assert row(epochs([*t, *(t[-1] + gap_s + k / 10 for k in range(20))]))["outages"] == expected
+
+    @pytest.mark.parametrize(("gap_s", "expected"), [(7.5, 0), (7.6, 1)])
+    def test_limit_of_a_slow_log_is_one_and_a_half_periods(self, gap_s: float, expected: int) -> None:
+        t = [5.0 * k for k in range(10)]
+        assert row(epochs([*t, *(t[-1] + gap_s + 5.0 * k for k in range(10))]))["outages"] == expected
+
+    def test_limit_is_never_beyond_the_reset_of_the_bank(self) -> None:
+        assert row(epochs([100.0 * k for k in range(4)]))["outages"] == 3
+
+
+class TestAvailability:
+    def test_share_of_time_not_of_epochs(self) -> None:
+        """20 s at 1 Hz with a TVB, then a second at 10 Hz without one: 20/21."""
+        t = [*seconds(21), *(20 + k / 10 for k in range(1, 11))]
+        tvb = [True] * 20 + [False] * 11
+        assert row(epochs(t, tvb=tvb))["availability"] == pytest.approx(20 / 21)
+
+    def test_standing_does_not_count(self) -> None:
+        odometer = [20.0 * min(k, 10) for k in range(31)]
+        tvb = [k < 5 for k in range(31)]
+        assert row(epochs(seconds(31), odometer_m=odometer, tvb=tvb))["availability"] == pytest.approx(0.5)
+
+    def test_a_train_that_never_moved(self) -> None:
+        assert row(epochs(seconds(9), odometer_m=5.0, speed_mps=0.0))["availability"] is None
+
+    def test_gap_while_moving_is_without_a_tvb(self) -> None:
+        assert row(epochs([*seconds(11), *(30.0 + k for k in range(11))]))["availability"] == pytest.approx(20 / 40)
+
+    def test_odometer_unknown_speed_known(self) -> None:
+        speed = [10.0] * 4 + [0.1] * 7
+        tvb = [True] * 3 + [False] * 8
+        found = row(epochs(seconds(11), odometer_m=None, speed_mps=speed, tvb=tvb))
+        assert found["availability"] == pytest.approx(3 / 4)
+
+
+class TestDistance:
+    def test_there_and_back_by_the_odometer(self) -> None:
+        assert row(epochs(seconds(5), odometer_m=[0.0, 20.0, None, 40.0, 10.0]))["distance_m"] == 70.0
+
+    def test_without_odometer_noise_at_a_stop_adds_nothing(self) -> None:
+        path = [0.0, 10.0, 20.0, 20.6, 19.7, 20.2, 19.8, 30.0, 40.0]
+        direction = [1, 1, 1, None, None, None, None, 1, 1]
+        found = row(epochs(seconds(9), odometer_m=None, path_m=path, direction=direction))
+        assert found["distance_m"] == 40.0
+
+    def test_without_odometer_there_and_back(self) -> None:
+        path = [0.0, 10.0, 20.0, 21.0, 11.0, 1.0]
+        found = row(epochs(seconds(6), odometer_m=None, path_m=path, direction=[1, 1, 1, -1, -1, -1]))
+        assert found["distance_m"] == 40.0
+
+
+class TestShares:
+    def test_by_time_with_gaps_apart(self) -> None:
+        """States hold to the next epoch; the 10 s gap and the last epoch count for nothing: 2, 1, 4, 1 of 8 s."""
+        t = [0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0]
+        state = ["P0", "P0", "P1", "P3", "P2", "P2", "P2", "P2", "P3", "P0"]
+        found = row(epochs(t, lds_state=state))
+        assert [found[f"share_p{k}"] for k in range(4)] == [2 / 8, 1 / 8, 4 / 8, 1 / 8]
+
+    def test_without_truth_only_the_negated_and_undiagnosed_are_known(self) -> None:
+        state = [None, None, None, "P2", "P3", "P3", None, None, None]
+        found = row(epochs(seconds(9), lds_state=state, error_along_m=None), evidence=None)
+        assert [found[f"share_p{k}"] for k in range(4)] == [None, None, 1 / 8, 2 / 8]
+
+    def test_truth_lost_for_a_while_is_missing_from_the_sum(self) -> None:
+        state = ["P0", "P0", None, None, "P0"]
+        found = row(epochs(seconds(5), lds_state=state))
+        assert [found[f"share_p{k}"] for k in range(4)] == [0.5, 0.0, 0.0, 0.0]
+
+
+def test_errors_of_the_positions() -> None:
+    errors = [-30.0, *([1.0] * 18), 2.0, None]
+    found = row(epochs(seconds(21), error_along_m=errors, error_cross_m=-0.5))
+    assert found["along_error_mean_m"] == pytest.approx(-0.5)
+    assert found["along_error_p95_m"] == pytest.approx(2.0 + 0.05 * 28.0)
+    assert (found["along_error_max_m"], found["cross_error_mean_m"]) == (30.0, -0.5)
+    assert (found["cross_error_max_m"], found["up_error_max_m"]) == (0.5, None)
+
+
+def test_stanford_counts_and_their_edges() -> None:
+    """Limit 14 m: each row is one error with its confidence; equality is on the safe side."""
+    cases = [
+        (0.0, 8.0, "nominal"),
+        (-8.0, 8.0, "nominal"),
+        (14.0, 14.0, "nominal"),
+        (-8.1, 8.0, "misleading"),
+        (14.0, 8.0, "misleading"),
+        (14.1, 14.0, "hazardous"),
+        (-200.0, 1.0, "hazardous"),
+        (0.0, 14.1, "unavailable"),
+        (90.0, 14.1, "unavailable"),
+        (None, 8.0, None),
+        (1.0, None, None),
+    ]
+    found = row(epochs(seconds(11), error_along_m=[c[0] for c in cases], confidence_m=[c[1] for c in cases]))
+    for region in ("nominal", "misleading", "hazardous", "unavailable"):
+        assert found[f"stanford_{region}"] == sum(c[2] == region for c in cases), region
+
+
+STATUS = ("accepted", "accepted", "accepted", "rejected_window", "rejected_monitor", "missed", "not_available")
+
+
+class TestBalises:
+    def test_counts_are_of_virtual_balises(self) -> None:
+        kind = ["virtual"] * 7 + ["physical"] * 7
+        found = row(epochs(seconds(3)), passages=passages(14, kind=kind, status=[*STATUS, *STATUS]))
+        assert found["balises_on_path"] == 7
+        assert (found["balises_accepted"], found["balises_rejected"]) == (3, 2)
+        assert (found["balises_missed"], found["balises_not_available"]) == (1, 1)
+
+    def test_an_offer_that_no_crossing_belongs_to_is_no_passage(self) -> None:
+        frame = passages(
+            3, t_offered=[1, 2, None], t_true=[1, None, 3], location_error_m=[0.1, 300.0, None],
+            status=["accepted", "rejected_window", "missed"],
+        )  # fmt: skip
+        assert row(epochs(seconds(3)), passages=frame)["balises_on_path"] == 2
+
+    def test_unsafe_beyond_the_failure_limit_either_way(self) -> None:
+        frame = passages(
+            5,
+            status=["accepted", "accepted", "accepted", "accepted", "rejected_window"],
+            location_error_m=[20.0, -20.1, 31.0, None, 400.0],
+        )
+        found = row(epochs(seconds(3)), passages=frame)
+        assert found["unsafe_accepted"] == 2
+        assert found["location_error_mean_m"] == pytest.approx(10.3)
+        assert found["location_error_max_m"] == 31.0
+        wide = Configuration(hazards=HazardConfig(failure_limit_m=25.0))
+        assert row(epochs(seconds(3)), wide, passages=frame)["unsafe_accepted"] == 1
+
+
+class TestHazards:
+    def test_classes_and_largest(self) -> None:
+        frame = hazards(
+            4,
+            hazard=["VB_JUMP_1A", "VB_SHIFT", "VB_SHIFT", "VB_JUMP_1B"],
+            detected=[True, True, False, True],
+            within_budget=[True, False, None, True],
+            time_to_detect_s=[0.0, 9.5, None, 0.0],
+            time_since_failure_s=[-2.0, 3.0, None, None],
+            hazardous_s=[0.0, 4.0, 60.0, None],
+        )
+        found = row(epochs(seconds(3)), hazards=frame)
+        assert [found[f"hazards_{kind}"] for kind in ("1a", "1b", "shift")] == [1, 1, 2]
+        assert (found["hazards_detected"], found["hazards_within_budget"]) == (3, 2)
+        assert (found["time_to_detect_max_s"], found["time_since_failure_max_s"]) == (9.5, 3.0)
+        assert found["hazardous_max_s"] == 60.0
+
+    def test_missed_detection(self) -> None:
+        """Failure at 10 s, budget 1.675 s: negation up to 11.675 s is in time, later or never is not."""
+        negated = [9.0, 10.0, 11.675, 11.676, 60.0, None]
+        frame = hazards(
+            7,
+            t_failure=[10 * NS] * 6 + [None],
+            t_negated=[None if t is None else round(t * NS) for t in negated] + [None],
+            budget_s=1.675,
+        )
+        assert row(epochs(seconds(3)), hazards=frame)["missed_detections"] == 3
+
+    def test_unknown_budget_is_no_leave(self) -> None:
+        frame = hazards(1, t_failure=[10 * NS], t_negated=[11 * NS], budget_s=None)
+        assert row(epochs(seconds(3)), hazards=frame)["missed_detections"] == 1
+
+
+HOUR = seconds(3601)
+
+
+class TestFalseAlarms:
+    def test_rate_with_exact_bounds(self) -> None:
+        found = row(epochs(HOUR), alarms=alarms(3, verdict=["false", "true", "false"]))
+        assert (found["alarms"], found["false_alarms"], found["false_alarm_rate_per_h"]) == (3, 2, 2.0)
+        assert found["false_alarm_rate_low_per_h"] == pytest.approx(0.2422, abs=5e-5)
+        assert found["false_alarm_rate_high_per_h"] == pytest.approx(7.2247, abs=5e-5)
+
+    def test_not_known_without_truth(self) -> None:
+        found = row(epochs(HOUR, error_along_m=None), evidence=None, alarms=alarms(1, verdict="unknown"))
+        assert (found["alarms"], found["false_alarms"], found["false_alarm_rate_per_h"]) == (1, None, None)
+
+    def test_no_rate_while_an_alarm_is_not_judged(self) -> None:
+        found = row(epochs(HOUR), alarms=alarms(2, verdict=["false", "unknown"]))
+        assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (1, None)
+
+
+class TestContinuity:
+    def test_time_between_losses_of_trusted_positions(self) -> None:
+        """Up 100 s, lost for 10 s, up 290 s, doubtful for 20 s, up 80 s: 470 s of up time over two losses."""
+        confidence = [8.0 if not 100 < k < 110 else 15.0 for k in range(501)]
+        probability = [1.0 if not 400 < k < 420 else 0.5 for k in range(501)]
+        found = row(epochs(seconds(501), confidence_m=confidence, gate_probability=probability))
+        assert found["outages"] == 0
+        assert found["mtbf_h"] == pytest.approx(470 / 2 / 3600)
+        assert found["continuity_15s"] == pytest.approx(math.exp(-15 / 235))
+
+    def test_waiting_for_the_first_position_is_no_loss(self) -> None:
+        confidence: list[Any] = [None] * 20 + [8.0] * 20
+        found = row(epochs(seconds(40), confidence_m=confidence))
+        assert found["mtbf_h"] is None
+
+    def test_lost_to_the_end(self) -> None:
+        confidence: list[Any] = [8.0] * 21 + [None] * 20
+        assert row(epochs(seconds(41), confidence_m=confidence))["mtbf_h"] == pytest.approx(20 / 3600)
+
+    def test_limit_is_configuration(self) -> None:
+        strict = Configuration(lds=LdsConfig(ci_limit_m=5.0))
+        assert row(epochs(seconds(41)), strict)["mtbf_h"] is None
+        assert row(epochs(seconds(41)), strict)["stanford_unavailable"] == 41
+
+
+def test_exposure() -> None:
+    exposure = [None, *(float(k) for k in range(101))]
+    found = row(epochs(seconds(102), exposure_s=exposure))
+    assert (found["exposure_max_s"], found["exposure_p99_s"]) == (100.0, 99.0)
+
+
+@given(shift=st.integers(-(10**9), 10**9))
+def test_shifting_all_times_changes_nothing_else(shift: int) -> None:
+    t = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
+    plain, moved = row(epochs(t)), row(epochs([x + shift for x in t]))
+    assert {k: v for k, v in plain.items() if k not in {"t_start", "t_end"}} == {
+        k: v for k, v in moved.items() if k not in {"t_start", "t_end"}
+    }
+
+
+@given(st.data())
+def test_shares_and_availability_are_shares(data: st.DataObject) -> None:
+    t = sorted(data.draw(st.sets(st.integers(0, 400), min_size=0, max_size=30)))
+    n = len(t)
+    column = lambda values: data.draw(st.lists(values, min_size=n, max_size=n))  # noqa: E731
+    frame = epochs(
+        [k / 4 for k in t],
+        lds_state=column(st.sampled_from(["P0", "P1", "P2", "P3", None])),
+        tvb=column(st.booleans()),
+        path_m=column(st.none() | st.floats(-1e4, 1e4)),
+        odometer_m=column(st.none() | st.floats(-1e4, 1e4)),
+        confidence_m=column(st.none() | st.floats(0, 50)),
+        error_along_m=column(st.none() | st.floats(-50, 50)),
+    )
+    found = row(frame)
+    known = [found[f"share_p{k}"] for k in range(4) if found[f"share_p{k}"] is not None]
+    assert sum(known) <= 1.0 + 1e-9
+    assert found["availability"] is None or 0.0 <= found["availability"] <= 1.0
+    both = frame.filter(pl.col("error_along_m").is_not_null() & pl.col("confidence_m").is_not_null()).height
+    assert both == sum(found[f"stanford_{r}"] for r in ("nominal", "misleading", "hazardous", "unavailable"))
