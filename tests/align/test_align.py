@@ -1,0 +1,123 @@
+"""Scale and latency known or learned causally: synthetic runs with the answer known before."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from pipeline.align import BEYOND_SPAN, NO_ODOMETER, align, threshold_factor
+from pipeline.monitors.bank import MonitorBank
+from schemas.config import Configuration, Vehicle
+from tests.align.straight import Straight, run
+
+CONFIG = Configuration()
+FACTOR = threshold_factor(1e-7)
+REAL = Straight(scale=1.004, latency_s=0.08)
+
+
+def alarms(aligned):
+    bank = MonitorBank(aligned, {}, CONFIG, FACTOR)
+    return [k for k in range(aligned.height) if bank.failed(k)]
+
+
+def seconds(aligned, epoch):
+    return aligned["t"].dt.timestamp("ns")[epoch] * 1e-9
+
+
+def test_threshold_factor_is_the_two_sided_quantile():
+    assert threshold_factor(1e-7) == pytest.approx(5.3267, abs=5e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_clean_run_without_vehicle_file_raises_no_alarm_and_finds_the_scale(seed):
+    aligned = align(*run(REAL, seed), Vehicle(), CONFIG)
+    assert alarms(aligned) == []
+    scale, scale_sigma, latency_s, latency_sigma_s = aligned.select(
+        "odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"
+    ).row(-1)
+    assert scale == pytest.approx(1.004, abs=1e-3)
+    assert abs(scale - 1.004) < 5 * scale_sigma
+    assert abs(latency_s - 0.08) < 4 * latency_sigma_s
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("rate_mps", [0.5, -0.5])
+def test_a_drift_after_five_kilometres_is_detected_before_the_position_failure(seed, rate_mps):
+    begin_s = 200.0
+    aligned = align(*run(REAL, seed, lambda t: rate_mps * np.maximum(t - begin_s, 0.0)), Vehicle(), CONFIG)
+    assert aligned["path_m"].filter(aligned["t"].dt.timestamp("ns") < begin_s * 1e9)[-1] > 5_000.0
+    first = alarms(aligned)[0]
+    assert begin_s <= seconds(aligned, first) < begin_s + 20.0 / abs(rate_mps)
+
+
+def test_scale_error_and_latency_would_alarm_if_they_were_taken_as_zero():
+    wrong = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
+    assert alarms(align(*run(REAL, 1), wrong, CONFIG))
+
+
+def test_the_vehicle_file_is_used_as_it_is():
+    vehicle = Vehicle(odometer_scale=1.004, odometer_scale_sigma=2e-4, gnss_latency_s=0.08, gnss_latency_sigma_s=0.01)
+    aligned = align(*run(REAL, 2), vehicle, CONFIG)
+    assert aligned["odometer_scale"].unique().to_list() == [1.004]
+    assert aligned["scale_sigma"].unique().to_list() == [2e-4]
+    assert aligned["latency_s"].unique().to_list() == [0.08]
+    assert alarms(aligned) == []
+
+
+def test_estimates_use_the_past_only():
+    epochs, odometer = run(REAL, 3)
+    whole = align(epochs, odometer, Vehicle(), CONFIG)
+    cut = 3_000
+    end = epochs["t"][cut]
+    part = align(epochs[:cut], odometer.filter(pl.col("t") <= end), Vehicle(), CONFIG)
+    names = ["odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"]
+    assert_frame_equal(part.select(names), whole[:cut].select(names), check_exact=True)
+
+
+def test_learning_stands_still_under_an_alarm_that_persists():
+    aligned = align(*run(REAL, 4, lambda t: np.where(t >= 300.0, 45.0, 0.0)), Vehicle(), CONFIG)
+    after = aligned.filter(pl.col("t").dt.timestamp("ns") >= 300 * 10**9)
+    assert after["odometer_scale"].n_unique() == 1
+    assert after["odometer_scale"][0] == pytest.approx(1.004, abs=1e-3)
+
+
+def test_learning_goes_on_after_a_jump_there_and_back():
+    aligned = align(*run(REAL, 5, lambda t: np.where((t >= 300.0) & (t < 303.0), 500.0, 0.0)), Vehicle(), CONFIG)
+    after = aligned.filter(pl.col("t").dt.timestamp("ns") >= 400 * 10**9)
+    assert after["odometer_scale"].n_unique() > 10
+    assert aligned["odometer_scale"][-1] == pytest.approx(1.004, abs=1e-3)
+
+
+def test_an_odometer_that_falls_while_the_path_grows_is_turned_round():
+    plain = align(*run(Straight(), 6), Vehicle(), CONFIG)
+    turned = align(*run(Straight(polarity=-1), 6), Vehicle(), CONFIG)
+    names = ["odometer_scale", "odometer_m", "speed_mps", "direction"]
+    assert_frame_equal(plain.select(names), turned.select(names), abs_tol=1e-9, rel_tol=0.0)
+
+
+def test_epochs_beyond_the_odometer_say_so():
+    epochs, odometer = run(Straight(duration_s=100.0), 7)
+    aligned = align(epochs, odometer.filter(pl.col("t").dt.timestamp("ns") < 60 * 10**9), Vehicle(), CONFIG)
+    late = aligned.filter(pl.col("t").dt.timestamp("ns") > 61 * 10**9)
+    assert late["odometer_reason"].unique().to_list() == [BEYOND_SPAN]
+    assert late["odometer_m"].null_count() == late.height
+
+
+def test_without_odometer_speed_comes_from_positions():
+    epochs, _ = run(Straight(duration_s=200.0, sigma_m=0.01), 8)
+    aligned = align(epochs, None, Vehicle(), CONFIG)
+    assert aligned["odometer_reason"].unique().to_list() == [NO_ODOMETER]
+    assert aligned["odometer_m"].null_count() == aligned.height
+    assert aligned["speed_mps"][-1] == pytest.approx(40.0, abs=0.2)
+
+
+def test_time_may_start_anywhere():
+    epochs, odometer = run(REAL, 9)
+    shift = pl.duration(days=400)
+    later = align(
+        epochs.with_columns(pl.col("t") + shift), odometer.with_columns(pl.col("t") + shift), Vehicle(), CONFIG
+    )
+    plain = align(epochs, odometer, Vehicle(), CONFIG)
+    assert_frame_equal(plain.drop("t"), later.drop("t"), check_exact=True)

@@ -1,0 +1,59 @@
+"""The odometer as a function of time: hand-worked tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.odometer import odometer_track, polarity
+from tests.align.straight import odometer_of
+
+
+def test_distance_is_interpolated_and_never_extrapolated():
+    track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=[100.0, 110.0, 130.0]), 1.0, 0.05)
+    at = np.array([-0.1, 0.0, 0.5, 1.5, 2.0, 2.1])
+    assert track.known_at(at).tolist() == [False, True, True, True, True, False]
+    np.testing.assert_allclose(track.distance_at(at)[1:5], [0.0, 5.0, 20.0, 30.0])
+
+
+def test_speed_alone_is_integrated_and_lost_over_a_pause():
+    frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], speed_mps=[10.0, 12.0, 10.0, 10.0, 10.0])
+    track = odometer_track(frame, 1.0, 0.05)
+    np.testing.assert_allclose(track.distance_m, [0.0, 5.5, 11.0, 11.0, 16.0])
+    assert track.stretch.tolist() == [0, 0, 0, 1, 1]
+    assert track.known_at(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
+
+
+def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
+    frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], distance_m=[0.0, 5.0, 10.0, 50.0, 55.0])
+    track = odometer_track(frame, 1.0, 0.05)
+    assert track.stretch.tolist() == [0, 0, 0, 0, 0]
+    assert track.known_at(np.array([1.0, 3.0, 5.0])).tolist() == [True, False, True]
+    np.testing.assert_allclose(track.distance_at(np.array([5.0])), 50.0)
+
+
+def test_reported_slip_is_no_distance():
+    frame = odometer_of([0.0, 0.5, 1.0, 1.5], distance_m=[0.0, 5.0, 20.0, 25.0], slip=[False, False, True, False])
+    track = odometer_track(frame, 1.0, 0.05)
+    assert track.known_at(np.array([0.2, 0.7, 1.2, 1.5])).tolist() == [True, False, False, True]
+    assert track.stretch[0] != track.stretch[3]
+
+
+def test_a_noisier_odometer_than_configured_counts():
+    frame = odometer_of([0.0, 0.5, 1.0], speed_mps=[10.0, 10.0, 10.0]).with_columns(sigma_speed_mps=0.4)
+    assert odometer_track(frame, 1.0, 0.05).white_rate_m2_per_s == pytest.approx(0.4**2 * 0.5)
+    assert odometer_track(frame.with_columns(sigma_speed_mps=0.01), 1.0, 0.05).white_rate_m2_per_s == 0.05**2
+
+
+@pytest.mark.parametrize(
+    ("reads", "expected"), [([0.0, 15.0, 30.0], 1), ([0.0, -15.0, -30.0], -1), ([0.0, 0.0, 0.0], 1)]
+)
+def test_polarity_comes_from_the_first_twenty_metres(reads, expected):
+    track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=reads), 1.0, 0.05)
+    t = np.array([0.0, 1.0, 2.0])
+    assert polarity(track, t, np.array([500.0, 515.0, 530.0]), 20.0) == expected
+
+
+def test_speed_is_the_mean_over_the_second_before():
+    track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 30.0]), 1.0, 0.05)
+    np.testing.assert_allclose(track.speed_at(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 20.0, 15.0])

@@ -1,0 +1,184 @@
+"""The bank as the LDS sees it: states with reasons, gaps, restarts, borders; hand-worked where numbers count."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.align import NO_ODOMETER, align, threshold_factor
+from pipeline.monitors.bank import MonitorBank
+from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
+from pipeline.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor
+from schemas.config import Configuration, Vehicle
+from schemas.tables import BANK_MONITORS
+from tests.align.straight import Straight, epochs_of, odometer_of, run
+
+CONFIG = Configuration()
+FACTOR = threshold_factor(1e-7)
+KNOWN = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
+
+
+def bank_of(epochs, odometer=None, config=CONFIG, vehicle=KNOWN):
+    return MonitorBank(align(epochs, odometer, vehicle, config), {}, config, FACTOR)
+
+
+def table(bank):
+    return pl.DataFrame(bank.columns())
+
+
+def steady(n, speed_mps=20.0, period_s=1.0, **columns):
+    t = np.arange(n) * period_s
+    odometer_t = np.arange(0.0, t[-1] + 0.05, 0.05)
+    return epochs_of(t, speed_mps * t, **columns), odometer_of(odometer_t, speed_mps * odometer_t)
+
+
+def test_rates_by_hand_at_one_hertz():
+    """GNSS ahead by 3 m at epoch 2: raw 3 m/s, EWMA 0.1 gives 0.3, then 0.27 (DIAG eq. 1 and 8)."""
+    epochs, odometer = steady(5)
+    path = epochs["path_m"].to_numpy().copy()
+    path[2:] += 3.0
+    result = table(bank_of(epochs.with_columns(path_m=pl.Series(path)), odometer))
+    assert result["along_raw_value"].to_list()[0] is None
+    np.testing.assert_allclose(result["along_raw_value"].to_list()[1:], [0.0, 3.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(result["along_ewma_0p1_value"].to_list()[1:], [0.0, 0.3, 0.27, 0.243], atol=1e-9)
+
+
+def test_raw_threshold_by_hand_at_one_hertz():
+    """k_T sqrt(sum 2 R_j (1 - phi_j) + 0.05^2) with sigma 1 m."""
+    result = table(bank_of(*steady(3)))
+    phi = np.exp(-1.0 / np.array([360.0, 1800.0, 3600.0, 100.0]))
+    expected = 5.3267 * np.sqrt((2 * np.array([0.083, 0.014, 0.15, 0.752]) * (1 - phi)).sum() + 0.05**2)
+    assert result["along_raw_threshold"][1] == pytest.approx(expected, rel=1e-4)
+    across = 5.3267 * np.sqrt((2 * np.array([0.083, 0.014, 0.15, 0.752]) * (1 - phi)).sum())
+    assert result["cross_raw_threshold"][1] == pytest.approx(across, rel=1e-4)
+
+
+def test_uncertain_scale_and_latency_widen_the_raw_threshold():
+    vehicle = Vehicle(odometer_scale=1.0, odometer_scale_sigma=0.01, gnss_latency_s=0.0)
+    plain = table(bank_of(*steady(3)))["along_raw_threshold"][2]
+    wide = table(bank_of(*steady(3), vehicle=vehicle))["along_raw_threshold"][2]
+    assert wide**2 == pytest.approx(plain**2 + (FACTOR * 0.01 * 20.0) ** 2, rel=1e-9)
+
+
+def test_absence_of_data_is_never_a_pass():
+    epochs, odometer = steady(6, fix_valid=[True, True, False, True, True, True])
+    epochs = epochs.with_columns(on_track=pl.Series([True, True, True, True, False, True]))
+    result = table(bank_of(epochs, odometer))
+    assert result["along_raw_state"].to_list() == [
+        "not_evaluated",
+        "pass",
+        "not_evaluated",
+        "pass",
+        "not_evaluated",
+        "pass",
+    ]
+    assert result["along_raw_reason"].to_list() == [FIRST_EPOCH, None, NO_POSITION, None, OFF_TRACK, None]
+    assert result["up_raw_reason"].to_list() == [NO_HEIGHT, NO_HEIGHT, NO_POSITION, NO_HEIGHT, OFF_TRACK, NO_HEIGHT]
+
+
+def test_without_odometer_only_the_along_axis_is_blind():
+    epochs, _ = steady(4)
+    result = table(bank_of(epochs))
+    assert result["along_ewma_0p01_reason"].unique().to_list() == [NO_ODOMETER]
+    assert result["along_ewma_0p01_state"].unique().to_list() == ["not_evaluated"]
+    assert result["cross_raw_state"].to_list() == ["not_evaluated", "pass", "pass", "pass"]
+
+
+def test_a_gap_is_a_longer_step_up_to_the_limit_and_a_restart_beyond():
+    t = np.array([0.0, 1.0, 41.0, 42.0, 142.0, 143.0])
+    path = 20.0 * t + np.array([0.0, 0.0, 12.0, 12.0, 500.0, 500.0])
+    odometer_t = np.arange(0.0, 143.1, 0.05)
+    result = table(bank_of(epochs_of(t, path), odometer_of(odometer_t, 20.0 * odometer_t)))
+    assert result["along_raw_value"][2] == pytest.approx(12.0 / 40.0)
+    assert result["along_raw_state"].to_list()[4] == "not_evaluated"
+    assert result["along_raw_reason"].to_list()[4] == FIRST_EPOCH
+
+
+def test_a_restart_forgets_what_rang():
+    epochs, odometer = steady(60)
+    path = epochs["path_m"].to_numpy().copy()
+    path[20:] += 45.0
+    bank = bank_of(epochs.with_columns(path_m=pl.Series(path)), odometer)
+    assert bank.failed(20)
+    assert bank.failed(40)
+    assert not bank.failed(19)
+    bank.restart(30)
+    assert [k for k in range(60) if bank.failed(k)] == list(range(20, 30))
+    assert not bank.along_evaluated(30)
+    assert bank.along_evaluated(31)
+
+
+def test_recovery_looks_at_raw_and_the_fastest_average_only():
+    epochs, odometer = steady(200)
+    path = epochs["path_m"].to_numpy().copy()
+    path[50:] += 45.0
+    bank = bank_of(epochs.with_columns(path_m=pl.Series(path)), odometer)
+    assert bank.failed(199)
+    assert not bank.fast_failed(199)
+
+
+def test_results_do_not_depend_on_how_far_was_asked_before():
+    epochs, odometer = run(Straight(), 12)
+    one, other = bank_of(epochs, odometer), bank_of(epochs, odometer)
+    for k in range(0, epochs.height, 17):
+        one.failed(k)
+    one.restart(1_000)
+    other.failed(1_200)
+    other.restart(1_000)
+    assert table(one).equals(table(other))
+
+
+def test_a_survey_step_at_an_element_border_is_judged_by_the_survey_not_averaged():
+    """1.5 m aside at the border: no alarm, nothing rings; 15 m aside is no survey error."""
+    elements = ["a"] * 10 + ["b"] * 10
+    for step_m, expected in ((1.5, []), (15.0, [10])):
+        cross = np.where(np.arange(20) >= 10, step_m, 0.0)
+        epochs, odometer = steady(20, netelement_id=elements, cross_track_m=cross)
+        bank = bank_of(epochs, odometer)
+        assert [k for k in range(20) if bank.failed(k)] == expected
+        assert table(bank)["cross_ewma_0p1_value"].drop_nulls().abs().max() == 0.0
+
+
+def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
+    config = Configuration.model_validate({"monitors": {"disabled": ["along_raw", "along_doppler"]}})
+    epochs, odometer = steady(5)
+    path = epochs["path_m"].to_numpy().copy()
+    path[2:] += 4.0
+    aligned = align(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
+    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config, FACTOR)}, config, FACTOR)
+    result = table(bank)
+    assert result["along_raw_reason"].unique().to_list() == [DISABLED]
+    assert result["along_doppler_reason"].unique().to_list() == [DISABLED]
+    assert result["along_raw_state"].unique().to_list() == ["not_evaluated"]
+
+
+def test_every_monitor_of_the_bank_has_its_four_columns():
+    names = table(bank_of(*steady(3))).columns
+    assert names == [f"{m}_{part}" for m in BANK_MONITORS for part in ("value", "threshold", "state", "reason")]
+
+
+def test_doppler_sides_with_gnss_when_the_wheels_slip():
+    t = np.arange(0.0, 20.0, 0.1)
+    odometer_t = np.arange(0.0, 20.0, 0.05)
+    slip = 5.0 * np.clip(odometer_t - 10.0, 0.0, 1.0)
+    epochs = epochs_of(t, 20.0 * t, velocity_along_mps=np.full(t.size, 20.0))
+    aligned = align(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
+    result = doppler_monitor(aligned, CONFIG, FACTOR)
+    fails = [t[k] for k in range(t.size) if result["state"][k] == "fail"]
+    assert 10.0 < fails[0] < 10.5
+    assert fails[-1] < 12.1
+    assert result["value"][120] == pytest.approx(-1.0, abs=4.1)
+    without = doppler_monitor(
+        align(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG, FACTOR
+    )
+    assert without["reason"].unique().to_list() == [NO_VELOCITY]
+
+
+def test_channels_are_compared_where_both_have_a_position():
+    one = epochs_of([0.0, 1.0, 2.0], [0.0, 20.0, 40.0])
+    other = epochs_of([0.0, 1.0, 2.0], [0.0, 30.0, 41.0], fix_valid=[True, True, False])
+    result = channel_monitor(one, other, FACTOR)
+    assert result["state"].to_list() == ["pass", "fail", "not_evaluated"]
+    assert result["value"].to_list() == [0.0, -10.0, None]
+    assert result["threshold"][0] == pytest.approx(FACTOR * np.sqrt(2.0))

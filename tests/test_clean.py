@@ -1,0 +1,46 @@
+"""Cleaning: order, duplicates and their counts, by hand."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from pipeline.clean import StreamCounts, clean
+from schemas.errors import InputError
+from schemas.run import RunLog
+
+
+def gnss(times, solution="primary", latitudes=None):
+    return pl.DataFrame(
+        {
+            "t": pl.Series(times, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
+            "solution": [solution] * len(times),
+            "latitude_deg": pl.Series(latitudes or [50.0] * len(times), dtype=pl.Float64),
+        }
+    )
+
+
+def test_order_is_restored_and_the_first_of_a_double_stays():
+    run = RunLog("r", gnss([1, 3, 2, 3, 5], latitudes=[50.1, 50.3, 50.2, 50.9, 50.5]))
+    cleaned, counts = clean(run)
+    assert cleaned.gnss["latitude_deg"].to_list() == [50.1, 50.2, 50.3, 50.5]
+    assert counts.solutions == {"primary": StreamCounts(duplicates=1, out_of_order=1)}
+
+
+def test_solutions_share_times_without_being_doubles():
+    run = RunLog("r", pl.concat([gnss([1, 2], "egnos"), gnss([1, 2, 2], "gps")]))
+    cleaned, counts = clean(run)
+    assert cleaned.gnss.height == 4
+    assert counts.solutions == {"egnos": StreamCounts(0, 0), "gps": StreamCounts(1, 0)}
+
+
+def test_the_callers_frames_are_untouched():
+    frame = gnss([3, 1, 2])
+    clean(RunLog("r", frame))
+    assert frame["t"].to_physical().to_list() == [3, 1, 2]
+
+
+@pytest.mark.parametrize("times", [[7], [7, 7, 7]])
+def test_one_time_only_cannot_be_replayed(times):
+    with pytest.raises(InputError, match="only one time"):
+        clean(RunLog("r", gnss(times)))
