@@ -1,0 +1,234 @@
+"""Where results go: local folders and object stores behind the same few operations.
+
+Local files appear under their final name by one rename. Object stores have no rename, but an object
+appears there whole or not at all, so that writing the marker last serves both.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pipeline.ingest.files import Address, is_url, name_of
+from schemas.errors import BaliseError, InputError, OutputError
+
+T = TypeVar("T")
+
+_TRIES = 4
+_FIRST_PAUSE_S = 0.25
+_BLOCK_BYTES = 1 << 20
+_SECRETS = re.compile(r"(?<=://)[^/@\s]+@|\?[^\s'\"]*|((?:AKIA|ASIA)[A-Z0-9]{12,})")
+
+
+def redacted(text: str) -> str:
+    """The text without user names, passwords, keys and signatures that addresses may carry."""
+    return _SECRETS.sub("", text)
+
+
+def absolute(address: Address) -> str:
+    """The address as a worker with another working directory understands it."""
+    return str(address) if is_url(address) else str(Path(address).absolute())
+
+
+def write_bytes(address: Address, content: bytes) -> None:
+    """Write a file that is there whole or not at all."""
+    commit([stage(address, content)])
+
+
+def stage(address: Address, content: bytes) -> tuple[Address, Address]:
+    """Put the content beside its final place (object stores: at it); `commit` gives it its name."""
+    if is_url(address):
+        _remote(address, lambda store, path: store.pipe_file(path, content))
+        return address, address
+    final = Path(address)
+    temporary = final.with_name(f".{final.name}.{secrets.token_hex(6)}.tmp")
+    with as_output_error(address):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+    return temporary, final
+
+
+def commit(staged: list[tuple[Address, Address]]) -> None:
+    """Give staged files their names, in order."""
+    for temporary, final in staged:
+        if temporary != final:
+            with as_output_error(final):
+                Path(temporary).replace(final)
+
+
+def discard(staged: list[tuple[Address, Address]]) -> None:
+    """Drop staged files that will not be committed."""
+    for temporary, final in staged:
+        if temporary != final:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def remove(address: Address) -> None:
+    """Remove a file; its absence is no error."""
+    if not is_url(address):
+        with as_output_error(address):
+            Path(address).unlink(missing_ok=True)
+        return
+
+    def delete(store: Any, path: str) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            store.rm_file(path)
+
+    _remote(address, delete)
+
+
+def remove_folder(address: Address) -> None:
+    """Remove a folder with all that is in it; its absence is no error."""
+    if not is_url(address):
+        shutil.rmtree(address, ignore_errors=True)
+        return
+
+    def delete(store: Any, path: str) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            store.rm(path, recursive=True)
+
+    _remote(address, delete)
+
+
+def folders_in(address: Address) -> list[str]:
+    """Names of the folders in a folder, sorted; none where it does not exist."""
+    if not is_url(address):
+        try:
+            return sorted(entry.name for entry in os.scandir(address) if entry.is_dir())
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+
+    def names(store: Any, path: str) -> list[str]:
+        try:
+            entries = store.ls(path, detail=True)
+        except FileNotFoundError:
+            return []
+        return sorted(name_of(entry["name"]) for entry in entries if entry["type"] == "directory")
+
+    return _remote(address, names)
+
+
+def read_many(addresses: list[str]) -> dict[str, bytes]:
+    """Contents of those of the remote objects that exist."""
+    if not addresses:
+        return {}
+    by_path = {_store(address)[1]: address for address in addresses}
+
+    def fetch(store: Any, _: str) -> dict[str, bytes]:
+        found: dict[str, bytes | Exception] = store.cat(list(by_path), on_error="return")
+        for content in found.values():
+            if isinstance(content, Exception) and not isinstance(content, FileNotFoundError):
+                raise content
+        return {by_path[path]: data for path, data in found.items() if isinstance(data, bytes)}
+
+    # With a single path fsspec would return bare bytes where it is not asked for a list.
+    return _remote(addresses[0], fetch)
+
+
+@contextlib.contextmanager
+def local_copy(address: Address) -> Iterator[Path]:
+    """A local path with the content of the address; downloads are removed afterwards."""
+    if not is_url(address):
+        yield Path(address)
+        return
+    with tempfile.TemporaryDirectory(prefix="balise-") as folder:
+        target = Path(folder) / name_of(address)
+
+        def fetch(store: Any, path: str) -> None:
+            store.get(path, str(target), recursive=store.isdir(path))
+
+        _remote(address, fetch, kind=InputError)
+        yield target
+
+
+def content_digest(path: Path) -> str:
+    """SHA-256 over names and contents of a file, or of the files directly in a folder."""
+    files = sorted(entry for entry in path.iterdir() if entry.is_file()) if path.is_dir() else [path]
+    total = hashlib.sha256()
+    for file in files:
+        digest = hashlib.sha256()
+        with file.open("rb") as stream:
+            while block := stream.read(_BLOCK_BYTES):
+                digest.update(block)
+        total.update(f"{file.name} {digest.hexdigest()}\n".encode())
+    return total.hexdigest()
+
+
+def signature(path: Path) -> tuple[tuple[str, int, int, int], ...]:
+    """What changes when somebody writes to a file while it is read: size, time of change, identity."""
+    files = sorted(entry for entry in path.iterdir() if entry.is_file()) if path.is_dir() else [path]
+    stats = [(file.name, file.stat()) for file in files]
+    return tuple((name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in stats)
+
+
+@contextlib.contextmanager
+def as_output_error(address: Address) -> Iterator[None]:
+    """Turn what an operating system or a store raises into one message that names the place."""
+    try:
+        yield
+    except OSError as error:
+        reason = redacted(error.strerror or str(error) or type(error).__name__)
+        raise OutputError(
+            f"cannot be written: {reason}",
+            place=redacted(str(address)),
+            remedy="Free space or choose another --out; complete runs stay and are skipped next time.",
+        ) from None
+
+
+@lru_cache(maxsize=64)
+def _filesystem(root: str) -> Any:
+    import fsspec
+
+    # Listings must not be remembered: other processes write here too.
+    return fsspec.core.url_to_fs(root, use_listings_cache=False)[0]
+
+
+def _store(address: Address) -> tuple[Any, str]:
+    """The file system of an address and its path there."""
+    protocol, _, rest = str(address).partition("://")
+    try:
+        store = _filesystem(f"{protocol}://{rest.split('/', 1)[0]}")
+        return store, str(store._strip_protocol(str(address)))
+    except (ImportError, ValueError) as error:
+        raise OutputError(
+            f"cannot be opened: {redacted(str(error))}",
+            place=redacted(str(address)),
+            remedy="Install the extra for this kind of address (`balise[s3]`).",
+        ) from None
+
+
+def _remote(address: Address, operation: Callable[[Any, str], T], kind: type[BaliseError] = OutputError) -> T:
+    """Run an operation on an object store, again after a pause where it answers with an error."""
+    store, path = _store(address)
+    for attempt in range(_TRIES):
+        try:
+            return operation(store, path)
+        except BaliseError:
+            raise
+        except Exception as error:
+            # Stores raise their client library's own exceptions, which share no base class.
+            if attempt == _TRIES - 1 or isinstance(error, FileNotFoundError | PermissionError):
+                raise kind(
+                    f"the store refused: {redacted(str(error)) or type(error).__name__}",
+                    place=redacted(str(address)),
+                    remedy="Check address, rights and connection; complete runs stay and are skipped next time.",
+                ) from None
+            time.sleep(_FIRST_PAUSE_S * 2**attempt)
+    raise AssertionError("the last attempt returns or raises")

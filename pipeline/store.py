@@ -1,0 +1,147 @@
+"""Result tables on disk: one small Parquet file per run and table, Hive-partitioned (CONTRACT section 3)."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.parse import quote, unquote
+
+import polars as pl
+
+from pipeline import storage
+from pipeline.ingest.files import Address, is_url, join
+from schemas.config import Settings, to_toml
+from schemas.errors import UsageError
+from schemas.run import RunTables
+from schemas.tables import CONTRACT_VERSION, TABLES
+
+PREFIX = "balise."
+# Compression is part of "the same bytes": neither level nor row groups may follow a library's default.
+_COMPRESSION_LEVEL = 3
+_ROWS_PER_GROUP = 262_144
+_MARKER = "runs"
+
+
+def table_address(out: Address, table: str, run_id: str) -> Address:
+    """`OUT/hazards/run_id=R/hazards.parquet`; what a path cannot hold is percent-encoded."""
+    return join(join(join(out, table), _partition(run_id)), f"{table}.parquet")
+
+
+def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> None:
+    """Write the five tables of one run; the runs table last, so that it marks the run complete.
+
+    `metadata` (digests, software) goes into every file beside the table's name and contract version.
+    The same tables and metadata give the same bytes. A killed process leaves either the complete
+    run or one without marker, which does not count.
+    """
+    contents = [(name, table_bytes(getattr(tables, name), name, metadata)) for name in TABLES]
+    marker = table_address(out, _MARKER, tables.run_id)
+    if is_url(out):
+        # An object store shows each object as soon as it is staged.
+        storage.remove(marker)
+    staged: list[tuple[Address, Address]] = []
+    try:
+        for name, content in contents:
+            staged.append(storage.stage(table_address(out, name, tables.run_id), content))
+        if not is_url(out):
+            storage.remove(marker)
+        storage.commit(staged)
+    except BaseException:
+        storage.discard(staged)
+        raise
+
+
+def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
+    """A table as Parquet, held to its contract."""
+    checked = TABLES[table].validate(frame, cast=True).select(TABLES[table].column_names())
+    described = {"table": table, "contract": CONTRACT_VERSION, **metadata}
+    buffer = io.BytesIO()
+    checked.rechunk().write_parquet(
+        buffer,
+        compression="zstd",
+        compression_level=_COMPRESSION_LEVEL,
+        row_group_size=_ROWS_PER_GROUP,
+        metadata={f"{PREFIX}{key}": described[key] for key in sorted(described)},
+    )
+    return buffer.getvalue()
+
+
+def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
+    """One table of all complete runs, or of one, with the column `run_id` in front."""
+    if table not in TABLES:
+        raise UsageError("is no table", place=table, expected=", ".join(TABLES))
+    runs = run_ids(out) if run_id is None else [run_id]
+    schema = {"run_id": pl.String(), **TABLES[table].create_empty().schema}
+    if not runs:
+        return pl.LazyFrame(schema=schema)
+    paths = [table_address(out, table, run) for run in runs]
+    if is_url(out):
+        return _read_remote([str(path) for path in paths], runs).select(list(schema))
+    if run_id is not None and not Path(paths[0]).exists():
+        raise UsageError("has no such run", place=str(out), found=run_id)
+    scan = pl.scan_parquet(
+        [Path(path) for path in paths], hive_partitioning=True, hive_schema={"run_id": pl.String}, glob=False
+    )
+    return scan.select(list(schema))
+
+
+def run_ids(out: Address) -> list[str]:
+    """The complete runs of a result, sorted."""
+    folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
+    runs = [unquote(name.removeprefix("run_id=")) for name in folders]
+    if not is_url(out):
+        runs = [run for run in runs if Path(table_address(out, _MARKER, run)).exists()]
+    return sorted(runs)
+
+
+def completed_runs(out: Address) -> dict[str, dict[str, str]]:
+    """Metadata of each complete run, without reading any table."""
+    runs = run_ids(out)
+    if is_url(out):
+        addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
+        contents = storage.read_many(list(addresses))
+        return {run: metadata_of(contents[place]) for place, run in addresses.items() if place in contents}
+    return {run: metadata_of(Path(table_address(out, _MARKER, run))) for run in runs}
+
+
+def metadata_of(source: Path | bytes) -> dict[str, str]:
+    """What `write_run` was told about the run; nothing for a file that cannot be read."""
+    try:
+        found = pl.read_parquet_metadata(source)
+    except (pl.exceptions.PolarsError, OSError):
+        return {}
+    return {key.removeprefix(PREFIX): value for key, value in found.items() if key.startswith(PREFIX)}
+
+
+def sweep(out: Address) -> None:
+    """Remove what an interrupted run left: tables without a marker, and unfinished files."""
+    complete = {_partition(run) for run in run_ids(out)}
+    for table in TABLES:
+        for folder in storage.folders_in(join(out, table)):
+            if folder.startswith("run_id=") and folder not in complete:
+                storage.remove_folder(join(join(out, table), folder))
+    if not is_url(out):
+        for leftover in Path(out).glob("*/run_id=*/.*.tmp"):
+            leftover.unlink(missing_ok=True)
+
+
+def write_config(out: Address, settings: Settings) -> None:
+    """`OUT/config.toml`: the resolved configuration."""
+    storage.write_bytes(join(out, "config.toml"), to_toml(settings).encode())
+
+
+def _partition(run_id: str) -> str:
+    return f"run_id={quote(run_id, safe=' +,()[]@!~')}"
+
+
+def _read_remote(paths: list[str], runs: list[str]) -> pl.LazyFrame:
+    contents = storage.read_many(paths)
+    frames = [
+        pl.read_parquet(contents[path]).lazy().with_columns(run_id=pl.lit(run))
+        for path, run in zip(paths, runs, strict=True)
+        if path in contents
+    ]
+    if not frames:
+        raise UsageError("has no such run", found=", ".join(runs[:5]))
+    return pl.concat(frames)
