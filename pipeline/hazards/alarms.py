@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.hazards.arrays import NS_PER_S, Bools
 from pipeline.hazards.fails import AlarmSpan, Fails
-from pipeline.hazards.rows import Judged
+from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
@@ -24,8 +24,7 @@ def alarms_table(
         {"solution": solution, "alarm_id": number, **_row(span, judged, witnesses, config)}
         for number, span in enumerate(fails.alarms)
     ]
-    frame = pl.DataFrame(rows, schema=Alarms.create_empty().schema)
-    return Alarms.validate(frame, cast=True)
+    return pl.DataFrame(rows, schema=schema_of(Alarms))
 
 
 def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: HazardConfig) -> dict[str, Any]:

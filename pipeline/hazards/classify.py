@@ -18,6 +18,7 @@ from pipeline.hazards.passages import (
     judge_passages,
     link_passages,
     link_unoffered,
+    location_errors,
     positions_at,
     suspicious_passages,
 )
@@ -121,7 +122,8 @@ def _passages(
     suspicious: Bools = suspicious_passages(passages, spans)
     gap_s = linking_gap_s(series.period_s, config.lds.crossing_gap_s)
     positioned = positions_at(epochs, t_true, gap_s)
-    return judge_passages(passages, series, passings, links, suspicious, positioned, config.hazards)
+    error = location_errors(passages, epochs, truth, gap_s)
+    return judge_passages(passages, error, t_true, links, suspicious, positioned, config.hazards)
 
 
 def _epochs(

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
-from pipeline.hazards.passing import TruePassings
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, interpolate_known, times_ns
 from pipeline.hazards.rows import Judged
-from pipeline.hazards.series import Series
+from pipeline.hazards.series import Series, direction_of
+from pipeline.hazards.truth import valid_ns
 from schemas.config import HazardConfig
-from schemas.enums import Cause, FailureMode, PassageStatus
+from schemas.enums import BaliseKind, Cause, FailureMode, PassageStatus
 from schemas.tables import Passages
 
 _MODES = pl.Enum([member.value for member in FailureMode])
@@ -29,16 +29,14 @@ class Links:
 
 def judge_passages(
     passages: pl.DataFrame,
-    series: Series,
-    passings: TruePassings,
+    error: Floats,
+    t_true: list[int | None],
     links: Links,
     suspicious: Bools,
     positioned: Bools,
     config: HazardConfig,
 ) -> pl.DataFrame:
     """Passages with the columns of the truth filled in. `positioned`: a position was there when the train passed."""
-    error = location_errors(passages, series)
-    t_true = passings.assign(passages)
     mode, cause = _modes(passages, error, links, positioned, config)
     filled = passages.with_columns(
         pl.Series("t_true", t_true, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
@@ -48,23 +46,28 @@ def judge_passages(
         pl.Series("suspect_after_the_fact", suspicious),
         pl.Series("hazard_id", [None if h < 0 else h for h in links.hazard.tolist()], dtype=pl.Int64),
     )
-    return Passages.validate(filled.select(list(Passages.columns())), cast=True)
+    return filled.select(Passages.column_names())
 
 
-def location_errors(passages: pl.DataFrame, series: Series) -> Floats:
-    """Error of the position at each offer [m], + = offered early; NaN without offer or truth."""
+def location_errors(passages: pl.DataFrame, epochs: pl.DataFrame, truth: pl.DataFrame, gap_s: float) -> Floats:
+    """How far the train was from the balise at its offer [m], + = offered early; NaN without offer or truth.
+
+    A VB is offered by a position as old as the GNSS latency, a telegram at the instant of its read.
+    """
     offered = passages["t_offered"].dt.timestamp("ns")
-    known = offered.is_not_null().to_numpy()
     error = np.full(passages.height, np.nan)
-    if series.size < 2 or not known.any():
+    rows = np.flatnonzero(offered.is_not_null().to_numpy())
+    if rows.size == 0:
         return error
-    at = offered.drop_nulls().to_numpy()
-    right = np.clip(np.searchsorted(series.t_ns, at), 1, series.size - 1)
-    span = series.t_ns[right] - series.t_ns[right - 1]
-    share = (at - series.t_ns[right - 1]) / span
-    value = series.error_m[right - 1] + share * (series.error_m[right] - series.error_m[right - 1])
-    inside = (share >= 0.0) & (share <= 1.0) & (series.linked[right] | (share == 0.0) | (share == 1.0))
-    error[known] = np.where(inside, value, np.nan)
+    at_ns = offered.drop_nulls().to_numpy()
+    virtual = (passages["kind"] == BaliseKind.VIRTUAL.value).to_numpy()[rows]
+    place, direction = floats(truth, "truth_path_m"), direction_of(epochs)
+    balise = floats(passages, "path_m")[rows]
+    for mine, stamps in ((virtual, times_ns(epochs)), (~virtual, valid_ns(epochs))):
+        x, at = (stamps - stamps[0]) / NS_PER_S, (at_ns[mine] - stamps[0]) / NS_PER_S
+        train = interpolate_known(at, x, place, gap_s)
+        near = np.clip(np.searchsorted(x, at), 0, x.size - 1)
+        error[rows[mine]] = (balise[mine] - train) * direction[near]
     return error
 
 

@@ -18,31 +18,48 @@ _AGAIN_M = 10.0
 
 @dataclass(frozen=True)
 class TruePassings:
-    """Instants at which the train passed each balise, in order of time."""
+    """Instants at which the train passed each balise, in order of time, and the true positions over time."""
 
     by_balise: dict[str, tuple[int, ...]]
+    at_ns: Ints
+    path_m: Floats
 
     def assign(self, passages: pl.DataFrame) -> list[int | None]:
-        """The true passage of each row: the nearest to its offer, or to where the odometer reckons it.
+        """The true passage of each row; none for an offer beyond it (each true passage is given once).
 
-        Rows with neither take in order of time what no other row took.
+        The nearest in time to the offer, or to where the odometer reckons the passage; rows with neither take in
+        order what is left.
         """
         balises = passages["balise_id"].to_list()
+        places = passages["path_m"].to_list()
         about = _about_when(passages)
+        pairs = [
+            (abs(t - t_ns), row, t)
+            for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True))
+            if t_ns is not None
+            for t in self.by_balise.get(balise, ())
+        ]
         result: list[int | None] = [None] * len(balises)
         taken: set[tuple[str, int]] = set()
+        for _, row, t in sorted(pairs):
+            free = result[row] is None and (balises[row], t) not in taken
+            if free and self._one_passage(about[row], t, places[row]):
+                result[row] = t
+                taken.add((balises[row], t))
         for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
-            candidates = self.by_balise.get(balise, ())
-            if t_ns is not None and candidates:
-                nearest = min(candidates, key=lambda t, at=t_ns: (abs(t - at), t))  # type: ignore[misc]
-                result[row] = nearest
-                taken.add((balise, nearest))
-        for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
-            free = [t for t in self.by_balise.get(balise, ()) if (balise, t) not in taken]
-            if t_ns is None and free:
-                result[row] = free[0]
-                taken.add((balise, free[0]))
+            left = [t for t in self.by_balise.get(balise, ()) if (balise, t) not in taken]
+            if t_ns is None and left:
+                result[row] = left[0]
+                taken.add((balise, left[0]))
         return result
+
+    def _one_passage(self, a_ns: int | None, b_ns: int, balise_m: float) -> bool:
+        """Between an offer and a true crossing the train only went from the one to the other."""
+        begin, end = np.searchsorted(self.at_ns, sorted((a_ns or b_ns, b_ns)))
+        way = np.abs(self.path_m[begin:end] - balise_m)
+        if way.size == 0:
+            return True
+        return bool(way.max() <= (way[0] if b_ns >= (a_ns or b_ns) else way[-1]) + _AGAIN_M)
 
 
 def _about_when(passages: pl.DataFrame) -> list[int | None]:
@@ -57,9 +74,9 @@ def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFra
     place = floats(truth, "truth_path_m")
     rows = np.flatnonzero(np.isfinite(place))
     found: dict[str, tuple[int, ...]] = {}
-    if rows.size < 2 or balises.height == 0:
-        return TruePassings(found)
     at_ns, x = valid_ns(epochs)[rows], place[rows]
+    if rows.size < 2 or balises.height == 0:
+        return TruePassings(found, at_ns, x)
     speed = floats(epochs, "speed_mps")[rows]
     leg = epochs["leg"].cast(pl.Int64).fill_null(strategy="forward").fill_null(strategy="backward").fill_null(-1)
     legs = leg.to_numpy()[rows]
@@ -68,7 +85,7 @@ def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFra
     for balise, beacon_leg, beacon_m in zip(balises["balise_id"].to_list(), passed_legs, places, strict=True):
         instants = _instants(at_ns, x, speed, legs == beacon_leg, beacon_m)
         found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))
-    return TruePassings(found)
+    return TruePassings(found, at_ns, x)
 
 
 def _instants(at_ns: Ints, x: Floats, speed: Floats, here: Bools, beacon_m: float) -> list[int]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import dataframely as dy
 import numpy as np
 import numpy.typing as npt
 import polars as pl
@@ -21,6 +22,11 @@ from schemas.tables import Hazards
 
 Locate = Callable[[npt.ArrayLike, npt.ArrayLike], tuple[npt.NDArray[np.object_], Floats]]
 """Net elements and measures of path positions: `locate(leg, path_m)`, as `TravelledPath.locate`."""
+
+
+def schema_of(table: type[dy.Schema]) -> pl.Schema:
+    """Columns and types of a table of the contract."""
+    return pl.Schema({name: column.dtype for name, column in table.columns().items()})
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,7 @@ def hazards_table(
                 **_place(item.draft, epochs, series, locate),
             }
         )
-    return Hazards.validate(pl.DataFrame(rows, schema=Hazards.create_empty().schema), cast=True)
+    return pl.DataFrame(rows, schema=schema_of(Hazards))
 
 
 def _kind(item: Judged) -> dict[str, Any]:

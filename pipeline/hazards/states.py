@@ -37,14 +37,19 @@ def lds_states(
     lds: LdsConfig,
 ) -> pl.Series:
     """P2 negated; P3 diagnosis faulty; P1 error beyond the failure limit; P0. Null without a truth."""
-    state = np.full(epochs.height, None, dtype=object)
     known = np.isfinite(error_along_m)
-    state[known] = LdsState.P0.value
-    state[known & (np.abs(error_along_m) > config.failure_limit_m)] = LdsState.P1.value
+    state = np.where(np.abs(error_along_m) > config.failure_limit_m, _code(LdsState.P1), _code(LdsState.P0))
+    state[~known] = -1
     faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(epochs, truth, passages, lds)
-    state[faulty] = LdsState.P3.value
-    state[flags(epochs, "negated")] = LdsState.P2.value
-    return pl.Series("lds_state", state.tolist(), dtype=_STATES)
+    state[faulty] = _code(LdsState.P3)
+    state[flags(epochs, "negated")] = _code(LdsState.P2)
+    names = pl.Series([member.value for member in LdsState], dtype=_STATES)
+    index = pl.Series("lds_state", state).replace(-1, None)
+    return names.gather(index).alias("lds_state")
+
+
+def _code(state: LdsState) -> int:
+    return list(LdsState).index(state)
 
 
 def odometer_beyond_confidence(

@@ -27,7 +27,7 @@ from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence
 
-_EVIDENCE = pl.Enum([member.value for member in Evidence])
+_NAMES = [member.value for member in Evidence]
 
 
 @dataclass(frozen=True)
@@ -137,15 +137,20 @@ def _initial_anchors(epochs: pl.DataFrame, travel: Travel, at_ns: Ints, init_s: 
 def _ladder(t: pl.Series, rungs: list[Rung], travel: Travel) -> pl.DataFrame:
     names = ("path_m", "sigma_m", "bound_m", "cross_m", "up_m")
     best = {name: np.full(t.len(), np.nan) for name in names}
-    evidence = np.full(t.len(), None, dtype=object)
+    evidence = np.full(t.len(), -1)
     for rung in rungs:
         free = ~np.isfinite(best["path_m"]) & np.isfinite(rung.path_m)
         for name in names:
             best[name][free] = getattr(rung, name)[free]
-        evidence[free] = rung.evidence.value
-    by_reference = np.where(evidence == Evidence.REFERENCE.value, best["path_m"], np.nan)
+        evidence[free] = _NAMES.index(rung.evidence.value)
+    by_reference = np.where(evidence == _NAMES.index(Evidence.REFERENCE.value), best["path_m"], np.nan)
     distance_m, stretch = travel.joined_with(by_reference)
     columns = {f"truth_{name}": pl.Series(best[name], nan_to_null=True) for name in names}
-    return pl.DataFrame({"t": t, "evidence": pl.Series(evidence.tolist(), dtype=_EVIDENCE), **columns}).with_columns(
+    return pl.DataFrame({"t": t, "evidence": _names_of(evidence), **columns}).with_columns(
         truth_travel_m=pl.Series(distance_m, nan_to_null=True), truth_stretch=pl.Series(stretch)
     )
+
+
+def _names_of(codes: Ints) -> pl.Series:
+    """Kinds of evidence by their number; -1 is none."""
+    return pl.Series(_NAMES, dtype=pl.Enum(_NAMES)).gather(pl.Series(codes).replace(-1, None))
