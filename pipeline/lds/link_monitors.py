@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
@@ -10,7 +9,8 @@ import polars as pl
 
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.crossings import Crossing
-from pipeline.lds.journey import Floats, Journey
+from pipeline.lds.journey import Bools, Floats, Journey
+from pipeline.lds.recovery import Anchor
 from schemas.config import LdsConfig
 from schemas.enums import MonitorState, PassageStatus
 from schemas.tables import Epochs
@@ -24,17 +24,8 @@ NO_ODOMETER = "no odometer"
 NO_POSITION = "no position"
 AMBIGUOUS = "match ambiguous or off track"
 NO_REFERENCE = "no balise or validated position to measure from"
+NO_SIGMA = "no standard deviation of the position"
 FIRST_EPOCH = "no epoch before"
-
-
-@dataclass(frozen=True, slots=True)
-class Anchor:
-    """A position that the diagnosis stands behind: GNSS minus odometer there, and its sigma [m]."""
-
-    offset_m: float
-    sigma_m: float
-    t_ns: int
-    travelled_m: float
 
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: LdsConfig, limits: LdsLimits) -> int:
@@ -50,20 +41,6 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Ld
     unexplained = excess_m > noise_m + config.odometer_share * abs(odometer_step_m)
     backwards = offered[0].sense != journey.heading[j]
     return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
-
-
-def relink_bound_m(anchor: Anchor, k: int, journey: Journey, config: LdsConfig, limits: LdsLimits) -> float | None:
-    """Bound on (GNSS - odometer) minus what it was at the anchor; `None` once nothing can be told.
-
-    k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2), with the sigma of both epochs for
-    2 sigma_x^2. Beyond the failure limit a persisting failure would pass: no re-link then.
-    """
-    waited_s = (int(journey.t_ns[k]) - anchor.t_ns) * 1e-9
-    scale_m = float(journey.scale_sigma[k]) * (float(journey.travelled_m[k]) - anchor.travelled_m)
-    variance_m2 = anchor.sigma_m**2 + float(journey.sigma_m[k]) ** 2
-    variance_m2 += limits.odometer_sigma_mps**2 * waited_s + scale_m**2
-    bound_m = limits.threshold_factor * sqrt(variance_m2)
-    return bound_m if bound_m <= limits.failure_limit_m else None
 
 
 class LinkOrder:
@@ -138,34 +115,45 @@ class LinkDistance:
 
 
 def _order_reasons(journey: Journey, disabled: bool) -> list[str | None]:
+    """Per step, so both its ends must be good for it; a step ends at the epoch that it is noted at."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
-    odometer = np.isfinite(journey.odometer_m)
-    step_known = odometer & odometer[before]
+    odometer, ambiguous, sigma = _odometer(journey), _ambiguous(journey), np.isfinite(journey.sigma_m)
     masks = (
         (np.full(odometer.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (before < 0, FIRST_EPOCH),
-        (~step_known, NO_ODOMETER),
+        (~odometer[before], NO_ODOMETER),
+        (ambiguous | ambiguous[before], AMBIGUOUS),
+        (~(sigma & sigma[before]), NO_SIGMA),
     )
     return _reasons(odometer.size, masks)
 
 
 def _distance_reasons(journey: Journey, disabled: bool) -> list[str | None]:
-    odometer = np.isfinite(journey.odometer_m)
-    ambiguous = np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in journey.refusal])
+    odometer = _odometer(journey)
     masks = (
         (np.full(odometer.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
-        (ambiguous.astype(bool), AMBIGUOUS),
+        (_ambiguous(journey), AMBIGUOUS),
+        (~np.isfinite(journey.sigma_m), NO_SIGMA),
     )
     return _reasons(odometer.size, masks)
 
 
-def _reasons(size: int, masks: tuple[tuple[np.ndarray, str], ...]) -> list[str | None]:
+def _odometer(journey: Journey) -> Bools:
+    known: Bools = np.isfinite(journey.odometer_m)
+    return known
+
+
+def _ambiguous(journey: Journey) -> Bools:
+    return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in journey.refusal], dtype=bool)
+
+
+def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> list[str | None]:
     reasons = np.full(size, None, dtype=object)
     for mask, reason in reversed(masks):
         reasons[mask] = reason

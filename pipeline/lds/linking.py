@@ -109,19 +109,21 @@ class LinkingChain:
         """Its window has closed without any offer."""
         return balise.balise_id in self._unoffered
 
-    def advance(self, odometer_m: float, travelled_m: float, heading: int, leg: int, t_ns: int, blind: bool) -> None:
-        """The train has come to this odometer reading; `blind`: it has no means to detect just now."""
+    def advance(
+        self, odometer_m: float, travelled_m: float, heading: int, leg: int, t_ns: int, absence: PassageStatus
+    ) -> None:
+        """The train has come to this odometer reading; `absence`: status of what it did not find."""
         if not self.linking:
             return
         if heading != self._heading or leg != self._leg:
             self._turn_round(odometer_m, travelled_m, heading, leg)
-        self._close_windows(self._distance_m(odometer_m), t_ns, blind)
+        self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
     def offer(self, offer: Offer) -> Passage:
         """Judge an offered balise; its passage is written whatever comes of it."""
         linking = self.linking and offer.odometer_m is not None
         if linking and offer.odometer_m is not None:
-            self._close_windows(self._distance_m(offer.odometer_m), offer.t_ns, blind=False)
+            self._close_windows(self._distance_m(offer.odometer_m), offer.t_ns, PassageStatus.MISSED)
         passage = self._passage_of(offer)
         if linking and offer.odometer_m is not None:
             passage.odometer_distance_m = self._distance_m(offer.odometer_m)
@@ -154,8 +156,8 @@ class LinkingChain:
         if passage is not None:
             kept[balise.balise_id] = passage
 
-    def finish(self, odometer_m: float, t_ns: int) -> None:
-        """The run ends blind: what the train has passed by its reckoning was not available."""
+    def finish(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
+        """The run ends without a position: `absence` is the status of what was passed by reckoning."""
         if not self.linking:
             return
         distance_m = self._distance_m(odometer_m)
@@ -163,7 +165,7 @@ class LinkingChain:
             unseen = balise.balise_id not in self._own and balise.balise_id not in self._optional
             if unseen and self._announced_m(balise) < distance_m:
                 passage = self._new_passage(balise, t_ns, self._heading)
-                passage.status = PassageStatus.NOT_AVAILABLE
+                passage.status = absence
 
     def _distance_m(self, odometer_m: float) -> float:
         assert self.reference is not None
@@ -215,19 +217,19 @@ class LinkingChain:
         in_its_way = (i for i in range(position) if names[i] not in self._optional)
         return next(in_its_way, position)
 
-    def _close_windows(self, distance_m: float, t_ns: int, blind: bool) -> None:
+    def _close_windows(self, distance_m: float, t_ns: int, absence: PassageStatus) -> None:
         while self._ahead and distance_m > self._window(self._ahead[0]).close_m:
-            self._close(self._ahead[0], t_ns, blind)
+            self._close(self._ahead[0], t_ns, absence)
             self._look_ahead(self._ahead[1:])
 
-    def _close(self, balise: Balise, t_ns: int, blind: bool) -> None:
+    def _close(self, balise: Balise, t_ns: int, absence: PassageStatus) -> None:
         """Not found in its window; the second in a row brakes (3.16.2.7; TVB eq. 4)."""
         if balise.balise_id in self._optional:
             return
         passage = self._own.pop(balise.balise_id, None)
         if passage is None:
             passage = self._new_passage(balise, t_ns, self._heading)
-            passage.status = PassageStatus.NOT_AVAILABLE if blind else PassageStatus.MISSED
+            passage.status = absence
             self._unoffered[balise.balise_id] = passage
         self._missed_in_a_row += 1
         _blame(passage, LinkingError.MISSED, balise.reaction)

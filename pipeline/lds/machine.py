@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan
+from math import isnan
 from typing import Literal
 
 import numpy as np
@@ -16,10 +16,11 @@ import numpy as np
 from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.crossings import Balise, Crossing, Seen, find_crossings
 from pipeline.lds.journey import Journey
-from pipeline.lds.link_monitors import Anchor, LinkDistance, LinkOrder, disorder, relink_bound_m
+from pipeline.lds.link_monitors import LinkDistance, LinkOrder, disorder
 from pipeline.lds.linking import LinkingChain, Offer, Reference
 from pipeline.lds.reads import Read
 from pipeline.lds.rearming import Latch
+from pipeline.lds.recovery import Anchor, Recovery
 from schemas.config import LdsConfig
 from schemas.enums import PassageStatus
 
@@ -81,15 +82,12 @@ class LocationSystem:
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._along_m: list[float] = (journey.odometer_m * journey.heading).tolist()
         self._refusal = journey.refusal
-        self._negation: Negation | None = None
+        self._recovery: Recovery | None = None  # while negated
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
         self._consistent_at_ns = 0
-        self._fast_failed_at_ns = 0
-        self._evaluated_at_ns = 0
         self._last_tvb: int | None = None
         self._accepted: Anchor | None = None  # where the last VB was accepted
-        self._read_anchor: Anchor | None = None  # where a physical balise was read while negated
 
     def run(self) -> None:
         """Walk along all epochs."""
@@ -105,8 +103,8 @@ class LocationSystem:
             failing = bank_failed or disordered or self.distance.fails(k)
             if failing:
                 self.alarm[k] = True
-            if self._negation is not None:
-                self._seek_return(k, disordered)
+            if self._recovery is not None:
+                self._seek_return(self._recovery, k, disordered)
             elif failing:
                 self._negate(k)
             elif self.evaluated[k] and self._refusal[k] is None:
@@ -166,7 +164,7 @@ class LocationSystem:
 
     def _refusal_at(self, k: int, bank_failed: bool) -> PassageStatus | None:
         """Why a virtual balise is not detected at this epoch, whatever linking says."""
-        if self._negation is not None or bank_failed:
+        if self._recovery is not None or bank_failed:
             return PassageStatus.REJECTED_MONITOR
         refusal = self._refusal[k]
         entry = self._config.entry_from_unfitted_area and self._journey.has_odometer
@@ -194,25 +192,24 @@ class LocationSystem:
             offer = Offer(read.balise, read.t_ns, heading, heading, read.odometer_m, read.travelled_m, None, None)
             passage = self.physical.offer(offer)
             self._latch.disarm(read.balise, read.odometer_m)
-            if self._negation is not None and passage.status is PassageStatus.ACCEPTED:
-                self._stand_on(read)
-
-    def _stand_on(self, read: Read) -> None:
-        """While negated a balise says where the train is, so what GNSS minus odometer should be."""
-        if read.odometer_m is not None and isfinite(read.travelled_m):
-            sigma_m = float(np.nan_to_num(self._journey.sigma_m[read.epoch]))
-            offset_m = read.balise.path_m - read.odometer_m
-            self._read_anchor = Anchor(offset_m, sigma_m, read.t_ns, read.travelled_m)
+            if self._recovery is not None and passage.status is PassageStatus.ACCEPTED:
+                self._recovery.stand_on(read)
 
     def _close_windows(self, k: int) -> None:
         """Windows that the train has left, and turns of the train."""
         along_m, turned = self._along_m[k], k in self._turns
         for chain in (self.virtual, self.physical):
             if turned or along_m > chain.closing_m:
-                blind = bool(self._journey.blind[k]) and chain is self.virtual
-                self._advance(chain, k, blind)
+                self._advance(chain, k, self._absence(k) if chain is self.virtual else PassageStatus.MISSED)
 
-    def _advance(self, chain: LinkingChain, k: int, blind: bool) -> None:
+    def _absence(self, k: int) -> PassageStatus:
+        """What to say of a balise that the train has passed and the position has not."""
+        if not self._journey.blind[k]:
+            return PassageStatus.MISSED
+        unplaced = bool(self._journey.placed_nowhere[k])
+        return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
+
+    def _advance(self, chain: LinkingChain, k: int, absence: PassageStatus) -> None:
         journey = self._journey
         chain.advance(
             float(journey.odometer_m[k]),
@@ -220,7 +217,7 @@ class LocationSystem:
             int(journey.heading[k]),
             int(journey.leg[k]),
             self._t_ns[k],
-            blind,
+            absence,
         )
 
     def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:
@@ -249,60 +246,35 @@ class LocationSystem:
         if t_ns - self._consistent_since_ns < self._config.init_s * 1e9:
             return False
         self._chain_from = k
-        self.distance.measure_from(self._anchor_at(k), k)
+        self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
         self._stand(k)
         return True
 
-    def _anchor_at(self, k: int) -> Anchor:
-        journey = self._journey
-        return Anchor(
-            float(journey.path_m[k] - journey.odometer_m[k]),
-            float(journey.sigma_m[k]),
-            self._t_ns[k],
-            float(journey.travelled_m[k]),
-        )
-
     def _negate(self, k: int) -> None:
-        self._negation = Negation(k)
-        self.negations.append(self._negation)
+        self._recovery = Recovery(k, self._journey, self._bank, self._config, self._limits)
+        self.negations.append(Negation(k))
         self.negated[k] = True
-        self._fast_failed_at_ns = self._evaluated_at_ns = self._t_ns[k]
-        self._consistent_since_ns = self._read_anchor = None
+        self._consistent_since_ns = None
 
-    def _seek_return(self, k: int, disordered: bool) -> None:
-        """Recovery: `recovery_s` seen without a fast failure, then the re-link test."""
+    def _seek_return(self, recovery: Recovery, k: int, disordered: bool) -> None:
         self.negated[k] = True
-        t_ns = self._t_ns[k]
-        usable = self._refusal[k] is None
-        seen = self.evaluated[k] if self._journey.has_odometer else usable
-        if seen:
-            if t_ns - self._evaluated_at_ns > self._journey.gap_ns:
-                self._fast_failed_at_ns = t_ns  # nobody looked: that is not "without a failure"
-            self._evaluated_at_ns = t_ns
-        if disordered or self._bank.fast_failed(k):
-            self._fast_failed_at_ns = t_ns
-        if seen and usable and t_ns - self._fast_failed_at_ns >= self._config.recovery_s * 1e9:
-            self._try_to_return(k)
-
-    def _try_to_return(self, k: int) -> None:
-        anchor = self._relink_anchor()
+        if not recovery.is_over(k, self.evaluated[k], disordered):
+            return
+        anchor = recovery.read or self._last_validated()
         if anchor is None:
             self._initialise_anew(k)
-            return
-        bound_m = relink_bound_m(anchor, k, self._journey, self._config, self._limits)
-        here = self._anchor_at(k)
-        if bound_m is not None and abs(here.offset_m - anchor.offset_m) <= bound_m:
-            self._return(k, "re-link" if self._read_anchor is None else "physical balise")
-            self.distance.measure_from(here, k)
+        elif recovery.relinks(k, anchor):
+            self._return(k, "re-link" if recovery.read is None else "physical balise")
+            self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
-    def _relink_anchor(self) -> Anchor | None:
-        """The last place where the position was validated, or a balise read since the alarm."""
-        if self._read_anchor is not None:
-            return self._read_anchor
-        tvb = None if self._last_tvb is None else self._anchor_at(self._last_tvb)
-        if tvb is None or (self._accepted is not None and self._accepted.t_ns > tvb.t_ns):
-            return self._accepted
-        return tvb
+    def _last_validated(self) -> Anchor | None:
+        """Where the last TVB was, or the last accepted VB if that came later."""
+        accepted = self._accepted
+        if self._last_tvb is None:
+            return accepted
+        if accepted is not None and accepted.t_ns > self._t_ns[self._last_tvb]:
+            return accepted
+        return Anchor.at_epoch(self._journey, self._last_tvb)
 
     def _initialise_anew(self, k: int) -> None:
         """Nothing was validated before the fault, so there is nothing to re-link to."""
@@ -313,10 +285,9 @@ class LocationSystem:
         self._stand(k)
 
     def _return(self, k: int, by: Return) -> None:
-        if self._negation is None:
-            raise RuntimeError("return without a negation")
-        self._negation.end_epoch, self._negation.ended_by = k, by
-        self._negation = None
+        negation = self.negations[-1]
+        negation.end_epoch, negation.ended_by = k, by
+        self._recovery = None
         self.negated[k] = False
         self._bank.restart(k)
         self.restarts.append(k)
@@ -330,8 +301,9 @@ class LocationSystem:
     def _finish(self) -> None:
         """Balises that the train has passed by its reckoning when the run ends without a position."""
         known = np.flatnonzero(np.isfinite(self._journey.odometer_m))
-        if known.size and self._journey.blind[-1]:
-            self.virtual.finish(float(self._journey.odometer_m[known[-1]]), self._t_ns[-1])
+        absence = self._absence(len(self._t_ns) - 1) if known.size else PassageStatus.MISSED
+        if absence is not PassageStatus.MISSED:
+            self.virtual.finish(float(self._journey.odometer_m[known[-1]]), self._t_ns[-1], absence)
 
 
 def _turns(journey: Journey) -> frozenset[int]:

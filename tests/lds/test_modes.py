@@ -248,8 +248,13 @@ def test_link_distance_bounds() -> None:
     ("columns", "order_reason", "distance_reason"),
     [
         ({}, None, None),
-        ({"on_track": [True] * 9 + [False]}, None, "match ambiguous or off track"),
+        ({"on_track": [True] * 9 + [False]}, "match ambiguous or off track", "match ambiguous or off track"),
         ({"fix_valid": [True] * 9 + [False]}, "no position", "no position"),
+        (
+            {"sigma_along_m": [None] * 10},
+            "no standard deviation of the position",
+            "no standard deviation of the position",
+        ),
         ({"odometer_m": pl.Series([*steps(0.0, 20.0, 9), None])}, "no odometer", "no odometer"),
     ],
 )
