@@ -14,7 +14,7 @@ import numpy.typing as npt
 import polars as pl
 from scipy.stats import norm
 
-from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.monitors.axis import AxisSeries, along_errors, run_axis
 from pipeline.monitors.recursion import Array, AxisState
 from pipeline.odometer import OdometerTrack, odometer_track, polarity
 from pipeline.odometer_filter import SPEED_SPAN_S, Estimate, FilterState, ScaleLatencyFilter, error_model, prior_of
@@ -27,6 +27,7 @@ NO_ODOMETER = "no odometer"
 BEYOND_SPAN = "outside the odometer's time span"
 INTERRUPTED = "odometer interrupted or slipping"
 _BLOCK = 2048
+_REGULAR_PERIODS = 3
 
 
 def threshold_factor(false_alarm_probability: float) -> float:
@@ -36,12 +37,30 @@ def threshold_factor(false_alarm_probability: float) -> float:
 
 @dataclass(frozen=True)
 class EpochArrays:
-    """What alignment reads of the matched epochs: times [s] on the odometer's scale, positions, usability."""
+    """What alignment reads of the matched epochs: times [s] on the odometer's scale, positions, usability.
+
+    `jitter_s`: by how much the stamps scatter about the receiver's regular times (see `stamp_jitter_s`).
+    """
 
     t_s: Array
     path_m: Array
     sigma_m: Array
     usable: Mask
+    jitter_s: float
+
+
+def stamp_jitter_s(t_s: Array) -> float:
+    """Standard deviation of the stamps about a regular clock [s].
+
+    A receiver measures at regular times; a recorder that stamps on receipt scatters them, and at 40 m/s ten
+    milliseconds are 0.4 m from one epoch to the next. Only the stamps are looked at, never a position.
+    """
+    dt = np.diff(t_s)
+    period = float(np.median(dt))
+    periods = np.round(dt / period)
+    regular = (periods >= 1) & (periods <= _REGULAR_PERIODS)
+    away = (dt - periods * period)[regular]
+    return float(np.sqrt(np.mean(away**2) / 2.0)) if away.size else 0.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +98,7 @@ def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle,
     matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy() & np.isfinite(path_m)
     sign = polarity(track, t_s, np.where(matched, path_m, np.nan), config.matching.orientation_distance_m)
     track = track.oriented(sign)
-    arrays = EpochArrays(t_s, path_m, _floats(epochs["sigma_along_m"]), matched)
+    arrays = EpochArrays(t_s, path_m, _floats(epochs["sigma_along_m"]), matched, stamp_jitter_s(t_s))
     learned = _learn(arrays, track, vehicle, config)
     return epochs.with_columns(_columns(arrays, track, learned, config))
 
@@ -108,6 +127,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
         pl.Series("odometer_step_m", step, nan_to_null=True),
         pl.Series("odometer_reason", reason.tolist(), dtype=pl.String),
         pl.Series("odometer_stretch", track.stretch_at(at)),
+        pl.Series("stamp_jitter_s", np.full(known.size, arrays.jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, track.white_rate_m2_per_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),
         pl.Series("speed_step_mps", speed_step, nan_to_null=True),
@@ -141,6 +161,7 @@ def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configurat
         odometer_step_m=nothing,
         odometer_reason=pl.lit(NO_ODOMETER),
         odometer_stretch=pl.lit(0, pl.Int64),
+        stamp_jitter_s=nothing,
         odometer_white_m2_per_s=nothing,
         speed_mps=pl.Series(speed, nan_to_null=True),
         speed_step_mps=nothing,
@@ -255,7 +276,7 @@ class _Learner:
 
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
-        bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size)
+        bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
         history = [(begin, state)]
         position = begin
         while position < self._rows.size:
@@ -283,7 +304,7 @@ class _Learner:
             t_s, path_m, sigma_m = self._observation(position)
             if self._broken(state.t_s, t_s):
                 state = self._filter.restart(state, t_s, path_m)
-            state = self._filter.update(state, t_s, path_m, sigma_m)
+            state = self._filter.update(state, t_s, path_m, sigma_m, self._arrays.jitter_s)
             states.append((self._next(t_s + SPEED_SPAN_S, position + 1), state))
             position = self._next(t_s + period_s, position + 1)
         return states
@@ -312,9 +333,7 @@ class _Learner:
         """Along-track increments of these positions; the one at `restart` has none before it."""
         first = max(begin - 1, restart)
         rows = self._rows[first:end]
-        series = along_series(
-            rows, self._arrays.t_s, self._arrays.path_m, self._arrays.sigma_m, self._track, self._learned, self._config
-        )
+        series = along_series(rows, self._arrays, self._track, self._learned, self._config)
         return series.between(begin - first, rows.size)
 
     def _hold(self, estimate: Estimate, alarm: int) -> int:
@@ -325,7 +344,7 @@ class _Learner:
         steps = _steps(rows, self._arrays.t_s, self._track, self._learned)
         away = path_m - path_m[0] - np.cumsum(steps.distance_m)
         series = self._series(begin, self._rows.size, begin)
-        state = AxisState.at_restart(self._alphas.size, self._filter.shares.size)
+        state = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
         result, _ = run_axis(series, self._alphas, state)
         beyond = np.abs(result.value[:, :2]) > self._factor * result.sigma[:, :2]
         fast = beyond.any(axis=1) | (np.arange(rows.size) <= 1)
@@ -344,17 +363,11 @@ class _Learner:
 
 
 def along_series(
-    rows: Index,
-    t_s: Array,
-    path_m: Array,
-    sigma_m: Array,
-    track: OdometerTrack,
-    learned: Learned,
-    config: Configuration,
+    rows: Index, arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration
 ) -> AxisSeries:
     """Increments of GNSS minus odometer between consecutive rows (DIAG eq. 1-3)."""
-    steps = _steps(rows, t_s, track, learned)
-    t, x = t_s[rows], path_m[rows]
+    steps = _steps(rows, arrays.t_s, track, learned)
+    t, x = arrays.t_s[rows], arrays.path_m[rows]
     dt = np.diff(t, prepend=t[0] - 1.0)
     stretch = track.stretch_at(t - learned.latency_s[rows])
     fresh = (dt > config.align.gap_reset_s) | (np.diff(stretch, prepend=stretch[0]) != 0)
@@ -368,8 +381,7 @@ def along_series(
         border=np.zeros(rows.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(distance - steps.distance_m) / dt,
-        variance_m2=np.outer(sigma_m[rows] ** 2, shares),
-        decorrelation=-np.expm1(-dt[:, None] / taus_s),
+        **along_errors(arrays.sigma_m[rows] ** 2, arrays.jitter_s * steps.distance_m / dt, dt, shares, taus_s),
         white_m2=track.white_rate_m2_per_s * dt,
         border_m2=zero,
         scale_mps=learned.scale_sigma[rows] * steps.distance_m / dt,

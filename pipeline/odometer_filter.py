@@ -80,8 +80,10 @@ class ScaleLatencyFilter:
         covariance[kept, kept] = state.covariance[kept, kept]
         return replace(fresh, covariance=covariance)
 
-    def update(self, state: FilterState, t_s: float, path_m: float, sigma_m: float) -> FilterState:
-        """The state after the epoch at `t_s` with GNSS path position and sigma."""
+    def update(
+        self, state: FilterState, t_s: float, path_m: float, sigma_m: float, jitter_s: float = 0.0
+    ) -> FilterState:
+        """The state after the epoch at `t_s` with GNSS path position, its sigma and the stamps' jitter."""
         mean, covariance = self._predict(state, t_s)
         at = t_s - mean[_LATENCY]
         around = at + np.array([-SPEED_SPAN_S, 0.0, SPEED_SPAN_S])
@@ -95,7 +97,8 @@ class ScaleLatencyFilter:
         row[_ERRORS:] = sigma_m * np.sqrt(self.shares)
         expected = mean[_OFFSET] + (1.0 + mean[_SCALE]) * row[_SCALE] + row[_ERRORS:] @ mean[_ERRORS:]
         spread = covariance @ row
-        gain = spread / (row @ spread + _WHITE_SHARE * sigma_m**2)
+        white = _WHITE_SHARE * sigma_m**2 + (jitter_s * speed) ** 2
+        gain = spread / (row @ spread + white)
         return replace(
             state,
             mean=mean + gain * (path_m - expected),

@@ -48,6 +48,17 @@ class AxisResult:
     sigma: Array
 
 
+def along_errors(variance_m2: Array, jitter_m: Array, dt_s: Array, shares: Array, taus_s: Array) -> dict[str, Array]:
+    """R_j and 1 - phi_j of the along-track axis: the Gauss-Markov errors, and stamps that scatter.
+
+    `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
+    """
+    return {
+        "variance_m2": np.column_stack([np.outer(variance_m2, shares), jitter_m**2]),
+        "decorrelation": np.column_stack([-np.expm1(-dt_s[:, None] / taus_s), np.ones(dt_s.size)]),
+    }
+
+
 def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisResult, AxisState]:
     """Values and sigmas of the axis from `state` on, and the state to carry on with."""
     moving = ~series.fresh

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.monitors.axis import AxisSeries, Mask
+from pipeline.monitors.axis import AxisSeries, Mask, along_errors
 from pipeline.monitors.recursion import Array
 from pipeline.odometer_filter import error_model
 from schemas.config import Configuration
@@ -88,12 +88,13 @@ class _Builder:
     def along(self, reasons: pl.Series) -> AxisSeries:
         rows = np.flatnonzero(reasons.is_null().to_numpy())
         if rows.size == 0:
-            return _empty(self._shares.size)
+            return _empty(self._shares.size + 1)
         dt, fresh = self._time_steps(rows)
         stretch = self._epochs["odometer_stretch"].to_numpy()[rows]
         fresh |= _changes(stretch)
         odometer = _steps(self._column("odometer_m", rows))
         speed = _steps(self._column("speed_mps", rows))
+        jitter = self._column("stamp_jitter_s", rows) * odometer / dt
         white = self._column("odometer_white_m2_per_s", rows) * dt
         return AxisSeries(
             epoch=rows,
@@ -101,8 +102,7 @@ class _Builder:
             border=np.zeros(rows.size, dtype=np.bool_),
             dt_s=dt,
             rate_mps=(_steps(self._column("path_m", rows)) - odometer) / dt,
-            variance_m2=np.outer(self._variance("sigma_along_m", rows), self._shares),
-            decorrelation=-np.expm1(-dt[:, None] / self._taus_s),
+            **along_errors(self._variance("sigma_along_m", rows), jitter, dt, self._shares, self._taus_s),
             white_m2=white,
             border_m2=np.zeros(rows.size),
             scale_mps=self._column("scale_sigma", rows) * odometer / dt,

@@ -97,9 +97,7 @@ def channel_monitor(epochs: pl.DataFrame, other: pl.DataFrame | None, factor: fl
     """
     if other is None:
         return blind_monitor(epochs.height, NO_OTHER_SOLUTION)
-    usable = other.filter("fix_valid", "on_track").select(
-        "t", path_other_m="path_m", sigma_other_m="sigma_along_m"
-    )
+    usable = other.filter("fix_valid", "on_track").select("t", path_other_m="path_m", sigma_other_m="sigma_along_m")
     both = epochs.select("t", "path_m", "sigma_along_m", "fix_valid", "on_track").join(
         usable, on="t", how="left", maintain_order="left"
     )
