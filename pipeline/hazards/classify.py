@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import polars as pl
 
 from pipeline.hazards.alarms import alarms_table
 from pipeline.hazards.arrays import Bools, Floats, linking_gap_s
 from pipeline.hazards.crossings import beacons_by_leg
 from pipeline.hazards.episodes import Draft, find_episodes
+from pipeline.hazards.excursions import faulty_spans
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.hazards.passages import (
     Links,
@@ -66,34 +66,35 @@ def classify(
     series = series_of(epochs, truth, config.lds)
     fails = fails_of(epochs, config.lds.recovery_s)
     witnesses = witnesses_of(epochs, truth, errors, config.matching.ambiguity_probability)
-    judged = _judge(series, fails, witnesses, truth, passages, balises, faults, config)
+    drafts, jumps = find_episodes(series, beacons_by_leg(balises), config.hazards)
+    judged = []
+    for draft in drafts:
+        timing = time_hazard(draft, series, jumps, fails, faults, config.hazards)
+        judged += _judge(draft, timing, series, fails, witnesses, truth, passages)
     hazards = hazards_table(judged, solution, epochs, series, locate, config.budget_s)
     alarms = alarms_table(fails, judged, solution, witnesses, config.hazards)
-    seen = _passages(series, judged, epochs, truth, passages, balises, config)
+    spans = faulty_spans(series, judged, jumps, fails, faults, config.hazards)
+    seen = _passages(series, judged, spans, epochs, truth, passages, balises, config)
     return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, config))
 
 
 def _judge(
+    draft: Draft,
+    timing: Timing,
     series: Series,
     fails: Fails,
     witnesses: Witnesses,
     truth: pl.DataFrame,
     passages: pl.DataFrame,
-    balises: pl.DataFrame,
-    faults: pl.DataFrame | None,
-    config: Configuration,
 ) -> list[Judged]:
-    drafts, jumps = find_episodes(series, beacons_by_leg(balises), config.hazards)
-    judged = []
-    for draft in drafts:
-        timing = time_hazard(draft, series, jumps, fails, faults, config.hazards)
-        first, last = int(series.row[timing.onset_epoch]), int(series.row[min(draft.end, series.size - 1)])
-        suspect = suspect_of_error(witnesses, min(first, last), max(first, last))
-        if suspect is Suspect.ODOMETER:
-            continue
-        evidence = str(truth["evidence"][int(series.row[draft.first_epoch])])
-        judged.append(_with_passages(draft, timing, evidence, suspect, passages, series))
-    return judged
+    """The hazard with its suspect; none where the odometer that carries the truth is held to be at fault."""
+    first, last = int(series.row[timing.onset_epoch]), int(series.row[min(draft.end, series.size - 1)])
+    first, last = min(first, last), max(first, last)
+    suspect = suspect_of_error(witnesses, first, last, fails.failed_in(first, last))
+    if suspect is Suspect.ODOMETER:
+        return []
+    evidence = str(truth["evidence"][int(series.row[draft.first_epoch])])
+    return [_with_passages(draft, timing, evidence, suspect, passages, series)]
 
 
 def _with_passages(
@@ -109,6 +110,7 @@ def _with_passages(
 def _passages(
     series: Series,
     judged: list[Judged],
+    spans: list[tuple[int, int]],
     epochs: pl.DataFrame,
     truth: pl.DataFrame,
     passages: pl.DataFrame,
@@ -118,7 +120,6 @@ def _passages(
     passings = true_passings(epochs, truth, balises)
     t_true = passings.assign(passages)
     links: Links = link_unoffered(passages, t_true, judged, link_passages(passages, judged, series))
-    spans = [(j.timing.onset_ns, j.timing.detected_ns or np.iinfo(np.int64).max) for j in judged]
     suspicious: Bools = suspicious_passages(passages, spans)
     gap_s = linking_gap_s(series.period_s, config.lds.crossing_gap_s)
     positioned = positions_at(epochs, t_true, gap_s)

@@ -30,14 +30,17 @@ class Draft:
     hits: list[Crossing] = field(default_factory=list)
     end: int = 0
     caused_by: Draft | None = None
+    mark: int = -1
 
     def add(self, hits: tuple[Crossing, ...]) -> None:
         self.hits.extend(hits)
 
     @property
     def first_epoch(self) -> int:
-        """The epoch at or after the hazard itself."""
-        return self.jump.first if self.jump else self.hits[0].epoch
+        """The epoch at or after the hazard itself; `mark` where an error has not hit any VB."""
+        if self.jump is not None:
+            return self.jump.first
+        return self.hits[0].epoch if self.hits else self.mark
 
 
 @dataclass

@@ -53,6 +53,11 @@ class Fails:
             return earlier[-1].monitors[0]
         return None
 
+    def failed_in(self, first: int, last: int) -> tuple[str, ...]:
+        """Monitors of all alarms that overlap the epochs `first..last`."""
+        names = [name for a in self.alarms if a.first <= last and a.last >= first for name in a.monitors]
+        return tuple(dict.fromkeys(names))
+
     def start_within(self, begin_ns: int, end_ns: int) -> int | None:
         """Start of the first alarm that came in `begin <= t < end`."""
         return next((a.start_ns for a in self.alarms if begin_ns <= a.start_ns < end_ns), None)

@@ -80,20 +80,30 @@ def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFra
     speed = floats(epochs, "speed_mps")[rows]
     leg = epochs["leg"].cast(pl.Int64).fill_null(strategy="forward").fill_null(strategy="backward").fill_null(-1)
     legs = leg.to_numpy()[rows]
-    passed_legs = balises["leg"].cast(pl.Int64).to_list()
-    places = balises["path_m"].to_list()
-    for balise, beacon_leg, beacon_m in zip(balises["balise_id"].to_list(), passed_legs, places, strict=True):
-        instants = _instants(at_ns, x, speed, legs == beacon_leg, beacon_m)
-        found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))
+    for (number,), part in balises.sort("path_m").group_by("leg", maintain_order=True):
+        names, places = part["balise_id"].to_list(), floats(part, "path_m")
+        changes = _changes(x, legs == number, places)
+        for index, (balise, beacon_m) in enumerate(zip(names, places.tolist(), strict=True)):
+            instants = _instants(at_ns, x, speed, changes.get(index, []), beacon_m)
+            found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))
     return TruePassings(found, at_ns, x)
 
 
-def _instants(at_ns: Ints, x: Floats, speed: Floats, here: Bools, beacon_m: float) -> list[int]:
-    passed = x >= beacon_m
-    changes = np.flatnonzero((passed[1:] != passed[:-1]) & here[1:]) + 1
+def _changes(x: Floats, here: Bools, places: Floats) -> dict[int, list[int]]:
+    """By number of the balise the epochs whose movement passes it."""
+    passed = np.searchsorted(places, x, side="right")
+    changes: dict[int, list[int]] = {}
+    for epoch in (np.flatnonzero((passed[1:] != passed[:-1]) & here[1:]) + 1).tolist():
+        a, b = sorted((int(passed[epoch - 1]), int(passed[epoch])))
+        for index in range(a, b):
+            changes.setdefault(index, []).append(epoch)
+    return changes
+
+
+def _instants(at_ns: Ints, x: Floats, speed: Floats, changes: list[int], beacon_m: float) -> list[int]:
     instants: list[int] = []
     previous = -1
-    for index in changes.tolist():
+    for index in changes:
         span_s = float(at_ns[index] - at_ns[index - 1]) / NS_PER_S
         if span_s > _HOLE_S:
             continue

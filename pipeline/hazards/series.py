@@ -90,5 +90,7 @@ def series_of(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Seri
 
 def direction_of(epochs: pl.DataFrame) -> Floats:
     """Direction of travel per epoch, +1 or -1; held where it is not known, growing path where it never is."""
-    filled = epochs["direction"].replace(0, None).forward_fill().backward_fill().fill_null(1)
-    return filled.cast(pl.Float64).to_numpy()
+    series = epochs["direction"]
+    if series.null_count() or (series == 0).any():
+        series = series.replace(0, None).forward_fill().backward_fill().fill_null(1)
+    return series.to_numpy().astype(np.float64)

@@ -14,7 +14,9 @@ from pipeline.hazards.jumps import Jump
 from pipeline.hazards.series import Series
 from schemas.config import HazardConfig
 
-_NO_GNSS_KINDS = ("slip", "slide", "scale", "outage")
+# Faults that do not displace the position along the track.
+_OTHER_KINDS = ("slip", "slide", "scale", "outage")
+_OTHER_TARGETS = ("odometer", "cross", "up")
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def _named_onset(faults: pl.DataFrame | None, by_error_ns: int, latest_ns: int) 
     """
     if faults is None or faults.height == 0:
         return None
-    on_position = ~pl.col("kind").is_in(_NO_GNSS_KINDS) & ~pl.col("target").str.starts_with("odometer")
+    on_position = ~pl.col("kind").is_in(_OTHER_KINDS) & ~pl.col("target").is_in(_OTHER_TARGETS)
     starts = pl.col("t_start").dt.timestamp("ns")
     ends = pl.col("t_end").dt.timestamp("ns").fill_null(np.iinfo(np.int64).max)
     on = faults.filter(on_position & (starts <= latest_ns) & (ends >= by_error_ns))

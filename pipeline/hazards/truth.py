@@ -23,6 +23,7 @@ from pipeline.hazards.arrays import (
     nominal_period_s,
     times_ns,
 )
+from pipeline.hazards.slip import repaired_by_doppler
 from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence
@@ -67,6 +68,9 @@ def establish_truth(
     rungs = []
     if reference is not None and reference.height:
         rungs.append(_reference_rung(at_ns, reference))
+        if np.isfinite(rungs[0].path_m).all():
+            return _ladder(epochs["t"], rungs, travel)
+    travel = repaired_by_doppler(travel, positions(epochs), floats(epochs, "velocity_along_mps"))
     if balise_reads is not None and balise_reads.height:
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"))
         rungs.append(_balise_rung(carry(anchors, travel, at_ns, lds, both_ways=True), config))
@@ -78,6 +82,11 @@ def valid_ns(epochs: pl.DataFrame) -> Ints:
     """Instant that each position is of: its stamp less the latency in use."""
     latency_ns = np.round(np.nan_to_num(floats(epochs, "latency_s")) * NS_PER_S).astype(np.int64)
     return times_ns(epochs) - latency_ns
+
+
+def positions(epochs: pl.DataFrame) -> Floats:
+    """Path positions of valid fixes; NaN elsewhere."""
+    return np.where(flags(epochs, "fix_valid"), floats(epochs, "path_m"), np.nan)
 
 
 def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
@@ -122,7 +131,7 @@ def _odometer_rung(
 
 def _initial_anchors(epochs: pl.DataFrame, travel: Travel, at_ns: Ints, init_s: float) -> Anchors:
     """Where no VB was accepted yet: the median of GNSS minus odometer over a stretch's first `init_s`."""
-    offset = np.where(flags(epochs, "fix_valid"), floats(epochs, "path_m"), np.nan) - travel.distance_m
+    offset = positions(epochs) - travel.distance_m
     known = np.flatnonzero(np.isfinite(offset))
     instants: list[int] = []
     places: list[float] = []

@@ -1,0 +1,65 @@
+"""Faults that hit no VB: errors beyond the limits, and true alarms, between the hazards.
+
+They make no row of their own, but a VB accepted between their onset and their detection is as
+suspect as one accepted in a hazard (DOMAIN section 4).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from pipeline.hazards.arrays import NS_PER_S, runs_of
+from pipeline.hazards.episodes import Calm, Draft
+from pipeline.hazards.fails import Fails
+from pipeline.hazards.jumps import Jump
+from pipeline.hazards.rows import Judged
+from pipeline.hazards.series import Series
+from pipeline.hazards.timing import Timing, time_hazard
+from schemas.config import HazardConfig
+from schemas.enums import Hazard
+
+NEVER_NS = int(np.iinfo(np.int64).max)
+
+
+def faulty_spans(
+    series: Series,
+    judged: list[Judged],
+    jumps: list[Jump],
+    fails: Fails,
+    faults: pl.DataFrame | None,
+    config: HazardConfig,
+) -> list[tuple[int, int]]:
+    """Onset and detection [ns] of each fault; without detection its span is open, for nothing told it was over."""
+    spans = [_span(item.timing) for item in judged]
+    marks = _marks(series, fails, config)
+    if not marks:
+        return spans
+    calm = Calm.of(series, config.episode_end_s)
+    covered = [(item.timing.onset_ns, item.timing.end_ns) for item in judged]
+    for mark in marks:
+        at_ns = int(series.t_ns[mark])
+        if any(begin <= at_ns <= end for begin, end in covered):
+            continue
+        draft = Draft(Hazard.VB_SHIFT, calm.last_before(mark), end=calm.first_from(mark), mark=mark)
+        timing = time_hazard(draft, series, jumps, fails, faults, config)
+        covered.append((timing.onset_ns, timing.end_ns))
+        spans.append(_span(timing))
+    return spans
+
+
+def _span(timing: Timing) -> tuple[int, int]:
+    return timing.onset_ns, NEVER_NS if timing.detected_ns is None else timing.detected_ns
+
+
+def _marks(series: Series, fails: Fails, config: HazardConfig) -> list[int]:
+    """First epochs of errors beyond the failure limit, and of errors that make an alarm true."""
+    size = np.abs(series.error_m)
+    beyond = (size > config.failure_limit_m) & (size > series.bound_m)
+    marks = set(runs_of(beyond)[0].tolist())
+    for alarm in fails.alarms:
+        since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
+        begin, end = np.searchsorted(series.t_ns, (since_ns, alarm.end_ns + 1))
+        wrong = size[begin:end] > np.maximum(config.false_alarm_margin_m, series.quiet_m[begin:end])
+        marks.update((begin + np.flatnonzero(wrong)[:1]).tolist())
+    return sorted(marks)

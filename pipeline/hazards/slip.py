@@ -1,0 +1,66 @@
+"""Slip and slide: where Doppler and position agree against the odometer, the Doppler velocity carries the truth.
+
+An odometer that slips would otherwise make a healthy position look like a hazard (DOMAIN section 5, Suspect).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.travel import Travel
+
+# A short slip shows over seconds, a slow one over a minute.
+_WINDOWS_S = (2.0, 10.0, 60.0)
+_DOPPLER_SIGMA_MPS = 0.1
+_LEAST_M = 2.0
+# Two-sided Gaussian 1e-7, as of the monitors (DOMAIN section 3).
+_FACTOR = 5.3267
+# Longest step between epochs over which the mean of two velocities stands for the way.
+_LONGEST_STEP_S = 2.0
+
+
+def repaired_by_doppler(travel: Travel, position_m: Floats, velocity_mps: Floats) -> Travel:
+    """The travel with the odometer's steps replaced by Doppler's where the odometer stands alone.
+
+    `position_m`: path position by GNSS, NaN where there is none; `velocity_mps`: GNSS velocity along growing path.
+    """
+    dt_s = np.diff(travel.at_ns) / NS_PER_S
+    by_doppler = 0.5 * (velocity_mps[1:] + velocity_mps[:-1]) * dt_s
+    by_odometer = np.diff(travel.distance_m)
+    by_odometer[np.diff(travel.stretch) != 0] = np.nan
+    known = np.isfinite(by_doppler) & np.isfinite(by_odometer) & (dt_s <= _LONGEST_STEP_S)
+    if not known.any():
+        return travel
+    apart = np.where(known, by_doppler - by_odometer, 0.0)
+    wrong: Bools = np.zeros(apart.size, dtype=np.bool_)
+    for window_s in _WINDOWS_S:
+        wrong |= _odometer_alone(travel, position_m, apart, window_s)
+    correction = np.concatenate(([0.0], np.cumsum(np.where(wrong & known, apart, 0.0))))
+    return replace(travel, distance_m=travel.distance_m + correction)
+
+
+def _odometer_alone(travel: Travel, position_m: Floats, apart: Floats, window_s: float) -> Bools:
+    """Steps within windows over which Doppler minus odometer exceeds its noise and GNSS positions follow Doppler."""
+    stamps = travel.at_ns
+    begin = np.searchsorted(stamps, stamps - round(window_s * NS_PER_S), side="left")
+    total = np.concatenate(([0.0], np.cumsum(apart)))
+    slipped = total - total[begin]
+    moved = travel.distance_m - travel.distance_m[begin]
+    noise = np.sqrt((_DOPPLER_SIGMA_MPS**2 + travel.white_m2_per_s) * window_s + (travel.scale_sigma * moved) ** 2)
+    follows = position_m - position_m[begin] - moved
+    with np.errstate(invalid="ignore"):
+        found = (np.abs(slipped) > np.maximum(_LEAST_M, _FACTOR * noise)) & (
+            np.abs(follows - slipped) < 0.5 * np.abs(slipped)
+        )
+    return _covered(begin[found], np.flatnonzero(found), apart.size)
+
+
+def _covered(begins: Ints, ends: Ints, size: int) -> Bools:
+    """Steps from each begin to its end; step k leads from epoch k to k + 1."""
+    depth = np.zeros(size + 1, dtype=np.int64)
+    np.add.at(depth, begins, 1)
+    np.add.at(depth, ends, -1)
+    return np.cumsum(depth)[:size] > 0

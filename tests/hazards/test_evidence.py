@@ -1,0 +1,141 @@
+"""The ladder of evidence, and the same faults with each kind of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of
+
+READS = tuple(np.arange(50.0, 2400.0, 500.0))
+VBS_ACCEPTED = {"V0": 5.0, "V1": 15.0, "V2": 25.0}
+
+FAULTS = {
+    "jump over two": Journey(steps=((31.0, 36.0, 300.0),), accepted=VBS_ACCEPTED),
+    "jump over one": Journey(steps=((34.0, 38.0, 45.0),), accepted=VBS_ACCEPTED),
+    "offset that stays": Journey(steps=((31.0, 60.0, 60.0),), accepted=VBS_ACCEPTED),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_same_faults_with_each_kind_of_evidence(name):
+    journey = FAULTS[name]
+    by_reference = judge(journey).hazards
+    by_balises = judge(journey.but(reference=False, reads=READS)).hazards
+    by_odometer = judge(journey.but(reference=False)).hazards
+    assert by_reference.height > 0
+    for found, evidence in ((by_balises, "balise"), (by_odometer, "odometer")):
+        assert found["evidence"].unique().to_list() == [evidence]
+        for column in ("hazard", "balise_ids", "t_hazard", "caused_by", "timing"):
+            assert found[column].to_list()[:1] == by_reference[column].to_list()[:1], (evidence, column)
+        assert found["hazard"].to_list() == by_reference["hazard"].to_list()
+
+
+def test_slow_drift_that_moves_the_anchors_is_seen_by_balise_reads_but_not_by_the_odometer_alone():
+    # Accepted VBs anchor the odometer anew, each a little more wrong: the odometer alone cannot see it.
+    accepted = {f"V{i}": (100.0 + 200.0 * i + 5.0) / 20.5 for i in range(8)}
+    journey = Journey(ramps=((10.0, 110.0, 0.5),), accepted=accepted, reference=False)
+    assert judge(journey).hazards.height == 0
+    (row,) = judge(journey.but(reads=READS)).hazards.to_dicts()
+    assert (row["hazard"], row["timing"], row["evidence"]) == ("VB_SHIFT", "early", "balise")
+
+
+def test_only_what_exceeds_the_odometers_confidence_is_a_hazard():
+    # V2 (500 m) accepted at 25 s; 22 m from 55 s on: V6 (1300 m) offered 778 m after it, 5 + 38.9 m cover that.
+    journey = Journey(steps=((55.0, 75.0, 19.5),), ramps=((56.0, 75.0, 0.5),), accepted=VBS_ACCEPTED)
+    assert judge(journey).hazards.height == 1
+    assert judge(journey.but(reference=False)).hazards.height == 0
+
+
+def test_truth_is_interpolated_to_the_time_of_validity():
+    # Latency 0.2 s at 20 m/s: the position stamped t is that of the train at t - 0.2 s, 4 m behind.
+    journey = Journey(steps=((0.0, 500.0, -4.0),))
+    epochs = journey.epochs().with_columns(latency_s=pl.lit(0.2))
+    from pipeline.hazards import classify, establish_truth
+    from schemas.config import Configuration
+
+    config = Configuration()
+    passages = journey.passages([{"balise_id": "V3", "t_offered": 35.2}])
+    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
+    result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    known = result.epochs_columns["error_along_m"].drop_nulls()
+    assert known.abs().max() == pytest.approx(0.0, abs=1e-6)
+    (row,) = result.passages.to_dicts()
+    assert seconds(row["t_true"]) == pytest.approx(35.0)
+    assert row["location_error_m"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_gap_in_the_reference_falls_down_the_ladder():
+    journey = Journey(reads=READS)
+    reference = journey.reference_frame().filter(
+        ~pl.col("t").is_between(
+            pl.lit(START_NS + 20 * 10**9).cast(UTC), pl.lit(START_NS + 30 * 10**9).cast(UTC), closed="none"
+        )
+    )
+    from pipeline.hazards import establish_truth
+    from schemas.config import Configuration
+
+    config = Configuration()
+    truth = establish_truth(
+        journey.epochs(), reference, journey.reads_frame(), journey.passages(), config.hazards, config.lds
+    )
+    evidence = truth["evidence"].to_list()
+    assert (evidence[199], evidence[250], evidence[301]) == ("reference", "balise", "reference")
+    assert truth["truth_path_m"].to_numpy() == pytest.approx(journey.truth_m(), abs=1e-6)
+
+
+def test_odometer_error_between_two_reads_is_shared_out_by_distance():
+    # 1 % too much counted between reads at 50 m and 550 m: 5 m; half way the truth is still met.
+    journey = Journey(reference=False, reads=(50.0, 550.0), slip=(2.5, 27.5, 0.2))
+    truth = truth_of(journey)
+    assert truth["truth_path_m"].to_numpy()[25:276] == pytest.approx(journey.truth_m()[25:276], abs=0.03)
+
+
+def test_reads_that_contradict_the_odometer_widen_the_bound():
+    # 60 m slipped between two reads 500 m apart: beyond 2 * 5 m + 5 % of the way; nothing below 60 m is a hazard.
+    journey = Journey(reference=False, reads=(50.0, 550.0), slip=(10.0, 20.0, 6.0))
+    truth = truth_of(journey)
+    assert truth["truth_bound_m"][150] == pytest.approx(60.0, abs=0.1)
+    assert judge(journey).hazards.height == 0
+
+
+def test_slip_with_doppler_is_no_hazard_whatever_the_evidence():
+    journey = Journey(
+        reference=False,
+        doppler=True,
+        accepted=VBS_ACCEPTED,
+        slip=(40.0, 50.0, 8.0),
+        fails={"along_raw": ((40.2, 50.0),)},
+    )
+    for reads in ((), READS):
+        result = judge(journey.but(reads=reads))
+        assert result.hazards.height == 0
+        (alarm,) = result.alarms.to_dicts()
+        assert alarm["suspect"] == "odometer"
+        assert alarm["verdict"] != "true"
+
+
+def test_doppler_names_the_position_where_it_left_alone():
+    journey = FAULTS["jump over one"].but(reference=False, doppler=True)
+    (row,) = judge(journey).hazards.to_dicts()
+    assert row["suspect"] == "gnss"
+    (row,) = judge(journey.but(doppler=False)).hazards.to_dicts()
+    assert row["suspect"] == "unknown"
+
+
+def test_without_reference_and_odometer_there_is_no_truth():
+    journey = Journey(reference=False)
+    nothing = pl.lit(None, pl.Float64)
+    epochs = journey.epochs().with_columns(odometer_m=nothing, scale_sigma=nothing, odometer_white_m2_per_s=nothing)
+    from pipeline.hazards import establish_truth
+    from schemas.config import Configuration
+
+    config = Configuration()
+    truth = establish_truth(epochs, None, None, journey.passages(), config.hazards, config.lds)
+    assert truth["evidence"].null_count() == truth.height
+    assert truth["truth_path_m"].null_count() == truth.height
+
+
+def test_stamps_of_the_synthetic_journeys_are_utc():
+    assert stamps([0.0]).dtype == UTC
