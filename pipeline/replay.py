@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 
-import dataframely as dy
 import polars as pl
 
 from pipeline.align import align, threshold_factor
@@ -18,6 +17,7 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.single import NO_RANGES, blind_monitor, channel_monitor, doppler_monitor
 from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
 from schemas.config import Configuration, Vehicle, digest_of
+from schemas.conform import conform
 from schemas.enums import Evidence
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
@@ -82,9 +82,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     reference = _reference_on_path(context, found.path)
     reads = _reads_on_path(run.balise_reads, balises)
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
-    result = classify(
-        solution, monitored, truth, lds.passages, balises, run.faults, found.path.locate, config
-    )
+    result = classify(solution, monitored, truth, lds.passages, balises, run.faults, found.path.locate, config)
     epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
     results = SolutionResults(
         solution=solution,
@@ -190,6 +188,4 @@ def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:
 
 def _table(name: str, parts: list[pl.DataFrame]) -> pl.DataFrame:
     """Rows of all solutions, by the contract."""
-    schema: type[dy.Schema] = TABLES[name]
-    columns = schema.column_names()
-    return schema.validate(pl.concat([part.select(columns) for part in parts]), cast=True)
+    return pl.concat([conform(part, TABLES[name]) for part in parts])
