@@ -122,9 +122,12 @@ def _notes(found: Match, lds: LdsResult) -> tuple[str, ...]:
     """What the reader of the `runs` row should know beside its figures."""
     notes = []
     if found.ambiguous.height:
+        clock = "%H:%M:%S"
         stretches = [
-            f"{row['netelement_id']} or {row['other_netelement_id']} from {row['t_start']:%H:%M:%S} to {row['t_end']:%H:%M:%S}"
-            for row in found.ambiguous.iter_rows(named=True)
+            f"{one} or {other} from {start:{clock}} to {end:{clock}}"
+            for one, other, start, end in found.ambiguous.select(
+                "netelement_id", "other_netelement_id", "t_start", "t_end"
+            ).iter_rows()
         ]
         notes.append("ambiguous: " + ", ".join(stretches))
     if lds.unknown_reads.height:

@@ -55,6 +55,4 @@ def one_of(kind: type[StrEnum], meaning: str, **rules: Any) -> dy.Enum:
 
 def instant(meaning: str, **rules: Any) -> dy.Datetime:
     """GNSS time of validity, UTC, nanoseconds."""
-    return dy.Datetime(
-        time_unit="ns", time_zone="UTC", description=meaning, metadata={"unit": "UTC"}, **rules
-    )
+    return dy.Datetime(time_unit="ns", time_zone="UTC", description=meaning, metadata={"unit": "UTC"}, **rules)

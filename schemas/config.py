@@ -245,12 +245,9 @@ def settings_from(data: Mapping[str, object], kind: type[S], place: str) -> S:
         return kind.model_validate(data)
     except ValidationError as error:
         breaches = [
-            f"{'.'.join(str(part) for part in breach['loc']) or '(file)'}: {breach['msg']}"
-            for breach in error.errors()
+            f"{'.'.join(str(part) for part in breach['loc']) or '(file)'}: {breach['msg']}" for breach in error.errors()
         ]
-        raise ConfigError(
-            "; ".join(breaches), place=place, remedy="See the configuration reference."
-        ) from None
+        raise ConfigError("; ".join(breaches), place=place, remedy="See the configuration reference.") from None
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import dataframely as dy
 import polars as pl
 from pydantic import BaseModel
@@ -26,10 +28,10 @@ def _dtype(column: dy.Column) -> str:
     return str(column.dtype)
 
 
-def groups() -> dict[str, dict[str, type[dy.Schema]]]:
+def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
     """All table contracts by where they stand: input streams, site, output tables."""
     return {
-        "Input streams": {name: schema for name, schema in STREAM_SCHEMAS.items()},
+        "Input streams": STREAM_SCHEMAS,
         "Site": SITE_SCHEMAS,
         "Output tables": TABLES,
     }
@@ -57,9 +59,7 @@ def dictionary_frame() -> pl.DataFrame:
 def settings_frame() -> pl.DataFrame:
     """One row per key of the configuration and the vehicle file: `file, key, default`."""
     rows = _settings_rows("configuration", "", Configuration()) + _settings_rows("vehicle", "", Vehicle())
-    return pl.DataFrame(
-        rows, schema={"file": pl.String, "key": pl.String, "default": pl.String}, orient="row"
-    )
+    return pl.DataFrame(rows, schema={"file": pl.String, "key": pl.String, "default": pl.String}, orient="row")
 
 
 def _settings_rows(file: str, prefix: str, settings: BaseModel) -> list[tuple[str, str, str]]:
@@ -68,9 +68,7 @@ def _settings_rows(file: str, prefix: str, settings: BaseModel) -> list[tuple[st
         value = getattr(settings, name)
         if isinstance(value, BaseModel):
             rows += _settings_rows(file, f"{prefix}{name}.", value)
-        elif (
-            isinstance(value, dict) and value and all(isinstance(item, BaseModel) for item in value.values())
-        ):
+        elif isinstance(value, dict) and value and all(isinstance(item, BaseModel) for item in value.values()):
             for key, item in value.items():
                 rows += _settings_rows(file, f"{prefix}{name}.{key}.", item)
         else:

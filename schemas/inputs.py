@@ -44,7 +44,7 @@ class Odometer(dy.Schema):
     slip = flag("the odometer reports slip or slide", nullable=True)
 
     @dy.rule()
-    def distance_or_speed(cls):  # type: ignore[no-untyped-def]
+    def distance_or_speed(cls):  # type: ignore[no-untyped-def]  # noqa: N805
         return cls.distance_m.col.is_not_null() | cls.speed_mps.col.is_not_null()
 
 

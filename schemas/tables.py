@@ -188,9 +188,7 @@ def _epochs_schema() -> type[dy.Schema]:
     for monitor in MONITORS:
         columns |= _monitor_columns(monitor)
     columns |= _EpochsAfterMonitors.columns()
-    return type(
-        "Epochs", (dy.Schema,), {"__doc__": _EpochsBeforeMonitors.__doc__, "__module__": __name__, **columns}
-    )
+    return type("Epochs", (dy.Schema,), {"__doc__": _EpochsBeforeMonitors.__doc__, "__module__": __name__, **columns})
 
 
 Epochs = _epochs_schema()

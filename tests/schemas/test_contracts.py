@@ -1,0 +1,107 @@
+"""Contracts, configuration and the generated dictionary."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from schemas.config import Configuration, Vehicle, digest_of, load_settings, settings_from, to_toml
+from schemas.conform import conform
+from schemas.dictionary import dictionary_frame, dictionary_markdown
+from schemas.errors import BaliseError, ConfigError, InputError
+from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
+from schemas.tables import MONITORS, TABLES, Alarms, Epochs
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_dictionary_page_is_fresh():
+    page = (ROOT / "docs" / "dictionary.md").read_text(encoding="utf-8")
+    assert page == dictionary_markdown(), "run `make dictionary`"
+
+
+def test_every_column_says_what_it_means_and_floats_have_unit_and_tolerance():
+    assert dictionary_frame().filter(pl.col("meaning") == "").is_empty()
+    for schema in (*STREAM_SCHEMAS.values(), *SITE_SCHEMAS.values(), *TABLES.values()):
+        for name, column in schema.columns().items():
+            if column.dtype == pl.Float64 and schema is not STREAM_SCHEMAS["faults"]:
+                assert {"unit", "tolerance"} <= set(column.metadata), (schema, name)
+
+
+def test_monitors_have_the_names_of_the_domain():
+    names = [
+        f"{axis}_{scale}"
+        for axis in ("along", "cross", "up")
+        for scale in ("raw", "ewma_0p1", "ewma_0p01", "ewma_0p001")
+    ]
+    assert list(MONITORS) == [*names, "link_order", "link_distance", "along_doppler", "pseudorange", "channel"]
+    assert {f"{name}_{part}" for name in MONITORS for part in ("value", "threshold", "state", "reason")} <= set(
+        Epochs.column_names()
+    )
+
+
+def test_allowed_times_to_detect_of_the_papers():
+    """TVB eq. 7; 1.675 s where the paper prints 1.44 s, the rate's mantissa."""
+    safety = Configuration().safety
+    assert safety.allowed_time_to_detect_s("npa") == pytest.approx(24.12, abs=0.005)
+    assert safety.allowed_time_to_detect_s("lpv200") == pytest.approx(0.5025, abs=5e-5)
+    assert Configuration().budget_s == pytest.approx(1.675, abs=5e-4)
+    assert safety.allowed_time_to_detect_s("horizontal_sis") == pytest.approx(100.5, abs=0.05)
+
+
+def test_unknown_keys_are_refused_with_their_path():
+    with pytest.raises(ConfigError, match=r"my\.toml.*lds\.recovery_sec") as caught:
+        settings_from({"lds": {"recovery_sec": 3.0}, "foo": 1}, Configuration, "my.toml")
+    assert "foo" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["lds = [", "\x00"])
+def test_a_file_that_is_no_toml_is_one_error(tmp_path, text):
+    path = tmp_path / "f.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"f\.toml"):
+        load_settings(path, Configuration)
+
+
+def test_a_missing_file_is_one_error(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_settings(tmp_path / "no.toml", Vehicle)
+
+
+def test_resolved_configuration_reads_back_as_itself(tmp_path):
+    config = settings_from({"lds": {"ci_limit_m": 20}, "ingest": {"gnss": {"topic": "/fix"}}}, Configuration, "x")
+    path = tmp_path / "c.toml"
+    path.write_text(to_toml(config))
+    again = load_settings(path, Configuration)
+    assert again == config
+    assert digest_of(again) == digest_of(config) != digest_of(Configuration())
+
+
+def test_a_service_level_that_does_not_exist_is_refused():
+    with pytest.raises(ConfigError, match="service_level"):
+        settings_from({"hazards": {"service_level": "apv"}}, Configuration, "x")
+
+
+def test_errors_keep_their_kind_and_words_between_processes():
+    error = InputError("no column", place="r/gnss.parquet", found="a", expected="t", remedy="Add it.")
+    again = pickle.loads(pickle.dumps(error))
+    assert isinstance(again, InputError)
+    assert isinstance(again, BaliseError)
+    assert str(again) == "r/gnss.parquet: no column; found a; expected t. Add it."
+
+
+def test_a_table_with_nan_or_a_forbidden_null_is_a_defect():
+    alarms = Alarms.create_empty()
+    row = {
+        "solution": "primary", "alarm_id": 0, "t_start": 0, "t_end": 1, "monitors": ["along_raw"], "peak_ratio": 2.0,
+        "verdict": "true", "suspect": "gnss", "hazard_id": None,
+    }  # fmt: skip
+    good = pl.DataFrame([row], schema_overrides=alarms.schema)
+    assert conform(good, Alarms).schema == alarms.schema
+    with pytest.raises(ValueError, match="peak_ratio holds NaN"):
+        conform(good.with_columns(peak_ratio=float("nan")), Alarms)
+    with pytest.raises(ValueError, match="verdict holds null"):
+        conform(good.with_columns(verdict=pl.lit(None)), Alarms)
