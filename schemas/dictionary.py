@@ -31,7 +31,7 @@ def _dtype(column: dy.Column) -> str:
 def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
     """All table contracts by where they stand: input streams, site, output tables."""
     return {
-        "Input streams": STREAM_SCHEMAS,
+        "Input streams": {str(name): schema for name, schema in STREAM_SCHEMAS.items()},
         "Site": SITE_SCHEMAS,
         "Output tables": TABLES,
     }
