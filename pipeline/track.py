@@ -65,6 +65,13 @@ def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: 
     return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
 
 
+def gap_m(track: Track, a: int, position_a: int, b: int, position_b: int) -> float:
+    """Length of a gap between two ends that counts as track [m]: 0 where it is only survey noise."""
+    pair = [track.end(a, position_a), track.end(b, position_b)]
+    gap = float(distances_m(track.latitude_deg[pair], track.longitude_deg[pair], np.zeros(2))[0])
+    return gap if gap > GAP_COUNTS_M else 0.0
+
+
 _NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")
 
 

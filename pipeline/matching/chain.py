@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
+from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.leg import Visit, leg_of, nearest_on_leg, path_at
@@ -15,18 +16,6 @@ from pipeline.matching.path import TravelledPath
 from pipeline.track import Track
 from schemas.config import MatchingConfig
 from schemas.enums import Navigability
-from schemas.errors import InputError
-from schemas.run import Site
-
-
-def chain_path(
-    fixes: Fixes, odometer: pl.DataFrame | None, track: Track, site: Site, config: MatchingConfig
-) -> tuple[TravelledPath, Assignment]:
-    """The part of the site's one chain that the run covers, oriented as the run began."""
-    visits = whole_chain(track, site.links)
-    if visits is None:
-        raise InputError("the track branches", place="site", expected="one chain of net elements")
-    return path_on_chain(fixes, odometer, track, visits, config)
 
 
 def path_on_chain(
@@ -36,7 +25,7 @@ def path_on_chain(
     feet = nearest_on_leg(fixes.points.take(np.flatnonzero(fixes.valid)), leg)
     near = feet.distance_m <= config.reach_m
     if not near.any():
-        raise InputError("the run is wholly off the track", place="gnss")
+        raise off_the_network(fixes, track, config)
     position = np.full(len(fixes), np.nan)
     position[fixes.valid] = np.where(near, path_at(leg, feet), np.nan)
     used = np.unique(leg.visit[feet.segment[near]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -54,9 +54,10 @@ class Leg:
     def end_m(self) -> float:
         return float(self.path_end_m[-1])
 
-    def visit_start_m(self, number: int) -> float:
-        """Path position where a visit begins."""
-        return float(self.path_start_m[np.searchsorted(self.visit, number)])
+    def entry_m(self, number: int) -> float:
+        """Path position where an element of the leg is entered, a gap before it left behind."""
+        own = np.searchsorted(self.visit, number)
+        return float(self.path_start_m[own + (self.measure_start_m[own] == self.measure_end_m[own])])
 
 
 def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
@@ -87,6 +88,11 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
         turn_end_rad=np.concatenate([turn, [0.0]]),
         **joined,
     )
+
+
+def shifted(leg: Leg, by_m: float) -> Leg:
+    """The same leg with its path position moved on."""
+    return replace(leg, path_start_m=leg.path_start_m + by_m, path_end_m=leg.path_end_m + by_m)
 
 
 def nearest_on_leg(points: Points, leg: Leg, near_path_m: Floats | None = None) -> Feet:

@@ -7,23 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.matching.chain import chain_path
-from pipeline.matching.epochs import Assignment, epoch_frame
+from pipeline.geodesy import Ints
+from pipeline.matching.chain import path_on_chain, whole_chain
+from pipeline.matching.epochs import epoch_frame
+from pipeline.matching.find import AMBIGUOUS_COLUMNS, find_path
 from pipeline.matching.fixes import Fixes, fixes_of
+from pipeline.matching.network import network_of
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.residuals import biases
-from pipeline.track import track_of
+from pipeline.track import Track, track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
-
-AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
-    "t_start": pl.Datetime("ns", "UTC"),
-    "t_end": pl.Datetime("ns", "UTC"),
-    "netelement_id": pl.String,
-    "other_netelement_id": pl.String,
-    "probability": pl.Float64,
-}
 
 
 @dataclass(frozen=True)
@@ -53,12 +48,28 @@ def match(
     arrays = fixes_of(fixes, fix_sigma)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    path, found = chain_path(arrays, odometer, track_of(site.track), site, config)
+    track = track_of(site.track)
+    chain = whole_chain(track, site.links)
+    if chain is not None:
+        path, found = path_on_chain(arrays, odometer, track, chain, config)
+        ambiguous = pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
+    else:
+        pinned = pins_of(arrays, site, track, balise_reads)
+        network = network_of(track, site.links)
+        path, found, ambiguous = find_path(arrays, odometer, network, pinned, config)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    return Match(epochs, path, biases(epochs), pl.DataFrame(schema=AMBIGUOUS_COLUMNS))
+    return Match(epochs, path, biases(epochs), ambiguous)
 
 
-def certain(fixes: Fixes) -> Assignment:
-    """One leg, no alternative."""
-    ones = np.ones(len(fixes))
-    return Assignment(np.zeros(len(fixes), dtype=np.int64), None, ones, ones)
+def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame | None) -> Ints:
+    """Per epoch the element of the balise read then (at the first epoch not before the read), else -1."""
+    pinned = np.full(len(fixes), -1, dtype=np.int64)
+    if balise_reads is None or site.balises is None:
+        return pinned
+    place = dict(site.balises.select("balise_id", "netelement_id").iter_rows())
+    times = balise_reads["t"].to_physical().to_list()
+    for t_ns, name in zip(times, balise_reads["balise_id"].to_list(), strict=True):
+        epoch = int(np.searchsorted(fixes.t_ns, t_ns))
+        if epoch < len(fixes) and place.get(name) in track.index:
+            pinned[epoch] = track.index[place[name]]
+    return pinned

@@ -160,7 +160,7 @@ def _balises_on(
             continue
         measures = track.measure_m[track.vertices(visit.element)]
         origin = float(measures[0] if visit.forward else measures[-1])
-        start = _entry_m(leg, index)
+        start = leg.entry_m(index)
         for row in group.iter_rows(named=True):
             if not measures[0] - MEASURE_TOLERANCE_M <= row["measure_m"] <= measures[-1] + MEASURE_TOLERANCE_M:
                 continue
@@ -168,12 +168,6 @@ def _balises_on(
             values = (row["balise_id"], row["kind"], name, row["measure_m"], path_m)
             rows.append((number, *values, row["location_accuracy_m"], row["linked"], row["link_reaction"]))
     return rows
-
-
-def _entry_m(leg: Leg, visit: int) -> float:
-    """Path position where an element is entered, a gap before it left behind."""
-    own = np.flatnonzero((leg.visit == visit) & (leg.measure_start_m != leg.measure_end_m))
-    return float(leg.path_start_m[own[0]])
 
 
 def _column(values: npt.ArrayLike) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,6 +25,16 @@ class Polyline:
 
     def __len__(self) -> int:
         return len(self.start)
+
+
+class HasSegments(Protocol):
+    """Anything made of segments between earth-centred places at height zero."""
+
+    @property
+    def start(self) -> Floats: ...
+
+    @property
+    def end(self) -> Floats: ...
 
 
 @dataclass(frozen=True)
@@ -93,7 +104,7 @@ def downhill(points: Points, line: Polyline, segment: Ints) -> Feet:
     return _held_to_line(feet, len(line))
 
 
-def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
+def on_segments(points: Points, line: HasSegments, segment: Ints) -> Feet:
     """Each point on its given segment, in the tangent plane of the point; `fraction` is not limited."""
     to_start, to_end = line.start[segment] - points.surface, line.end[segment] - points.surface
     x, y = _dot(to_start, points.east), _dot(to_start, points.north)

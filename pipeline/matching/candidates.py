@@ -1,0 +1,171 @@
+"""Where each epoch may be: the nearest place on every net element within reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.matching.segments import on_segments
+from pipeline.track import Track
+
+# Search points along every element, ends included, are at most this far apart.
+PROBE_SPACING_M = 25.0
+
+
+@dataclass(frozen=True)
+class Segments:
+    """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e."""
+
+    start: Floats
+    end: Floats
+    element: Ints
+    first: Ints
+    measure_start_m: Floats
+    measure_end_m: Floats
+    heading_rad: Floats
+    sigma_m: Floats
+    tree: cKDTree
+    probe_segment: Ints
+
+    def __len__(self) -> int:
+        return len(self.element)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
+
+    `along_m` from the element's start, `beyond_m` how far the position lies past an end, `offset_m` left of
+    the element's own sense.
+    """
+
+    first: Ints
+    step: Ints
+    element: Ints
+    along_m: Floats
+    beyond_m: Floats
+    offset_m: Floats
+    distance_m: Floats
+    heading_rad: Floats
+    survey_sigma_m: Floats
+    past: Ints
+
+    def take(self, rows: Ints, steps: int) -> Candidates:
+        """Some of the candidates, in the same order."""
+        step = self.step[rows]
+        columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
+        return Candidates(first=np.searchsorted(step, np.arange(steps + 1)), **columns)
+
+
+_COLUMNS = (
+    *("step", "element", "along_m", "beyond_m", "offset_m"),
+    *("distance_m", "heading_rad", "survey_sigma_m", "past"),
+)
+
+
+def segments_of(track: Track) -> Segments:
+    """Segments of all elements with probes for the search."""
+    places = points_of(track.latitude_deg, track.longitude_deg)
+    owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    head = np.flatnonzero(owner[:-1] == owner[1:])
+    start, end = places.surface[head], places.surface[head + 1]
+    along = end - start
+    east = np.einsum("ij,ij->i", along, places.east[head])
+    north = np.einsum("ij,ij->i", along, places.north[head])
+    probes, probe_segment = _probes(start, end, owner[head])
+    return Segments(
+        start=start,
+        end=end,
+        element=owner[head],
+        first=np.searchsorted(owner[head], np.arange(len(track.ids) + 1)),
+        measure_start_m=track.measure_m[head],
+        measure_end_m=track.measure_m[head + 1],
+        heading_rad=np.arctan2(east, north),
+        sigma_m=np.fmax(track.sigma_m[head], track.sigma_m[head + 1]),
+        tree=cKDTree(probes, balanced_tree=False, compact_nodes=False),
+        probe_segment=probe_segment,
+    )
+
+
+def candidates_of(points: Points, track: Track, segments: Segments, reach_m: float) -> Candidates:
+    """For every point the nearest place on each element whose distance is within reach [m]."""
+    tree = cKDTree(points.surface)
+    radius = np.hypot(reach_m, PROBE_SPACING_M / 2.0) + 1.0
+    pairs = tree.sparse_distance_matrix(segments.tree, radius, output_type="ndarray")
+    step, segment = pairs["i"].astype(np.int64), segments.probe_segment[pairs["j"]]
+    order = np.lexsort((pairs["v"], segments.element[segment], step))
+    step, segment = step[order], segment[order]
+    element = segments.element[segment]
+    fresh = np.ones(len(step), dtype=bool)
+    fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
+    step, segment = step[fresh], _downhill(points, segments, step[fresh], segment[fresh])
+    return _candidates(points, track, segments, step, segment, reach_m)
+
+
+def _candidates(
+    points: Points, track: Track, segments: Segments, step: Ints, segment: Ints, reach_m: float
+) -> Candidates:
+    feet = on_segments(points.take(step), segments, segment)
+    near = np.flatnonzero(feet.distance_m <= reach_m)
+    feet, step, segment = feet.take(near), step[near], segment[near]
+    element = segments.element[segment]
+    held = np.clip(feet.fraction, 0.0, 1.0)
+    measure = segments.measure_start_m[segment]
+    span = segments.measure_end_m[segment] - measure
+    at_start = (segment == segments.first[element]) & (feet.fraction < 0)
+    at_end = (segment == segments.first[element + 1] - 1) & (feet.fraction > 1)
+    past = np.where(at_start, -1, np.where(at_end, 1, 0))
+    corner = (past == 0) & (held != feet.fraction)
+    side = np.where(feet.offset_m < 0, -1.0, 1.0)
+    return Candidates(
+        first=np.searchsorted(step, np.arange(len(points) + 1)),
+        step=step,
+        element=element,
+        along_m=measure + held * span - track.measure_m[track.first[element]],
+        beyond_m=np.abs(feet.fraction - held) * span * (past != 0),
+        offset_m=np.where(corner, side * feet.distance_m, feet.offset_m),
+        distance_m=feet.distance_m,
+        heading_rad=segments.heading_rad[segment],
+        survey_sigma_m=segments.sigma_m[segment],
+        past=past,
+    )
+
+
+def _downhill(points: Points, segments: Segments, step: Ints, segment: Ints) -> Ints:
+    """Each candidate's nearest segment, walking along its element while that gets nearer."""
+    segment = segment.copy()
+    feet = on_segments(points.take(step), segments, segment)
+    active = np.flatnonzero((feet.fraction < 0) | (feet.fraction > 1))
+    while len(active):
+        other = segment[active] + np.where(feet.fraction[active] < 0, -1, 1)
+        inside = (other >= 0) & (other < len(segments))
+        active, other = active[inside], other[inside]
+        same = segments.element[other] == segments.element[segment[active]]
+        active, other = active[same], other[same]
+        trial = on_segments(points.take(step[active]), segments, other)
+        better: Bools = trial.distance_m < feet.distance_m[active] - 1e-9
+        rows = np.flatnonzero(better)
+        active = active[rows]
+        segment[active] = other[rows]
+        feet.put(active, trial.take(rows))
+        active = active[(feet.fraction[active] < 0) | (feet.fraction[active] > 1)]
+    return segment
+
+
+def _probes(start: Floats, end: Floats, element: Ints) -> tuple[Floats, Ints]:
+    """Search points: along long segments several, along runs of short ones only some."""
+    lengths = np.linalg.norm(end - start, axis=1)
+    pieces = np.maximum(1, np.ceil(lengths / PROBE_SPACING_M)).astype(np.int64)
+    segment = np.repeat(np.arange(len(start)), pieces)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    fraction = (number + 0.5) / pieces[segment]
+    place = np.cumsum(lengths)[segment] - lengths[segment] * (1.0 - fraction)
+    bucket = np.floor(place / (PROBE_SPACING_M / 2.0))
+    new = np.ones(len(segment), dtype=bool)
+    new[1:] = (bucket[1:] != bucket[:-1]) | (element[segment[1:]] != element[segment[:-1]])
+    kept = np.flatnonzero(new)
+    chosen = segment[kept]
+    return start[chosen] + fraction[kept][:, None] * (end - start)[chosen], chosen

@@ -1,0 +1,96 @@
+"""How well a net element explains a position (Newson & Krumm 2009, eq. 1, made fit for correlated errors).
+
+Newson & Krumm take the positions' errors as independent. A receiver's are not: they last for a minute, so
+independent epochs would make the search certain of the wrong track within seconds. Here the offset from a
+track is a first-order Gauss-Markov process whose variance V is the position's and the survey's, and each
+step is judged by what it adds: N(r; φ r', V (1 - φ²)), exact for such errors at any spacing of the steps.
+A small share of outliers with a wide distribution keeps single jumps from deciding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.geodesy import Bools, Floats, Ints
+from pipeline.matching.candidates import Candidates
+from pipeline.matching.fixes import Fixes
+from pipeline.matching.steps import Steps
+from schemas.config import MatchingConfig
+
+# Floor of what the offset changes from step to step [m]: rounding of surveys and fixes.
+_FLOOR_M = 0.02
+_HEADING_LIMIT = 8.0
+_ENDS_SIGMA_M = 1.0
+_RULED_OUT = -50.0
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Per candidate: variance of the offset, what of it is new since the step before, and the rest.
+
+    `fixed` is the log-likelihood that does not depend on the step before (place past an element's end,
+    reads of balises, heading as far as it is new); `heading` is the whole of it, for a first step.
+    """
+
+    variance_m2: Floats
+    fresh_m2: Floats
+    keep: Floats
+    fixed: Floats
+    heading: Floats
+    outlier: float
+    outlier_scale_m: float
+
+    def with_pins(self, ruled_out: Bools) -> Likelihood:
+        """As before, and candidates ruled out by a balise read next to impossible."""
+        return replace(self, fixed=self.fixed + np.where(ruled_out, _RULED_OUT, 0.0))
+
+
+def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: MatchingConfig) -> Likelihood:
+    """The part of the likelihood that needs no neighbouring step."""
+    row = steps.epoch[candidates.step]
+    gnss_m2 = _cross_m2(fixes, row, candidates.heading_rad)
+    survey = np.where(np.isfinite(candidates.survey_sigma_m), candidates.survey_sigma_m, config.survey_sigma_default_m)
+    # A table's sigma knows nothing of antenna and datum: their offset comes on top, and it does not change.
+    bias_m2 = np.where(fixes.from_receiver[row], 0.0, config.bias_sigma_m**2)
+    variance = gnss_m2 + survey**2 + bias_m2
+    elapsed, way = steps.elapsed_s[candidates.step], steps.chord_m[candidates.step]
+    renewed = -np.expm1(-2.0 * np.nan_to_num(elapsed) / config.noise_tau_s)
+    new_track = -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
+    fresh = np.clip(gnss_m2 * renewed + survey**2 * new_track, _FLOOR_M**2, variance)
+    heading = _heading(steps, candidates, config)
+    beyond = candidates.beyond_m**2 / (variance + _ENDS_SIGMA_M**2)
+    return Likelihood(
+        variance_m2=variance,
+        fresh_m2=fresh,
+        keep=np.sqrt(1.0 - fresh / variance),
+        fixed=-0.5 * beyond + heading * fresh / variance,
+        heading=heading,
+        outlier=config.outlier_probability,
+        outlier_scale_m=config.outlier_scale_m,
+    )
+
+
+def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Likelihood) -> Floats:
+    """Log density of an offset: Gaussian, or with small probability an outlier (Cauchy)."""
+    gauss = -0.5 * ((offset_m - mean_m) ** 2 / variance_m2 + np.log(2.0 * np.pi * variance_m2))
+    scale = like.outlier_scale_m
+    wide = -np.log(np.pi * scale * (1.0 + (offset_m / scale) ** 2))
+    return np.logaddexp(np.log1p(-like.outlier) + gauss, np.log(like.outlier) + wide)
+
+
+def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
+    """Variance of the position across an element's axis."""
+    sin, cos = np.sin(heading_rad), np.cos(heading_rad)
+    ee, en, nn = fixes.cov_ee_m2[row], fixes.cov_en_m2[row], fixes.cov_nn_m2[row]
+    return np.maximum(cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn, 1e-6)
+
+
+def _heading(steps: Steps, candidates: Candidates, config: MatchingConfig) -> Floats:
+    """Log-likelihood of the direction of travel, either way along the element; nothing at standstill."""
+    difference = steps.heading_rad[candidates.step] - candidates.heading_rad
+    folded = (np.degrees(difference) + 90.0) % 180.0 - 90.0
+    value = np.maximum(-0.5 * (folded / config.heading_sigma_deg) ** 2, -_HEADING_LIMIT)
+    moving = steps.speed_mps[candidates.step] >= config.heading_min_speed_mps
+    return np.where(moving & np.isfinite(value), value, 0.0)

@@ -1,0 +1,118 @@
+"""Which epochs can change what is known of the path: the steps of the search.
+
+Position errors last for a minute or more, so epochs a few metres apart say the same about the track; and an
+epoch that lies further from the last one than the train can have moved says nothing about it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.geodesy import Bools, Floats, Ints
+from pipeline.matching.fixes import Fixes
+from pipeline.odometer import odometer_track
+from schemas.config import MatchingConfig
+
+# No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s).
+_TOP_SPEED_MPS = 100.0
+# How far odometer and GNSS may differ over a step before it counts as a jump: share, and standard deviations.
+_ODOMETER_SHARE = 0.05
+_JUMP_SIGMAS = 5.0
+_JUMP_MARGIN_M = 10.0
+# A pause in an odometer of speeds alone that is longer loses the way.
+_ODOMETER_GAP_S = 1.0
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Epochs that are judged; distances [m] and times [s] since the step before (NaN at the first).
+
+    `odometer_m` is signed in the odometer's own sense, NaN where it is not known.
+    """
+
+    epoch: Ints
+    elapsed_s: Floats
+    chord_m: Floats
+    odometer_m: Floats
+    speed_mps: Floats
+    heading_rad: Floats
+
+    def __len__(self) -> int:
+        return len(self.epoch)
+
+
+@dataclass(frozen=True)
+class Travelled:
+    """Odometer distance at each epoch [m], NaN outside its span; comparable within one `stretch` only."""
+
+    distance_m: Floats
+    stretch: Ints
+
+    def between(self, rows: Ints, others: Ints) -> Floats:
+        """Signed distance from some epochs to others, NaN where the odometer does not know it."""
+        same = self.stretch[rows] == self.stretch[others]
+        return np.where(same, self.distance_m[others] - self.distance_m[rows], np.nan)
+
+
+def travelled(fixes: Fixes, odometer: pl.DataFrame | None) -> Travelled:
+    """The odometer at the epochs' times."""
+    if odometer is None or odometer.height < 2:
+        return Travelled(np.full(len(fixes), np.nan), np.zeros(len(fixes), dtype=np.int64))
+    track = odometer_track(odometer, gap_s=_ODOMETER_GAP_S, sigma_mps=1.0)
+    t_s = track.seconds(fixes.t_ns)
+    inside = (t_s >= track.t_s[0]) & (t_s <= track.t_s[-1])
+    return Travelled(np.where(inside, track.distance_at(t_s), np.nan), track.stretch_at(t_s))
+
+
+def steps_of(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig) -> Steps:
+    """Steps every `step_distance_m` of movement and `step_time_s` of time among the usable epochs."""
+    rows = np.flatnonzero(usable)
+    if len(rows) == 0:
+        return _steps(fixes, rows, way)
+    moved = np.linalg.norm(np.diff(fixes.points.surface[rows], axis=0), axis=1)
+    far = np.floor(np.concatenate([[0.0], np.cumsum(moved)]) / config.step_distance_m)
+    late = np.floor((fixes.t_s[rows] - fixes.t_s[rows[0]]) / config.step_time_s)
+    fresh = np.ones(len(rows), dtype=bool)
+    fresh[1:] = (np.diff(far) > 0) | (np.diff(late) > 0)
+    fresh[-1] = True
+    chosen = rows[fresh]
+    return _steps(fixes, chosen[_believable(fixes, chosen, way, config)], way)
+
+
+def _believable(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Bools:
+    """Steps that the train can have reached from the last believed one; after `jump_hold_s` any."""
+    place, t_s = fixes.points.surface[rows], fixes.t_s[rows]
+    sigma = np.sqrt(0.5 * (fixes.cov_ee_m2[rows] + fixes.cov_nn_m2[rows]))
+    by_odometer, stretch = way.distance_m[rows], way.stretch[rows]
+    believed = np.zeros(len(rows), dtype=bool)
+    last = 0
+    for row in range(len(rows)):
+        apart = float(np.sqrt(((place[row] - place[last]) ** 2).sum()))
+        elapsed = float(t_s[row] - t_s[last])
+        moved = abs(float(by_odometer[row] - by_odometer[last]))
+        known = np.isfinite(moved) and stretch[row] == stretch[last]
+        limit = moved * (1 + _ODOMETER_SHARE) if known else elapsed * _TOP_SPEED_MPS
+        limit += _JUMP_MARGIN_M + _JUMP_SIGMAS * float(sigma[row] + sigma[last])
+        if apart <= limit or elapsed > config.jump_hold_s:
+            believed[row], last = True, row
+    return believed
+
+
+def _steps(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
+    unknown = np.full(min(1, len(rows)), np.nan)
+    elapsed = np.concatenate([unknown, np.diff(fixes.t_s[rows])])
+    moved = np.diff(fixes.points.surface[rows], axis=0, prepend=np.nan)
+    chord = np.linalg.norm(moved, axis=1)
+    east = np.einsum("ij,ij->i", moved, fixes.points.east[rows])
+    north = np.einsum("ij,ij->i", moved, fixes.points.north[rows])
+    # The receiver's own velocity where there is one; else the way between steps.
+    vel_e, vel_n = fixes.vel_e_mps[rows], fixes.vel_n_mps[rows]
+    doppler = np.isfinite(vel_e) & np.isfinite(vel_n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        speed = np.where(doppler, np.hypot(vel_e, vel_n), chord / elapsed)
+    heading = np.where(doppler, np.arctan2(vel_e, vel_n), np.arctan2(east, north))
+    by_odometer = np.concatenate([unknown, way.between(rows[:-1], rows[1:])])
+    return Steps(rows, elapsed, chord, by_odometer, speed, heading)
