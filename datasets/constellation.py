@@ -168,7 +168,8 @@ def visible(
 def _sidereal_angle(t_ns: Times) -> Array:
     """Greenwich mean sidereal time [rad] (IAU 1982, linear term; UT1 taken as UTC)."""
     days = (t_ns - _instant_ns(2000, 1, 1)) * 1e-9 / _DAY_S - 0.5
-    return np.radians((280.46061837 + 360.98564736629 * days) % 360.0)
+    angle: Array = np.radians((280.46061837 + 360.98564736629 * days) % 360.0)
+    return angle
 
 
 def _earth_fixed(latitude_deg: float, longitude_deg: float, height_m: float) -> Array:

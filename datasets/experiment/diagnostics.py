@@ -219,8 +219,6 @@ def write_experiment(
     return written + (draw_figures(frames.pmd, frames.detection, frames.geometry, out) if figures else [])
 
 
-
-
 _LABELS = {
     "constellation": pl.String,
     "reading": pl.String,

@@ -163,7 +163,7 @@ class Watch:
         keep = 1.0 - self._plan.alphas[self._banks.alpha]
         smooth = 1.0 - keep ** np.maximum(elapsed, 0)
         drift = np.broadcast_to(elapsed, (end - begin, self._slope.size - self._monitors))
-        return np.maximum(np.hstack([smooth, drift]) * self._slope, _TINY)
+        return np.asarray(np.maximum(np.hstack([smooth, drift]) * self._slope, _TINY))
 
     def before_onset(self, basis: Array, begin: int) -> None:
         threshold = self.thresholds(begin, begin + len(basis))
@@ -186,7 +186,8 @@ class Watch:
         self._look(basis, form, run, threshold, response, begin)
         opposite = low < -least
         if opposite.any():
-            self._look_opposite(basis, *np.nonzero(opposite), threshold, response, begin)
+            form, run = np.nonzero(opposite)
+            self._look_opposite(basis, form, run, threshold, response, begin)
 
     def _open_for_forms(self) -> Array:
         """Largest rate that some question of the form still waits for, shape (forms, repetitions)."""
@@ -194,7 +195,7 @@ class Watch:
         largest = self._largest_open[lists[:, 0]]
         for column in lists.T[1:]:
             np.maximum(largest, self._largest_open[column], out=largest)
-        return largest[self._pattern_of_form]
+        return np.asarray(largest[self._pattern_of_form])
 
     def _envelope(self, basis: Array) -> tuple[Array, Array]:
         """Upper and lower bound of every form over the block."""
@@ -204,14 +205,12 @@ class Watch:
     def _values(self, basis: Array, form: Index, run: Index) -> Array:
         """Forms of runs, epoch by epoch, shape (epochs, pairs)."""
         place, factor = self._terms
-        values = basis[:, place[form, 0], run] * factor[form, 0]
+        values: Array = basis[:, place[form, 0], run] * factor[form, 0]
         for term in range(1, place.shape[1]):
             values += basis[:, place[form, term], run] * factor[form, term]
         return values
 
-    def _look(
-        self, basis: Array, form: Index, run: Index, threshold: Array, response: Array, begin: int
-    ) -> None:
+    def _look(self, basis: Array, form: Index, run: Index, threshold: Array, response: Array, begin: int) -> None:
         """First passages of the chosen pairs, epoch by epoch."""
         reach = threshold[:, form] - self._values(basis, form, run)
         reach /= response[:, form]
@@ -241,9 +240,7 @@ class Watch:
         self._largest_open[question, chosen] = still_open.max(axis=1)
 
 
-def first_passages(
-    plan: Plan, banks: Forms, failures: Forms, repetitions: int, rng: np.random.Generator
-) -> Passages:
+def first_passages(plan: Plan, banks: Forms, failures: Forms, repetitions: int, rng: np.random.Generator) -> Passages:
     """Simulate `repetitions` runs of the plan and answer all of its questions."""
     paths = NoisePaths(plan, repetitions, rng)
     watch = Watch(plan, banks, failures, paths.weights, repetitions)

@@ -154,9 +154,7 @@ class _Builder:
     def up(self) -> None:
         axis = np.array([0.0, 0.0, 1.0])
         for alpha in self._plan.alphas:
-            members = [
-                s == "odometer_and_track" and alpha in self._plan.banks[r] for r, _, s in self._plan.questions
-            ]
+            members = [s == "odometer_and_track" and alpha in self._plan.banks[r] for r, _, s in self._plan.questions]
             self._add("up", axis, alpha, {"up": 1.0}, 0.0, self._plan.map_m, members)
 
     def _add(

@@ -1,0 +1,200 @@
+"""The paper's findings as statements that hold or do not, and the share of geometries in which they do.
+
+The findings stand in DIAG, section Simulation, for one sky that is lost. Each is put as a condition on
+simulated times, judged per sky, constellation and reading of the odometer's noise, and null where it says nothing (the
+failure never happens there).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from datasets.experiment.diagnostics import SEED, detection_times
+from datasets.experiment.geometry import CONSTELLATIONS, PLACES, Geometry, epochs_of_day, geometry_at
+from datasets.experiment.passage import first_passages
+from datasets.experiment.plan import Plan, bank_forms, failure_forms
+from datasets.experiment.tables import write_tables
+from datasets.experiment.workers import generator, in_blocks, mapped
+from pipeline.statistics import clopper_pearson
+
+EPOCHS_PER_PLACE = 40
+REPETITIONS = 500
+_BLOCK_REPETITIONS = 250
+_TWICE = 2.0
+_THIRD_SMALLER = 2.0 / 3.0
+# From this rate on, every ramp is to be detected; up to this one, spreads are compared.
+_SLOWEST_COVERED_MPS = 0.03
+_FASTEST_COMPARED_MPS = 1.0
+
+STATEMENTS: dict[str, str] = {
+    "pmd_zero_0p03": "heading 0, odometer only: no run at 0.03 m/s is undetected at the failure (Fig. 5)",
+    "pmd_zero_0p1": "heading 0, odometer only: no run at 0.10 m/s is undetected at the failure (Fig. 5)",
+    "pmd_not_zero_0p01": "heading 0, odometer only: some run at 0.01 m/s is undetected at the failure (Fig. 5)",
+    "dual_ahead": "heading 0: expected T_dsf of GPS + Galileo is below that of GPS, at every rate (Fig. 7)",
+    "dual_ahead_from_0p03": "the same at every rate from 0.03 m/s on",
+    "turning_away": "odometer only: T_d at 75 deg is at least twice that at 0 deg, or nothing is detected (Fig. 6)",
+    "track_covers": "with track: every run from 0.03 m/s on is detected, at every heading (Fig. 6)",
+    "track_steadies": "max/min of T_d over headings is with track at most 2/3 of odometer only, 0.03 to 1 m/s (Fig. 6)",
+}
+
+
+@dataclass(frozen=True)
+class _Sky:
+    number: int
+    seed: int
+    repetitions: int
+    geometries: tuple[Geometry, ...]
+
+
+def skies(per_place: int) -> list[tuple[Geometry, ...]]:
+    """Both constellations at each place and epoch."""
+    return [
+        tuple(geometry_at(place, t_ns, constellation) for constellation in CONSTELLATIONS)
+        for place in PLACES
+        for t_ns in epochs_of_day(place, per_place)
+    ]
+
+
+def findings_by_geometry(
+    per_place: int = EPOCHS_PER_PLACE, repetitions: int = REPETITIONS, seed: int = SEED, jobs: int = 1
+) -> pl.DataFrame:
+    """`place, t, elevation_deg, constellation, reading, finding, holds`, one row per statement and sky."""
+    tasks = [_Sky(number, seed, repetitions, sky) for number, sky in enumerate(skies(per_place))]
+    return pl.concat(mapped(_judge_sky, tasks, jobs))
+
+
+def shares(by_geometry: pl.DataFrame) -> pl.DataFrame:
+    """Share of skies in which each finding holds, with exact bounds; `silent` counts those where it says nothing."""
+    keys = ["finding", "constellation", "reading"]
+    counted = by_geometry.group_by(keys, maintain_order=True).agg(
+        holds=pl.col("holds").sum(), judged=pl.col("holds").count(), silent=pl.col("holds").null_count()
+    )
+    estimates = [clopper_pearson(row["holds"], row["judged"]) for row in counted.iter_rows(named=True)]
+    return counted.with_columns(
+        share=pl.Series([e.value for e in estimates], dtype=pl.Float64),
+        share_low=pl.Series([e.low for e in estimates], dtype=pl.Float64),
+        share_high=pl.Series([e.high for e in estimates], dtype=pl.Float64),
+        statement=pl.col("finding").replace_strict(STATEMENTS),
+    ).sort(keys)
+
+
+def _judge_sky(sky: _Sky) -> pl.DataFrame:
+    frames = []
+    for index, geometry in enumerate(sky.geometries):
+        plan = Plan(geometry)
+        banks, failures = bank_forms(plan), failure_forms(plan)
+        parts = [
+            detection_times(
+                plan,
+                first_passages(plan, banks, failures, size, generator(sky.seed, sky.number, index, block)),
+            )
+            for block, size in enumerate(in_blocks(sky.repetitions, sky.repetitions))
+        ]
+        frames.extend(parts)
+    geometry = sky.geometries[0]
+    return judge(pl.concat(frames)).select(
+        pl.lit(geometry.place).alias("place"),
+        pl.lit(geometry.t_ns).cast(pl.Datetime("ns", "UTC")).alias("t"),
+        pl.lit(float(geometry.elevation_deg[geometry.faulty])).alias("elevation_deg"),
+        pl.all(),
+    )
+
+
+def judge(detection: pl.DataFrame) -> pl.DataFrame:
+    """`constellation, reading, finding, holds` from the table of detection times of one sky."""
+    keys = ["constellation", "reading"]
+    parts = [
+        _at_failure(detection, 0.03, "pmd_zero_0p03", pl.col("pmd_at_failure") == 0),
+        _at_failure(detection, 0.1, "pmd_zero_0p1", pl.col("pmd_at_failure") == 0),
+        _at_failure(detection, 0.01, "pmd_not_zero_0p01", pl.col("pmd_at_failure") > 0),
+        _dual_ahead(detection, 0.0, "dual_ahead"),
+        _dual_ahead(detection, _SLOWEST_COVERED_MPS, "dual_ahead_from_0p03"),
+        _turning_away(detection),
+        _track_covers(detection),
+        _track_steadies(detection),
+    ]
+    return pl.concat([part.select(*keys, "finding", "holds") for part in parts]).sort("finding", *keys)
+
+
+def _at_failure(detection: pl.DataFrame, rate_mps: float, finding: str, holds: pl.Expr) -> pl.DataFrame:
+    odometer_only = (pl.col("sensors") == "odometer") & (pl.col("heading_deg") == 0.0)
+    return detection.filter(odometer_only & (pl.col("rate_mps") == rate_mps)).with_columns(
+        finding=pl.lit(finding), holds=holds
+    )
+
+
+def _dual_ahead(detection: pl.DataFrame, from_mps: float, finding: str) -> pl.DataFrame:
+    """Judged for odometer only, as Fig. 5; null where the failure never happens with one of the two."""
+    times = (
+        detection.filter(
+            (pl.col("sensors") == "odometer") & (pl.col("heading_deg") == 0.0) & (pl.col("rate_mps") >= from_mps)
+        )
+        .pivot("constellation", index=["reading", "rate_mps"], values="time_since_failure_s")
+        .with_columns(ahead=pl.col("gps_galileo") < pl.col("gps"))
+    )
+    return (
+        times.group_by("reading", maintain_order=True)
+        .agg(holds=pl.when(pl.col("ahead").null_count() == 0).then(pl.col("ahead").all()))
+        .with_columns(finding=pl.lit(finding), constellation=pl.lit("gps_galileo"))
+    )
+
+
+def _turning_away(detection: pl.DataFrame) -> pl.DataFrame:
+    """At 0.10 m/s, the middle of the rates; faster ramps are seen within seconds whatever the heading."""
+    odometer_only = detection.filter((pl.col("sensors") == "odometer") & (pl.col("rate_mps") == 0.1))
+    return _extremes(odometer_only, pl.col("heading_deg").is_in([0.0, 75.0])).with_columns(
+        finding=pl.lit("turning_away"),
+        holds=(pl.col("last_s") >= _TWICE * pl.col("first_s")) | (pl.col("last_detected") == 0),
+    )
+
+
+def _extremes(detection: pl.DataFrame, chosen: pl.Expr) -> pl.DataFrame:
+    ordered = detection.filter(chosen).sort("heading_deg")
+    return ordered.group_by("constellation", "reading", maintain_order=True).agg(
+        first_s=pl.col("time_to_detect_s").first(),
+        last_s=pl.col("time_to_detect_s").last(),
+        last_detected=pl.col("detected").last(),
+    )
+
+
+def _track_covers(detection: pl.DataFrame) -> pl.DataFrame:
+    with_track = (pl.col("sensors") == "odometer_and_track") & (pl.col("rate_mps") >= _SLOWEST_COVERED_MPS)
+    return (
+        detection.filter(with_track)
+        .group_by("constellation", "reading", maintain_order=True)
+        .agg(holds=(pl.col("censored") == 0).all())
+        .with_columns(finding=pl.lit("track_covers"))
+    )
+
+
+def _track_steadies(detection: pl.DataFrame) -> pl.DataFrame:
+    compared = pl.col("rate_mps").is_between(_SLOWEST_COVERED_MPS, _FASTEST_COMPARED_MPS)
+    spread = (
+        detection.filter(compared)
+        .group_by("constellation", "reading", "rate_mps", "sensors", maintain_order=True)
+        .agg(ratio=pl.col("time_to_detect_s").max() / pl.col("time_to_detect_s").min())
+        .pivot("sensors", index=["constellation", "reading", "rate_mps"], values="ratio")
+    )
+    steadier = pl.col("odometer_and_track") <= _THIRD_SMALLER * pl.col("odometer")
+    return (
+        spread.group_by("constellation", "reading", maintain_order=True)
+        .agg(holds=steadier.all())
+        .with_columns(finding=pl.lit("track_steadies"))
+    )
+
+
+def write_findings(
+    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, per_place: int = EPOCHS_PER_PLACE
+) -> list[Path]:
+    """`findings.parquet` (per sky) and `shares.parquet`."""
+    by_geometry = findings_by_geometry(per_place, repetitions or REPETITIONS, seed, jobs)
+    settings = {
+        "experiment": "findings",
+        "repetitions": repetitions or REPETITIONS,
+        "seed": seed,
+        "epochs_per_place": per_place,
+    }
+    return write_tables(out, {"findings": by_geometry, "shares": shares(by_geometry)}, settings)
