@@ -1,4 +1,27 @@
-"""Location determination system: virtual balises, ETCS linking, travelling virtual balise."""
+"""Location determination system: virtual balises, ETCS linking, travelling virtual balise.
+
+Where the sources leave a choice, this package reads them so:
+
+- A step that passes a balise is judged by its last epoch: first the monitors (negated or failing: rejected
+  by monitor), then the match, then the confidence; only what is then a detection is judged by linking.
+- A passage has one row. An offer outside the window, before or after it, is the passage's row unless the
+  position went back over the balise; further offers have rows of their own. `linking_error` keeps the
+  first error: an early balise that is then not found in its window stays `early`, and still counts for
+  two missed in a row.
+- A balise that is passed but not accepted is `missed` by linking whatever kept it from being accepted
+  (outage, monitor, confidence, ambiguity): `status` says what happened, `linking_error` what the train
+  made of it.
+- Virtual balises and physical ones are two chains that know nothing of each other, with one exception: a
+  physical balise read while the position is negated says what GNSS minus odometer should be.
+- Linking holds in both directions of travel. Balises in whose window the train turned round may be found
+  or not; the 5 % of the odometer then count on the whole way run since the reference.
+- Not announced (`linked` false): rejected while linking is in force, taken like any other before that.
+- With `entry_from_unfitted_area` the first virtual balise too needs the diagnosis behind it (a TVB, or
+  `init_s` of consistent epochs); without it the first one may begin the chain at once.
+- The linking distance monitor allows the odometer's 5 m + 5 % and the noise of the two positions at k_T:
+  5 m alone would alarm on sound receivers.
+- Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
+"""
 
 from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.run import LdsResult, run_lds

@@ -136,8 +136,8 @@ def _row(passage: Passage, journey: Journey, solution: str) -> dict[str, object]
 def _direction(passage: Passage, journey: Journey) -> Direction:
     heading = passage.heading
     if journey.has_odometer:
-        epoch = min(int(np.searchsorted(journey.t_ns, passage.t_ns)), journey.t_ns.size - 1)
-        heading = int(journey.travel[epoch])
+        before = max(int(np.searchsorted(journey.t_ns, passage.t_ns)) - 1, 0)
+        heading = int(journey.travel[before])
     return Direction.GROWING if heading > 0 else Direction.FALLING
 
 

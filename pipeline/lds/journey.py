@@ -22,9 +22,10 @@ class Journey:
     """Epochs in order of time; a NaN is a value that is not known.
 
     `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
-    count, `None` where it would. `heading`: +1/-1, known at that epoch; `travel`: the same, put
-    back to where the train turned (for labels only). `travelled_m`: way run, turns included.
-    `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
+    count, `None` where it would. `heading`: direction of travel (+1/-1) as known at that epoch;
+    `travel`: that of the step from this epoch to the next, put back to where the train turned (for
+    labels only). `travelled_m`: way run, turns included. `blind`: no position for longer than a
+    crossing is interpolated over (`gap_ns`).
     """
 
     t_ns: Integers

@@ -109,30 +109,43 @@ class LinkingChain:
         """Its window has closed without any offer."""
         return balise.balise_id in self._unoffered
 
-    def advance(
-        self, odometer_m: float, travelled_m: float, heading: int, leg: int, t_ns: int, absence: PassageStatus
-    ) -> None:
+    def advance(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
         """The train has come to this odometer reading; `absence`: status of what it did not find."""
-        if not self.linking:
+        if self.linking:
+            self._close_windows(self._distance_m(odometer_m), t_ns, absence)
+
+    def turn(self, odometer_m: float, travelled_m: float, heading: int, leg: int) -> None:
+        """The train goes the other way, or on another leg: expect what lies on its new way."""
+        if self.reference is None or not self.linking:
             return
-        if heading != self._heading or leg != self._leg:
-            self._turn_round(odometer_m, travelled_m, heading, leg)
-        self._close_windows(self._distance_m(odometer_m), t_ns, absence)
+        self._heading, self._leg = heading, leg
+        self._turn = _Turn(self._distance_m(odometer_m), travelled_m - self.reference.travelled_m)
+        for kept in (self._own, self._set_aside, self._unoffered):
+            kept.clear()
+        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel()]
+        here_m = self._turn.distance_m
+        self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
+        self._look_ahead([balise for balise, window in windows if window.close_m > here_m])
 
     def offer(self, offer: Offer) -> Passage:
         """Judge an offered balise; its passage is written whatever comes of it."""
-        linking = self.linking and offer.odometer_m is not None
-        if linking and offer.odometer_m is not None:
-            self._close_windows(self._distance_m(offer.odometer_m), offer.t_ns, PassageStatus.MISSED)
+        distance_m = None
+        if self.linking and offer.odometer_m is not None:
+            distance_m = self._distance_m(offer.odometer_m)
+            self._close_windows(distance_m, offer.t_ns, PassageStatus.MISSED)
+        overdue = offer.sense == offer.heading and self.is_overdue(offer.balise)
         passage = self._passage_of(offer)
-        if linking and offer.odometer_m is not None:
-            passage.odometer_distance_m = self._distance_m(offer.odometer_m)
+        passage.odometer_distance_m = distance_m
+        if distance_m is None and not overdue:
+            passage.window = None
         if offer.refusal is not None:
             passage.status = offer.refusal
-        elif linking:
-            self._judge(passage)
-        else:
+        elif overdue:
+            passage.status = PassageStatus.REJECTED_WINDOW
+        elif distance_m is None:
             passage.status = PassageStatus.ACCEPTED
+        else:
+            self._judge(passage, distance_m)
         if passage.status is PassageStatus.ACCEPTED:
             self._refer_to(offer)
         return passage
@@ -186,10 +199,9 @@ class LinkingChain:
         margin_m = balise.accuracy_m + reference_accuracy_m + self._config.odometer_fixed_m
         return window_after_turn_m(distance_m, travelled_m, margin_m, self._config)
 
-    def _judge(self, passage: Passage) -> None:
+    def _judge(self, passage: Passage, distance_m: float) -> None:
         """A detection while linking is in force (SUBSET-026 3.16.2.3.1)."""
-        balise, distance_m = passage.balise, passage.odometer_distance_m
-        assert distance_m is not None
+        balise = passage.balise
         if not balise.linked:
             passage.status = PassageStatus.REJECTED_UNLINKED
             return
@@ -246,19 +258,6 @@ class LinkingChain:
         self._own.pop(balise.balise_id, None)
         beyond = [other for other in self._in_order_of_travel() if self._announced_m(other) > 0]
         self._look_ahead(beyond if self.linking else [])
-
-    def _turn_round(self, odometer_m: float, travelled_m: float, heading: int, leg: int) -> None:
-        """The train goes the other way, or on another leg: expect what lies on its new way."""
-        assert self.reference is not None
-        self._heading, self._leg = heading, leg
-        self._turn = _Turn(self._distance_m(odometer_m), travelled_m - self.reference.travelled_m)
-        self._own.clear()
-        self._set_aside.clear()
-        self._unoffered.clear()
-        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel()]
-        here_m = self._turn.distance_m
-        self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
-        self._look_ahead([balise for balise, window in windows if window.close_m > here_m])
 
     def _in_order_of_travel(self) -> list[Balise]:
         on_leg = [balise for balise in self._announced if balise.leg == self._leg]

@@ -92,12 +92,14 @@ class LocationSystem:
     def run(self) -> None:
         """Walk along all epochs."""
         for k in range(len(self._t_ns)):
+            if k in self._turns:
+                self._turn(k)
             if k in self._reads:
                 self._read_balises(k)
-            if self._latch:
-                self._latch.advance(k)
             bank_failed = self._bank.failed(k)
             disordered = k in self._crossings and self._pass_balises(k, bank_failed)
+            if self._latch:
+                self._latch.advance(k)
             self._close_windows(k)
             self.evaluated[k] = self._bank.along_evaluated(k)
             failing = bank_failed or disordered or self.distance.fails(k)
@@ -195,12 +197,23 @@ class LocationSystem:
             if self._recovery is not None and passage.status is PassageStatus.ACCEPTED:
                 self._recovery.stand_on(read)
 
-    def _close_windows(self, k: int) -> None:
-        """Windows that the train has left, and turns of the train."""
-        along_m, turned = self._along_m[k], k in self._turns
+    def _turn(self, k: int) -> None:
+        journey = self._journey
         for chain in (self.virtual, self.physical):
-            if turned or along_m > chain.closing_m:
-                self._advance(chain, k, self._absence(k) if chain is self.virtual else PassageStatus.MISSED)
+            chain.turn(
+                float(journey.odometer_m[k]),
+                float(journey.travelled_m[k]),
+                int(journey.heading[k]),
+                int(journey.leg[k]),
+            )
+
+    def _close_windows(self, k: int) -> None:
+        """Windows that the train has left are closed."""
+        along_m = self._along_m[k]
+        if along_m > self.virtual.closing_m:
+            self.virtual.advance(float(self._journey.odometer_m[k]), self._t_ns[k], self._absence(k))
+        if along_m > self.physical.closing_m:
+            self.physical.advance(float(self._journey.odometer_m[k]), self._t_ns[k], PassageStatus.MISSED)
 
     def _absence(self, k: int) -> PassageStatus:
         """What to say of a balise that the train has passed and the position has not."""
@@ -208,17 +221,6 @@ class LocationSystem:
             return PassageStatus.MISSED
         unplaced = bool(self._journey.placed_nowhere[k])
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
-
-    def _advance(self, chain: LinkingChain, k: int, absence: PassageStatus) -> None:
-        journey = self._journey
-        chain.advance(
-            float(journey.odometer_m[k]),
-            float(journey.travelled_m[k]),
-            int(journey.heading[k]),
-            int(journey.leg[k]),
-            self._t_ns[k],
-            absence,
-        )
 
     def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:
         if not self.order.is_evaluated(k):

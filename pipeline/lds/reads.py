@@ -43,7 +43,7 @@ def _read(row: dict[str, object], balises: list[Balise], journey: Journey) -> Re
     given = row.get("odometer_m")
     odometer_m = float(str(given)) if given is not None else _odometer_at(journey, t_ns, epoch)
     since_m = journey.odometer_m[epoch] - (np.nan if odometer_m is None else odometer_m)
-    travelled_m = float(journey.travelled_m[epoch] - since_m * journey.travel[epoch])
+    travelled_m = float(journey.travelled_m[epoch] - since_m * journey.travel[max(epoch - 1, 0)])
     return Read(balise, t_ns, epoch, odometer_m, travelled_m)
 
 

@@ -203,6 +203,15 @@ def test_shunting_back_over_a_balise() -> None:
     ]
 
 
+def test_turned_and_passed_within_one_step() -> None:
+    # At 5 s the train stands at 122 m, 12 m beyond V1; at 6 s it is back at 102 m.
+    at_m = [22.0, 42.0, 62.0, 82.0, 102.0, 122.0, 102.0, 82.0, 62.0]
+    assert told(run(epochs_of(at_m), balises_at(V1)), *STATUS, "direction") == [
+        ("V1", "accepted", 4.4, "growing"),
+        ("V1", "accepted", 5.6, "falling"),
+    ]
+
+
 def test_turning_inside_a_window_misses_nothing() -> None:
     # Turned at 490 m, inside the window of V2 at 510 m; V1 is passed again on the way back.
     at_m = steps(0.0, 10.0, 50) + steps(490.0, -10.0, 50)
