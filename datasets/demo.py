@@ -14,6 +14,7 @@ from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.ingest.run import read_run
 from pipeline.ingest.site import read_site
+from pipeline.replay import replay
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
 
@@ -58,8 +59,6 @@ def replay_trial(
     scenario: Scenario, site: Site, paths: list[Path], config: Configuration, progress: Progress | None = None
 ) -> DemoResult:
     """Replay the runs of a trial that was written and compare each with what its scenario expects."""
-    from pipeline.replay import replay
-
     checks: list[Check] = []
     tables = []
     for spec, path in zip(scenario.runs, paths, strict=True):

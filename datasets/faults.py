@@ -49,14 +49,17 @@ _NEEDS = {
 }
 _QUANTITIES = ("size_m", "rate_mps", "sigma_m", "latency_s", "scale")
 _ON_ODOMETER = (FaultKind.SLIP, FaultKind.SLIDE, FaultKind.SCALE)
-_TARGET = r"^(along|cross|up|east|north|position|odometer|[A-Z][0-9]{2})$"
+_GROUPS = ("satellites", "gps", "galileo")
+_TARGET = r"^(along|cross|up|east|north|position|odometer|satellites|gps|galileo|[A-Z][0-9]{2})$"
 
 
 class FaultSpec(Settings):
     """One fault, from `start_s` after the first epoch of the run on; without `duration_s` to the end of the run.
 
-    `target`: `along`, `cross`, `up`, `east`, `north` displace the position, `position` serves outage and
-    latency, `odometer` slip, slide, scale and outage, and a satellite (`G08`) its range.
+    `target`: `along`, `cross`, `up`, `east`, `north` displace the position (of ranges too, all in accord, as a
+    spoofer does), `position` serves outage and latency, `odometer` slip, slide, scale and outage; a satellite
+    (`G08`), a constellation (`gps`, `galileo`) or all `satellites` are hit in their ranges, those of groups only
+    below `below_deg` of elevation and between two azimuths, clockwise, where these are given.
     A ramp grows by `rate_mps` for its duration and then stays, unless it `returns`.
     Slip adds `rate_mps` to the odometer's speed, slide takes it off (wheels never turn backwards);
     `scale` multiplies the odometer's increments. `solution` limits the fault to one solution.
@@ -73,6 +76,8 @@ class FaultSpec(Settings):
     scale: Positive | None = None
     returns: bool = False
     solution: str | None = None
+    below_deg: Annotated[float, Field(gt=0, le=90)] | None = None
+    azimuth_deg: tuple[float, float] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -88,13 +93,15 @@ class FaultSpec(Settings):
         if given != ([needed] if needed else []):
             raise ValueError(f"a fault of kind {self.kind.value} takes {needed or 'no size'}, not {given}")
         allowed = _allowed_targets(self.kind)
-        if self.target not in allowed and not (self.hits_satellite and "satellite" in allowed):
+        if self.target not in allowed and not (self.hits_ranges and "satellite" in allowed):
             raise ValueError(f"a fault of kind {self.kind.value} has target {' or '.join(allowed)}")
+        if (self.below_deg is not None or self.azimuth_deg is not None) and self.target not in _GROUPS:
+            raise ValueError(f"below_deg and azimuth_deg go with target {' or '.join(_GROUPS)}")
         return self
 
     @property
-    def hits_satellite(self) -> bool:
-        return len(self.target) == 3 and self.target[0].isupper()
+    def hits_ranges(self) -> bool:
+        return self.target in _GROUPS or self.target[:1].isupper()
 
     @property
     def hits_odometer(self) -> bool:
@@ -105,14 +112,17 @@ class FaultSpec(Settings):
 
 
 class PlacedFault(FaultSpec):
-    """A fault of a scenario: it may begin where the train first reaches chainage `at_m`."""
+    """A fault of a scenario: it may begin where the train first reaches chainage `at_m`, and end at `until_m`."""
 
     at_m: NonNegative | None = None
+    until_m: NonNegative | None = None
 
     @model_validator(mode="after")
-    def _begins_somewhere(self) -> Self:
+    def _begins_and_ends_once(self) -> Self:
         if (self.at_m is None) == (self.start_s is None):
             raise ValueError("a fault has either start_s or at_m")
+        if self.until_m is not None and self.duration_s is not None:
+            raise ValueError("a fault has either duration_s or until_m, or lasts")
         return self
 
 
@@ -233,3 +243,16 @@ def _allowed_targets(kind: FaultKind) -> tuple[str, ...]:
     if kind is FaultKind.LATENCY:
         return ("position",)
     return ("along", "cross", "up", "east", "north", "satellite")
+
+
+def in_sector(fault: FaultSpec, svs: Sequence[str], azimuth_deg: Floats, elevation_deg: Floats) -> Bools:
+    """Which satellites a fault of ranges hits, shape of the angles (epochs, satellites)."""
+    names = {"gps": "G", "galileo": "E", "satellites": ""}
+    prefix = names.get(fault.target, fault.target)
+    hit: Bools = np.broadcast_to([sv.startswith(prefix) for sv in svs], azimuth_deg.shape)
+    if fault.below_deg is not None:
+        hit = hit & (elevation_deg < fault.below_deg)
+    if fault.azimuth_deg is not None:
+        begin, end = fault.azimuth_deg
+        hit = hit & ((azimuth_deg - begin) % 360.0 <= (end - begin) % 360.0)
+    return hit

@@ -15,18 +15,28 @@ from datasets.line import Line, Places, offset_places, shifted
 from datasets.motion import Motion
 from datasets.odometer import sample_times_ns
 from datasets.scenario import GnssSpec, ReferenceSpec
+from datasets.sky import Observed, observe_sky
+from datasets.solution import protection_levels
 from schemas.config import Vehicle
 from schemas.enums import Fix
 from schemas.inputs import Gnss, Reference
 
 Floats = npt.NDArray[np.float64]
 
-# DO-229 J.1: HPL factor for non-precision approach and VPL factor.
-_K_H_NPA = 6.18
-_K_V = 5.33
 # The SBAS satellite that the synthetic receiver uses, and the age of what it sends.
 _SBAS_PRN = 123
 _SBAS_AGE_S = 3.0
+_MARGIN_S = 1.0
+_COVARIANCES = (
+    ("cov_ee_m2", 0, 0),
+    ("cov_en_m2", 0, 1),
+    ("cov_eu_m2", 0, 2),
+    ("cov_nn_m2", 1, 1),
+    ("cov_nu_m2", 1, 2),
+    ("cov_uu_m2", 2, 2),
+)
+_VELOCITIES = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
+_LEVELS = ("hpl_m", "vpl_m")
 
 
 @dataclass(frozen=True)
@@ -46,20 +56,52 @@ class Journey:
         return shifted(beside, zeros, zeros, zeros + self.vehicle.antenna_height_m)
 
 
-def gnss_stream(
+def gnss_streams(
     spec: GnssSpec, journey: Journey, faults: Sequence[FaultSpec], first_ns: int, rng: np.random.Generator
-) -> pl.DataFrame:
-    """Positions with correlated errors of known covariance, displaced by faults; lost epochs have no row."""
+) -> tuple[pl.DataFrame, pl.DataFrame | None]:
+    """The `gnss` stream, and `satellites` where the errors come from geometry; displaced and thinned by faults."""
     t_ns = sample_times_ns(journey.motion.duration_s, spec.rate_hz)
-    t_s = t_ns / NS_PER_S
-    effect = position_effect(faults, t_s, rng)
+    if spec.sky is None:
+        observed, ranges = [_without_sky(spec, t_ns.size, rng)], None
+    else:
+        start = journey.antenna(np.zeros(1))
+        place = (float(start.latitude_deg[0]), float(start.longitude_deg[0]), float(start.height_m[0]))
+        observed, ranges = observe_sky(spec.sky, place, first_ns, t_ns, 1.0 / spec.rate_hz, faults, rng)
+    velocity_rng = rng.spawn(1)[0]
+    tables = [_solution_table(spec, journey, faults, first_ns, t_ns, one, rng, velocity_rng) for one in observed]
+    return pl.concat(tables).sort("t", "solution", maintain_order=True), ranges
+
+
+def _without_sky(spec: GnssSpec, epochs: int, rng: np.random.Generator) -> Observed:
     sigmas = (spec.sigma_east_m, spec.sigma_north_m, spec.sigma_up_m)
+    covariance = np.broadcast_to(np.diag(np.square(sigmas)), (epochs, 3, 3))
+    satellites = None if spec.satellites is None else np.full(epochs, spec.satellites)
+    errors = position_errors(sigmas, epochs, 1.0 / spec.rate_hz, rng)
+    levels = protection_levels(covariance)
+    return Observed(
+        "primary", errors, covariance, levels.hpl_npa_m, levels.vpl_m, satellites, np.zeros(epochs, dtype=np.bool_)
+    )
+
+
+def _solution_table(
+    spec: GnssSpec,
+    journey: Journey,
+    faults: Sequence[FaultSpec],
+    first_ns: int,
+    t_ns: npt.NDArray[np.int64],
+    observed: Observed,
+    rng: np.random.Generator,
+    velocity_rng: np.random.Generator,
+) -> pl.DataFrame:
+    t_s = t_ns / NS_PER_S
+    own = [fault for fault in faults if fault.solution in (None, observed.solution)]
+    effect = position_effect(own, t_s, rng)
     bias = np.array([spec.bias_east_m, spec.bias_north_m, spec.bias_up_m])
-    errors = bias + position_errors(sigmas, t_s.size, 1.0 / spec.rate_hz, rng)
     old_s = t_s - spec.latency_s - effect.latency_s
-    places = displaced(journey.antenna(old_s, effect.along_m, effect.cross_m), effect, errors)
-    velocity = _velocity(spec, journey, old_s, rng)
-    return _table(spec, first_ns + t_ns, places, velocity).filter(pl.Series(~effect.lost))
+    rail = journey.antenna(old_s, effect.along_m, effect.cross_m)
+    places = displaced(rail, effect, observed.error_m + bias)
+    velocity = _velocity(spec, journey, old_s, velocity_rng)
+    return _table(spec, first_ns + t_ns, places, velocity, observed, effect.lost | observed.lost)
 
 
 def displaced(places: Places, effect: PositionEffect, errors_m: Floats) -> Places:
@@ -69,8 +111,11 @@ def displaced(places: Places, effect: PositionEffect, errors_m: Floats) -> Place
 
 
 def reference_stream(spec: ReferenceSpec, journey: Journey, first_ns: int, rng: np.random.Generator) -> pl.DataFrame:
-    """The truth, at its own rate and with its own small noise."""
-    t_ns = sample_times_ns(journey.motion.duration_s, spec.rate_hz)
+    """The truth, at its own rate and with its own small noise.
+
+    It begins and ends a second beyond the receiver's recording: late positions are of times before their stamps.
+    """
+    t_ns = sample_times_ns(journey.motion.duration_s + 2.0 * _MARGIN_S, spec.rate_hz) - round(_MARGIN_S * NS_PER_S)
     noise = spec.sigma_m * rng.standard_normal((3, t_ns.size))
     places = shifted(journey.antenna(t_ns / NS_PER_S), *noise)
     table = pl.DataFrame(
@@ -98,32 +143,37 @@ def _velocity(spec: GnssSpec, journey: Journey, t_s: Floats, rng: np.random.Gene
     return true_velocity(journey, t_s) + noise if spec.velocity else None
 
 
-def _table(spec: GnssSpec, t_ns: npt.NDArray[np.int64], places: Places, velocity: Floats | None) -> pl.DataFrame:
-    unknown = pl.lit(None, pl.Float64)
-    stated = np.array([spec.sigma_east_m, spec.sigma_north_m, spec.sigma_up_m]) * spec.reported_factor
-    variances = [pl.lit(float(sigma**2)) if spec.covariance else unknown for sigma in stated]
-    covariances = [pl.lit(0.0) if spec.covariance else unknown] * 3
-    speeds = [unknown] * 3 if velocity is None else [pl.lit(pl.Series(column)) for column in velocity.T]
-    levels = (_K_H_NPA * max(stated[:2]), _K_V * stated[2]) if spec.protection_levels else (None, None)
-    sbas = spec.fix is Fix.SBAS
-    table = pl.DataFrame({"t": t_ns}).with_columns(
-        t=pl.col("t").cast(pl.Datetime("ns", "UTC")),
-        solution=pl.lit("primary"),
-        latitude_deg=pl.Series(places.latitude_deg),
-        longitude_deg=pl.Series(places.longitude_deg),
-        height_m=pl.Series(places.height_m),
-        **_named(("cov_ee_m2", "cov_nn_m2", "cov_uu_m2"), variances),
-        **_named(("cov_en_m2", "cov_eu_m2", "cov_nu_m2"), covariances),
-        **_named(("vel_e_mps", "vel_n_mps", "vel_u_mps"), speeds),
-        hpl_m=pl.lit(levels[0], pl.Float64),
-        vpl_m=pl.lit(levels[1], pl.Float64),
-        fix=pl.lit(spec.fix.value),
-        satellites=pl.lit(spec.satellites, pl.Int64),
-        sbas_prn=pl.lit(_SBAS_PRN if sbas else None, pl.Int64),
-        sbas_age_s=pl.lit(_SBAS_AGE_S if sbas else None, pl.Float64),
+def _table(
+    spec: GnssSpec,
+    t_ns: npt.NDArray[np.int64],
+    places: Places,
+    velocity: Floats | None,
+    observed: Observed,
+    lost: npt.NDArray[np.bool_],
+) -> pl.DataFrame:
+    unknown = np.full(t_ns.size, np.nan)
+    covariance = spec.reported_factor**2 * observed.covariance_m2
+    levels = [spec.reported_factor * level for level in (observed.hpl_m, observed.vpl_m)]
+    values = {
+        "latitude_deg": places.latitude_deg,
+        "longitude_deg": places.longitude_deg,
+        "height_m": places.height_m,
+        **{name: covariance[:, i, j] if spec.covariance else unknown for name, i, j in _COVARIANCES},
+        **dict(zip(_VELOCITIES, [unknown] * 3 if velocity is None else velocity.T, strict=True)),
+        **dict(zip(_LEVELS, levels if spec.protection_levels else [unknown] * 2, strict=True)),
+    }
+    columns = {name: pl.Series(np.where(lost, np.nan, value), nan_to_null=True) for name, value in values.items()}
+    by_sbas = pl.lit(spec.fix is Fix.SBAS) & ~pl.col("lost")
+    table = (
+        pl.DataFrame({"t": t_ns, "lost": lost, **columns})
+        .with_columns(
+            t=pl.col("t").cast(pl.Datetime("ns", "UTC")),
+            solution=pl.lit(observed.solution),
+            fix=pl.when("lost").then(pl.lit(Fix.NONE.value)).otherwise(pl.lit(spec.fix.value)),
+            satellites=pl.lit(None, pl.Int64) if observed.satellites is None else pl.Series(observed.satellites),
+            sbas_prn=pl.when(by_sbas).then(_SBAS_PRN),
+            sbas_age_s=pl.when(by_sbas).then(_SBAS_AGE_S),
+        )
+        .filter(~pl.col("lost") | pl.lit(spec.keep_lost))
     )
-    return Gnss.validate(table, cast=True)
-
-
-def _named(names: tuple[str, ...], values: Sequence[pl.Expr]) -> dict[str, pl.Expr]:
-    return dict(zip(names, values, strict=True))
+    return Gnss.validate(table.select(Gnss.column_names()), cast=True)

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from datasets.expectation import ExpectedRun
 from datasets.faults import PlacedFault
 from datasets.motion import MotionSpec
+from datasets.range_errors import RangeErrorSpec
 from schemas.config import (
     NonNegative,
     Positive,
@@ -22,6 +23,8 @@ from schemas.config import (
 )
 from schemas.enums import BaliseKind, Fix, Reaction
 
+Constellation = Literal["gps", "galileo"]
+LogKind = Literal["parquet", "json", "protobuf", "cdr"]
 Identity = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
 
 
@@ -94,10 +97,28 @@ class LineSpec(Settings):
     survey: SurveySpec = SurveySpec()
 
 
+def _gps_alone() -> Mapping[str, tuple[Constellation, ...]]:
+    return {"primary": ("gps",)}
+
+
+class SkySpec(Settings):
+    """A receiver whose errors come from satellite geometry: each solution uses the constellations it names."""
+
+    solutions: Annotated[Mapping[Identity, tuple[Constellation, ...]], Field(min_length=1)] = Field(
+        default_factory=_gps_alone
+    )
+    mask_deg: Annotated[float, Field(ge=0, lt=90)] = 5.0
+    ranges: RangeErrorSpec = RangeErrorSpec()
+    protection: Literal["pa", "npa"] = "npa"
+    record_ranges: bool = True
+
+
 class GnssSpec(Settings):
     """A receiver with Gauss-Markov position errors (DIAG Table 1) of the given standard deviations.
 
-    `reported_factor` is the receiver's stated sigma over the true one.
+    With `sky` they come from satellite geometry, and the sigmas and `satellites` here do not count.
+    `reported_factor` is the receiver's stated sigma over the true one. `keep_lost` keeps epochs without
+    position as rows of fix `none`, otherwise they have no row.
     """
 
     rate_hz: Positive = 10.0
@@ -115,6 +136,8 @@ class GnssSpec(Settings):
     velocity: bool = True
     velocity_sigma_mps: NonNegative = 0.03
     protection_levels: bool = True
+    keep_lost: bool = False
+    sky: SkySpec | None = None
 
 
 class OdometerSpec(Settings):
@@ -144,7 +167,7 @@ class RunSpec(Settings):
 
     id: Identity
     title: str = ""
-    log: Literal["parquet", "json", "protobuf", "cdr"] = "parquet"
+    log: LogKind = "parquet"
     vehicle: bool = True
     motion: MotionSpec
     gnss: GnssSpec = GnssSpec()

@@ -19,9 +19,10 @@ from datasets.faults import FaultSpec, PlacedFault, faults_table
 from datasets.line import Line, balises_table, build_line, links_table, track_table
 from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
-from datasets.receiver import Journey, gnss_stream, reference_stream
-from datasets.scenario import RunSpec, Scenario
-from schemas.config import Vehicle, to_toml
+from datasets.receiver import Journey, gnss_streams, reference_stream
+from datasets.scenario import LogKind, RunSpec, Scenario
+from pipeline.ingest.mcap_writer import write_mcap
+from schemas.config import Vehicle, settings_from, to_toml
 from schemas.errors import OutputError
 from schemas.run import STREAMS, RunLog, Site
 
@@ -60,7 +61,7 @@ def build_run(scenario: Scenario, spec: RunSpec, line: Line | None = None) -> Ru
     def rng(purpose: str) -> np.random.Generator:
         return _rng(scenario, spec.id, purpose)
 
-    gnss = gnss_stream(spec.gnss, journey, faults, first_ns, rng("gnss"))
+    gnss, satellites = gnss_streams(spec.gnss, journey, faults, first_ns, rng("gnss"))
     last_ns = first_ns + round(journey.motion.duration_s * 1e9)
     odometer = reference = None
     if spec.odometer:
@@ -68,14 +69,21 @@ def build_run(scenario: Scenario, spec: RunSpec, line: Line | None = None) -> Ru
     if spec.reference:
         reference = reference_stream(spec.reference, journey, first_ns, rng("reference"))
     truth = faults_table(faults, first_ns, last_ns) if faults else None
-    return RunLog(spec.id, gnss, odometer=odometer, reference=reference, faults=truth)
+    return RunLog(spec.id, gnss, odometer=odometer, satellites=satellites, reference=reference, faults=truth)
 
 
 def placed(fault: PlacedFault, motion: Motion, rate_hz: float) -> FaultSpec:
-    """A fault with its start in time: the first GNSS epoch once the train is at its place."""
-    start_s = motion.time_at(fault.at_m) if fault.at_m is not None else fault.begins_s()
-    epoch_s = np.ceil(start_s * rate_hz - 1e-9) / rate_hz
-    return FaultSpec(**fault.model_dump(exclude={"at_m", "start_s"}), start_s=float(epoch_s))
+    """A fault with its times: from the first GNSS epoch once the train is at its place."""
+
+    def epoch_s(time_s: float) -> float:
+        return float(np.ceil(time_s * rate_hz - 1e-9) / rate_hz)
+
+    start_s = epoch_s(motion.time_at(fault.at_m) if fault.at_m is not None else fault.begins_s())
+    duration_s = fault.duration_s
+    if fault.until_m is not None:
+        duration_s = epoch_s(motion.time_at(fault.until_m)) - start_s
+    given = fault.model_dump(exclude={"at_m", "until_m", "start_s", "duration_s"})
+    return settings_from({**given, "start_s": start_s, "duration_s": duration_s}, FaultSpec, "scenario: faults")
 
 
 def write_trial(scenario: Scenario, out: Path, done: Callable[[str], None] | None = None) -> list[Path]:
@@ -108,12 +116,10 @@ def write_site(site: Site, folder: Path) -> None:
             table.write_parquet(folder / f"{name}.parquet")
 
 
-def write_run_log(run: RunLog, folder: Path, log: str = "parquet") -> Path:
+def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
     """One run as a folder of Parquet files, or as an MCAP log in the encoding `json`, `protobuf` or `cdr`."""
     folder.mkdir(parents=True, exist_ok=True)
     if log != "parquet":
-        from pipeline.ingest.mcap_writer import write_mcap
-
         path = folder / f"{run.run_id}.mcap"
         write_mcap(run, path, encoding=log)
         return path

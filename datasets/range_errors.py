@@ -1,0 +1,58 @@
+"""Range errors of single satellites: the processes of DIAG Table 1 with the elevation models of DO-229."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.gnss_errors import gauss_markov
+from schemas.config import NonNegative, Positive, Settings
+
+Floats = npt.NDArray[np.float64]
+
+# DO-229 A.4.4.10.4: height of the ionosphere's shell, radius of the Earth [km].
+_SHELL_KM = 350.0
+_EARTH_KM = 6378.1363
+
+
+class RangeErrorSpec(Settings):
+    """Error of each range (DIAG Table 1): sigma at zenith or variance, and correlation time, by source.
+
+    `stated_factor` is the sigma that weighs and bounds the ranges over the true one.
+    """
+
+    ionosphere_zenith_m: NonNegative = 0.3
+    ionosphere_tau_s: Positive = 360.0
+    troposphere_zenith_m: NonNegative = 0.12
+    troposphere_tau_s: Positive = 1800.0
+    orbit_clock_m2: NonNegative = 0.3
+    orbit_clock_tau_s: Positive = 3600.0
+    user_m2: Positive = 1.5
+    user_tau_s: Positive = 100.0
+    stated_factor: Positive = 1.0
+
+
+def range_variances_m2(spec: RangeErrorSpec, elevation_deg: Floats) -> Floats:
+    """Variance by source (ionosphere, troposphere, orbit and clock, user), shape (4, ...) [m^2]."""
+    elevation = np.radians(elevation_deg)
+    ratio = _EARTH_KM * np.cos(elevation) / (_EARTH_KM + _SHELL_KM)
+    ionosphere = spec.ionosphere_zenith_m**2 / (1.0 - ratio**2)
+    troposphere = (spec.troposphere_zenith_m * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
+    level = np.ones_like(elevation)
+    return np.stack([ionosphere, troposphere, spec.orbit_clock_m2 * level, spec.user_m2 * level])
+
+
+def range_sigma_m(spec: RangeErrorSpec, elevation_deg: Floats) -> Floats:
+    """The sigma that the receiver believes [m]."""
+    sigma: Floats = spec.stated_factor * np.sqrt(range_variances_m2(spec, elevation_deg).sum(axis=0))
+    return sigma
+
+
+def range_errors_m(spec: RangeErrorSpec, elevation_deg: Floats, step_s: float, rng: np.random.Generator) -> Floats:
+    """Errors of all satellites, shape (epochs, satellites) [m]; the variance follows the elevation."""
+    taus = (spec.ionosphere_tau_s, spec.troposphere_tau_s, spec.orbit_clock_tau_s, spec.user_tau_s)
+    total = np.zeros_like(elevation_deg)
+    # Below the horizon nothing is received; the clip keeps the models in their range.
+    for variance, tau_s in zip(range_variances_m2(spec, elevation_deg.clip(min=0.0)), taus, strict=True):
+        total += np.sqrt(variance) * gauss_markov(1.0, tau_s, step_s, elevation_deg.shape, rng)
+    return total
