@@ -45,15 +45,16 @@ class Chaos:
         self.linked = [dice.random() < 0.9 for _ in self.places]
         self.reads = sorted((dice.uniform(0.0, size), f"P{dice.randrange(5):02d}") for _ in range(10))
 
-    def replayed(self, shift_s: float = 0.0) -> LdsResult:
-        epochs = epochs_of(self.path_m, self.odometer_m, t_s=[k + shift_s for k in range(len(self.path_m))])
+    def replayed(self, shift_s: int = 0) -> LdsResult:
+        later = pl.col("t") + pl.duration(seconds=shift_s)
+        epochs = epochs_of(self.path_m, self.odometer_m).with_columns(later)
         balises = balises_at(self.places, kind=self.kinds, linked=self.linked)
-        reads = reads_at([(t + shift_s, name) for t, name in self.reads])
+        reads = reads_at(self.reads).with_columns(later)
         return run(epochs, balises, ScriptedBank(self.fails, blind=self.blind), reads)
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_rows_contradict_neither_each_other_nor_the_epochs(seed: int) -> None:
     result = Chaos(seed).replayed()
     epochs = result.epochs
@@ -79,7 +80,7 @@ def test_rows_contradict_neither_each_other_nor_the_epochs(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_row_for_each_crossing_that_no_latch_held(seed: int) -> None:
     """Far from any latch: balises at least 60 m apart and no re-crossing within 60 m of odometer."""
     chaos = Chaos(seed)
@@ -104,21 +105,18 @@ def test_a_row_for_each_crossing_that_no_latch_held(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 100_000), shift_s=st.integers(1, 10**6))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_constant_added_to_all_times_changes_nothing_else(seed: int, shift_s: int) -> None:
     chaos = Chaos(seed)
-    here, later = chaos.replayed(), chaos.replayed(float(shift_s))
+    here, later = chaos.replayed(), chaos.replayed(shift_s)
     times = [name for name, kind in here.passages.schema.items() if kind == pl.Datetime]
     back = later.passages.with_columns(pl.col(name) - pl.duration(seconds=shift_s) for name in times)
-    assert back.drop(times).equals(here.passages.drop(times))
-    # Telegrams lie at fractions of a second that a float does not hold exactly.
-    for name in times:
-        assert ((back[name] - here.passages[name]).dt.total_microseconds().abs().drop_nulls() <= 1).all()
+    assert back.equals(here.passages)
     assert later.epochs.drop("t").equals(here.epochs.drop("t"))
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_what_comes_later_changes_no_decision_before(seed: int) -> None:
     """A run cut short gives the same decisions up to the cut (labels of unfinished passages aside)."""
     chaos = Chaos(seed)
