@@ -46,9 +46,9 @@ BRUSSELS = Place("brussels", 50.85, 4.35, 100.0)
 MADRID = Place("madrid", 40.42, -3.70, 650.0)
 PLACES: tuple[Place, ...] = (BRUSSELS, MADRID)
 _DAY_NS = int(datetime(2024, 3, 20, tzinfo=UTC).timestamp()) * 1_000_000_000
-# 07:26 UTC: satellite 8 at 34 degrees in the south-west, 7 GPS and 15 GPS + Galileo satellites. One of the skies in
-# which all findings of the paper hold (odometer noise on position); `findings` gives the shares over the day.
-_DEFAULT_SECOND_OF_DAY = 26_760
+# 06:27 UTC: satellite 8 at 9 degrees in the south-west, 8 GPS and 16 GPS + Galileo satellites. One of the skies in
+# which all findings of the paper hold with odometer noise on position; `findings` gives the shares over the day.
+_DEFAULT_SECOND_OF_DAY = 23_220
 
 
 @dataclass(frozen=True)
