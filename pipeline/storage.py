@@ -125,6 +125,16 @@ def folders_in(address: Address) -> list[str]:
     return _remote(address, names)
 
 
+def glob_remote(pattern: str) -> list[Address]:
+    """Addresses that match a glob in an object store, sorted."""
+    return [
+        str(found)
+        for found in _remote(
+            pattern, lambda store, path: sorted(store.unstrip_protocol(p) for p in store.glob(path)), kind=InputError
+        )
+    ]
+
+
 def read_many(addresses: list[str]) -> dict[str, bytes]:
     """Contents of those of the remote objects that exist."""
     if not addresses:

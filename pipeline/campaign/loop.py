@@ -1,0 +1,232 @@
+"""The campaign loop: hand out runs, collect outcomes, survive what happens to workers."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Protocol
+
+from pipeline import store
+from pipeline.campaign.engines import Engine, Result, engine_for
+from pipeline.campaign.lock import locked
+from pipeline.campaign.plan import Plan, RunJob, with_previous
+from pipeline.campaign.worker import RunOutcome, fail_run
+from pipeline.ingest.files import is_url
+from schemas.enums import RunStatus
+from schemas.errors import UsageError
+
+_LOOK_S = 0.2
+_TRIES = 2
+TIME_LIMIT_S = 3600.0
+
+
+class Interrupted(BaseException):
+    """The user or the system asked to stop; `summary` tells what is complete."""
+
+    def __init__(self, signum: int, summary: Summary | None = None) -> None:
+        super().__init__(signal.Signals(signum).name)
+        self.signum = signum
+        self.summary = summary
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A campaign in figures."""
+
+    planned: int
+    outcomes: tuple[RunOutcome, ...]
+    seconds: float
+
+    def count(self, status: RunStatus) -> int:
+        return sum(outcome.status == status for outcome in self.outcomes)
+
+    @property
+    def skipped(self) -> int:
+        return sum(outcome.skipped for outcome in self.outcomes)
+
+    @property
+    def defects(self) -> int:
+        return sum(outcome.defect for outcome in self.outcomes)
+
+    @property
+    def left(self) -> int:
+        """Runs that were not reached."""
+        return self.planned - len(self.outcomes)
+
+
+class Watch(Protocol):
+    """Whoever wants to see a campaign go on."""
+
+    def begin(self, plan: Plan) -> None: ...
+
+    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
+        """Called several times a second with the runs under way and their age [s]."""
+
+    def finished(self, outcome: RunOutcome) -> None: ...
+
+    def end(self, summary: Summary) -> None: ...
+
+
+@dataclass
+class _UnderWay:
+    job: RunJob
+    attempt: int
+    since_s: float
+    overdue: bool = False
+
+
+@dataclass
+class _State:
+    """What the loop keeps between two looks."""
+
+    waiting: deque[tuple[RunJob, int]]
+    under_way: dict[Result, _UnderWay] = field(default_factory=dict)
+    outcomes: list[RunOutcome] = field(default_factory=list)
+    stop: int | None = None
+
+
+def run_campaign(
+    plan: Plan,
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    force: bool = False,
+    time_limit_s: float = TIME_LIMIT_S,
+    watches: Sequence[Watch] = (),
+) -> Summary:
+    """Replay every run of the plan whose result is not there already.
+
+    Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT and SIGTERM; either way
+    what is complete stays, and the same call later does the rest. The tables are the same for any `jobs`,
+    any `scheduler` and any order of runs.
+    """
+    _check_shared(plan, scheduler)
+    with locked(plan.out):
+        store.sweep(plan.out)
+        plan = plan if force else with_previous(plan)
+        store.write_config(plan.out, plan.config)
+        engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
+        try:
+            return _watched(plan, engine, time_limit_s, watches)
+        finally:
+            engine.close()
+
+
+def _check_shared(plan: Plan, scheduler: str | None) -> None:
+    """Whether a cluster can write there is found out by its workers; that nothing is to do, here."""
+    if not plan.jobs:
+        raise UsageError("no run is named")
+    if scheduler is not None and is_url(plan.out) and plan.out.startswith("memory://"):
+        raise UsageError("workers cannot write into this process's memory", place=plan.out)
+
+
+def _watched(plan: Plan, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> Summary:
+    state = _State(deque((job, 1) for job in plan.jobs))
+    begun = time.monotonic()
+    for watch in watches:
+        watch.begin(plan)
+    stopped: Interrupted | None = None
+    with _listening(state, engine.in_process):
+        try:
+            _loop(state, engine, limit_s, watches)
+        except Interrupted as interrupted:
+            stopped = interrupted
+    summary = Summary(len(plan.jobs), tuple(_in_order(state.outcomes)), time.monotonic() - begun)
+    for watch in watches:
+        watch.end(summary)
+    if stopped is not None:
+        raise Interrupted(stopped.signum, summary)
+    return summary
+
+
+def _in_order(outcomes: list[RunOutcome]) -> list[RunOutcome]:
+    return sorted(outcomes, key=lambda outcome: outcome.run_id)
+
+
+def _loop(state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> None:
+    while state.waiting or state.under_way:
+        _hand_out(state, engine)
+        done, _ = wait(state.under_way, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
+        if state.stop is not None:
+            raise Interrupted(state.stop)
+        for result in done:
+            outcome = _collect(state, engine, result, limit_s)
+            if outcome is not None:
+                state.outcomes.append(outcome)
+                for watch in watches:
+                    watch.finished(outcome)
+        _end_overdue(state, engine, limit_s)
+        now = time.monotonic()
+        ages = [(item.job.run_id, now - item.since_s) for item in state.under_way.values()]
+        for watch in watches:
+            watch.look(ages)
+
+
+def _hand_out(state: _State, engine: Engine) -> None:
+    capacity = engine.capacity()
+    while state.waiting and len(state.under_way) < capacity and state.stop is None:
+        job, attempt = state.waiting.popleft()
+        state.under_way[engine.submit(job)] = _UnderWay(job, attempt, time.monotonic())
+
+
+def _collect(state: _State, engine: Engine, result: Result, limit_s: float) -> RunOutcome | None:
+    """The outcome, or none where the run is tried again."""
+    item = state.under_way.pop(result)
+    if result.cancelled():
+        raise UsageError("the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped.")
+    error = result.exception()
+    if error is None:
+        return result.result()
+    if item.overdue:
+        return fail_run(item.job, f"took longer than the time limit of {limit_s:g} s")
+    if isinstance(error, CancelledError):
+        raise UsageError("the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped.")
+    if not engine.is_lost_worker(error):
+        raise error
+    if item.attempt < _TRIES and not engine.retries_itself:
+        state.waiting.appendleft((item.job, item.attempt + 1))
+        return None
+    return fail_run(
+        item.job,
+        "its worker died each time (killed, out of memory, or over the time limit). "
+        "Give it more memory or fewer --jobs; the next call tries it again.",
+    )
+
+
+def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
+    now = time.monotonic()
+    for result, item in state.under_way.items():
+        if now - item.since_s > limit_s and not item.overdue:
+            item.overdue = not engine.retries_itself
+            engine.kill(result)
+
+
+@contextmanager
+def _listening(state: _State, in_process: bool) -> Iterator[None]:
+    """Answer SIGINT and SIGTERM: at the loop's next look, or at once where the run is in this process."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def answer(signum: int, frame: FrameType | None) -> None:
+        state.stop = signum
+        if in_process:
+            raise Interrupted(signum)
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {signum: signal.signal(signum, answer) for signum in signals}
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+
+
+__all__ = ["TIME_LIMIT_S", "Interrupted", "Summary", "Watch", "run_campaign"]

@@ -1,0 +1,172 @@
+"""What a campaign is to do: which runs, with what, and what earlier calls have done already."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+from pipeline import storage, store
+from pipeline.ingest import files
+from pipeline.ingest.files import Address
+from pipeline.ingest.site import read_site
+from schemas.config import Configuration, Vehicle, digest_of
+from schemas.errors import InputError, UsageError
+from schemas.run import STREAMS
+from schemas.version import SOFTWARE
+
+_DECIDING_LIBRARIES = ("dataframely", "numpy", "polars", "pyarrow", "pyproj", "scipy")
+
+
+@dataclass(frozen=True)
+class RunJob:
+    """One run as a worker gets it; everything in it survives the way to another machine.
+
+    `previous` is the metadata of the complete run that an earlier campaign left, if any.
+    """
+
+    run_id: str
+    address: str
+    site: str
+    site_digest: str
+    config: Configuration
+    vehicle: Vehicle
+    out: str
+    software_digest: str
+    previous: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of one call, and where their results go."""
+
+    jobs: tuple[RunJob, ...]
+    out: str
+    config: Configuration
+    vehicle: Vehicle
+
+
+def make_plan(
+    runs: Sequence[str],
+    site: Address,
+    out: Address,
+    config: Configuration | None = None,
+    vehicle: Vehicle | None = None,
+) -> Plan:
+    """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done."""
+    config, vehicle = config or Configuration(), vehicle or Vehicle()
+    addresses = find_runs(runs)
+    site_digest = read_site(site).digest
+    base = RunJob(
+        run_id="",
+        address="",
+        site=storage.absolute(site),
+        site_digest=site_digest,
+        config=config,
+        vehicle=vehicle,
+        out=storage.absolute(out),
+        software_digest=software_digest(),
+    )
+    jobs = [replace(base, run_id=run_id, address=address) for run_id, address in addresses.items()]
+    return Plan(tuple(jobs), base.out, config, vehicle)
+
+
+def with_previous(plan: Plan) -> Plan:
+    """The plan with what earlier campaigns completed in the same output."""
+    complete = store.completed_runs(plan.out)
+    return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in plan.jobs))
+
+
+def digests(job: RunJob, log_digest: str) -> dict[str, str]:
+    """What decides a run's tables; equal digests mean equal tables, so that the run is skipped."""
+    return {
+        "config_digest": digest_of(job.config, job.vehicle),
+        "log_digest": log_digest,
+        "site_digest": job.site_digest,
+        "software": SOFTWARE,
+        "software_digest": job.software_digest,
+    }
+
+
+def find_runs(named: Iterable[str]) -> dict[str, str]:
+    """Addresses by run id, sorted: paths, globs, folders of runs and `s3://`-style addresses."""
+    found: dict[str, str] = {}
+    for name in named:
+        for address in _expand(name):
+            run_id = files.stem_of(address)
+            other = found.setdefault(run_id, storage.absolute(address))
+            if other != storage.absolute(address):
+                raise UsageError(
+                    f"and {storage.redacted(str(address))} have the same run id {run_id!r}",
+                    place=storage.redacted(other),
+                    remedy="Rename one of them: results are filed by run id.",
+                )
+    return dict(sorted(found.items()))
+
+
+def _expand(name: str) -> list[Address]:
+    matches = _matches(name)
+    if not matches:
+        raise UsageError(
+            "no such run", place=storage.redacted(name), expected="RUN.mcap, a run folder, a folder of runs or a glob"
+        )
+    runs: list[Address] = []
+    for match in matches:
+        runs += [match] if _is_run(match) else _runs_in(match)
+    return runs
+
+
+def _matches(name: str) -> list[Address]:
+    if files.is_url(name):
+        return storage.glob_remote(name) if glob.has_magic(name) else [name]
+    if Path(name).exists():
+        return [Path(name)]
+    return sorted(Path(match) for match in glob.glob(name, recursive=True))
+
+
+def _is_run(address: Address) -> bool:
+    """A file, or a folder that holds a stream itself; whether it can be read is found out later."""
+    if files.name_of(address).endswith(".mcap") or not files.is_dir(address):
+        return True
+    names = files.list_dir(address)
+    return any(f"{stream}.parquet" in names for stream in STREAMS)
+
+
+def _runs_in(folder: Address) -> list[Address]:
+    inside = [files.join(folder, name) for name in files.list_dir(folder)]
+    runs = [child for child in inside if _looks_like_run(child)]
+    if not runs:
+        raise UsageError(
+            "holds no run", place=storage.redacted(str(folder)), expected="RUN.mcap files or folders with gnss.parquet"
+        )
+    return runs
+
+
+def _looks_like_run(child: Address) -> bool:
+    if files.name_of(child).startswith("."):
+        return False
+    try:
+        return files.name_of(child).endswith(".mcap") or (files.is_dir(child) and _is_run(child))
+    except InputError:
+        return False
+
+
+@lru_cache(maxsize=1)
+def software_digest() -> str:
+    """SHA-256 over the program's own sources and the versions of the libraries that its figures rest on.
+
+    The version alone would let results of an edited checkout pass for its own.
+    """
+    root = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for package in ("pipeline", "schemas"):
+        for source in sorted((root / package).rglob("*.py")):
+            digest.update(f"{source.relative_to(root).as_posix()} ".encode())
+            digest.update(hashlib.sha256(source.read_bytes()).digest())
+    for library in _DECIDING_LIBRARIES:
+        digest.update(f"{library} {version(library)}\n".encode())
+    return digest.hexdigest()
