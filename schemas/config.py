@@ -39,6 +39,7 @@ class StreamMapping(Settings):
     fields: dict[str, str] = {}
     factors: dict[str, float] = {}
     constants: dict[str, str | float | bool] = {}
+    fix_codes: dict[str, Fix] = {}
     time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
     time_epoch: Literal["unix", "gps"] = "unix"

@@ -10,11 +10,9 @@ import polars as pl
 from pipeline.ingest.breaches import Breach
 from pipeline.ingest.conform import conform
 from pipeline.ingest.plan import Source
+from pipeline.ingest.reader import ORDINAL
 from schemas.errors import InputError
 from schemas.run import STREAMS, Stream
-
-ORDINAL = "(ordinal)"  # place of a message in the file
-
 
 @dataclass(frozen=True)
 class Decoded:

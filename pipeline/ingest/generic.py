@@ -96,14 +96,19 @@ def _made(make: Callable[[], Decode | None], channel: Channel) -> Decode:
     return decode
 
 
+def protobuf_descriptor(channel: Channel) -> Any:
+    """The descriptor of a channel's messages."""
+    return _protobuf_decoder(channel)(b"").DESCRIPTOR
+
+
 def decode_columns(
-    channel: Channel, payloads: Iterable[bytes], types: Mapping[str, pl.DataType]
+    channel: Channel, payloads: Iterable[bytes], types: Mapping[str, pl.DataType], numbers: Iterable[int]
 ) -> pl.DataFrame:
-    """One column per field path, decoded message by message."""
+    """One column per field path, decoded message by message; `numbers` are their places in the file."""
     decode = decoder_for(channel)
     takers = [(path, *_taker(path), _coercion(dtype)) for path, dtype in types.items()]
     values: dict[str, list[Value]] = {path: [] for path in types}
-    for number, payload in enumerate(payloads):
+    for number, payload in zip(numbers, payloads, strict=True):
         try:
             message = decode(payload)
             for path, _, take, coerce in takers:

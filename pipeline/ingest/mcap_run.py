@@ -3,93 +3,166 @@
 from __future__ import annotations
 
 import hashlib
-import io
+import zlib
+from collections.abc import Mapping
 
+import numpy as np
 import polars as pl
 
 from pipeline.ingest import files
-from pipeline.ingest.assemble import ORDINAL, Decoded, stream_frames
+from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import Breach, refuse
-from pipeline.ingest.generic import NotDecodable, decode_columns, decoder_for
+from pipeline.ingest.byte_window import ByteWindow
+from pipeline.ingest.generic import NotDecodable, decoder_for
 from pipeline.ingest.inventory import fields_of
-from pipeline.ingest.mcap_model import Channel, Schema
-from pipeline.ingest.plan import Plan, Sample, plan_streams
-from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
+from pipeline.ingest.mcap_block import Block
+from pipeline.ingest.mcap_model import Channel
+from pipeline.ingest.mcap_records import Damage
+from pipeline.ingest.mcap_walk import McapWalk
+from pipeline.ingest.plan import Sample, candidates, settle, source_of
+from pipeline.ingest.reader import SourceReader
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog
 
+_MIB = 1024 * 1024
+
+
+class McapStreams:
+    """Feeds the messages of a log to readers, which are chosen as channels appear."""
+
+    def __init__(self, config: IngestConfig) -> None:
+        self._config = config
+        self.readers: dict[int, list[SourceReader]] = {}
+
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        for channel_id in np.flatnonzero(np.bincount(block.channel)).tolist():
+            readers = self.readers.get(channel_id)
+            if readers is None:
+                readers = self.readers[channel_id] = self._readers(block, channels[channel_id])
+            if readers:
+                rows = np.flatnonzero(block.channel == channel_id)
+                for reader in readers:
+                    reader.add(block, rows)
+
+    def _readers(self, block: Block, channel: Channel) -> list[SourceReader]:
+        found = candidates(channel, self._config)
+        if not found:
+            return []
+        sample = sample_of(block, channel)
+        return [SourceReader(source_of(sample, candidate)) for candidate in found]
+
+
+def sample_of(block: Block, channel: Channel) -> Sample:
+    """The fields of the channel's first message."""
+    row = int(np.argmax(block.channel == channel.id))
+    start = int(block.start[row])
+    payload = block.data[start : start + int(block.length[row])].tobytes()
+    try:
+        return Sample(channel, fields_of(decoder_for(channel)(payload)))
+    except NotDecodable as error:
+        raise InputError(
+            f"message {block.first_ordinal + row} cannot be decoded: {error}",
+            place=channel.place,
+            remedy="Record the log again.",
+        ) from None
+
 
 def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
-    """All streams of a log."""
-    from mcap.records import Channel as ChannelRecord
-    from mcap.records import Message as MessageRecord
-    from mcap.records import Schema as SchemaRecord
-    from mcap.stream_reader import StreamReader
-
-    content = files.read_bytes(path)
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    messages: dict[int, list[tuple[int, int, int, bytes]]] = {}
-    ordinal = 0
-    try:
-        for record in StreamReader(io.BytesIO(content), validate_crcs=True).records:
-            if isinstance(record, SchemaRecord):
-                schemas[record.id] = Schema(record.id, record.name, record.encoding, record.data)
-            elif isinstance(record, ChannelRecord):
-                channels[record.id] = Channel(
-                    record.id, record.topic, record.message_encoding, schemas.get(record.schema_id), str(path)
-                )
-            elif isinstance(record, MessageRecord):
-                ordinal += 1
-                row = (ordinal, record.log_time, record.publish_time, record.data)
-                messages.setdefault(record.channel_id, []).append(row)
-    except Exception as error:
-        raise InputError(f"is damaged: {type(error).__name__} {error}", place=str(path)) from None
-    samples = [_sample(channels[id_], rows[0][3]) for id_, rows in messages.items()]
-    plan = plan_streams(samples, config)
-    decoded = [
-        Decoded(source, _decoded(messages[source.channel.id], source.channel, dict(source.types)))
-        for source in plan.sources
-    ]
-    breaches: list[Breach] = []
-    frames = stream_frames(decoded, breaches)
-    if "gnss" not in frames:
-        breaches.append(_no_gnss(path, plan))
-    refuse(breaches)
-    skipped = tuple(f"{topic} ({schema})" for topic, schema in sorted(plan.left_over.items()))
+    """All streams of a log, read strictly from front to back in pieces."""
+    digest = hashlib.sha256()
+    streams = McapStreams(config)
+    walk = walk_log(path, config, streams, digest.update)
+    frames, slow_messages, left_over = _frames(path, config, walk, streams)
     return RunLog(
         run_id=files.stem_of(path),
-        notes=IngestNotes(skipped_topics=skipped),
-        input_digest=hashlib.sha256(content).hexdigest(),
+        notes=IngestNotes(
+            partial_until_ns=_last_ns(frames["gnss"]) if walk.cut_at is not None else None,
+            damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
+            slow_path_messages=slow_messages,
+            chunks_without_crc=walk.chunks_without_crc,
+            skipped_topics=left_over,
+        ),
+        input_digest=digest.hexdigest(),
         **frames,
     )
 
 
-def _sample(channel: Channel, payload: bytes) -> Sample:
+def walk_log(path: files.Address, config: IngestConfig, streams: McapStreams, on_bytes: object) -> McapWalk:
+    """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind."""
+    limit = int(config.chunk_limit_mib * _MIB)
     try:
-        return Sample(channel, fields_of(decoder_for(channel)(payload)))
-    except (NotDecodable, InputError):
-        return Sample(channel, {})
+        with files.open_binary(path) as stream:
+            window = ByteWindow(stream, files.size_of(path), on_bytes)  # type: ignore[arg-type]
+            walk = McapWalk(window, str(path), limit)
+            for block in walk.blocks():
+                streams.add(block, walk.channels)
+            window.drain()
+        _check_data_crc(path, walk)
+    except Damage as damage:
+        raise InputError(
+            str(damage), place=str(path), remedy="Record or copy the log again, or try `mcap recover`."
+        ) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error}", place=str(path)) from None
+    return walk
 
 
-def _decoded(
-    rows: list[tuple[int, int, int, bytes]], channel: Channel, types: dict[str, pl.DataType]
-) -> pl.DataFrame:
-    ordinals, log_times, publish_times, payloads = zip(*rows, strict=True)
-    frame = decode_columns(channel, payloads, types)
-    return frame.with_columns(
-        pl.Series(ORDINAL, ordinals, dtype=pl.Int64),
-        pl.Series(LOG_TIME, log_times, dtype=pl.Int64),
-        pl.Series(PUBLISH_TIME, publish_times, dtype=pl.Int64),
-    )
+def _check_data_crc(path: files.Address, walk: McapWalk) -> None:
+    """The checksum over the whole data section, which few recorders write."""
+    expected, end = walk.data_crc
+    if not expected:
+        return
+    crc, left = 0, end
+    with files.open_binary(path) as stream:
+        while left and (piece := stream.read(min(left, 4 * _MIB))):
+            crc = zlib.crc32(piece, crc)
+            left -= len(piece)
+    if crc != expected:
+        raise Damage(end, "the checksum of the data section does not match")
 
 
-def _no_gnss(path: files.Address, plan: Plan) -> Breach:
+def _frames(
+    path: files.Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
+) -> tuple[dict[str, pl.DataFrame], int, tuple[str, ...]]:
+    """Frames of all streams, messages decoded one by one, and the topics that fed none."""
+    readers = [reader for found in streams.readers.values() for reader in found]
+    met = [walk.channels[channel_id] for channel_id in streams.readers]
+    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
+    by_key = {(source.channel.id, source.stream, id(source.recipe)): source for source in settled}
+    decoded, slow_messages = [], 0
+    for reader in readers:
+        source = by_key.get((reader.source.channel.id, reader.source.stream, id(reader.source.recipe)))
+        if source is not None:
+            decoded.append(Decoded(source, reader.frame()))
+            slow_messages += reader.slow_messages
+    used = {source.channel.topic for source in settled}
+    unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
+    left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
+    breaches: list[Breach] = []
+    frames = stream_frames(decoded, breaches)
+    if "gnss" not in frames:
+        breaches.append(_no_gnss(path, walk, left_over))
+    refuse(breaches)
+    return frames, slow_messages, left_over
+
+
+def _no_gnss(path: files.Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:
+    if walk.cut_at is not None and not walk.message_counts:
+        return Breach(
+            str(path),
+            f"is cut off at byte {walk.cut_at}, before any complete message",
+            remedy="Record or copy the log again.",
+        )
     return Breach(
         str(path),
         "holds no GNSS stream",
-        found=", ".join(f"{topic} ({schema})" for topic, schema in sorted(plan.left_over.items())) or None,
+        found=", ".join(left_over) or "no messages of other topics",
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints a starting one.",
     )
+
+
+def _last_ns(gnss: pl.DataFrame) -> int:
+    """The latest epoch that was read."""
+    return int(gnss["t"].to_physical().max())  # type: ignore[arg-type]

@@ -46,6 +46,7 @@ def write_mcap(
     compression: Compression = "zstd",
     chunk_size: int | None = 1024 * 1024,
     odometer_message: OdometerMessage = "geometry_msgs/msg/TwistStamped",
+    checksums: bool = True,
 ) -> tuple[str, ...]:
     """Write a run; returns what the chosen messages cannot hold, such as `gnss.hpl_m`.
 
@@ -67,6 +68,7 @@ def write_mcap(
             compression=kind[compression],
             chunk_size=chunk_size or 1024 * 1024,
             use_chunking=chunk_size is not None,
+            enable_crcs=checksums,
         )
         writer.start(profile="ros2" if encoding == "cdr" else "", library="balise")
         _write(writer, topics)

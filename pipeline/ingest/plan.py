@@ -14,16 +14,17 @@ from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.recipes import FIX_TYPE, Recipe, recipe_for, recorded_type
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TimeSource, time_source
 from schemas.config import IngestConfig, StreamMapping
+from schemas.enums import Fix
 from schemas.errors import ConfigError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
-_STAMPS_BY_CUSTOM = ("header.stamp", "timestamp", "stamp")
+_USUAL_STAMPS = ("header.stamp", "timestamp", "stamp")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A channel with the fields of its first message."""
+    """A channel with the fields of its first message and their kinds."""
 
     channel: Channel
     fields: Mapping[str, str]
@@ -39,90 +40,64 @@ class Source:
     times: Mapping[str, TimeSource]
     types: Mapping[str, pl.DataType]
     solution: str | None = None
+    breaches: tuple[Breach, ...] = ()
 
     @property
     def stream(self) -> Stream:
         return self.recipe.stream
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Sources in order of channel, and the topics that nothing is made of with the reason."""
-
-    sources: tuple[Source, ...]
-    left_over: Mapping[str, str]
+Candidate = tuple[Recipe, StreamMapping | None]
 
 
-def plan_streams(samples: Sequence[Sample], config: IngestConfig) -> Plan:
-    """The configured topics of each stream, else those whose schema is known."""
-    refuse(_absent_topics(samples, config))
-    breaches: list[Breach] = []
-    sources: list[Source] = []
+def mappings_of(config: IngestConfig, stream: Stream) -> tuple[StreamMapping, ...]:
+    """What the configuration says about a stream (injected faults cannot be mapped)."""
+    mappings: tuple[StreamMapping, ...] = getattr(config, stream, ())
+    return mappings
+
+
+def candidates(channel: Channel, config: IngestConfig) -> list[Candidate]:
+    """The streams that a channel may feed: by configuration, else by its schema."""
+    known = recipe_for(channel.schema_name, channel.topic)
+    found: list[Candidate] = []
     for stream in STREAMS:
-        mappings: tuple[StreamMapping, ...] = getattr(config, stream, ())
-        chosen = _configured(samples, stream, mappings) if mappings else _recognised(samples, stream)
-        sources += [source for pair in chosen if (source := _source(*pair, breaches)) is not None]
-        breaches += _competing(stream, chosen)
-    refuse(breaches)
-    return Plan(tuple(_with_solutions(sources)), _left_over(samples, sources))
+        mappings = mappings_of(config, stream)
+        found += [
+            (mapped_recipe(channel, stream, mapping), mapping)
+            for mapping in mappings
+            if mapping.topic == channel.topic
+        ]
+        supplement = known is not None and known.supplement
+        if known is not None and known.stream == stream and (not mappings or supplement):
+            found.append((known, None))
+    return found
 
 
-Chosen = tuple[Sample, Recipe, StreamMapping | None]
-
-
-def _absent_topics(samples: Sequence[Sample], config: IngestConfig) -> list[Breach]:
-    topics = sorted({sample.channel.topic for sample in samples})
-    file = samples[0].channel.file if samples else "log"
-    return [
-        Breach(
-            f"{file}: topic {mapping.topic}",
-            f"is configured for {stream} but has no messages",
-            found=", ".join(topics) or "no topics",
-            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
-        )
-        for stream in STREAMS
-        for mapping in getattr(config, stream, ())
-        if mapping.topic not in topics
-    ]
-
-
-def _configured(
-    samples: Sequence[Sample], stream: Stream, mappings: Sequence[StreamMapping]
-) -> list[Chosen]:
-    if stream == "gnss":
-        _refuse_shared_solutions(mappings)
-    return [
-        (sample, _mapped_recipe(sample, stream, mapping), mapping)
-        for mapping in mappings
-        for sample in samples
-        if sample.channel.topic == mapping.topic
-    ]
-
-
-def _refuse_shared_solutions(mappings: Sequence[StreamMapping]) -> None:
-    """Two receivers under one name would be read as one that jumps between their positions."""
-    names = [mapping.solution for mapping in mappings if not _is_supplement_only(mapping)]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(
-                "several topics feed the same solution",
-                place=f"[ingest.gnss] solution {name}",
-                expected="one name per topic",
-                remedy="Set solution in each [[ingest.gnss]].",
-            )
-
-
-def _is_supplement_only(mapping: StreamMapping) -> bool:
-    return False
-
-
-def _mapped_recipe(sample: Sample, stream: Stream, mapping: StreamMapping) -> Recipe:
+def mapped_recipe(channel: Channel, stream: Stream, mapping: StreamMapping) -> Recipe:
     """The mapping over the recipe of the schema, if that is one of the same stream."""
-    base = recipe_for(sample.channel.schema_name, sample.channel.topic)
+    base = recipe_for(channel.schema_name, channel.topic)
     if base is None or base.stream != stream:
-        base = Recipe(stream=stream, columns={}, stamps={})
+        fix = {"fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE)} if stream == "gnss" else {}
+        base = Recipe(stream=stream, columns=fix, stamps={})
     contract = STREAM_SCHEMAS[stream].columns()
-    unknown = sorted((set(mapping.fields) | set(mapping.constants) | set(mapping.factors) - {"t"}) - set(contract))
+    _refuse_unknown_columns(stream, mapping, contract)
+    fields = {name: path for name, path in mapping.fields.items() if name != "t"}
+    columns = dict(base.columns) | {name: pl.col(path) for name, path in fields.items()}
+    types = dict(base.types) | {path: recorded_type(contract[name]) for name, path in fields.items()}
+    if "fix" in fields and mapping.fix_codes:
+        types[fields["fix"]] = pl.Int64()
+        codes = {int(code): kind.value for code, kind in mapping.fix_codes.items()}
+        columns["fix"] = columns["fix"].replace_strict(codes, default=None, return_dtype=FIX_TYPE)
+    columns |= {name: _constant(contract[name], value) for name, value in mapping.constants.items()}
+    columns |= {name: columns[name] * factor for name, factor in mapping.factors.items() if name in columns}
+    return replace(base, columns=columns, types=types)
+
+
+def _refuse_unknown_columns(
+    stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]
+) -> None:
+    named = {*mapping.fields, *mapping.constants, *mapping.factors}
+    unknown = sorted(named - set(contract))
     if unknown:
         raise ConfigError(
             "is no column of this stream",
@@ -130,73 +105,33 @@ def _mapped_recipe(sample: Sample, stream: Stream, mapping: StreamMapping) -> Re
             found=", ".join(unknown),
             expected=", ".join(contract),
         )
-    columns = dict(base.columns) | {name: pl.col(path) for name, path in mapping.fields.items() if name != "t"}
-    columns |= {name: _constant(contract[name], value) for name, value in mapping.constants.items()}
-    for name, factor in mapping.factors.items():
-        if name in columns:
-            columns[name] = columns[name] * factor
-    types = {path: recorded_type(contract[name]) for name, path in mapping.fields.items() if name != "t"}
-    return replace(base, columns=columns, types=dict(base.types) | types)
 
 
 def _constant(column: dy.Column, value: str | float | bool) -> pl.Expr:
     return pl.lit(value, dtype=FIX_TYPE if isinstance(column, dy.Enum) else column.dtype)
 
 
-def _recognised(samples: Sequence[Sample], stream: Stream) -> list[Chosen]:
-    """Channels by schema; where this project's own schema is present, it alone."""
-    known = [
-        (sample, recipe, None)
-        for sample in samples
-        if (recipe := recipe_for(sample.channel.schema_name, sample.channel.topic)) is not None
-        and recipe.stream == stream
-    ]
-    own = [chosen for chosen in known if chosen[1].own]
-    return own or known  # type: ignore[return-value]
-
-
-def _competing(stream: Stream, chosen: Sequence[Chosen]) -> list[Breach]:
-    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
-    topics = list(dict.fromkeys(sample.channel.topic for sample, _, _ in chosen))
-    if stream == "gnss" or len(topics) < 2 or stream == "satellites":
-        return []
-    return [
-        Breach(
-            chosen[0][0].channel.file,
-            f"several topics could be the {stream}",
-            found=", ".join(topics),
-            expected="one",
-            remedy=f"Choose one by [ingest.{stream}] topic in the configuration.",
-        )
-    ]
-
-
-def _source(
-    sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[Breach]
-) -> Source | None:
-    """The source, or breaches: a column that the contract demands whose field the messages do not have."""
+def source_of(sample: Sample, candidate: Candidate) -> Source:
+    """How the channel's messages make rows; `breaches` tells what they lack."""
+    recipe, mapping = candidate
     contract = STREAM_SCHEMAS[recipe.stream].columns()
     closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
-    columns = {}
+    columns: dict[str, pl.Expr] = {}
+    breaches: list[Breach] = []
     for name, expression in recipe.columns.items():
         absent = [path for path in recipe.fields_of(name) if path not in sample.fields]
+        wanted = mapping is not None and name in mapping.fields
         if not absent or (not closed and contract[name].nullable):
             columns[name] = expression
-        elif (not contract[name].nullable and name != "solution") or (mapping and name in mapping.fields):
+        elif wanted or not (contract[name].nullable or name == "solution"):
             breaches.append(_missing_field(sample, name, absent))
-    times = _times(sample, recipe, mapping)
-    types = {path: recipe.type_of(path) for name in columns for path in recipe.fields_of(name)}
+    times = _times(sample, recipe, mapping, breaches)
+    paths = dict.fromkeys([*recipe.key, *(path for name in columns for path in recipe.fields_of(name))])
+    types = {path: recipe.type_of(path) for path in paths}
     for time in times.values():
         types |= time.types
     solution = mapping.solution if mapping else None
-    return Source(sample.channel, recipe, columns, times, types, solution)
-
-
-def _times(sample: Sample, recipe: Recipe, mapping: StreamMapping | None) -> dict[str, TimeSource]:
-    """The time of validity, and further times (end of a fault), which look like it and may be absent."""
-    (column, path), *others = (recipe.stamps or {"t": ""}).items()
-    first = _time(sample, path, mapping)
-    return {column: first} | {name: first.of_field(path, other) for name, other in others}
+    return Source(sample.channel, recipe, columns, times, types, solution, tuple(breaches))
 
 
 def _missing_field(sample: Sample, column: str, absent: Sequence[str]) -> Breach:
@@ -208,28 +143,115 @@ def _missing_field(sample: Sample, column: str, absent: Sequence[str]) -> Breach
     )
 
 
-def _time(sample: Sample, path: str, mapping: StreamMapping | None) -> TimeSource:
+def _times(
+    sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[Breach]
+) -> dict[str, TimeSource]:
+    """The time of validity, and further times (end of a fault), which look like it and may be absent."""
+    if recipe.time is not None:
+        return {"t": recipe.time}
+    (column, path), *others = (recipe.stamps or {"t": ""}).items()
+    first = _time(sample, path, mapping, breaches)
+    return {column: first} | {name: first.of_field(path, other) for name, other in others}
+
+
+def _time(
+    sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[Breach]
+) -> TimeSource:
     """The time of validity: as configured, else the payload's stamp, else the log time."""
     wanted = mapping.time if mapping else "auto"
-    if wanted in ("log", "publish"):
-        name = LOG_TIME if wanted == "log" else PUBLISH_TIME
-        return time_source((name,), {name: "int"}, mapping)
-    if wanted.startswith("field:"):
-        path = wanted.removeprefix("field:")
-        parts = stamp_parts(dict(sample.fields), path)
-        if not parts:
-            refuse([_missing_field(sample, "t", [path])])
-        return time_source(parts, sample.fields, mapping)
-    for candidate in (path, *_STAMPS_BY_CUSTOM):
+    log_time = time_source((LOG_TIME,), {LOG_TIME: "int"}, mapping)
+    if wanted == "log":
+        return log_time
+    if wanted == "publish":
+        return time_source((PUBLISH_TIME,), {PUBLISH_TIME: "int"}, mapping)
+    named = wanted.removeprefix("field:") if wanted != "auto" else mapping.fields.get("t") if mapping else None
+    for candidate in (named,) if named else (path, *_USUAL_STAMPS):
         parts = stamp_parts(dict(sample.fields), candidate)
         if parts:
             return time_source(parts, sample.fields, mapping)
-    return time_source((LOG_TIME,), {LOG_TIME: "int"}, mapping)
+    if named:
+        breaches.append(_missing_field(sample, "t", [named]))
+    return log_time
+
+
+def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
+    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
+    breaches = _absent_topics(topics, config, file)
+    kept: list[Source] = []
+    for stream in STREAMS:
+        chosen = _preferred([source for source in sources if source.stream == stream])
+        _refuse_shared_solutions(stream, chosen)
+        breaches += _competing(stream, chosen, file)
+        breaches += [breach for source in chosen for breach in source.breaches]
+        kept += chosen
+    refuse(breaches)
+    return _with_solutions(kept)
+
+
+def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[Breach]:
+    return [
+        Breach(
+            f"{file}: topic {mapping.topic}",
+            f"is configured for {stream} but has no messages",
+            found=", ".join(sorted(set(topics))) or "no topics",
+            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
+        )
+        for stream in STREAMS
+        for mapping in mappings_of(config, stream)
+        if mapping.topic not in topics
+    ]
+
+
+def _preferred(sources: Sequence[Source]) -> list[Source]:
+    """This project's own schema alone where it is present; a supplement only with what it adds to."""
+    own = [source for source in sources if source.recipe.own]
+    if own:
+        return own
+    whole = [source for source in sources if not source.recipe.supplement]
+    return list(sources) if whole else []
+
+
+def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
+    """Two receivers under one name would be read as one that jumps between their positions."""
+    if stream != "gnss":
+        return
+    topics: dict[str, str] = {}
+    for source in sources:
+        if source.solution is None or source.recipe.supplement:
+            continue
+        if topics.setdefault(source.solution, source.channel.topic) != source.channel.topic:
+            raise ConfigError(
+                "several topics feed the same solution",
+                place=f"[ingest.gnss] solution {source.solution}",
+                found=f"{topics[source.solution]}, {source.channel.topic}",
+                expected="one name per topic",
+                remedy="Set solution in each [[ingest.gnss]].",
+            )
+
+
+def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Breach]:
+    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
+    topics = list(dict.fromkeys(source.channel.topic for source in sources))
+    if stream in ("gnss", "satellites") or len(topics) < 2:
+        return []
+    return [
+        Breach(
+            file,
+            f"several topics could be the {stream}",
+            found=", ".join(topics),
+            expected="one",
+            remedy=f"Choose one by [ingest.{stream}] topic in the configuration.",
+        )
+    ]
 
 
 def _with_solutions(sources: Sequence[Source]) -> list[Source]:
     """Names of solutions: as configured, `primary` for the only topic, else after the topic."""
-    topics = {source.channel.topic for source in sources if source.stream == "gnss"}
+    topics = {
+        source.channel.topic
+        for source in sources
+        if source.stream == "gnss" and not source.recipe.supplement
+    }
     return [
         source
         if source.solution is not None or source.stream not in ("gnss", "satellites")
@@ -240,12 +262,3 @@ def _with_solutions(sources: Sequence[Source]) -> list[Source]:
 
 def _named_after(topic: str) -> str:
     return topic.strip("/").replace("/", "_") or "primary"
-
-
-def _left_over(samples: Sequence[Sample], sources: Sequence[Source]) -> dict[str, str]:
-    used = {source.channel.topic for source in sources}
-    return {
-        sample.channel.topic: sample.channel.schema_name or sample.channel.encoding
-        for sample in samples
-        if sample.channel.topic not in used
-    }

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import dataframely as dy
 import polars as pl
 
+from pipeline.ingest.stamps import TimeSource
 from schemas.enums import Fix
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
@@ -26,7 +27,7 @@ class Recipe:
 
     `stamps` names the fields that hold times (absent: the log time), `types` the types of fields that
     are not floats. `key` names the fields by which a `supplement` (a message that holds
-    further columns of the same epochs, such as a covariance) finds its epoch.
+    further columns of the same epochs, such as a covariance) finds its epoch. `time` is set where the time is computed.
     """
 
     stream: Stream
@@ -37,6 +38,7 @@ class Recipe:
     supplement: bool = False
     own: bool = False
     remark: str = ""
+    time: TimeSource | None = None
 
     def fields_of(self, column: str) -> list[str]:
         """The recorded fields that a column is made of."""

@@ -1,0 +1,184 @@
+"""Columnar decoding of ROS 2 messages in CDR, laid out by the `ros2msg` text that the log carries."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.ingest.template import Field, Fixed, Flag, Template, Text, Unfit, check_type, template_of
+
+_MOST_ELEMENTS = 4096
+_HEADER_SIZE = 4  # encapsulation: representation, options
+
+_PRIMITIVES = {
+    "bool": "u1", "byte": "u1", "char": "i1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_LINE = re.compile(
+    r"^(?P<type>[A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)$"
+)
+
+
+@dataclass(frozen=True)
+class Member:
+    """A field of a message: `count` none for a single value, 0 for a sequence, else a fixed array."""
+
+    name: str
+    type: str
+    count: int | None
+
+
+Definition = tuple[Member, ...]
+_TIME = (Member("sec", "uint32", None), Member("nanosec", "uint32", None))
+
+
+def parse_definitions(name: str, text: str) -> dict[str, Definition]:
+    """All messages of a concatenated definition by short name (`pkg/Type`)."""
+    found: dict[str, Definition] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
+    for index, section in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
+        title = re.search(r"^MSG:\s+(\S+)\s*$", section, flags=re.MULTILINE)
+        if title is None and index > 0:
+            raise Unfit("a part of the definition has no name")
+        full = title.group(1) if title else name
+        package = full.split("/")[0]
+        lines = [line for line in section.splitlines() if not line.startswith("MSG:")]
+        found[_short(full)] = tuple(member for line in lines if (member := _member(line, package)))
+    return found
+
+
+def _short(full: str) -> str:
+    parts = full.split("/")
+    return f"{parts[0]}/{parts[-1]}"
+
+
+def _member(line: str, package: str) -> Member | None:
+    content = line.split("#", 1)[0].strip()
+    match = _LINE.match(content)
+    if not content or (match and match["rest"].startswith("=")):
+        return None
+    if match is None:
+        raise Unfit(f"the definition line {content!r} is not understood")
+    kind = match["type"]
+    if kind not in _PRIMITIVES and kind not in ("string", "wstring"):
+        kind = _short(kind) if "/" in kind else f"{package}/{kind}"
+    array = match["array"]
+    if array is None:
+        return Member(match["name"], kind, None)
+    size = array[1:-1]
+    return Member(match["name"], kind, int(size) if size.isdigit() else 0)
+
+
+class CdrWalk:
+    """Walks one message by its definition; calling it gives the template of the message's layout."""
+
+    def __init__(self, name: str, text: str, types: Mapping[str, pl.DataType]) -> None:
+        self._definitions = parse_definitions(name, text)
+        self._root = _short(name)
+        self._types = types
+        if self._root not in self._definitions:
+            raise Unfit(f"no definition of {name}")
+
+    def __call__(self, payload: bytes) -> Template:
+        if len(payload) < _HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
+            raise Unfit("not plain CDR")
+        walk = _Walk(payload, self._definitions, self._types)
+        walk.message(self._root, "", 0)
+        missing = set(self._types) - set(walk.fields)
+        if missing:
+            raise Unfit(f"no field {', '.join(sorted(missing))}")
+        return template_of(payload, walk.static, walk.fields)
+
+
+class _Walk:
+    """The state of one walk."""
+
+    def __init__(
+        self, payload: bytes, definitions: Mapping[str, Definition], types: Mapping[str, pl.DataType]
+    ) -> None:
+        self.fields: dict[str, Field] = {}
+        self.static = bytearray(len(payload))
+        self.static[0:2] = b"\xff\xff"
+        self._payload = payload
+        self._definitions = definitions
+        self._types = types
+        self._at = _HEADER_SIZE
+        self._order = "little" if payload[1] else "big"
+        self._mark = "<" if payload[1] else ">"
+
+    def message(self, name: str, path: str, depth: int) -> None:
+        if name not in self._definitions or depth > 32:
+            raise Unfit(f"no definition of {name}")
+        members = self._definitions[name]
+        if not members:
+            self._skip(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
+        for member in members:
+            self._member(member, f"{path}.{member.name}" if path else member.name, depth)
+
+    def _member(self, member: Member, path: str, depth: int) -> None:
+        if member.count is None:
+            self._value(member.type, path, depth)
+            return
+        count = member.count or self._prefix()
+        if member.type in _PRIMITIVES:
+            self._numbers(member.type, path, count)
+            return
+        if count > _MOST_ELEMENTS:
+            raise Unfit("too many elements")
+        for index in range(count):
+            self._value(member.type, f"{path}[{index}]", depth)
+
+    def _value(self, kind: str, path: str, depth: int) -> None:
+        if kind in _PRIMITIVES:
+            self._keep(path, kind, self._skip(_size(kind), _size(kind)))
+        elif kind == "string":
+            self._text(path)
+        elif kind == "wstring":
+            raise Unfit("wide text")
+        else:
+            self.message(kind, path, depth + 1)
+
+    def _numbers(self, kind: str, path: str, count: int) -> None:
+        if count == 0:
+            return
+        size = _size(kind)
+        offset = self._skip(size * count, size)
+        for wanted in self._types:
+            if wanted.startswith(f"{path}["):
+                index = wanted[len(path) + 1 : -1]
+                if index.isdigit() and int(index) < count:
+                    self._keep(wanted, kind, offset + size * int(index))
+
+    def _keep(self, path: str, kind: str, offset: int) -> None:
+        if path not in self._types:
+            return
+        field: Field = Flag(offset) if kind == "bool" else Fixed(offset, self._mark + _PRIMITIVES[kind])
+        self.fields[path] = check_type(field, self._types[path])
+
+    def _text(self, path: str) -> None:
+        length = self._prefix()
+        offset = self._skip(length, 1)
+        if path in self._types:
+            if length == 0 or self._payload[offset + length - 1] != 0:
+                raise Unfit("a text without its closing zero")
+            self.static[offset + length - 1] = 0xFF
+            self.fields[path] = check_type(Text(offset, length - 1), self._types[path])
+
+    def _prefix(self) -> int:
+        """A length, which shapes what follows and is therefore checked on every message."""
+        offset = self._skip(4, 4)
+        self.static[offset : offset + 4] = b"\xff" * 4
+        return int.from_bytes(self._payload[offset : offset + 4], self._order)  # type: ignore[arg-type]
+
+    def _skip(self, size: int, alignment: int) -> int:
+        start = self._at + -(self._at - _HEADER_SIZE) % alignment
+        if start + size > len(self._payload):
+            raise Unfit("the message ends too early")
+        self._at = start + size
+        return start
+
+
+def _size(kind: str) -> int:
+    return int(_PRIMITIVES[kind][1])

@@ -1,0 +1,311 @@
+"""The strict walk through an MCAP file, front to back.
+
+Indexes are never trusted to find data: every record is met in order and every length held against its
+parent, so that nothing is read twice, left out or made up. What the file says about itself (indexes,
+checksums, statistics) is then held against what was met.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.ingest import mcap_records as records
+from pipeline.ingest.byte_window import ByteWindow
+from pipeline.ingest.mcap_block import Block, block_of, decompressed, message_offsets
+from pipeline.ingest.mcap_model import Channel, Schema
+from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, Damage, Op
+
+_DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
+_RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
+_SMALL_RECORD = 64 * 1024 * 1024  # no record but chunks and attachments is larger
+
+
+@dataclass
+class Pending:
+    """A chunk whose message indexes are still being met."""
+
+    chunk: ChunkRecord
+    length: int
+    indexes: list[tuple[int, memoryview]] = field(default_factory=list)
+
+
+class McapWalk:
+    """Walks a log once; `blocks` yields its messages, the attributes tell what was met so far."""
+
+    def __init__(self, window: ByteWindow, file: str, chunk_limit: int) -> None:
+        self.channels: dict[int, Channel] = {}
+        self.message_counts: Counter[int] = Counter()
+        self.data_crc = (0, 0)
+        self.chunks_without_crc = 0
+        self.cut_at: int | None = None
+        self.unknown_records = 0
+        self._window = window
+        self._file = file
+        self._limit = chunk_limit
+        self._schemas: dict[int, Schema] = {}
+        self._definitions: dict[int, records.ChannelRecord] = {}
+        self._pending: Pending | None = None
+        self._met: list[ChunkSummary] = []
+        self._indexed: list[ChunkSummary] = []
+        self._attachments = 0
+        self._metadata = 0
+        self._ordinal = 0
+        self._span_ns: tuple[int, int] | None = None
+        self._crc = 0
+        self._summary_start: int | None = None
+
+    def blocks(self) -> Iterator[Block]:
+        """All messages in order of the file. Stops at a cut, with `cut_at` set; raises `Damage`."""
+        position = self._first_record()
+        while position is not None:
+            head = self._head(position)
+            if head is None:
+                break
+            opcode, length = head
+            if opcode != Op.MESSAGE_INDEX and self._pending:
+                yield self._finished_chunk()
+            if opcode == Op.MESSAGE and self._summary_start is None:
+                block, position = self._loose_messages(position)
+                yield block
+            else:
+                position = self._record(opcode, length, position)
+        if self._pending:
+            # The cut may have taken part of the chunk's indexes, so the chunk is walked instead.
+            self._pending.indexes.clear()
+            yield self._finished_chunk()
+
+    def _first_record(self) -> int | None:
+        size = self._window.size
+        if size == 0:
+            raise Damage(0, "the file is empty")
+        start = bytes(self._window.at(0, min(size, len(MAGIC))))
+        if not MAGIC.startswith(start):
+            raise Damage(0, "the file does not start as MCAP does")
+        if size == len(start):
+            self.cut_at = size
+            return None
+        head = self._head(len(MAGIC))
+        if head is not None and head[0] != Op.HEADER:
+            raise Damage(len(MAGIC), "the first record is no Header")
+        return len(MAGIC) if head is not None else None
+
+    def _head(self, position: int) -> tuple[int, int] | None:
+        """Opcode and length of the record here; none where the log is cut off."""
+        left = self._window.size - position
+        if left >= HEAD_SIZE:
+            opcode, length = HEAD.unpack_from(self._window.at(position, HEAD_SIZE))
+            if opcode == 0:
+                return self._zeros(position)
+            if length <= left - HEAD_SIZE:
+                return opcode, length
+        if left and self._window.ends_with(MAGIC):
+            raise Damage(position, "a record runs past the end of the file")
+        self.cut_at = position
+        return None
+
+    def _zeros(self, position: int) -> None:
+        if not self._window.is_zero_from(position):
+            raise Damage(position, "a record has the invalid opcode 0")
+        self.cut_at = position
+
+    def _loose_messages(self, position: int) -> tuple[Block, int]:
+        """Messages outside of chunks, as many as are in memory and follow each other."""
+        first = HEAD.unpack_from(self._window.at(position, HEAD_SIZE))[1]
+        self._window.at(position, HEAD_SIZE + first)
+        view = self._window.available(position)
+        starts, at, room, message = [], 0, len(view) - HEAD_SIZE, int(Op.MESSAGE)
+        unpack = HEAD.unpack_from
+        while at <= room and len(starts) < _RAW_BLOCK:
+            opcode, length = unpack(view, at)
+            following = at + HEAD_SIZE + length
+            if opcode != message or following > len(view):
+                break
+            starts.append(at)
+            at = following
+        data = np.frombuffer(view, dtype=np.uint8)
+        block = block_of(data, np.array(starts, dtype=np.int64), position, self._ordinal)
+        return self._counted(block, position), position + at
+
+    def _record(self, opcode: int, length: int, position: int) -> int | None:
+        """Meet one record; the position of the next, none after the closing magic."""
+        following = position + HEAD_SIZE + length
+        if self._summary_start is not None:
+            return self._summary_record(opcode, length, position)
+        if opcode == Op.ATTACHMENT:
+            self._attachment(length, position)
+            return following
+        if opcode not in _HANDLERS:
+            self._other_record(opcode, position)
+            return following
+        if opcode != Op.CHUNK and length > _SMALL_RECORD:
+            raise Damage(position, f"a {Op(opcode).name} record declares {length} bytes")
+        body = self._window.at(position + HEAD_SIZE, length)
+        _HANDLERS[opcode](self, body, position)
+        return following
+
+    def _other_record(self, opcode: int, position: int) -> None:
+        """Unknown opcodes are skipped, by specification; known ones stand where they must not."""
+        if opcode <= max(Op):
+            raise Damage(position, f"a {Op(opcode).name} record stands in the data section")
+        self.unknown_records += 1
+
+    def _header(self, body: memoryview, position: int) -> None:
+        if position != len(MAGIC):
+            raise Damage(position, "a second Header: is this two files in one?")
+        cursor = records.Cursor(body, position, "Header")
+        cursor.text()
+        cursor.text()
+
+    def _schema(self, body: memoryview, position: int) -> None:
+        schema = records.parse_schema(body, position)
+        if self._schemas.setdefault(schema.id, schema) != schema:
+            raise Damage(position, f"schema {schema.id} is defined a second time, differently")
+
+    def _channel(self, body: memoryview, position: int) -> None:
+        record = records.parse_channel(body, position)
+        if self._definitions.setdefault(record.id, record) != record:
+            raise Damage(position, f"channel {record.id} ({record.topic}) is defined a second time, differently")
+        if record.schema_id and record.schema_id not in self._schemas:
+            raise Damage(position, f"schema {record.schema_id} of topic {record.topic} is missing")
+        schema = self._schemas.get(record.schema_id)
+        if record.id not in self.channels:
+            self.channels[record.id] = Channel(record.id, record.topic, record.encoding, schema, self._file)
+
+    def _chunk(self, body: memoryview, position: int) -> None:
+        self._pending = Pending(records.parse_chunk(body, position), len(body) + HEAD_SIZE)
+
+    def _message_index(self, body: memoryview, position: int) -> None:
+        if self._pending is None:
+            raise Damage(position, "a message index follows no chunk")
+        self._pending.indexes.append(records.parse_message_index(body, position))
+
+    def _attachment(self, length: int, position: int) -> None:
+        head = self._window.at(position + HEAD_SIZE, min(length, _SMALL_RECORD))
+        records.parse_attachment_lengths(head, length, position)
+        self._attachments += 1
+
+    def _metadata_record(self, body: memoryview, position: int) -> None:
+        self._metadata += 1
+
+    def _data_end(self, body: memoryview, position: int) -> None:
+        cursor = records.Cursor(body, position, "DataEnd")
+        self.data_crc = (cursor.u32(), position)
+        self._summary_start = position + HEAD_SIZE + len(body)
+
+    def _finished_chunk(self) -> Block:
+        pending, self._pending = self._pending, None
+        assert pending is not None  # callers checked
+        chunk = pending.chunk
+        data = decompressed(chunk, self._limit)
+        self.chunks_without_crc += chunk.crc == 0
+        offsets = message_offsets(data, pending.indexes, chunk.offset, self._chunk_record)
+        block = self._counted(block_of(data, offsets, chunk.offset, self._ordinal), chunk.offset)
+        self._met.append(
+            ChunkSummary(
+                chunk.start_ns, chunk.end_ns, chunk.offset, pending.length, chunk.compression,
+                len(chunk.records), chunk.size,
+            )
+        )  # fmt: skip
+        return block
+
+    def _chunk_record(self, opcode: int, body: memoryview, position: int) -> None:
+        """A record inside a chunk that is no message."""
+        if opcode == Op.SCHEMA:
+            self._schema(body, position)
+        elif opcode == Op.CHANNEL:
+            self._channel(body, position)
+        elif opcode <= max(Op):
+            raise Damage(position, f"a record of opcode {opcode} stands inside a chunk")
+        else:
+            self.unknown_records += 1
+
+    def _counted(self, block: Block, offset: int) -> Block:
+        counts = np.bincount(block.channel)
+        for channel_id in np.flatnonzero(counts):
+            if int(channel_id) not in self.channels:
+                raise Damage(offset, f"a message belongs to the unknown channel {channel_id}")
+            self.message_counts[int(channel_id)] += int(counts[channel_id])
+        self._ordinal += len(block.start)
+        if len(block.start):
+            low, high = int(block.log_time.min()), int(block.log_time.max())
+            old = self._span_ns or (low, high)
+            self._span_ns = (min(old[0], low), max(old[1], high))
+        return block
+
+    def _summary_record(self, opcode: int, length: int, position: int) -> int | None:
+        if opcode in _DATA_OPS:
+            raise Damage(position, f"a {Op(opcode).name} record stands after the end of the data")
+        if length > _SMALL_RECORD:
+            raise Damage(position, f"a record of the summary declares {length} bytes")
+        whole = self._window.at(position, HEAD_SIZE + length)
+        body = whole[HEAD_SIZE:]
+        if opcode == Op.FOOTER:
+            self._footer(whole, position)
+            return None
+        self._crc = zlib.crc32(whole, self._crc)
+        if opcode in (Op.SCHEMA, Op.CHANNEL):
+            _HANDLERS[opcode](self, body, position)
+        elif opcode == Op.CHUNK_INDEX:
+            self._indexed.append(records.parse_chunk_index(body, position))
+        elif opcode == Op.STATISTICS:
+            self._check_statistics(records.parse_statistics(body, position), position)
+        return position + HEAD_SIZE + length
+
+    def _check_statistics(self, told: records.Statistics, position: int) -> None:
+        counts = {channel: count for channel, count in told.by_channel.items() if count}
+        pairs = [
+            ("messages", told.messages, self._ordinal),
+            ("chunks", told.chunks, len(self._met)),
+            ("attachments", told.attachments, self._attachments),
+            ("metadata records", told.metadata, self._metadata),
+            ("messages per channel", counts or dict(self.message_counts), dict(self.message_counts)),
+        ]
+        if self._span_ns:
+            pairs.append(("times", (told.start_ns, told.end_ns), self._span_ns))
+        for name, expected, met in pairs:
+            if expected != met:
+                raise Damage(position, f"the statistics speak of {expected} {name}, the file holds {met}")
+
+    def _footer(self, whole: memoryview, position: int) -> None:
+        cursor = records.Cursor(whole[HEAD_SIZE:], position, "Footer")
+        summary_start, _, crc = cursor.u64(), cursor.u64(), cursor.u32()
+        cursor.finish()
+        met = self._summary_start if position != self._summary_start else 0
+        if summary_start != met:
+            raise Damage(position, f"the footer places the summary at {summary_start}, it is at {met}")
+        if crc and zlib.crc32(whole[:-4], self._crc) != crc:
+            raise Damage(position, "the checksum of the summary does not match")
+        end = position + len(whole)
+        closing = bytes(self._window.at(end, min(len(MAGIC), self._window.size - end))) if end < self._window.size else b""
+        if closing != MAGIC:
+            if not MAGIC.startswith(closing):
+                raise Damage(end, "the closing magic is wrong")
+            self.cut_at = end
+        elif end + len(MAGIC) != self._window.size:
+            raise Damage(end + len(MAGIC), "the file goes on after its end: trailing data, or two files in one")
+        self._check_chunk_index(position)
+
+    def _check_chunk_index(self, position: int) -> None:
+        """A chunk index lists every chunk once, or there is none."""
+        if not self._indexed:
+            return
+        if sorted(chunk.offset for chunk in self._indexed) != [chunk.offset for chunk in self._met]:
+            raise Damage(position, f"the chunk index names {len(self._indexed)} chunks, not the {len(self._met)} there are")
+        if sorted(self._indexed, key=lambda chunk: chunk.offset) != self._met:
+            raise Damage(position, "the chunk index disagrees with the chunks")
+
+
+_HANDLERS = {
+    Op.HEADER: McapWalk._header,
+    Op.SCHEMA: McapWalk._schema,
+    Op.CHANNEL: McapWalk._channel,
+    Op.CHUNK: McapWalk._chunk,
+    Op.MESSAGE_INDEX: McapWalk._message_index,
+    Op.METADATA: McapWalk._metadata_record,
+    Op.DATA_END: McapWalk._data_end,
+}
