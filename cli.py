@@ -1,0 +1,264 @@
+"""The command line: parse, call, show. Whatever is heavy is imported inside the command that needs it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from pipeline.campaign import Summary
+    from schemas.config import Configuration, Vehicle
+
+OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
+_SHOWN_RUNS = 25
+
+app = typer.Typer(
+    name="balise",
+    help="Replays recorded train journeys and says whether satellite positioning could have replaced balises.",
+    epilog="Exit status: 0 all runs ok; 1 some run failed or partial; 2 bad usage, configuration or site; "
+    "3 a defect of the program; 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Site = Annotated[str, typer.Option("--site", help="Folder with track, links, balises, route.")]
+Out = Annotated[str, typer.Option("--out", help="Where the tables go: a folder or an address.")]
+OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+VehicleFile = Annotated[Path | None, typer.Option("--vehicle", help="Vehicle file (TOML).")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")]
+Json = Annotated[bool, typer.Option("--json", help="The result as JSON on standard output.")]
+
+
+@app.callback(invoke_without_command=True)
+def _about(
+    version: Annotated[bool, typer.Option("--version", help="Version of the program and of its tables.")] = False,
+) -> None:
+    if version:
+        from schemas.version import SOFTWARE
+
+        print(SOFTWARE)
+        raise typer.Exit(OK)
+
+
+@app.command()
+def replay(
+    runs: Annotated[list[str], typer.Argument(help="Logs, run folders, folders of runs, globs, addresses.")],
+    site: Site,
+    out: Out,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
+    time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
+    from pipeline.campaign import Interrupted, make_plan, run_campaign
+    from pipeline.campaign.progress import watches
+
+    settings, train = _settings(config, vehicle)
+    plan = make_plan(runs, site, out, settings, train)
+    try:
+        summary = run_campaign(
+            plan,
+            jobs=jobs or os.cpu_count() or 1,
+            scheduler=scheduler,
+            force=force,
+            time_limit_s=time_limit,
+            watches=watches(quiet or as_json),
+        )
+    except Interrupted as interrupted:
+        if interrupted.summary is not None:
+            _show_summary(interrupted.summary, out, quiet, as_json)
+        print("balise: interrupted; the same command goes on from here", file=sys.stderr)
+        raise typer.Exit(128 + interrupted.signum) from None
+    _show_summary(summary, out, quiet, as_json)
+    raise typer.Exit(_status_of(summary))
+
+
+@app.command()
+def dictionary(
+    as_json: Json = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="As one Markdown page.")] = False,
+    table: Annotated[str | None, typer.Option(help="One table only.")] = None,
+) -> None:
+    """Every table with its columns, units and meaning, and every key of the configuration."""
+    from schemas.dictionary import dictionary_frame, dictionary_markdown, settings_frame
+
+    if markdown:
+        print(dictionary_markdown(), end="")
+        return
+    columns = dictionary_frame()
+    if table is not None:
+        columns = _one_table(columns, table)
+    if as_json:
+        _print_json(columns if table else {"columns": columns, "settings": settings_frame()})
+        return
+    from pipeline.present import show_table
+
+    for name, rows in columns.group_by("group", "table", maintain_order=True):
+        show_table(rows.drop("group", "table"), f"{name[1]} ({name[0]})")
+        print()
+    if table is None:
+        show_table(settings_frame(), "Configuration and vehicle")
+
+
+@app.command()
+def demo(out: OutFolder = Path("demo-out"), seed: int | None = None, quiet: Quiet = False) -> None:
+    """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
+    from datasets.demo import demo as run_demo
+    from pipeline.present import show_table
+
+    result = run_demo(out, seed=seed, progress=None if quiet else _say)
+    _write_demo(out, result)
+    if not quiet:
+        show_table(result.checks, "What was injected, expected and found")
+        print(f"\nTrial and tables are in {out}.")
+    raise typer.Exit(OK if result.agrees else DEFECT)
+
+
+@app.command()
+def synth(
+    scenario: Annotated[Path, typer.Argument(help="Scenario (TOML).")], out: OutFolder, quiet: Quiet = False
+) -> None:
+    """Write a synthetic trial: site, runs and the faults injected into them."""
+    from datasets.scenario import load_scenario
+    from datasets.trial import write_trial
+
+    paths = write_trial(load_scenario(scenario), out, None if quiet else _say)
+    if not quiet:
+        print(f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
+
+
+@app.command()
+def safety(config: ConfigFile = None, as_json: Json = False) -> None:
+    """Tolerable hazard rates, allowed detection times, Markov and continuity tables, errata of the sources."""
+    from pipeline.present import show_table
+    from pipeline.safety import safety_tables
+    from pipeline.safety.errata import errata_table
+
+    settings, _ = _settings(config, None)
+    tables = {**safety_tables(settings.safety), "errata": errata_table()}
+    if as_json:
+        _print_json(tables)
+        return
+    for name, table in tables.items():
+        show_table(table, name)
+        print()
+
+
+def main() -> None:
+    """Entry point of the program: turns whatever happens into one message and an exit status."""
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    sys.exit(_guarded(arguments, debug="--debug" in sys.argv[1:]))
+
+
+def _guarded(arguments: list[str], debug: bool) -> int:
+    from schemas.errors import BaliseError, InputError
+
+    try:
+        app(arguments, prog_name="balise", standalone_mode=True)
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else USAGE
+    except BaliseError as error:
+        _complain(str(error), debug)
+        return RUNS_NOT_OK if isinstance(error, InputError) else USAGE
+    except KeyboardInterrupt:
+        _complain("interrupted", debug)
+        return 128 + signal.SIGINT
+    except BrokenPipeError:
+        # The reader of our output has gone (`| head`): nothing more to say, not even on closing.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except Exception as error:
+        _complain(f"a defect of this program: {type(error).__name__}: {error}", debug)
+        print("Please report it with the output of the same command and --debug.", file=sys.stderr)
+        return DEFECT
+    return OK
+
+
+def _complain(text: str, debug: bool) -> None:
+    if debug:
+        traceback.print_exc()
+    print(f"balise: {text}", file=sys.stderr)
+
+
+def _settings(config: Path | None, vehicle: Path | None) -> tuple[Configuration, Vehicle]:
+    from schemas.config import Configuration, Vehicle, load_settings
+
+    return load_settings(config, Configuration), load_settings(vehicle, Vehicle)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _print_json(value: Any) -> None:
+    from pipeline.present import to_json
+
+    print(to_json(value))
+
+
+def _one_table(columns: Any, table: str) -> Any:
+    from schemas.errors import UsageError
+
+    chosen = columns.filter(columns["table"] == table)
+    if chosen.is_empty():
+        known = ", ".join(columns["table"].unique(maintain_order=True))
+        raise UsageError("is no table", place=table, expected=known)
+    return chosen
+
+
+def _status_of(summary: Summary) -> int:
+    from schemas.enums import RunStatus
+
+    if summary.defects:
+        return DEFECT
+    return OK if summary.count(RunStatus.OK) == summary.planned else RUNS_NOT_OK
+
+
+def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
+    from pipeline.campaign.progress import summary_line
+    from pipeline.present import show_table
+
+    rows = _summary_rows(summary)
+    if as_json:
+        figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
+        _print_json({**figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
+    elif not quiet:
+        shown = rows if rows.height <= _SHOWN_RUNS else rows.filter(rows["status"] != "ok").head(_SHOWN_RUNS)
+        if shown.height:
+            show_table(shown)
+        print(f"{summary_line(summary)}. Tables are in {out}.")
+
+
+def _summary_rows(summary: Summary) -> Any:
+    import polars as pl
+
+    names = ("run_id", "status", "hazards", "missed_detections", "seconds", "skipped", "error")
+    rows = [tuple(getattr(outcome, name) for name in names) for outcome in summary.outcomes]
+    kinds = (pl.String, pl.String, pl.Int64, pl.Int64, pl.Float64, pl.Boolean, pl.String)
+    return pl.DataFrame(rows, schema=dict(zip(names, kinds, strict=True)), orient="row")
+
+
+def _write_demo(out: Path, result: Any) -> None:
+    """The tables of the demo, as a campaign would leave them."""
+    from pipeline.store import write_run
+    from schemas.version import SOFTWARE
+
+    for tables in result.tables:
+        write_run(tables, out / "tables", {"software": SOFTWARE})
+
+
+if __name__ == "__main__":
+    main()
