@@ -3,7 +3,8 @@
 Where the sources leave a choice, this package reads them so:
 
 - A step that passes a balise is judged by its last epoch: first the monitors (negated or failing: rejected
-  by monitor), then the match, then the confidence; only what is then a detection is judged by linking.
+  by monitor), then the match (of both its epochs), then the confidence; only what is then a detection is
+  judged by linking.
 - A passage has one row. An offer outside the window, before or after it, is the passage's row unless the
   position went back over the balise; further offers have rows of their own. `linking_error` keeps the
   first error: an early balise that is then not found in its window stays `early`, and still counts for

@@ -22,7 +22,11 @@ class Bank(Protocol):
         ...
 
     def fast_failed(self, epoch: int) -> bool:
-        """A raw or a fastest-EWMA monitor fails at this epoch: only these hold back recovery."""
+        """A monitor fails that does not ring: raw, fastest EWMA, or without memory. Only these hold back recovery.
+
+        A monitor without memory (Doppler, ranges, channels) belongs here: it does not outlive its fault, and a
+        return while it fails would restart the bank every `recovery_s` and so blind its slow averages.
+        """
         ...
 
     def along_evaluated(self, epoch: int) -> bool:

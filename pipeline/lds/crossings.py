@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.lds.journey import Floats, Journey
+from pipeline.lds.journey import Floats, Integers, Journey
 from schemas.enums import BaliseKind, Reaction
 
 
@@ -72,6 +74,19 @@ def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
     ]
 
 
+class _Step(NamedTuple):
+    """Two successive valid epochs, by index, time, path and odometer."""
+
+    before: int
+    epoch: int
+    t_before_ns: int
+    t_ns: int
+    path_before_m: float
+    path_m: float
+    odometer_before_m: float
+    odometer_m: float
+
+
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> dict[int, list[Crossing]]:
     """Crossings by the epoch that completes them, those of one step in the order of being passed.
 
@@ -87,11 +102,19 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> dict[int, lis
         before, after = known[steps], known[steps + 1]
         passed_before = np.searchsorted(at_m, journey.path_m[before], side="right")
         passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
-        for step in np.flatnonzero(passed_before != passed_after).tolist():
-            i, j = int(before[step]), int(after[step])
-            passed = _in_order(on_leg, int(passed_before[step]), int(passed_after[step]))
-            found[j] = [_crossing(journey, balise, i, j, sense) for balise, sense in passed]
+        passing = np.flatnonzero(passed_before != passed_after)
+        counts = zip(passed_before[passing].tolist(), passed_after[passing].tolist(), strict=True)
+        for step, (first, last) in zip(_steps(journey, before[passing], after[passing]), counts, strict=True):
+            passed = _in_order(on_leg, first, last)
+            found[step.epoch] = [_crossing(journey, balise, step, sense) for balise, sense in passed]
     return dict(sorted(found.items()))
+
+
+def _steps(journey: Journey, before: Integers, after: Integers) -> Iterator[_Step]:
+    columns: list[Integers | Floats] = [before, after]
+    for values in (journey.t_ns, journey.path_m, journey.odometer_m):
+        columns += [values[before], values[after]]
+    return (_Step(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
@@ -101,23 +124,15 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
         yield from ((balise, -1) for balise in reversed(balises[after:before]))
 
 
-def _crossing(journey: Journey, balise: Balise, i: int, j: int, sense: int) -> Crossing:
-    t_i, t_j = int(journey.t_ns[i]), int(journey.t_ns[j])
-    if t_j - t_i > journey.gap_ns:
-        seen = Seen.UNPLACED if journey.placed_nowhere[i + 1 : j].any() else Seen.IN_GAP
-        return Crossing(balise, i, j, sense, seen, t_j, _known(journey.odometer_m, j))
-    share = float((balise.path_m - journey.path_m[i]) / (journey.path_m[j] - journey.path_m[i]))
-    odometer_m = journey.odometer_m[i] + share * (journey.odometer_m[j] - journey.odometer_m[i])
-    return Crossing(
-        balise,
-        i,
-        j,
-        sense,
-        Seen.CROSSED,
-        t_i + round(share * (t_j - t_i)),
-        float(odometer_m) if np.isfinite(odometer_m) else None,
-    )
-
-
-def _known(values: Floats, k: int) -> float | None:
-    return float(values[k]) if np.isfinite(values[k]) else None
+def _crossing(journey: Journey, balise: Balise, step: _Step, sense: int) -> Crossing:
+    waited_ns = step.t_ns - step.t_before_ns
+    if waited_ns > journey.gap_ns:
+        unplaced = journey.placed_nowhere[step.before + 1 : step.epoch].any()
+        seen = Seen.UNPLACED if unplaced else Seen.IN_GAP
+        odometer_m = step.odometer_m if isfinite(step.odometer_m) else None
+        return Crossing(balise, step.before, step.epoch, sense, seen, step.t_ns, odometer_m)
+    share = (balise.path_m - step.path_before_m) / (step.path_m - step.path_before_m)
+    at_m = step.odometer_before_m + share * (step.odometer_m - step.odometer_before_m)
+    t_ns = step.t_before_ns + round(share * waited_ns)
+    odometer_m = at_m if isfinite(at_m) else None
+    return Crossing(balise, step.before, step.epoch, sense, Seen.CROSSED, t_ns, odometer_m)

@@ -67,6 +67,7 @@ class LocationSystem:
         for read in reads:
             self._reads.setdefault(read.epoch, []).append(read)
         self._turns = _turns(journey)
+        self._has_odometer = journey.has_odometer
         self._latch = Latch(journey, config)
         self.virtual = LinkingChain(virtual, config)
         self.physical = LinkingChain(physical if reads else [], config)
@@ -133,7 +134,7 @@ class LocationSystem:
         return self._order_fails(k, offered, overdue)
 
     def _offer(self, crossing: Crossing, bank_failed: bool) -> None:
-        offer = self._offer_of(crossing, self._refusal_at(crossing.epoch, bank_failed))
+        offer = self._offer_of(crossing, self._refusal_of(crossing, bank_failed))
         passage = self.virtual.offer(offer)
         self._latch.disarm(offer.balise, offer.odometer_m)
         if passage.status is PassageStatus.ACCEPTED:
@@ -147,7 +148,7 @@ class LocationSystem:
 
     def _heading(self, crossing: Crossing) -> int:
         """Direction of travel; without an odometer there is only that of the position itself."""
-        return int(self._journey.heading[crossing.epoch]) if self._journey.has_odometer else crossing.sense
+        return int(self._journey.heading[crossing.epoch]) if self._has_odometer else crossing.sense
 
     def _offer_of(self, crossing: Crossing, refusal: PassageStatus | None) -> Offer:
         k, odometer_m, heading = crossing.epoch, crossing.odometer_m, self._heading(crossing)
@@ -164,12 +165,17 @@ class LocationSystem:
             refusal=refusal,
         )
 
-    def _refusal_at(self, k: int, bank_failed: bool) -> PassageStatus | None:
-        """Why a virtual balise is not detected at this epoch, whatever linking says."""
+    def _refusal_of(self, crossing: Crossing, bank_failed: bool) -> PassageStatus | None:
+        """Why a virtual balise is not detected at this crossing, whatever linking says.
+
+        A step out of an ambiguous position passes what the train did not.
+        """
         if self._recovery is not None or bank_failed:
             return PassageStatus.REJECTED_MONITOR
-        refusal = self._refusal[k]
-        entry = self._config.entry_from_unfitted_area and self._journey.has_odometer
+        if self._refusal[crossing.before] is PassageStatus.REJECTED_AMBIGUOUS:
+            return PassageStatus.REJECTED_AMBIGUOUS
+        refusal = self._refusal[crossing.epoch]
+        entry = self._config.entry_from_unfitted_area and self._has_odometer
         if refusal is None and entry and self._chain_from is None:
             # Insertion is what endangers an entry: the diagnosis must stand behind the first VB too.
             return PassageStatus.REJECTED_MONITOR
@@ -260,7 +266,10 @@ class LocationSystem:
 
     def _seek_return(self, recovery: Recovery, k: int, disordered: bool) -> None:
         self.negated[k] = True
-        if not recovery.is_over(k, self.evaluated[k], disordered):
+        usable = self._refusal[k] is None
+        # Without an odometer there is no along bank to look on; the position itself has to do.
+        seen = self.evaluated[k] if self._has_odometer else usable
+        if not recovery.is_over(k, self._t_ns[k], seen, usable, disordered):
             return
         anchor = recovery.read or self._last_validated()
         if anchor is None:

@@ -17,6 +17,7 @@ class Latch:
 
     def __init__(self, journey: Journey, config: LdsConfig) -> None:
         self._journey, self._config = journey, config
+        self._has_odometer = journey.has_odometer
         self._disarmed: dict[str, tuple[Balise, float]] = {}
 
     def __bool__(self) -> bool:
@@ -37,7 +38,7 @@ class Latch:
                 del self._disarmed[name]
 
     def _moved_m(self, k: int, balise: Balise, at_m: float) -> float:
-        if not self._journey.has_odometer:
+        if not self._has_odometer:
             return float(self._journey.path_m[k]) - balise.path_m
         odometer_m = float(self._journey.odometer_m[k])
         if isnan(at_m):

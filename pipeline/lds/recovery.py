@@ -50,7 +50,8 @@ class Recovery:
     """One negation: since when nothing has failed fast, and what was read of physical balises meanwhile."""
 
     def __init__(self, k: int, journey: Journey, bank: Bank, config: LdsConfig, limits: LdsLimits) -> None:
-        self._journey, self._bank, self._config, self._limits = journey, bank, config, limits
+        self._journey, self._bank, self._limits = journey, bank, limits
+        self._recovery_ns = config.recovery_s * 1e9
         self._failed_at_ns = self._seen_at_ns = int(journey.t_ns[k])
         self.read: Anchor | None = None
 
@@ -61,22 +62,21 @@ class Recovery:
             offset_m = read.balise.path_m - read.odometer_m
             self.read = Anchor(offset_m, sigma_m, read.t_ns, read.travelled_m)
 
-    def is_over(self, k: int, evaluated: bool, disordered: bool) -> bool:
+    def is_over(self, k: int, t_ns: int, seen: bool, usable: bool, disordered: bool) -> bool:
         """`recovery_s` without a failure of the fast monitors, all of it seen, and a usable position now."""
-        t_ns = int(self._journey.t_ns[k])
-        usable = self._journey.refusal[k] is None
-        # Without an odometer there is no along bank to look on; the position itself has to do.
-        seen = evaluated if self._journey.has_odometer else usable
         if seen:
             if t_ns - self._seen_at_ns > self._journey.gap_ns:
                 self._failed_at_ns = t_ns
             self._seen_at_ns = t_ns
         if disordered or self._bank.fast_failed(k):
             self._failed_at_ns = t_ns
-        return seen and usable and t_ns - self._failed_at_ns >= self._config.recovery_s * 1e9
+        return seen and usable and t_ns - self._failed_at_ns >= self._recovery_ns
 
     def relinks(self, k: int, anchor: Anchor) -> bool:
         """GNSS minus odometer is what it was at the anchor."""
-        bound_m = relink_bound_m(anchor, k, self._journey, self._limits)
         offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
-        return bound_m is not None and abs(offset_m - anchor.offset_m) <= bound_m
+        moved_m = abs(offset_m - anchor.offset_m)
+        if moved_m > self._limits.failure_limit_m:
+            return False
+        bound_m = relink_bound_m(anchor, k, self._journey, self._limits)
+        return bound_m is not None and moved_m <= bound_m

@@ -126,6 +126,8 @@ def test_position_that_never_arrives_misses_it() -> None:
         ({"gate_probability": [0.98] * 12}, "rejected_ambiguous"),
         ({"gate_probability": [None] * 12}, "rejected_ambiguous"),
         ({"on_track": [True] * 6 + [False] * 6}, "rejected_ambiguous"),
+        ({"on_track": [False] * 6 + [True] * 6}, "rejected_ambiguous"),
+        ({"on_track": [False] * 5 + [True] * 7}, "accepted"),
         ({"on_track": [False] * 12, "confidence_m": [20.0] * 12}, "rejected_ambiguous"),
     ],
 )

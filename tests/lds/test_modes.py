@@ -281,6 +281,24 @@ def test_jump_back_over_one_balise_is_out_of_order() -> None:
     assert result.epochs["link_order_state"][10] == "fail"
 
 
+def test_positions_off_the_track_raise_no_linking_alarm() -> None:
+    # From 10 to 20 s the position wanders off the track, back over V1 and ahead over V2.
+    odometer_m = steps(0.0, 20.0, 40)
+    path_m = [80.0 if 10 <= k < 15 else 700.0 if 15 <= k < 20 else x for k, x in enumerate(odometer_m)]
+    on_track = [not 10 <= k < 20 for k in range(40)]
+    balises = balises_at({"V1": 110.0, "V2": 610.0})
+    result = run(epochs_of(path_m, odometer_m, on_track=on_track), balises)
+    assert not result.epochs["alarm"].any()
+    assert told(result, "balise_id", "status", "t_offered") == [
+        ("V1", "accepted", 5.5),
+        ("V1", "rejected_ambiguous", pytest.approx(9 + 70 / 100)),
+        ("V1", "rejected_ambiguous", pytest.approx(14 + 30 / 620)),
+        ("V2", "rejected_ambiguous", pytest.approx(14 + 530 / 620)),
+        ("V2", "rejected_ambiguous", pytest.approx(19 + 90 / 300)),
+        ("V2", "accepted", 30.5),
+    ]
+
+
 # Contract
 
 
