@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.matching.network import Network
 from pipeline.matching.segments import on_segments
 from pipeline.track import Track
 
@@ -38,20 +39,24 @@ class Segments:
 class Candidates:
     """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
 
-    `along_m` from the element's start, `beyond_m` how far the position lies past an end, `offset_m` left of
-    the element's own sense.
+    `along_m` from the element's start and `left_m` to its end, `beyond_m` how far the position lies past the
+    end that `past` names (-1 start, 1 end, 0 neither), `offset_m` left of the element's own sense;
+    `linked_start`, `linked_end`: whether a relation leads on there.
     """
 
     first: Ints
     step: Ints
     element: Ints
     along_m: Floats
+    left_m: Floats
     beyond_m: Floats
     offset_m: Floats
     distance_m: Floats
     heading_rad: Floats
     survey_sigma_m: Floats
     past: Ints
+    linked_start: Bools
+    linked_end: Bools
 
     def take(self, rows: Ints, steps: int) -> Candidates:
         """Some of the candidates, in the same order."""
@@ -59,10 +64,17 @@ class Candidates:
         columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
         return Candidates(first=np.searchsorted(step, np.arange(steps + 1)), **columns)
 
+    def renumbered(self, kept: Bools) -> Candidates:
+        """As before, steps counted among the kept ones only; the others have no candidates."""
+        number = np.cumsum(kept) - 1
+        step = number[self.step]
+        return replace(self, step=step, first=np.searchsorted(step, np.arange(int(kept.sum()) + 1)))
+
 
 _COLUMNS = (
-    *("step", "element", "along_m", "beyond_m", "offset_m"),
+    *("step", "element", "along_m", "left_m", "beyond_m", "offset_m"),
     *("distance_m", "heading_rad", "survey_sigma_m", "past"),
+    *("linked_start", "linked_end"),
 )
 
 
@@ -90,7 +102,7 @@ def segments_of(track: Track) -> Segments:
     )
 
 
-def candidates_of(points: Points, track: Track, segments: Segments, reach_m: float) -> Candidates:
+def candidates_of(points: Points, network: Network, segments: Segments, reach_m: float) -> Candidates:
     """For every point the nearest place on each element whose distance is within reach [m]."""
     tree = cKDTree(points.surface)
     radius = np.hypot(reach_m, PROBE_SPACING_M / 2.0) + 1.0
@@ -102,11 +114,21 @@ def candidates_of(points: Points, track: Track, segments: Segments, reach_m: flo
     fresh = np.ones(len(step), dtype=bool)
     fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
     step, segment = step[fresh], _downhill(points, segments, step[fresh], segment[fresh])
-    return _candidates(points, track, segments, step, segment, reach_m)
+    return _candidates(points, network, segments, step, segment, reach_m)
+
+
+def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candidates:
+    """Candidates of different steps together; those of the second are numbered anew."""
+    steps = len(some.first) - 1
+    others = replace(others, step=step_of_others[others.step])
+    columns = {name: np.concatenate([getattr(some, name), getattr(others, name)]) for name in _COLUMNS}
+    order = np.argsort(columns["step"], kind="stable")
+    columns = {name: values[order] for name, values in columns.items()}
+    return Candidates(first=np.searchsorted(columns["step"], np.arange(steps + 1)), **columns)
 
 
 def _candidates(
-    points: Points, track: Track, segments: Segments, step: Ints, segment: Ints, reach_m: float
+    points: Points, network: Network, segments: Segments, step: Ints, segment: Ints, reach_m: float
 ) -> Candidates:
     feet = on_segments(points.take(step), segments, segment)
     near = np.flatnonzero(feet.distance_m <= reach_m)
@@ -120,17 +142,23 @@ def _candidates(
     past = np.where(at_start, -1, np.where(at_end, 1, 0))
     corner = (past == 0) & (held != feet.fraction)
     side = np.where(feet.offset_m < 0, -1.0, 1.0)
+    track = network.track
+    along = measure + held * span - track.measure_m[track.first[element]]
+    linked = network.linked_ends()
     return Candidates(
         first=np.searchsorted(step, np.arange(len(points) + 1)),
         step=step,
         element=element,
-        along_m=measure + held * span - track.measure_m[track.first[element]],
+        along_m=along,
+        left_m=track.length_m[element] - along,
         beyond_m=np.abs(feet.fraction - held) * span * (past != 0),
         offset_m=np.where(corner, side * feet.distance_m, feet.offset_m),
         distance_m=feet.distance_m,
         heading_rad=segments.heading_rad[segment],
         survey_sigma_m=segments.sigma_m[segment],
         past=past,
+        linked_start=linked[element, 0],
+        linked_end=linked[element, 1],
     )
 
 

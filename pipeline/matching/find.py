@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.geodesy import Bools, Floats, Ints
-from pipeline.matching.candidates import Candidates, Segments, candidates_of, segments_of
+from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, segments_of
 from pipeline.matching.decode import Decoded, aligned, decode, legs_of, positions_m
 from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
@@ -18,7 +18,7 @@ from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.search import Found, search
-from pipeline.matching.steps import Steps, steps_of, travelled
+from pipeline.matching.steps import Steps, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from schemas.config import MatchingConfig
 
@@ -32,6 +32,10 @@ AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
 # An element past whose end a position lies by more is no candidate, unless the track ends there.
 _BEYOND_M = 15.0
 _BEYOND_SIGMAS = 4.0
+# Epochs off every track are compared with tracks within this many times the reach.
+_FAR = 3.0
+# A position this close to a track lies near it whatever else is around [m].
+_CLOSE_M = 10.0
 # Elements of the path this many before or after the one in question are the same way, not another.
 _NEIGHBOURS = 2
 
@@ -73,33 +77,50 @@ def find_path(
 def _trellis(
     fixes: Fixes, odometer: pl.DataFrame | None, network: Network, pinned: Ints, config: MatchingConfig
 ) -> Trellis:
-    """Steps with their candidates; steps without any near track are left out."""
-    segments = segments_of(network.track)
+    """Steps with their candidates; steps without any are left out.
+
+    Between epochs near a track, epochs further off count too: a position that drifts away slowly still shows
+    by its movement which way the train turned.
+    """
     way = travelled(fixes, odometer)
-    usable = fixes.valid
-    steps = steps_of(fixes, usable, way, config)
-    candidates = _candidates(fixes, steps, network, segments, config)
-    reached = np.diff(candidates.first) > 0
-    if not reached.any():
+    steps = steps_of(fixes, fixes.valid, way, config)
+    wide = _all_candidates(fixes, steps, network, config)
+    nearest = np.full(len(steps), np.inf)
+    np.minimum.at(nearest, wide.step, wide.distance_m)
+    near = np.flatnonzero(nearest <= config.reach_m)
+    if len(near) == 0:
         raise off_the_network(fixes, network.track, config)
-    if not reached.all():
-        usable = np.zeros(len(fixes), dtype=bool)
-        usable[steps.epoch[reached]] = True
-        steps = steps_of(fixes, usable, way, config)
-        candidates = _candidates(fixes, steps, network, segments, config)
+    judged = nearest <= (_FAR - 1.0) * config.reach_m
+    judged[: near[0]] = judged[near[-1] + 1 :] = False
+    # A track much further off than the nearest is none of several possible ones; one just out of reach is.
+    kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
+    candidates = wide.take(np.flatnonzero(kept), len(steps)).renumbered(judged)
+    steps = resumed(fixes, steps.epoch[judged], way)
     like = likelihood_of(fixes, steps, candidates, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, like, config)
 
 
-def _candidates(fixes: Fixes, steps: Steps, network: Network, segments: Segments, config: MatchingConfig) -> Candidates:
-    everything = candidates_of(fixes.points.take(steps.epoch), network.track, segments, config.reach_m)
-    row = steps.epoch[everything.step]
+def _all_candidates(fixes: Fixes, steps: Steps, network: Network, config: MatchingConfig) -> Candidates:
+    """Candidates within reach, and for steps that are not close to a track those in a wider circle."""
+    segments = segments_of(network.track)
+    close_m = config.reach_m + _CLOSE_M
+    found = _candidates(fixes, steps.epoch, network, segments, close_m)
+    close = np.zeros(len(steps), dtype=bool)
+    close[found.step[found.distance_m <= _CLOSE_M]] = True
+    if close.all():
+        return found
+    far = _candidates(fixes, steps.epoch[~close], network, segments, _FAR * config.reach_m)
+    return merged(found.take(np.flatnonzero(close[found.step]), len(steps)), far, np.flatnonzero(~close))
+
+
+def _candidates(fixes: Fixes, epoch: Ints, network: Network, segments: Segments, reach_m: float) -> Candidates:
+    everything = candidates_of(fixes.points.take(epoch), network, segments, reach_m)
+    row = epoch[everything.step]
     sigma = np.sqrt(0.5 * (fixes.cov_ee_m2[row] + fixes.cov_nn_m2[row]))
     near = everything.beyond_m <= np.maximum(_BEYOND_M, _BEYOND_SIGMAS * sigma)
-    ends = [[network.open_end(element, position) for position in (0, 1)] for element in range(network.count)]
-    last = np.array(ends)[everything.element, (everything.past > 0).astype(np.int64)]
-    return everything.take(np.flatnonzero(near | last), len(steps))
+    onward = np.where(everything.past < 0, everything.linked_start, everything.linked_end)
+    return everything.take(np.flatnonzero(near | ~onward), len(epoch))
 
 
 def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
@@ -110,7 +131,7 @@ def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
     proved = wanted[candidates.step]
     here = np.zeros(len(steps), dtype=bool)
     here[candidates.step[candidates.element == proved]] = True
-    return (proved >= 0) & here[candidates.step] & (candidates.element != proved)
+    return np.asarray((proved >= 0) & here[candidates.step] & (candidates.element != proved))
 
 
 def _doubt(trellis: Trellis, found: Found, decoded: Decoded) -> Doubt:
@@ -130,8 +151,7 @@ def _doubt(trellis: Trellis, found: Found, decoded: Decoded) -> Doubt:
             own[state] = elements[state] in known
     other = np.where(own, -1.0, found.forward + found.posterior)
     count = np.diff(trellis.first)
-    step = np.repeat(np.arange(len(count)), count)
-    worst = np.lexsort((other, step))[trellis.first[1:] - 1]
+    worst = np.lexsort((other, np.repeat(np.arange(len(count)), count)))[trellis.first[1:] - 1]
     return Doubt(
         posterior=_share(found.posterior * own, trellis.first),
         gate=_share(found.forward * own, trellis.first),
@@ -174,5 +194,4 @@ def _ambiguous(fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, confi
                 float(probability[worst]),
             )
         )
-    plain = {name: pl.Int64 if name.startswith("t_") else kind for name, kind in AMBIGUOUS_COLUMNS.items()}
-    return pl.DataFrame(rows, schema=plain, orient="row").cast(AMBIGUOUS_COLUMNS)
+    return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")

@@ -6,9 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipeline.geodesy import Floats, Ints, Points, points_of
-from pipeline.matching.segments import Feet, Polyline, downhill, nearest, on_segments, polyline_of
+from pipeline.matching.segments import (
+    SAMPLE_SPACING_M,
+    Feet,
+    Polyline,
+    held_to_line,
+    nearest,
+    on_segments,
+    polyline_of,
+)
 from pipeline.track import GAP_COUNTS_M, Track
 
 # A hint further than this from the nearest place may mean another passage of the same place,
@@ -30,6 +39,7 @@ class Leg:
     """A chain of net elements on which `path_m` is one to one; arrays are per segment, in order.
 
     `turn_start_rad`, `turn_end_rad`: change of heading at the segment's ends, positive to the left.
+    `returns`: the leg comes back to a place where it was.
     """
 
     visits: tuple[Visit, ...]
@@ -45,6 +55,7 @@ class Leg:
     heading_deg: Floats
     turn_start_rad: Floats
     turn_end_rad: Floats
+    returns: bool
 
     @property
     def start_m(self) -> float:
@@ -80,9 +91,11 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     joined = {item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(_Part)}
     start, end = joined.pop("start"), joined.pop("end")
     heading, turn = _headings(start, end, joined.pop("east"), joined.pop("north"))
+    line = polyline_of(start, end)
     return Leg(
         visits=tuple(visits),
-        line=polyline_of(start, end),
+        line=line,
+        returns=_returns(line, joined["path_start_m"]),
         heading_deg=np.degrees(heading) % 360.0,
         turn_start_rad=np.concatenate([[0.0], turn]),
         turn_end_rad=np.concatenate([turn, [0.0]]),
@@ -98,7 +111,7 @@ def shifted(leg: Leg, by_m: float) -> Leg:
 def nearest_on_leg(points: Points, leg: Leg, near_path_m: Floats | None = None) -> Feet:
     """The nearest place on a leg; of several passages of that place the one close to the hint."""
     feet = nearest(points, leg.line)
-    if near_path_m is None:
+    if near_path_m is None or not leg.returns:
         return feet
     away = np.abs(path_at(leg, feet) - near_path_m) > HINT_WINDOW_M
     for row in np.flatnonzero(away):
@@ -124,9 +137,17 @@ def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -
     if len(inside) == 0:
         return
     trial = on_segments(point.take(np.zeros(len(inside), dtype=np.int64)), leg.line, inside)
-    foot = downhill(point, leg.line, inside[[int(np.argmin(trial.distance_m))]])
-    if foot.distance_m[0] <= feet.distance_m[row] + SAME_PLACE_M:
-        feet.put(np.array([row]), foot)
+    best = int(np.argmin(trial.distance_m))
+    if trial.distance_m[best] <= feet.distance_m[row] + SAME_PLACE_M:
+        feet.put(np.array([row]), held_to_line(trial.take(np.array([best])), len(leg.line)))
+
+
+def _returns(line: Polyline, path_start_m: Floats) -> bool:
+    """Whether the line comes back to where it was: a loop, or an element passed twice."""
+    probes = np.unique(np.searchsorted(path_start_m, np.arange(path_start_m[0], path_start_m[-1], SAMPLE_SPACING_M)))
+    places, path_m = line.start[probes], path_start_m[probes]
+    pairs = cKDTree(places).query_pairs(SAME_PLACE_M + 2 * SAMPLE_SPACING_M, output_type="ndarray")
+    return bool((np.abs(path_m[pairs[:, 0]] - path_m[pairs[:, 1]]) > HINT_WINDOW_M).any())
 
 
 @dataclass(frozen=True)

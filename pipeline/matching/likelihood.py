@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates
@@ -60,16 +61,25 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     new_track = -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
     fresh = np.clip(gnss_m2 * renewed + survey**2 * new_track, _FLOOR_M**2, variance)
     heading = _heading(steps, candidates, config)
-    beyond = candidates.beyond_m**2 / (variance + _ENDS_SIGMA_M**2)
     return Likelihood(
         variance_m2=variance,
         fresh_m2=fresh,
         keep=np.sqrt(1.0 - fresh / variance),
-        fixed=-0.5 * beyond + heading * fresh / variance,
+        fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2) + heading * fresh / variance,
         heading=heading,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
     )
+
+
+def expected_m(before_m: Floats, candidate: Ints, like: Likelihood) -> Floats:
+    """Offset expected at candidates after an offset of the step before [m].
+
+    An error returns towards zero; one far outside its sigma follows no such law, so no more than the return
+    from three sigma is expected of it, and what counts is how it moves.
+    """
+    usual = 3.0 * np.sqrt(like.variance_m2[candidate])
+    return before_m - (1.0 - like.keep[candidate]) * np.clip(before_m, -usual, usual)
 
 
 def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Likelihood) -> Floats:
@@ -77,7 +87,7 @@ def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Lik
     gauss = -0.5 * ((offset_m - mean_m) ** 2 / variance_m2 + np.log(2.0 * np.pi * variance_m2))
     scale = like.outlier_scale_m
     wide = -np.log(np.pi * scale * (1.0 + (offset_m / scale) ** 2))
-    return np.logaddexp(np.log1p(-like.outlier) + gauss, np.log(like.outlier) + wide)
+    return np.asarray(np.logaddexp(np.log1p(-like.outlier) + gauss, np.log(like.outlier) + wide))
 
 
 def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
@@ -85,6 +95,23 @@ def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
     sin, cos = np.sin(heading_rad), np.cos(heading_rad)
     ee, en, nn = fixes.cov_ee_m2[row], fixes.cov_en_m2[row], fixes.cov_nn_m2[row]
     return np.maximum(cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn, 1e-6)
+
+
+def _ends(candidates: Candidates, variance_m2: Floats) -> Floats:
+    """Log-probability that a position belongs to the element rather than to those linked to its ends.
+
+    About a link it is shared between the elements on both sides and adds up to one, so that a track in many
+    pieces is as probable as one in a single piece. Past an end without a link it falls off as a Gaussian.
+    """
+    sigma = np.sqrt(variance_m2)
+    value = np.where(candidates.past != 0, -0.5 * (candidates.beyond_m / sigma) ** 2, 0.0)
+    for inside_m, linked, past in (
+        (candidates.along_m, candidates.linked_start, candidates.past < 0),
+        (candidates.left_m, candidates.linked_end, candidates.past > 0),
+    ):
+        shared = log_ndtr(np.where(past, -candidates.beyond_m, inside_m) / sigma)
+        value = np.where(linked & past, shared, value + np.where(linked & ~past, shared, 0.0))
+    return value
 
 
 def _heading(steps: Steps, candidates: Candidates, config: MatchingConfig) -> Floats:

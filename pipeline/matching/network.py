@@ -11,8 +11,10 @@ import heapq
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
 import polars as pl
 
+from pipeline.geodesy import Bools
 from pipeline.track import Track, gap_m
 from schemas.enums import Navigability
 
@@ -68,9 +70,10 @@ class Network:
             edge.to == one for edge in self.successors[other]
         )
 
-    def open_end(self, element: int, position: int) -> bool:
-        """Whether no relation leads on from an end (0 start, 1 end) of an element."""
-        return not self.successors[2 * element + (1 - position)]
+    def linked_ends(self) -> Bools:
+        """Per element, whether a relation leads on from its start and from its end."""
+        onward = np.array([bool(edges) for edges in self.successors])
+        return onward.reshape(-1, 2)[:, ::-1]
 
     def _search(self, source: int, limit_m: float) -> dict[int, Reach]:
         """Dijkstra; a move that is not allowed counts as a long detour, so an allowed way is preferred."""
@@ -82,7 +85,7 @@ class Network:
             if oriented in settled or found.distance_m > limit_m:
                 continue
             settled[oriented] = found
-            through = found.between + (oriented,)
+            through = (*found.between, oriented)
             onward = found._replace(distance_m=found.distance_m + self.length_m(oriented), between=through)
             self._push(queue, oriented, onward)
         return settled

@@ -101,7 +101,7 @@ def downhill(points: Points, line: Polyline, segment: Ints) -> Feet:
         active = active[better]
         feet.put(active, trial.take(better))
         active = active[(feet.fraction[active] < 0) | (feet.fraction[active] > 1)]
-    return _held_to_line(feet, len(line))
+    return held_to_line(feet, len(line))
 
 
 def on_segments(points: Points, line: HasSegments, segment: Ints) -> Feet:
@@ -117,7 +117,7 @@ def on_segments(points: Points, line: HasSegments, segment: Ints) -> Feet:
     return Feet(np.array(segment), fraction, offset, distance)
 
 
-def _held_to_line(feet: Feet, count: int) -> Feet:
+def held_to_line(feet: Feet, count: int) -> Feet:
     """At a corner between two segments the vertex is nearest; only beyond the ends the line goes on."""
     low = np.where(feet.segment == 0, -np.inf, 0.0)
     high = np.where(feet.segment == count - 1, np.inf, 1.0)

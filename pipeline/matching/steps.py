@@ -71,7 +71,7 @@ def steps_of(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig
     """Steps every `step_distance_m` of movement and `step_time_s` of time among the usable epochs."""
     rows = np.flatnonzero(usable)
     if len(rows) == 0:
-        return _steps(fixes, rows, way)
+        return resumed(fixes, rows, way)
     moved = np.linalg.norm(np.diff(fixes.points.surface[rows], axis=0), axis=1)
     far = np.floor(np.concatenate([[0.0], np.cumsum(moved)]) / config.step_distance_m)
     late = np.floor((fixes.t_s[rows] - fixes.t_s[rows[0]]) / config.step_time_s)
@@ -79,7 +79,7 @@ def steps_of(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig
     fresh[1:] = (np.diff(far) > 0) | (np.diff(late) > 0)
     fresh[-1] = True
     chosen = rows[fresh]
-    return _steps(fixes, chosen[_believable(fixes, chosen, way, config)], way)
+    return resumed(fixes, chosen[_believable(fixes, chosen, way, config)], way)
 
 
 def _believable(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Bools:
@@ -101,7 +101,8 @@ def _believable(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig
     return believed
 
 
-def _steps(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
+def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
+    """Given epochs as steps, each with what happened since the one before."""
     unknown = np.full(min(1, len(rows)), np.nan)
     elapsed = np.concatenate([unknown, np.diff(fixes.t_s[rows])])
     moved = np.diff(fixes.points.surface[rows], axis=0, prepend=np.nan)

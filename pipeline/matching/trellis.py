@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates
-from pipeline.matching.likelihood import Likelihood, log_density
+from pipeline.matching.likelihood import Likelihood, expected_m, log_density
 from pipeline.matching.moves import Way, best_move, mismatch_scores
 from pipeline.matching.network import Network
 from pipeline.matching.steps import Steps
@@ -62,11 +62,11 @@ class Trellis:
         moves = np.array([[self._move_score(one, other, step) for other in after] for one in before])
         rows, columns = np.array(before)[:, None], np.array(after)[None, :]
         candidate = self.candidate[columns]
-        mean = self.like.keep[candidate] * self.offset_m[rows]
+        mean = expected_m(self.offset_m[rows], candidate, self.like)
         offset = log_density(self.offset_m[columns], mean, self.like.fresh_m2[candidate], self.like)
         continued = moves + offset + self.like.fixed[candidate]
         broken = BREAK + self.initial[columns]
-        return np.maximum(continued, broken)
+        return np.asarray(np.maximum(continued, broken))
 
     def _move_score(self, one: int, other: int, step: int) -> float:
         way, limit = self.way(step)
@@ -144,7 +144,7 @@ def _stay_scores(trellis: Trellis, stays: Bools) -> Floats:
     displacement = trellis.place_m[rows] - trellis.place_m[before]
     score = _stay_moves(trellis, step[rows], displacement)
     candidate = trellis.candidate[rows]
-    mean = trellis.like.keep[candidate] * trellis.offset_m[before]
+    mean = expected_m(trellis.offset_m[before], candidate, trellis.like)
     score += log_density(trellis.offset_m[rows], mean, trellis.like.fresh_m2[candidate], trellis.like)
     stay = np.full(len(trellis.oriented), -np.inf)
     stay[rows] = score + trellis.like.fixed[candidate]
