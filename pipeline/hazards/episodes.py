@@ -21,7 +21,8 @@ class Draft:
     """One hazard row in the making; epochs are indices of the series.
 
     `floor` is the last epoch that cannot belong to the episode (-1: none), `end` the first one after
-    it (`series.size`: it lasts to the end of the log).
+    it (`series.size`: it lasts to the end of the log). `returns`: the jump ends an error that had hit no
+    VB before, and the VBs that it crosses are the first ones hit.
     """
 
     hazard: Hazard
@@ -31,6 +32,7 @@ class Draft:
     end: int = 0
     caused_by: Draft | None = None
     mark: int = -1
+    returns: bool = False
 
     def add(self, hits: tuple[Crossing, ...]) -> None:
         self.hits.extend(hits)
@@ -64,29 +66,37 @@ class _Episode:
 def find_episodes(series: Series, beacons: tuple[Beacons, ...], config: HazardConfig) -> tuple[list[Draft], list[Jump]]:
     """All hazards of one solution in order of time, and all jumps, also those that cross no VB."""
     jumps = find_jumps(series, beacons, config)
-    hits = _hits_beside_jumps(crossings_with_error(series, beacons, config.shift_limit_m), jumps)
+    limit_m = config.shift_limit_m
+    hits = _hits_beside_jumps(crossings_with_error(series, beacons, limit_m), jumps, limit_m)
     if not hits and not any(jump.crossed for jump in jumps):
         return [], jumps
-    events: list[Jump | Crossing] = sorted([*jumps, *hits], key=_time_of)
     walk = _Walk(series, Calm.of(series, config.episode_end_s), config)
-    for event in events:
+    for event in _in_order(jumps, hits, limit_m):
         walk.take(event)
     return walk.finish(), jumps
 
 
-def _time_of(event: Jump | Crossing) -> tuple[int, int, int]:
-    if isinstance(event, Jump):
-        return event.first, 0, 0
-    return event.epoch, 1, event.t_ns
+def _in_order(jumps: list[Jump], hits: list[Crossing], limit_m: float) -> list[Jump | Crossing]:
+    """By epoch; what is offered on the way of a jump belongs to the error before it, if there was one."""
+    returns = {jump.first for jump in jumps if abs(jump.error_before_m) > limit_m}
+
+    def key(event: Jump | Crossing) -> tuple[int, int, int]:
+        if isinstance(event, Jump):
+            return event.first, 1, 0
+        return event.epoch, 0 if event.epoch in returns else 2, event.t_ns
+
+    return sorted([*jumps, *hits], key=key)
 
 
-def _hits_beside_jumps(hits: list[Crossing], jumps: list[Jump]) -> list[Crossing]:
-    inside = {epoch for jump in jumps for epoch in range(jump.first, jump.last + 1)}
+def _hits_beside_jumps(hits: list[Crossing], jumps: list[Jump], limit_m: float) -> list[Crossing]:
+    """Early and late offers that no jump accounts for.
+
+    A VB that the true movement crosses within the epoch of a jump is offered right but for the
+    interpolation, unless the position was wrong already; a jump drawn out over epochs offers it early.
+    """
     taken = {(c.epoch, c.balise_id) for jump in jumps for c in jump.crossed}
-    # A crossing inside a jump that the true movement makes as well belongs to the jump only when the
-    # jump is one epoch long; a jump drawn out over seconds offers such a VB early all the same.
-    single = {jump.first for jump in jumps if jump.first == jump.last}
-    return [c for c in hits if c.epoch not in single and not (c.epoch in inside and (c.epoch, c.balise_id) in taken)]
+    fresh = {jump.first for jump in jumps if jump.first == jump.last and abs(jump.error_before_m) <= limit_m}
+    return [c for c in hits if c.epoch not in fresh and (c.epoch, c.balise_id) not in taken]
 
 
 @dataclass(frozen=True)
@@ -167,7 +177,9 @@ class _Walk:
     def _jump(self, jump: Jump) -> None:
         hazard = _class_of(jump)
         if self._open is None:
-            self._begin(Draft(hazard, jump.first - 1, jump, list(jump.crossed)), jump.last)
+            returns = self._is_back(jump)
+            floor = max(self._floor, self._calm.last_before(jump.first)) if returns else jump.first - 1
+            self._begin(Draft(hazard, floor, jump, list(jump.crossed), returns=returns), jump.last)
             return
         row = self._open.row_of(hazard)
         if row is not None:

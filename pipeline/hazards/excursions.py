@@ -19,8 +19,6 @@ from pipeline.hazards.timing import Timing, time_hazard
 from schemas.config import HazardConfig
 from schemas.enums import Hazard
 
-NEVER_NS = int(np.iinfo(np.int64).max)
-
 
 def faulty_spans(
     series: Series,
@@ -30,8 +28,11 @@ def faulty_spans(
     faults: pl.DataFrame | None,
     config: HazardConfig,
 ) -> list[tuple[int, int]]:
-    """Onset and detection [ns] of each fault; without detection its span is open, for nothing told it was over."""
-    spans = [_span(item.timing) for item in judged]
+    """When each fault was on without being detected [ns]: from onset to detection, or to its end.
+
+    A step begins after the last epoch before it: the offers of its own movement are interpolated to before it.
+    """
+    spans = [_span(item.timing, series) for item in judged]
     marks = _marks(series, fails, config)
     if not marks:
         return spans
@@ -44,12 +45,15 @@ def faulty_spans(
         draft = Draft(Hazard.VB_SHIFT, calm.last_before(mark), end=calm.first_from(mark), mark=mark)
         timing = time_hazard(draft, series, jumps, fails, faults, config)
         covered.append((timing.onset_ns, timing.end_ns))
-        spans.append(_span(timing))
+        spans.append(_span(timing, series))
     return spans
 
 
-def _span(timing: Timing) -> tuple[int, int]:
-    return timing.onset_ns, NEVER_NS if timing.detected_ns is None else timing.detected_ns
+def _span(timing: Timing, series: Series) -> tuple[int, int]:
+    begin = timing.onset_ns
+    if timing.is_step and timing.onset_epoch > 0:
+        begin = min(begin, int(series.t_ns[timing.onset_epoch - 1]) + 1)
+    return begin, timing.end_ns if timing.detected_ns is None else timing.detected_ns
 
 
 def _marks(series: Series, fails: Fails, config: HazardConfig) -> list[int]:

@@ -44,7 +44,8 @@ def time_hazard(
     config: HazardConfig,
 ) -> Timing:
     """Onset, failure, detection and negation of one hazard."""
-    step = draft.jump or _step_of_shift(draft, series, jumps, config)
+    begun_by_own_jump = draft.jump is not None and not draft.returns
+    step = draft.jump if begun_by_own_jump else _step_of_shift(draft, series, jumps, config)
     if step is not None:
         onset, failure = step.first, _failure_of_step(step, draft, series, config)
     else:
@@ -165,6 +166,8 @@ def _detection(
     if standing is not None:
         return _Detection(onset_ns, standing, True)
     until = end_ns + 1 if draft.end >= series.size else end_ns
+    if draft.jump is not None:
+        until = max(until, int(series.t_ns[draft.jump.last]) + 1)
     if draft.caused_by is not None:
         until = max(until, onset_ns + round(config.episode_end_s * NS_PER_S))
     found = fails.first_in(onset_ns, until)

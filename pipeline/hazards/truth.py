@@ -1,7 +1,7 @@
 """Where the train was: the ladder of evidence (DOMAIN section 5).
 
-The reference stream; else physical balise reads carried on by the odometer; else the odometer since
-the LRVB, where only what exceeds its confidence counts.
+The reference stream; else physical balise reads carried on by the odometer; else (by option) GNSS and
+odometer smoothed; else the odometer since the LRVB, where only what exceeds its confidence counts.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from pipeline.hazards.arrays import (
     times_ns,
 )
 from pipeline.hazards.slip import repaired_by_doppler
+from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence
@@ -41,6 +42,7 @@ class Rung:
     bound_m: Floats
     cross_m: Floats
     up_m: Floats
+    smoothed: bool = False
 
 
 def establish_truth(
@@ -59,9 +61,10 @@ def establish_truth(
     `balise_reads`: `t, path_m` of physical balises; `passages`: `status, path_m, t_offered` of the
     LDS, whose accepted VBs anchor the odometer.
     Yields per epoch `t, evidence, truth_path_m, truth_sigma_m, truth_bound_m, truth_cross_m,
-    truth_up_m, truth_travel_m, truth_stretch`: `truth_bound_m` is what an error has to exceed before
+    truth_up_m, truth_travel_m, truth_stretch, truth_smoothed`: `truth_bound_m` is what an error has to exceed before
     it is called a hazard, differences of `truth_travel_m` within one `truth_stretch` are true
-    movements free of the steps that a new anchor makes.
+    movements free of the steps that a new anchor makes; `truth_smoothed` marks the post-processed truth
+    of `config.smoothed_reference`, which steps in where there is neither reference nor balise read.
     """
     at_ns = valid_ns(epochs)
     travel = odometer_travel(epochs, at_ns)
@@ -74,6 +77,8 @@ def establish_truth(
     if balise_reads is not None and balise_reads.height:
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"))
         rungs.append(_balise_rung(carry(anchors, travel, at_ns, lds, both_ways=True), config))
+    if config.smoothed_reference:
+        rungs.append(_smoothed_rung(epochs, travel, config))
     rungs.append(_odometer_rung(epochs, passages, travel, at_ns, lds))
     return _ladder(epochs["t"], rungs, travel)
 
@@ -112,6 +117,14 @@ def _balise_rung(carried: Carried, config: HazardConfig) -> Rung:
     return Rung(Evidence.BALISE, carried.path_m, sigma, bound, nothing, nothing)
 
 
+def _smoothed_rung(epochs: pl.DataFrame, travel: Travel, config: HazardConfig) -> Rung:
+    """Smoothed from the position itself, so no more than odometer evidence, and marked (`truth_smoothed`)."""
+    smoothed = smoothed_truth(epochs, travel, positions(epochs), config.alarm_lead_s)
+    nothing = np.full(smoothed.path_m.size, np.nan)
+    bound = 3.0 * smoothed.sigma_m
+    return Rung(Evidence.ODOMETER, smoothed.path_m, smoothed.sigma_m, bound, nothing, nothing, smoothed=True)
+
+
 def _odometer_rung(
     epochs: pl.DataFrame, passages: pl.DataFrame | None, travel: Travel, at_ns: Ints, lds: LdsConfig
 ) -> Rung:
@@ -147,16 +160,20 @@ def _ladder(t: pl.Series, rungs: list[Rung], travel: Travel) -> pl.DataFrame:
     names = ("path_m", "sigma_m", "bound_m", "cross_m", "up_m")
     best = {name: np.full(t.len(), np.nan) for name in names}
     evidence = np.full(t.len(), -1)
+    smoothed = np.zeros(t.len(), dtype=np.bool_)
     for rung in rungs:
         free = ~np.isfinite(best["path_m"]) & np.isfinite(rung.path_m)
         for name in names:
             best[name][free] = getattr(rung, name)[free]
+        smoothed[free] = rung.smoothed
         evidence[free] = _NAMES.index(rung.evidence.value)
     by_reference = np.where(evidence == _NAMES.index(Evidence.REFERENCE.value), best["path_m"], np.nan)
     distance_m, stretch = travel.joined_with(by_reference)
     columns = {f"truth_{name}": pl.Series(best[name], nan_to_null=True) for name in names}
     return pl.DataFrame({"t": t, "evidence": _names_of(evidence), **columns}).with_columns(
-        truth_travel_m=pl.Series(distance_m, nan_to_null=True), truth_stretch=pl.Series(stretch)
+        truth_travel_m=pl.Series(distance_m, nan_to_null=True),
+        truth_stretch=pl.Series(stretch),
+        truth_smoothed=pl.Series(smoothed),
     )
 
 

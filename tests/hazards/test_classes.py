@@ -151,3 +151,22 @@ def test_travel_against_the_path():
 
 def test_small_errors_are_no_hazard():
     assert rows(judge(Journey(steps=((31.0, 60.0, 19.0),)))) == []
+
+
+def test_return_over_a_balise_that_was_passed_unseen():
+    # -50 m at 34 s (train 680 m, position 630 m: V2 (500) not reached); back at 37 s: train 740 m, V3 (700) was
+    # passed at 35 s and is offered now, late, by a jump over one VB. The error began at 34 s.
+    (row,) = rows(judge(Journey(steps=((34.0, 37.0, -50.0),), fails={"along_raw": ((34.0, 34.0), (37.0, 37.0))})))
+    assert (row["hazard"], row["balise_ids"], row["timing"]) == ("VB_JUMP_1B", ["V3"], "late")
+    assert row["caused_by"] is None
+    assert seconds(row["t_onset"]) == seconds(row["t_failure"]) == seconds(row["t_detected"]) == 34.0
+    assert seconds(row["t_hazard"]) == seconds(row["t_end"]) == 37.0
+    assert row["size_m"] == pytest.approx(-50.0)
+
+
+def test_late_offer_on_the_way_of_the_return_belongs_to_the_late_episode():
+    # 1 Hz, -60 m from 33 s: V3 (700) is met at 38 s by the late position; at 42 s the position is at 780 m.
+    # V4 at 785 m lies between the late position of 42 s (780 m) and that of a second later (800 m).
+    journey = Journey(rate_hz=1.0, balises_m=(100.0, 300.0, 500.0, 700.0, 785.0), steps=((33.0, 43.0, -60.0),))
+    (row,) = rows(judge(journey))
+    assert (row["hazard"], row["balise_ids"], row["timing"]) == ("VB_SHIFT", ["V3", "V4"], "late")

@@ -6,7 +6,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of
+from pipeline.hazards import classify, establish_truth
+from schemas.config import Configuration
+from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of, with_hazards
 
 READS = tuple(np.arange(50.0, 2400.0, 500.0))
 VBS_ACCEPTED = {"V0": 5.0, "V1": 15.0, "V2": 25.0}
@@ -52,9 +54,6 @@ def test_truth_is_interpolated_to_the_time_of_validity():
     # Latency 0.2 s at 20 m/s: the position stamped t is that of the train at t - 0.2 s, 4 m behind.
     journey = Journey(steps=((0.0, 500.0, -4.0),))
     epochs = journey.epochs().with_columns(latency_s=pl.lit(0.2))
-    from pipeline.hazards import classify, establish_truth
-    from schemas.config import Configuration
-
     config = Configuration()
     passages = journey.passages([{"balise_id": "V3", "t_offered": 35.2}])
     truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
@@ -73,9 +72,6 @@ def test_gap_in_the_reference_falls_down_the_ladder():
             pl.lit(START_NS + 20 * 10**9).cast(UTC), pl.lit(START_NS + 30 * 10**9).cast(UTC), closed="none"
         )
     )
-    from pipeline.hazards import establish_truth
-    from schemas.config import Configuration
-
     config = Configuration()
     truth = establish_truth(
         journey.epochs(), reference, journey.reads_frame(), journey.passages(), config.hazards, config.lds
@@ -128,9 +124,6 @@ def test_without_reference_and_odometer_there_is_no_truth():
     journey = Journey(reference=False)
     nothing = pl.lit(None, pl.Float64)
     epochs = journey.epochs().with_columns(odometer_m=nothing, scale_sigma=nothing, odometer_white_m2_per_s=nothing)
-    from pipeline.hazards import establish_truth
-    from schemas.config import Configuration
-
     config = Configuration()
     truth = establish_truth(epochs, None, None, journey.passages(), config.hazards, config.lds)
     assert truth["evidence"].null_count() == truth.height
@@ -139,3 +132,36 @@ def test_without_reference_and_odometer_there_is_no_truth():
 
 def test_stamps_of_the_synthetic_journeys_are_utc():
     assert stamps([0.0]).dtype == UTC
+
+
+def test_smoothed_reference_sees_what_the_anchors_follow():
+    # An offset of 25 m for 20 s under alarm: LRVB anchors with 5 m + 5 % cannot hold it, the smoother can.
+    accepted = {**VBS_ACCEPTED, "V3": 35.0}
+    journey = Journey(
+        reference=False,
+        accepted=accepted,
+        steps=((60.0, 85.0, 28.0),),
+        fails={"along_raw": ((60.0, 61.0),)},
+        negated=((60.1, 115.0),),
+    )
+    assert judge(journey).hazards.height == 0
+    result = judge(journey, config=with_hazards(smoothed_reference=True))
+    (row,) = result.hazards.to_dicts()
+    assert (row["hazard"], row["evidence"], row["timing"]) == ("VB_SHIFT", "odometer", "early")
+    assert row["size_m"] == pytest.approx(28.0, abs=0.5)
+    truth = truth_of(journey, config=with_hazards(smoothed_reference=True))
+    assert truth["truth_smoothed"].all()
+    assert truth["truth_path_m"].to_numpy() == pytest.approx(journey.truth_m(), abs=0.5)
+
+
+def test_smoothed_truth_stays_within_its_own_sigma():
+    # 0.1 % of the way counted too much, white position noise of 1 m: the scale error is found with the offset.
+    rng = np.random.default_rng(7)
+    journey = Journey(duration_s=300.0, reference=False, slip=(0.0, 300.0, 0.02), sigma_m=1.0)
+    noise = rng.normal(0.0, 1.0, journey.t_s().size)
+    epochs = journey.epochs().with_columns(pl.col("path_m") + pl.Series(noise), scale_sigma=pl.lit(0.01))
+    config = with_hazards(smoothed_reference=True)
+    truth = establish_truth(epochs, None, None, journey.passages(), config.hazards, config.lds)
+    error = truth["truth_path_m"].to_numpy() - journey.truth_m()
+    assert np.abs(error).max() < 1.0
+    assert np.all(np.abs(error) < 3.0 * truth["truth_sigma_m"].to_numpy())

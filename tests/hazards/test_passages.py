@@ -89,3 +89,37 @@ def test_odometer_beyond_its_confidence_is_a_faulty_diagnosis():
     journey = Journey(slip=(50.0, 60.0, 6.0), accepted={"V4": 45.0})
     states = judge(journey).epochs_columns["lds_state"].to_list()
     assert (states[520], states[530]) == ("P0", "P3")
+
+
+def test_suspicion_ends_with_a_fault_that_nobody_detected():
+    # Jump over V3 at 34.0 s (offered on the way, 33.947 s) and back at 38 s; V4 at 45 s is sound.
+    journey = Journey(steps=((34.0, 38.0, 45.0),))
+    offers = [{"balise_id": "V3", "t_offered": 33.9 + 0.1 * 22.0 / 47.0}, {"balise_id": "V4", "t_offered": 45.0}]
+    assert [row["suspect_after_the_fact"] for row in passages(journey, offers)] == [True, False]
+
+
+def test_accepted_in_an_excursion_that_hits_no_balise_is_suspect():
+    # 0.5 m/s from 40 s: beyond 3 sigma from 46.1 s on; V5 (1100 m) accepted at 54.4 s with e = 7.2 m. Alarm at 60 s.
+    journey = Journey(ramps=((40.0, 70.0, 0.5),), balises_m=(100.0, 300.0, 500.0, 700.0, 900.0, 1100.0))
+    offers = [{"balise_id": "V4", "t_offered": 44.9}, {"balise_id": "V5", "t_offered": 54.634}]
+    detected = journey.but(fails={"along_ewma_0p1": ((60.0, 72.0),)})
+    result = judge(detected, detected.passages(offers))
+    assert result.hazards.height == 0
+    assert result.passages["suspect_after_the_fact"].to_list() == [False, True]
+    assert result.alarms["verdict"].to_list() == ["true"]
+    silent = judge(journey.but(ramps=((40.0, 55.0, 0.5),)), journey.passages(offers))
+    assert silent.passages["suspect_after_the_fact"].to_list() == [False, False]
+
+
+def test_each_true_passage_is_given_to_one_offer():
+    # Jump over V4 (900 m) at 41 s (train at 820 m) and back at 42 s; the right offer follows at 45 s.
+    journey = Journey(steps=((41.0, 42.0, 100.0),))
+    offers = [
+        {"balise_id": "V4", "t_offered": 40.98, "status": "rejected_monitor"},
+        {"balise_id": "V4", "t_offered": 41.96, "status": "rejected_monitor"},
+        {"balise_id": "V4", "t_offered": 45.0},
+    ]
+    rows = passages(journey, offers)
+    assert [seconds(row["t_true"]) for row in rows] == [None, None, pytest.approx(45.0)]
+    assert [row["hazard_id"] for row in rows] == [0, 1, None]
+    assert [row["failure_mode"] for row in rows] == ["insertion", "insertion", "none"]
