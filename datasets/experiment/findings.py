@@ -33,8 +33,8 @@ STATEMENTS: dict[str, str] = {
     "pmd_zero_0p03": "heading 0, odometer only: no run at 0.03 m/s is undetected at the failure (Fig. 5)",
     "pmd_zero_0p1": "heading 0, odometer only: no run at 0.10 m/s is undetected at the failure (Fig. 5)",
     "pmd_not_zero_0p01": "heading 0, odometer only: some run at 0.01 m/s is undetected at the failure (Fig. 5)",
-    "dual_ahead": "heading 0: expected T_dsf of GPS + Galileo, cut off at the end of the 15 000 s, is below that of GPS "
-    "at every rate (Fig. 7); at 0.01 m/s the cut decides, and over 60 000 s GPS alone is ahead",
+    "dual_ahead": "heading 0: expected T_dsf of GPS + Galileo, cut off at the end of the 15 000 s, is below "
+    "that of GPS at every rate (Fig. 7); at 0.01 m/s the cut decides, and over 60 000 s GPS alone is ahead",
     "dual_ahead_from_0p02": "the same at every rate from 0.02 m/s on, where hardly anything is cut off",
     "turning_away": "odometer only: T_d at 75 deg is at least twice that at 0 deg, or nothing is detected (Fig. 6)",
     "track_covers": "with track: every run from 0.03 m/s on is detected, at every heading (Fig. 6)",

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles
-from pipeline.monitors.sight import clock_columns, line_of_sight_rows
+from pipeline.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
 
 Array = npt.NDArray[np.float64]
 Constellation = Literal["gps", "gps_galileo"]
@@ -23,15 +23,8 @@ CONSTELLATIONS: tuple[Constellation, ...] = ("gps", "gps_galileo")
 FAULTY_SATELLITE = "G08"
 MASK_DEG = 5.0
 SOURCES: tuple[str, ...] = ("ionosphere", "troposphere", "orbit_clock", "user")
-# DIAG Table 1: correlation times [s] and, where they do not depend on elevation, variances [m^2].
+# DIAG Table 1: correlation times [s].
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
-_ORBIT_CLOCK_M2 = 0.3
-_USER_M2 = 1.5
-# DO-229 appendix A.4.4.10.4 (obliquity) and A.4.2.4 (troposphere); 0.3 m at zenith stands for the lost value.
-_EARTH_RADIUS_KM = 6378.1363
-_IONOSPHERE_HEIGHT_KM = 350.0
-_ZENITH_IONOSPHERE_M = 0.3
-_ZENITH_TROPOSPHERE_M = 0.12
 
 
 @dataclass(frozen=True)
@@ -91,22 +84,6 @@ class Geometry:
         course = np.radians(self.azimuth_deg[self.faulty] + heading_deg)
         east, north = np.sin(course), np.cos(course)
         return np.array([[east, north, 0.0], [-north, east, 0.0], [0.0, 0.0, 1.0]])
-
-
-def range_variances_m2(elevation_deg: Array) -> Array:
-    """Variances of the four range errors by elevation [m^2], shape (n, 4) (DIAG Table 1; DO-229)."""
-    elevation = np.radians(elevation_deg)
-    ratio = _EARTH_RADIUS_KM * np.cos(elevation) / (_EARTH_RADIUS_KM + _IONOSPHERE_HEIGHT_KM)
-    ionosphere = _ZENITH_IONOSPHERE_M**2 / (1.0 - ratio**2)
-    troposphere = (_ZENITH_TROPOSPHERE_M * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
-    return np.column_stack(
-        [
-            ionosphere,
-            troposphere,
-            np.full_like(elevation, _ORBIT_CLOCK_M2),
-            np.full_like(elevation, _USER_M2),
-        ]
-    )
 
 
 def geometry_at(place: Place, t_ns: int, constellation: Constellation, mask_deg: float = MASK_DEG) -> Geometry:

@@ -1,4 +1,4 @@
-"""Lines of sight as rows of the linearised range equations (DO-229 appendix J, G_i)."""
+"""Satellites as a receiver sees them: lines of sight (DO-229 appendix J, G_i) and how good ranges are."""
 
 from __future__ import annotations
 
@@ -8,6 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+# DIAG Table 1, variances that do not depend on elevation [m^2].
+_ORBIT_CLOCK_M2 = 0.3
+_USER_M2 = 1.5
+# DO-229 A.4.4.10.4 (obliquity) and A.4.2.4 (troposphere); 0.3 m at zenith stands for the paper's lost value.
+_EARTH_RADIUS_KM = 6378.1363
+_IONOSPHERE_HEIGHT_KM = 350.0
+_ZENITH_IONOSPHERE_M = 0.3
+_ZENITH_TROPOSPHERE_M = 0.12
 
 
 def line_of_sight_rows(azimuth_deg: Array, elevation_deg: Array) -> Array:
@@ -23,3 +32,16 @@ def clock_columns(svs: Sequence[str]) -> Array:
     """One receiver clock per constellation (first letter of the satellite's name), shape (n, clocks)."""
     systems = sorted({sv[:1] for sv in svs})
     return np.array([[float(sv.startswith(system)) for system in systems] for sv in svs])
+
+
+def range_variances_m2(elevation_deg: Array) -> Array:
+    """Variances of range errors by elevation [m^2]: ionosphere, troposphere, orbit and clock, user; shape (..., 4).
+
+    DIAG Table 1 for a range corrected by SBAS, with the elevation models of DO-229.
+    """
+    elevation = np.radians(np.maximum(elevation_deg, 0.0))
+    ratio = _EARTH_RADIUS_KM * np.cos(elevation) / (_EARTH_RADIUS_KM + _IONOSPHERE_HEIGHT_KM)
+    ionosphere = _ZENITH_IONOSPHERE_M**2 / (1.0 - ratio**2)
+    troposphere = (_ZENITH_TROPOSPHERE_M * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
+    level = np.ones_like(elevation)
+    return np.stack([ionosphere, troposphere, _ORBIT_CLOCK_M2 * level, _USER_M2 * level], axis=-1)

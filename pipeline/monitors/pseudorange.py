@@ -1,0 +1,219 @@
+"""Pseudorange monitor: do the ranges agree with a position on the track? (TVB section 6; DOMAIN section 3).
+
+The residuals that the receiver recorded belong to its published position. Here they are moved to the point of
+the track beside it, and only what the track does not know stays free: the error along it, and one clock
+per constellation. The survey's error across and in height enters as a prior of its own sigma. What remains, as
+weighted sum of squares, is chi-square distributed while all ranges are healthy. A slow ramp in one range, which
+no increment shows, stays in it for as long as it lasts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from scipy.special import chdtri
+
+from pipeline.monitors.series import NO_POSITION
+from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
+from pipeline.monitors.single import NO_RANGES, blind_monitor, judged
+from schemas.config import Configuration
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
+TOO_FEW = "too few satellites to test the ranges"
+AMBIGUOUS = "the track is ambiguous"
+# Stamps of positions and of satellites that belong together may differ by rounding.
+_TOLERANCE_NS = 1_000_000
+_LEAST_SURVEY_SIGMA_M = 1e-3
+_RIDGE = 1e-13
+_CHUNK = 8192
+
+
+def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, config: Configuration) -> pl.DataFrame:
+    """`value, threshold, state, reason`, row for row with the matched epochs of one solution.
+
+    `satellites`: the recorded stream, of this solution. Value: weighted sum of squares [1]; threshold: its
+    chi-square quantile at the configured false-alarm probability for the epoch's degrees of freedom.
+    """
+    if satellites is None or satellites.is_empty():
+        return blind_monitor(epochs.height, NO_RANGES)
+    ranges = _ranges_by_epoch(epochs, satellites)
+    track = _track_of(epochs, config)
+    value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
+    chosen = np.flatnonzero(track.usable)[np.isin(np.flatnonzero(track.usable), ranges.epoch)]
+    for begin in range(0, chosen.size, _CHUNK):
+        part = chosen[begin : begin + _CHUNK]
+        value[part], freedom[part] = _sums_of_squares(ranges, track, part)
+    tested = freedom > 0
+    threshold = np.full(epochs.height, np.nan)
+    threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
+    return judged(value, threshold, _reasons(epochs, track, ranges, tested, config))
+
+
+@dataclass(frozen=True)
+class _Ranges:
+    """Used satellites with a residual, ordered by epoch; `system` numbers the constellations."""
+
+    epoch: Index
+    system: Index
+    rows: Array
+    residual_m: Array
+    variance_m2: Array
+
+    @property
+    def systems(self) -> int:
+        return int(self.system.max(initial=-1)) + 1
+
+
+@dataclass(frozen=True)
+class _Track:
+    """The track at each epoch: unit vectors east, north, up and offset of the position from it [m]."""
+
+    along: Array
+    cross: Array
+    offset_m: Array
+    sigma_m: Array
+    height_known: Mask
+    usable: Mask
+    matched: Mask
+
+
+def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame) -> _Ranges:
+    t_ns = epochs["t"].dt.timestamp("ns").to_numpy()
+    sorted_rows = (
+        satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
+        .unique(["t", "sv"], keep="first", maintain_order=True)
+        .sort("t", maintain_order=True)
+    )
+    stamps = sorted_rows["t"].dt.timestamp("ns").to_numpy()
+    epoch = _nearest(t_ns, stamps)
+    kept = sorted_rows.filter(pl.Series(np.abs(t_ns[epoch] - stamps) <= _TOLERANCE_NS))
+    epoch = _nearest(t_ns, kept["t"].dt.timestamp("ns").to_numpy())
+    azimuth, elevation = kept["azimuth_deg"].to_numpy(), kept["elevation_deg"].to_numpy()
+    stated = kept["sigma_m"].cast(pl.Float64).to_numpy().astype(np.float64) ** 2
+    _, system = np.unique(kept["sv"].str.slice(0, 1).to_numpy(), return_inverse=True)
+    return _Ranges(
+        epoch,
+        system,
+        line_of_sight_rows(azimuth, elevation),
+        kept["residual_m"].to_numpy(),
+        np.where(np.isfinite(stated), stated, range_variances_m2(elevation).sum(axis=-1)),
+    )
+
+
+def _nearest(t_ns: Index, stamps: Index) -> Index:
+    """Index of the epoch nearest to each stamp."""
+    after = np.searchsorted(t_ns, stamps).clip(0, t_ns.size - 1)
+    before = np.maximum(after - 1, 0)
+    nearest: Index = np.where(stamps - t_ns[before] <= t_ns[after] - stamps, before, after)
+    return nearest
+
+
+def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
+    heading, slope, cross_m, vertical_m, survey_m, chord_m = (
+        epochs[name].cast(pl.Float64).to_numpy().astype(np.float64)
+        for name in (
+            "heading_deg",
+            "slope",
+            "cross_track_m",
+            "vertical_m",
+            "survey_sigma_m",
+            "interpolation_error_m",
+        )
+    )
+    angle, rise = np.radians(heading), np.arctan(np.nan_to_num(slope))
+    level = np.cos(rise)
+    zero = np.zeros_like(angle)
+    survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
+    survey_m = np.hypot(np.maximum(survey_m, _LEAST_SURVEY_SIGMA_M), np.nan_to_num(chord_m))
+    matched = (
+        epochs["fix_valid"].fill_null(False).to_numpy()
+        & epochs["on_track"].fill_null(False).to_numpy()
+        & np.isfinite(cross_m)
+        & np.isfinite(heading)
+    )
+    known = np.isfinite(vertical_m)
+    left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
+    offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    return _Track(
+        along=np.stack([level * np.sin(angle), level * np.cos(angle), np.sin(rise)], axis=-1),
+        cross=left,
+        offset_m=offset,
+        sigma_m=survey_m,
+        height_known=known,
+        usable=matched & _unambiguous(epochs, config),
+        matched=matched,
+    )
+
+
+def _unambiguous(epochs: pl.DataFrame, config: Configuration) -> Mask:
+    """The causal probability of the path is good enough to hold the position on it."""
+    sure = epochs["gate_probability"] >= config.matching.ambiguity_probability
+    return sure.fill_null(False).to_numpy()
+
+
+def _sums_of_squares(ranges: _Ranges, track: _Track, epochs: Index) -> tuple[Array, Index]:
+    """Weighted sum of squares and degrees of freedom of these epochs, which all have satellites."""
+    first = np.searchsorted(ranges.epoch, epochs)
+    count = np.searchsorted(ranges.epoch, epochs, side="right") - first
+    slot = np.arange(int(count.max()))
+    held = slot < count[:, None]
+    place = np.where(held, first[:, None] + slot, first[:, None])
+    rows, system = ranges.rows[place], ranges.system[place]
+    weight = np.where(held, 1.0 / ranges.variance_m2[place], 0.0)
+    clocks = (system[:, :, None] == np.arange(ranges.systems)).astype(np.float64)
+    residual = ranges.residual_m[place] + np.einsum("eni,ei->en", rows, track.offset_m[epochs])
+    along = np.einsum("eni,ei->en", rows, track.along[epochs])
+    cross = np.einsum("eni,ei->en", rows, track.cross[epochs])
+    design = np.concatenate([along[..., None], cross[..., None], rows[..., 2:], clocks], axis=-1)
+    prior, free = _priors(track, epochs, (clocks * held[..., None]).any(axis=1))
+    return _left_over(design, weight, residual, prior), count - free
+
+
+def _priors(track: _Track, epochs: Index, present: Mask) -> tuple[Array, Index]:
+    """Prior precision of along, cross, up and clocks [1/m^2], and how many of them are free.
+
+    Nothing is known of the error along the track and of clocks, the survey's sigma holds the others; without
+    heights in the survey the height is free too. A constellation without satellites gets a precision that
+    keeps the equations solvable and changes nothing.
+    """
+    precision = 1.0 / track.sigma_m[epochs] ** 2
+    height = np.where(track.height_known[epochs], precision, 0.0)
+    prior = np.column_stack([np.zeros(epochs.size), precision, height, np.where(present, 0.0, 1.0)])
+    free = 1 + present.sum(axis=1) + ~track.height_known[epochs]
+    return prior, free
+
+
+def _left_over(design: Array, weight: Array, residual: Array, prior: Array) -> Array:
+    """Least weighted sum of squares over the unknowns, priors included."""
+    weighted = design * weight[..., None]
+    normal = np.einsum("eni,enj->eij", weighted, design)
+    index = np.arange(prior.shape[1])
+    normal[:, index, index] += prior
+    right = np.einsum("eni,en->ei", weighted, residual)
+    # Badly placed satellites may leave a direction open; the ridge is far below any information in a range.
+    normal[:, index, index] += _RIDGE * normal[:, index, index].max(axis=1, keepdims=True)
+    solution = np.linalg.solve(normal, right[..., None])[..., 0]
+    total = np.einsum("en,en->e", weight, residual**2) - np.einsum("ei,ei->e", solution, right)
+    return np.asarray(np.maximum(total, 0.0))
+
+
+def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Mask, config: Configuration) -> pl.Series:
+    seen = np.isin(np.arange(epochs.height), ranges.epoch)
+    return pl.select(
+        pl.when(pl.Series(tested))
+        .then(pl.lit(None, pl.String))
+        .when(pl.Series(~track.matched))
+        .then(pl.lit(NO_POSITION))
+        .when(pl.Series(~track.usable))
+        .then(pl.lit(AMBIGUOUS))
+        .when(pl.Series(~seen))
+        .then(pl.lit(NO_RANGES_AT_EPOCH))
+        .otherwise(pl.lit(TOO_FEW))
+    ).to_series()
