@@ -96,3 +96,7 @@ def _markdown_row(name: str, column: dy.Column) -> str:
     return f"| `{name}` | {_dtype(column)} | {unit} | {nullable} | {column.description or ''} |\n".replace(
         "|value|", "\\|value\\|"
     )
+
+
+if __name__ == "__main__":
+    print(dictionary_markdown(), end="")
