@@ -6,7 +6,7 @@ from typing import Any
 
 import polars as pl
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.clean import StreamCounts
@@ -336,6 +336,7 @@ def test_exposure() -> None:
     assert (found["exposure_max_s"], found["exposure_p99_s"]) == (100.0, 99.0)
 
 
+@settings(deadline=None, max_examples=30)
 @given(shift=st.integers(-(10**9), 10**9))
 def test_shifting_all_times_changes_nothing_else(shift: int) -> None:
     t = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
@@ -345,6 +346,7 @@ def test_shifting_all_times_changes_nothing_else(shift: int) -> None:
     }
 
 
+@settings(deadline=None, max_examples=40)
 @given(st.data())
 def test_shares_and_availability_are_shares(data: st.DataObject) -> None:
     t = sorted(data.draw(st.sets(st.integers(0, 400), min_size=0, max_size=30)))

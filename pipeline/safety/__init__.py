@@ -1,0 +1,37 @@
+"""Safety figures: the published budget, recalculated, and what a campaign measured against it."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.safety.architectures import architectures_table, fail_safety_table
+from pipeline.safety.budget import allocation_table, allowed_table, demands_table
+from pipeline.safety.continuity import continuity_table
+from pipeline.safety.errata import Erratum, errata, errata_table
+from pipeline.safety.markov import markov_table
+from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements, substantiation_table
+from schemas.config import SafetyConfig
+
+__all__ = [
+    "Erratum",
+    "detection_by_level",
+    "errata",
+    "measured_figures",
+    "plain_statements",
+    "safety_tables",
+]
+
+
+def safety_tables(config: SafetyConfig) -> dict[str, pl.DataFrame]:
+    """Every table of the safety budget by name, in the order in which one builds on the other."""
+    return {
+        "allocation": allocation_table(config),
+        "allowed_time_to_detect": allowed_table(config),
+        "demands": demands_table(config),
+        "markov": markov_table(config),
+        "architectures": architectures_table(config),
+        "fail_safety": fail_safety_table(config),
+        "continuity": continuity_table(),
+        "substantiation": substantiation_table(config),
+        "errata": errata_table(),
+    }

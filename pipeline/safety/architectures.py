@@ -1,0 +1,108 @@
+"""Linking, testing balise and travelling virtual balise; composite and reactive fail-safety."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.safety.budget import S_PER_H, allowed_time_to_detect_s
+from pipeline.safety.continuity import (
+    APV_CONTINUITY_RISK,
+    APV_INTERVAL_S,
+    mtbf_h,
+    mtbf_one_of_two_h,
+    mtbf_two_of_two_h,
+)
+from pipeline.safety.markov import lds_hazard_rate_per_h
+from schemas.config import SafetyConfig
+
+SPACINGS_M = (400.0, 2000.0, 2500.0)  # TVB section 2: 400 m on average, 2500 m at most
+SPEEDS_KMH = (40.0, 80.0, 120.0, 160.0, 200.0, 300.0)
+
+
+def linking_time_s(distance_m: float, speed_kmh: float) -> float:
+    """T_L = D_L / v [s] between two linked information points (TVB eq. 3)."""
+    return distance_m / (speed_kmh / 3.6)
+
+
+def failure_probability(lambda_per_h: float, duration_s: float) -> float:
+    """Probability that a failure lasting `duration_s` deletes an information point (TVB eq. 3 and 5)."""
+    return lambda_per_h * duration_s / S_PER_H
+
+
+def hazard_rate_with_linking_per_h(lambda_per_h: float, distance_m: float, speed_kmh: float) -> float:
+    """Rate of deletions on a mission of 1 h [1/h] (TVB eq. 4): two missed in a row brake the train."""
+    return lambda_per_h * 2.0 * linking_time_s(distance_m, speed_kmh) / S_PER_H
+
+
+def hazard_rate_with_testing_per_h(lambda_per_h: float, time_to_detect_s: float) -> float:
+    """Rate of deletions with a testing balise or a TVB [1/h] (TVB eq. 6): spacing plays no part."""
+    return lambda_per_h * time_to_detect_s / S_PER_H
+
+
+def architectures_table(
+    config: SafetyConfig,
+    spacings_m: tuple[float, ...] = SPACINGS_M,
+    speeds_kmh: tuple[float, ...] = SPEEDS_KMH,
+) -> pl.DataFrame:
+    """Linking against TVB by service level, spacing and speed (TVB eq. 3-6), T_D as allowed by eq. 7."""
+    rows = []
+    for level, service in config.service_levels.items():
+        rate = service.hazard_rate_per_h
+        detect_s = allowed_time_to_detect_s(config.thr_vb_per_h, rate)
+        for spacing_m in spacings_m:
+            for speed_kmh in speeds_kmh:
+                link_s = linking_time_s(spacing_m, speed_kmh)
+                linked = hazard_rate_with_linking_per_h(rate, spacing_m, speed_kmh)
+                rows.append(
+                    {
+                        "service_level": level,
+                        "spacing_m": spacing_m,
+                        "speed_kmh": speed_kmh,
+                        "linking_time_s": link_s,
+                        "two_linking_times_s": 2.0 * link_s,
+                        "deletion_probability": failure_probability(rate, link_s),
+                        "linking_per_h": linked,
+                        "linking_fulfils_thr": linked <= config.thr_vb_per_h,
+                        "time_to_detect_s": detect_s,
+                        "testing_or_tvb_per_h": hazard_rate_with_testing_per_h(rate, detect_s),
+                        "gain": 2.0 * link_s / detect_s,
+                    }
+                )
+    return pl.DataFrame(rows)
+
+
+def composite_rate_per_h(
+    first_per_h: float, second_per_h: float, time_to_detect_s: float, common_cause_share: float = 0.0
+) -> float:
+    """Rate [1/h] at which both of two compared channels are wrong at once.
+
+    A fault of one lasts until the comparison negates it, and the other fails meanwhile:
+    2 h1 h2 T_D, plus what strikes both (EN 50129:2003 annex B.3, independent channels; ours for the share).
+    """
+    both = 2.0 * first_per_h * second_per_h * time_to_detect_s / S_PER_H
+    return both + common_cause_share * min(first_per_h, second_per_h)
+
+
+def fail_safety_table(config: SafetyConfig) -> pl.DataFrame:
+    """Reactive (LOC Fig. 4) and composite (LOC Fig. 3) fail-safety side by side per service level.
+
+    Of two redundant reactive channels one is in use at a time, so that its faults alone count.
+    `common_cause_limit` is the share of common causes at which the composite LDS alone uses up
+    the THR: signals corrected by one SBAS are not independent.
+    """
+    channel_h = mtbf_h(APV_CONTINUITY_RISK, APV_INTERVAL_S)
+    rows = []
+    for level, service in config.service_levels.items():
+        rate = service.hazard_rate_per_h
+        detect_s = allowed_time_to_detect_s(config.thr_vb_per_h, rate)
+        reactive = lds_hazard_rate_per_h(rate, detect_s)
+        composite = composite_rate_per_h(rate, rate, detect_s)
+        common = max(0.0, config.thr_vb_per_h - composite) / rate
+        rows += [
+            (level, "reactive 1oo1", detect_s, reactive, None, channel_h),
+            (level, "reactive 1oo2", detect_s, reactive, None, mtbf_one_of_two_h(channel_h)),
+            (level, "composite 2oo2", detect_s, composite, common, mtbf_two_of_two_h(channel_h)),
+        ]
+    columns = ["service_level", "architecture", "time_to_detect_s", "hazard_rate_per_h", "common_cause_limit", "mtbf_h"]
+    table = pl.DataFrame(rows, schema=columns, orient="row")
+    return table.with_columns(fulfils_thr=pl.col("hazard_rate_per_h") <= config.thr_vb_per_h * (1.0 + 1e-12))

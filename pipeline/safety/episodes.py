@@ -1,0 +1,32 @@
+"""Hazard rows as independent events: what may be counted in a rate."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.summary import missed_detection
+
+
+def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
+    """One row per fault: `run_id, solution, failed, missed, time_to_detect_s, hazardous_s`.
+
+    A fault may stand in several rows of `hazards` (one per class, and the jump back as a row
+    `caused_by` the first); counted one by one they would make the bounds too narrow. Takes the
+    hazards of many runs with their `run_id`. `hazardous_s` is null where a failure was never negated.
+    """
+    failed = pl.col("t_failure").is_not_null()
+    return (
+        hazards.filter(pl.col("caused_by").is_null())
+        .with_columns(begin=pl.coalesce("t_onset", "t_hazard"), missed=missed_detection())
+        .group_by("run_id", "solution", "begin")
+        .agg(
+            failed=failed.any(),
+            missed=pl.col("missed").any(),
+            time_to_detect_s=pl.col("time_to_detect_s").max(),
+            # One row that was never negated makes the whole fault one that was never negated.
+            hazardous_s=pl.when((failed & pl.col("hazardous_s").is_null()).any())
+            .then(None)
+            .otherwise(pl.col("hazardous_s").filter(failed).max()),
+        )
+        .sort("run_id", "solution", "begin")
+    )

@@ -1,0 +1,210 @@
+"""What a campaign measured, each figure with how certain it is, against the safety budget."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.safety.episodes import independent_episodes
+from pipeline.statistics import (
+    Estimate,
+    clopper_pearson,
+    hours_still_needed,
+    hours_to_substantiate,
+    poisson_rate,
+    poisson_rate_upper,
+)
+from schemas.config import SafetyConfig
+from schemas.enums import Evidence, RunStatus
+
+Row = dict[str, object]
+
+_TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
+
+
+def columns_of(name: str, estimate: Estimate, unit: str = "") -> Row:
+    """An estimate as three columns `name`, `name_low`, `name_high`, with their unit at the end."""
+    return {
+        f"{name}{unit}": estimate.value,
+        f"{name}_low{unit}": estimate.low,
+        f"{name}_high{unit}": estimate.high,
+    }
+
+
+_FIGURES: dict[str, pl.DataType | type[pl.DataType]] = {
+    "solution": pl.String,
+    "runs": pl.Int64,
+    "runs_failed": pl.Int64,
+    "hours": pl.Float64,
+    "hours_with_evidence": pl.Float64,
+    "hours_with_truth": pl.Float64,
+    "hazards": pl.Int64,
+    "hazard_rate_per_h": pl.Float64,
+    "hazard_rate_low_per_h": pl.Float64,
+    "hazard_rate_high_per_h": pl.Float64,
+    "failures": pl.Int64,
+    "missed": pl.Int64,
+    "missed_share": pl.Float64,
+    "missed_share_low": pl.Float64,
+    "missed_share_high": pl.Float64,
+    "missed_rate_upper_per_h": pl.Float64,
+    "hours_judged": pl.Float64,
+    "false_alarms": pl.Int64,
+    "false_alarm_rate_per_h": pl.Float64,
+    "false_alarm_rate_low_per_h": pl.Float64,
+    "false_alarm_rate_high_per_h": pl.Float64,
+    "accepted": pl.Int64,
+    "unsafe_accepted": pl.Int64,
+    "outages": pl.Int64,
+    "outage_rate_per_h": pl.Float64,
+    "outage_rate_low_per_h": pl.Float64,
+    "outage_rate_high_per_h": pl.Float64,
+    "thr_vb_per_h": pl.Float64,
+    "hours_needed": pl.Float64,
+    "hours_still_needed": pl.Float64,
+}
+
+
+def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
+    """One row per solution over all runs: rates with exact two-sided 95 % bounds.
+
+    Takes the `runs` and `hazards` tables of the campaign with their `run_id`. Each fault counts once,
+    per hour with any evidence; missed detections are judged by the budget in their own rows. A THR is
+    substantiated by hours with a truth only (reference or balises): what the odometer alone lets see
+    has to exceed its confidence first.
+    """
+    failed = runs.filter(pl.col("status") == RunStatus.FAILED).height
+    done = runs.filter(pl.col("status") != RunStatus.FAILED)
+    episodes = independent_episodes(hazards)
+    rows = [
+        {"solution": solution, "runs_failed": failed}
+        | _figures(part, episodes.filter(pl.col("solution") == solution), config.thr_vb_per_h)
+        for (solution,), part in sorted(done.group_by("solution"), key=lambda item: str(item[0][0]))
+    ]
+    return pl.DataFrame(rows, schema=_FIGURES)
+
+
+def _hours(runs: pl.DataFrame) -> float:
+    return float(runs["duration_s"].fill_null(0.0).sum()) / 3600.0
+
+
+def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
+    seen = _hours(runs.filter(pl.col("evidence").is_not_null()))
+    judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
+    hours, hours_judged = _hours(runs.filter(pl.col("evidence").is_in(_TRUTH))), _hours(judged)
+    failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
+    false_alarms, outages = int(judged["false_alarms"].sum()), int(runs["outages"].sum())
+    return {
+        "runs": runs.height,
+        "hours": _hours(runs),
+        "hours_with_evidence": seen,
+        "hours_with_truth": hours,
+        "hazards": episodes.height,
+        **columns_of("hazard_rate", poisson_rate(episodes.height, seen), "_per_h"),
+        "failures": failures,
+        "missed": missed,
+        **columns_of("missed_share", clopper_pearson(missed, failures)),
+        "missed_rate_upper_per_h": poisson_rate_upper(missed, hours),
+        "hours_judged": hours_judged,
+        "false_alarms": false_alarms,
+        **columns_of("false_alarm_rate", poisson_rate(false_alarms, hours_judged), "_per_h"),
+        "accepted": int(runs["balises_accepted"].sum()),
+        "unsafe_accepted": int(runs["unsafe_accepted"].sum()),
+        "outages": outages,
+        **columns_of("outage_rate", poisson_rate(outages, _hours(runs)), "_per_h"),
+        "thr_vb_per_h": thr_vb_per_h,
+        "hours_needed": hours_to_substantiate(thr_vb_per_h, missed),
+        "hours_still_needed": hours_still_needed(thr_vb_per_h, missed, hours),
+    }
+
+
+_BY_LEVEL: dict[str, pl.DataType | type[pl.DataType]] = {
+    "solution": pl.String,
+    "service_level": pl.String,
+    "allowed_s": pl.Float64,
+    "failures": pl.Int64,
+    "within": pl.Int64,
+    "within_share": pl.Float64,
+    "within_share_low": pl.Float64,
+    "within_share_high": pl.Float64,
+    "never_negated": pl.Int64,
+    "hazardous_median_s": pl.Float64,
+    "hazardous_p95_s": pl.Float64,
+    "hazardous_max_s": pl.Float64,
+    "detected": pl.Int64,
+    "time_to_detect_median_s": pl.Float64,
+    "time_to_detect_p95_s": pl.Float64,
+    "time_to_detect_max_s": pl.Float64,
+}
+
+
+def detection_by_level(hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
+    """Measured T_D and hazardous time against the allowed T_D of every service level (TVB eq. 7).
+
+    Eq. 7 limits how long a hazardous position may stand, so `within` compares the hazardous time;
+    the quantiles leave out what was never negated or detected, which is counted beside them.
+    """
+    episodes = independent_episodes(hazards)
+    solutions = sorted(episodes["solution"].unique().to_list())
+    rows = [
+        {"solution": solution, "service_level": level}
+        | _against(episodes.filter(pl.col("solution") == solution), config.allowed_time_to_detect_s(level))
+        for solution in solutions
+        for level in config.service_levels
+    ]
+    return pl.DataFrame(rows, schema=_BY_LEVEL)
+
+
+def _quantiles(values: pl.Series, name: str) -> Row:
+    known = values.drop_nulls()
+    return {
+        f"{name}_median_s": known.median(),
+        f"{name}_p95_s": known.quantile(0.95, interpolation="linear"),
+        f"{name}_max_s": known.max(),
+    }
+
+
+def _against(episodes: pl.DataFrame, allowed_s: float) -> Row:
+    failures = episodes.filter(pl.col("failed"))
+    within = failures.filter(pl.col("hazardous_s") <= allowed_s).height
+    return {
+        "allowed_s": allowed_s,
+        "failures": failures.height,
+        "within": within,
+        **columns_of("within_share", clopper_pearson(within, failures.height)),
+        "never_negated": failures["hazardous_s"].null_count(),
+        **_quantiles(failures["hazardous_s"], "hazardous"),
+        "detected": episodes["time_to_detect_s"].count(),
+        **_quantiles(episodes["time_to_detect_s"], "time_to_detect"),
+    }
+
+
+def plain_statements(figures: pl.DataFrame) -> list[str]:
+    """What the figures do and do not show, one sentence or two per solution."""
+    return [_statement(row) for row in figures.iter_rows(named=True)]
+
+
+def _statement(row: Row) -> str:
+    claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
+    head = (
+        f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
+        f" in {row['hours_with_truth']:.6g} h with a truth."
+    )
+    if row["hours_still_needed"] == 0.0:
+        return f"{head} This substantiates a {claim}."
+    return (
+        f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with no further"
+        f" miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
+    )
+
+
+def substantiation_table(config: SafetyConfig, events: tuple[int, ...] = (0, 1, 2, 5)) -> pl.DataFrame:
+    """Hours [h] that show a rate at 95 %, by events seen, for THR_VB and the rate of each service level."""
+    targets = {"THR_VB": config.thr_vb_per_h} | {
+        f"signal in space, {level}": service.hazard_rate_per_h for level, service in config.service_levels.items()
+    }
+    rows = [
+        (target, rate, count, hours_to_substantiate(rate, count), hours_to_substantiate(rate, count) / 8766.0)
+        for target, rate in targets.items()
+        for count in events
+    ]
+    return pl.DataFrame(rows, schema=["target", "rate_per_h", "events", "hours", "years"], orient="row")

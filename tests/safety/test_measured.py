@@ -1,0 +1,146 @@
+"""Campaign figures from small tables worked by hand."""
+
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pipeline.safety import detection_by_level, measured_figures, plain_statements
+from pipeline.safety.episodes import independent_episodes
+from pipeline.statistics import clopper_pearson, poisson_rate
+from schemas.config import SafetyConfig
+from schemas.tables import Runs
+from tests.summary.tables import NS, hazards, table
+
+CONFIG = SafetyConfig()
+
+
+def with_run(frame: pl.DataFrame, run_id: str | list[str]) -> pl.DataFrame:
+    ids = [run_id] * frame.height if isinstance(run_id, str) else run_id
+    return frame.with_columns(pl.Series("run_id", ids, dtype=pl.String))
+
+
+def runs(height: int, **columns: Any) -> pl.DataFrame:
+    plain: dict[str, Any] = {
+        "solution": "primary",
+        "status": "ok",
+        "duration_s": 3600.0,
+        "evidence": "reference",
+        "false_alarm_rate_per_h": 0.0,
+        "false_alarms": 0,
+    }
+    return with_run(table(Runs, height, **(plain | columns)), [f"r{k}" for k in range(height)])
+
+
+def fault(height: int, **columns: Any) -> pl.DataFrame:
+    plain = {"t_onset": [k * 100 * NS for k in range(height)], "budget_s": 1.675}
+    return with_run(hazards(height, solution="primary", **(plain | columns)), "r0")
+
+
+NO_HAZARDS = fault(0)
+
+
+def test_rows_of_one_fault_are_one_event() -> None:
+    frame = fault(
+        5,
+        t_onset=[100 * NS, 100 * NS, 150 * NS, 900 * NS, None],
+        t_hazard=[110 * NS, 120 * NS, 150 * NS, 905 * NS, 905 * NS],
+        caused_by=[None, None, 0, None, None],
+        t_failure=[112 * NS, None, 150 * NS, None, 905 * NS],
+        t_negated=[113 * NS, None, None, None, None],
+        hazardous_s=[1.0, None, None, None, None],
+        time_to_detect_s=[12.0, 13.0, None, None, None],
+    )
+    events = independent_episodes(frame)
+    assert events["failed"].to_list() == [True, False, True]
+    assert events["missed"].to_list() == [False, False, True]
+    assert events["hazardous_s"].to_list() == [1.0, None, None]
+    assert events["time_to_detect_s"].to_list() == [13.0, None, None]
+
+
+def test_the_same_time_in_another_run_or_solution_is_another_event() -> None:
+    frame = pl.concat([fault(1), with_run(fault(1), "r1"), fault(1).with_columns(solution=pl.lit("gps"))])
+    assert independent_episodes(frame).height == 3
+
+
+def test_rates_over_the_campaign() -> None:
+    catalogue = runs(
+        6,
+        status=["ok", "partial", "ok", "ok", "failed", "ok"],
+        evidence=["reference", "balise", "odometer", None, None, "reference"],
+        duration_s=[3600.0, 1800.0, 7200.0, 3600.0, None, 1800.0],
+        false_alarms=[2, 0, None, None, None, 1],
+        false_alarm_rate_per_h=[2.0, 0.0, None, None, None, None],
+        balises_accepted=[10, 5, 5, 5, 0, 5],
+        unsafe_accepted=[0, 1, 0, 0, 0, 0],
+        outages=[1, 0, 2, 0, 0, 0],
+    )
+    faults = fault(
+        3,
+        t_failure=[10 * NS, 120 * NS, None],
+        t_negated=[11 * NS, None, None],
+        hazardous_s=[1.0, None, None],
+    )
+    found = measured_figures(catalogue, faults, CONFIG).row(0, named=True)
+    assert (found["runs"], found["runs_failed"], found["hours"]) == (5, 1, 5.0)
+    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (4.0, 2.0, 1.5)
+    rate = poisson_rate(3, 4.0)
+    assert (found["hazards"], found["hazard_rate_per_h"]) == (3, 0.75)
+    assert (found["hazard_rate_low_per_h"], found["hazard_rate_high_per_h"]) == (rate.low, rate.high)
+    share = clopper_pearson(1, 2)
+    assert (found["failures"], found["missed"], found["missed_share"]) == (2, 1, 0.5)
+    assert (found["missed_share_low"], found["missed_share_high"]) == (share.low, share.high)
+    assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.5))
+    assert (found["accepted"], found["unsafe_accepted"], found["outages"]) == (30, 1, 3)
+
+
+def test_a_trial_without_a_miss_says_what_it_lacks() -> None:
+    figures = measured_figures(runs(100), NO_HAZARDS, CONFIG)
+    found = figures.row(0, named=True)
+    assert found["hours_needed"] == pytest.approx(4.4713e9, rel=1e-4)
+    assert found["hours_still_needed"] == found["hours_needed"] - 100.0
+    assert found["missed_rate_upper_per_h"] == pytest.approx(2.9957 / 100, rel=1e-4)
+    (sentence,) = plain_statements(figures)
+    assert "0 missed detections of 0 position failures in 100 h" in sentence
+    assert "cannot substantiate" in sentence
+    assert "4.47e+09 h" in sentence
+
+
+def test_a_trial_that_is_long_enough_says_so() -> None:
+    loose = SafetyConfig(thr_vb_per_h=0.1)
+    (sentence,) = plain_statements(measured_figures(runs(100), NO_HAZARDS, loose))
+    assert "This substantiates a THR_VB of 1.00e-01/h" in sentence
+
+
+def test_no_runs_no_rows() -> None:
+    assert measured_figures(runs(0), NO_HAZARDS, CONFIG).height == 0
+    assert measured_figures(runs(2, status="failed"), NO_HAZARDS, CONFIG).height == 0
+    assert detection_by_level(NO_HAZARDS, CONFIG).height == 0
+
+
+def test_solutions_are_counted_apart() -> None:
+    catalogue = runs(4, solution=["gps", "primary", "gps", "primary"], duration_s=[3600.0, 3600.0, 1800.0, 1800.0])
+    figures = measured_figures(catalogue, fault(2), CONFIG)
+    assert figures["solution"].to_list() == ["gps", "primary"]
+    assert figures["hazards"].to_list() == [0, 2]
+    assert figures["hours"].to_list() == [1.5, 1.5]
+
+
+def test_measured_times_against_every_level() -> None:
+    """Hazardous times 0.2, 1.0, 20 s and one never negated, against 24.12, 0.5025, 1.675 and 100.5 s."""
+    faults = fault(
+        5,
+        t_failure=[5 * NS, 105 * NS, 205 * NS, 305 * NS, None],
+        hazardous_s=[0.2, 1.0, 20.0, None, None],
+        time_to_detect_s=[5.2, 6.0, 25.0, None, 2.0],
+    )
+    table = detection_by_level(faults, CONFIG)
+    assert table["service_level"].to_list() == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
+    assert table["within"].to_list() == [3, 1, 2, 3]
+    assert set(table["failures"]) == {4}
+    assert set(table["never_negated"]) == {1}
+    row = table.row(0, named=True)
+    assert (row["hazardous_median_s"], row["hazardous_max_s"]) == (1.0, 20.0)
+    assert (row["detected"], row["time_to_detect_median_s"], row["time_to_detect_max_s"]) == (4, 5.6, 25.0)
+    bounds = clopper_pearson(3, 4)
+    assert (row["within_share_low"], row["within_share_high"]) == (bounds.low, bounds.high)
