@@ -103,6 +103,27 @@ def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle,
     return epochs.with_columns(_columns(arrays, track, learned, config))
 
 
+def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometer: pl.DataFrame, config: Configuration) -> pl.Series:
+    """Odometer distance at any times [m], on the scale of `aligned`'s `odometer_m`; null beyond what is known.
+
+    Carried on from the nearest epoch before (or the first one) with the scale in use there.
+    """
+    anchors = aligned.drop_nulls("odometer_m")
+    if anchors.is_empty():
+        return pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
+    track = odometer_track(odometer, config.align.odometer_gap_s, config.monitors.odometer_sigma_mps)
+    anchor_s = track.seconds(anchors["t"].dt.timestamp("ns").to_numpy()) - _floats(anchors["latency_s"])
+    travelled = _floats(anchors["odometer_m"])
+    forward = np.sum(np.diff(travelled) * np.diff(track.distance_at(anchor_s)))
+    track = track.oriented(-1 if forward < 0 else 1)
+    at_s = track.seconds(times.dt.timestamp("ns").to_numpy())
+    near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
+    way = track.distance_at(at_s) - track.distance_at(anchor_s[near])
+    known = track.known_at(at_s) & (track.stretch_at(at_s) == track.stretch_at(anchor_s[near]))
+    distance = np.where(known, travelled[near] + _floats(anchors["odometer_scale"])[near] * way, np.nan)
+    return pl.Series("odometer_m", distance, nan_to_null=True)
+
+
 def _floats(series: pl.Series) -> Array:
     """A nullable float column as an array with NaN for null."""
     values: Array = series.to_numpy().astype(np.float64)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.align import align, threshold_factor
+from pipeline.align import align, odometer_at, threshold_factor
 from pipeline.clean import CleanCounts, clean
 from pipeline.hazards import HazardResult, classify, establish_truth
 from pipeline.lds.bank_protocol import LdsLimits
@@ -77,7 +77,8 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     balises = found.path.balises(context.site.balises)
     aligned = align(found.epochs, run.odometer, context.vehicle, config).with_columns(_confidence(context, solution))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
-    lds = run_lds(aligned, bank, balises, run.balise_reads, config.lds, LdsLimits.of(config), solution)
+    telegrams = _with_odometer(run, aligned, config)
+    lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
     reference = _reference_on_path(context, found.path)
     reads = _reads_on_path(run.balise_reads, balises)
@@ -155,6 +156,13 @@ def _single_monitors(
         "channel": channel_monitor(aligned, compared, context.factor),
         "pseudorange": blind_monitor(aligned.height, NO_RANGES),
     }
+
+
+def _with_odometer(run: RunLog, aligned: pl.DataFrame, config: Configuration) -> pl.DataFrame | None:
+    """Balise reads with the odometer's distance, which windows need where GNSS has a gap."""
+    if run.balise_reads is None or run.odometer is None:
+        return run.balise_reads
+    return run.balise_reads.with_columns(odometer_at(run.balise_reads["t"], aligned, run.odometer, config))
 
 
 def _reference_on_path(context: _Context, path: TravelledPath) -> pl.DataFrame | None:

@@ -126,7 +126,8 @@ class MonitorBank:
         part = slice(begin, self._known_to + 1)
         fails = [axis.state[part] == _FAIL for axis in self._axes]
         self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
-        self._fast[part] = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
+        fast = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
+        self._fast[part] = fast | self._single_fails[part]
         self._along[part] = (self._axes[0].state[part] != _NOT_EVALUATED).any(axis=1)
 
     def failed(self, epoch: int) -> bool:
@@ -135,7 +136,7 @@ class MonitorBank:
         return bool(self._any[epoch])
 
     def fast_failed(self, epoch: int) -> bool:
-        """A raw or fastest-EWMA monitor fails at this epoch: only these hold back recovery."""
+        """A raw, fastest-EWMA or memoryless monitor fails at this epoch: only these hold back recovery."""
         self._look(epoch)
         return bool(self._fast[epoch])
 

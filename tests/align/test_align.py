@@ -7,10 +7,10 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.align import BEYOND_SPAN, NO_ODOMETER, align, threshold_factor
+from pipeline.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at, threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from schemas.config import Configuration, Vehicle
-from tests.align.straight import Straight, run
+from tests.align.straight import Straight, distance, run, times
 
 CONFIG = Configuration()
 FACTOR = threshold_factor(1e-7)
@@ -121,3 +121,16 @@ def test_time_may_start_anywhere():
     )
     plain = align(epochs, odometer, Vehicle(), CONFIG)
     assert_frame_equal(plain.drop("t"), later.drop("t"), check_exact=True)
+
+
+def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
+    epochs, odometer = run(Straight(duration_s=200.0, polarity=-1, scale=1.004), 10)
+    vehicle = Vehicle(odometer_scale=1.004, gnss_latency_s=0.0)
+    gap = epochs.filter((pl.col("t").dt.timestamp("ns") < 100 * 10**9) | (pl.col("t").dt.timestamp("ns") > 120 * 10**9))
+    aligned = align(gap, odometer, vehicle, CONFIG)
+    at = times(np.array([0.5, 90.05, 110.0, 150.0, 300.0]))
+    start = distance(np.array([1.0, 200.0]))[0]
+    expected = distance(np.array([0.5, 90.05, 110.0, 150.0, 200.0]))[:4] - start
+    found = odometer_at(at, aligned, odometer, CONFIG).to_list()
+    assert found[4] is None
+    np.testing.assert_allclose(found[:4], expected, atol=2.5)
