@@ -1,0 +1,196 @@
+"""A known fault added to a recorded run, so that detection is measured on real noise."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from datasets.faults import (
+    NS_PER_S,
+    FaultKind,
+    FaultSpec,
+    active,
+    faults_table,
+    odometer_increments,
+    offset_m,
+)
+from datasets.inject_ranges import inject_ranges
+from datasets.line import Places, shifted
+from datasets.run_path import displacement_m
+from schemas.config import Settings, read_toml, settings_from
+from schemas.errors import ConfigError, InputError
+from schemas.run import RunLog, Site
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+_PLACE = ("latitude_deg", "longitude_deg", "height_m")
+_LATE = (*_PLACE, "vel_e_mps", "vel_n_mps", "vel_u_mps")
+# Positions further apart are not joined by a straight line when a late position is read between them.
+_JOINED_S = 1.5
+
+
+class FaultFile(Settings):
+    """A fault file: `[[faults]]` tables."""
+
+    faults: tuple[FaultSpec, ...]
+
+
+def load_faults(path: Path) -> tuple[FaultSpec, ...]:
+    """The faults of a TOML file; breaches of its contract are one `ConfigError`."""
+    found = settings_from(read_toml(path), FaultFile, str(path)).faults
+    if not found:
+        raise ConfigError("holds no fault", place=str(path), expected="[[faults]] tables")
+    return found
+
+
+def inject_all(run: RunLog, faults: Iterable[FaultSpec], site: Site | None = None) -> RunLog:
+    """Add faults one after the other."""
+    for fault in faults:
+        run = inject(run, fault, site)
+    return run
+
+
+def inject(run: RunLog, fault: FaultSpec, site: Site | None = None) -> RunLog:
+    """The run with the fault added, and a `faults` stream that says so.
+
+    Times count from the run's first GNSS epoch. Position faults keep the recorded noise: they are added to it.
+    Along and across the track follow the site where one is given, else the run's own way. Range faults need
+    the `satellites` stream. Recorded velocities stay as they are. Random noise hangs on run and fault alone.
+    """
+    first_ns, last_ns = _span_ns(run)
+    if fault.begins_s() * NS_PER_S > last_ns - first_ns:
+        raise ConfigError(
+            "begins behind the end of the run", place=f"fault {fault.kind.value}", found=f"{fault.start_s} s"
+        )
+    if fault.solution is not None and fault.solution not in run.solutions():
+        known = ", ".join(run.solutions())
+        raise ConfigError("names a solution that the run has not", place=f"fault {fault.kind.value}", expected=known)
+    rng = np.random.default_rng(zlib.crc32(json.dumps([run.run_id, fault.model_dump(mode="json")]).encode()))
+    if fault.hits_odometer:
+        changed = run.with_streams(odometer=_odometer(run, fault, first_ns))
+    elif fault.hits_ranges:
+        changed = inject_ranges(run, fault, first_ns, rng)
+    else:
+        changed = run.with_streams(gnss=_positions(run, fault, first_ns, rng, site))
+    told = faults_table([fault], first_ns, last_ns)
+    if run.faults is not None:
+        told = pl.concat([run.faults, told]).sort("t_start", maintain_order=True)
+    return changed.with_streams(faults=told)
+
+
+def _span_ns(run: RunLog) -> tuple[int, int]:
+    if run.gnss.is_empty():
+        raise InputError("holds no epoch", place=f"{run.run_id}: gnss")
+    t_ns = run.gnss["t"].to_physical()
+    return int(t_ns.min()), int(t_ns.max())  # type: ignore[arg-type]
+
+
+def _seconds(frame: pl.DataFrame, first_ns: int) -> Floats:
+    seconds: Floats = (frame["t"].to_physical().to_numpy() - first_ns) / NS_PER_S
+    return seconds
+
+
+def _positions(
+    run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.Generator, site: Site | None
+) -> pl.DataFrame:
+    parts = []
+    for solution in run.gnss["solution"].unique(maintain_order=True):
+        part = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
+        if fault.solution in (None, solution):
+            part = _position_fault(run, fault, part, solution, first_ns, rng, site)
+        parts.append(part)
+    return pl.concat(parts).sort("row").drop("row")
+
+
+def _position_fault(
+    run: RunLog,
+    fault: FaultSpec,
+    part: pl.DataFrame,
+    solution: str,
+    first_ns: int,
+    rng: np.random.Generator,
+    site: Site | None,
+) -> pl.DataFrame:
+    t_s = _seconds(part, first_ns)
+    if fault.kind is FaultKind.OUTAGE:
+        return part.filter(pl.Series(~active(fault, t_s)))
+    if fault.kind is FaultKind.LATENCY:
+        return _late(part, fault, t_s)
+    size = offset_m(fault, t_s, rng)
+    return _moved(part, _vectors(run, fault.target, solution, part, size, site))
+
+
+def _vectors(run: RunLog, axis: str, solution: str, part: pl.DataFrame, size_m: Floats, site: Site | None) -> Floats:
+    """Displacement east, north, up of each epoch [m]."""
+    zeros = np.zeros(size_m.size)
+    if axis in ("along", "cross"):
+        t_ns = part["t"].to_physical().to_numpy()
+        ahead, left = (size_m, zeros) if axis == "along" else (zeros, size_m)
+        return displacement_m(run, solution, t_ns, ahead, left, site)
+    return np.column_stack([size_m if axis == name else zeros for name in ("east", "north", "up")])
+
+
+def _moved(part: pl.DataFrame, vectors_m: Floats) -> pl.DataFrame:
+    """Positions moved; a height that is not known stays so."""
+    latitude, longitude, height = (part[name].to_numpy().astype(np.float64) for name in _PLACE)
+    nothing = np.zeros(0)
+    places = shifted(Places(latitude, longitude, np.nan_to_num(height), nothing, nothing), *vectors_m.T)
+    moved = (places.latitude_deg, places.longitude_deg, height + vectors_m[:, 2])
+    return part.with_columns(
+        pl.Series(name, values, nan_to_null=True) for name, values in zip(_PLACE, moved, strict=True)
+    )
+
+
+def _late(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
+    """Positions and velocities of `latency_s` ago under the stamps of now; where none is recorded the epoch is lost."""
+    now = active(fault, t_s)
+    known = part.filter(pl.col("latitude_deg").is_not_null()).sort("t", maintain_order=True)
+    known_s = t_s[np.isin(part["row"].to_numpy(), known["row"].to_numpy())]
+    known_s = np.sort(known_s, kind="stable")
+    wanted = t_s - (fault.latency_s or 0.0)
+    right = np.searchsorted(known_s, wanted, side="left").clip(1, max(known_s.size - 1, 1))
+    lost = now & ((wanted < known_s[0]) | (known_s[right] - known_s[right - 1] > _JOINED_S))
+    columns = {
+        name: np.where(
+            now, np.interp(wanted, known_s, known[name].to_numpy().astype(np.float64)), part[name].to_numpy()
+        )
+        for name in _LATE
+    }
+    series = [pl.Series(name, values, nan_to_null=True) for name, values in columns.items()]
+    return part.with_columns(series).filter(pl.Series(~lost))
+
+
+def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
+    if run.odometer is None:
+        raise InputError("has no odometer to be at fault", place=run.run_id, expected="an odometer stream")
+    odometer = run.odometer.sort("t", maintain_order=True)
+    t_s = _seconds(odometer, first_ns)
+    if fault.kind is FaultKind.OUTAGE:
+        return odometer.filter(pl.Series(~active(fault, t_s)))
+    distance, speed = odometer["distance_m"].to_numpy().copy(), odometer["speed_mps"].to_numpy().copy()
+    rows = np.flatnonzero(np.isfinite(distance))
+    if rows.size:
+        steps = np.diff(distance[rows], prepend=distance[rows[0]])
+        distance[rows] = distance[rows[0]] + np.cumsum(odometer_increments([fault], t_s[rows], steps))
+    step_s = np.diff(t_s, prepend=2.0 * t_s[0] - t_s[1] if t_s.size > 1 else 0.0)
+    timed = np.flatnonzero(np.isfinite(speed) & (step_s > 0.0))
+    if timed.size:
+        speed[timed] = _speed_under(fault, t_s[timed], speed[timed])
+    return odometer.with_columns(
+        distance_m=pl.Series(distance, nan_to_null=True), speed_mps=pl.Series(speed, nan_to_null=True)
+    )
+
+
+def _speed_under(fault: FaultSpec, t_s: Floats, speed_mps: Floats) -> Floats:
+    """Speed as increments over one second each, so that slip, slide and scale act on it alike."""
+    seconds = np.arange(t_s.size, dtype=np.float64)
+    now = active(fault, t_s)
+    whole = fault.model_copy(update={"start_s": 0.0, "duration_s": None})
+    return np.where(now, odometer_increments([whole], seconds, speed_mps), speed_mps)

@@ -1,0 +1,173 @@
+"""The way a recorded train went, so that a displaced position stays on its track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from datasets.line import curvature_radii_m
+from pipeline.clean import clean
+from pipeline.geodesy import distances_m
+from pipeline.matching import match
+from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.errors import InputError
+from schemas.run import RunLog, Site
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+# Positions are averaged over this much way, and movement below it is taken for noise of a standing train.
+_BIN_M = 10.0
+_OUTER_CELLS = 3
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Where the train was along its own way at some instants, and the way itself by the distance along it."""
+
+    t_ns: Ints
+    s_m: Floats
+    axis_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+
+    def places(self, s_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Positions at distances along the way; beyond its ends it goes on straight."""
+        axes = (self.latitude_deg, self.longitude_deg, self.height_m)
+        latitude, longitude, height = (_interpolated(s_m, self.axis_m, values) for values in axes)
+        return latitude, longitude, height
+
+
+def displacement_m(
+    run: RunLog, solution: str, t_ns: Ints, ahead_m: Floats, left_m: Floats, site: Site | None = None
+) -> Floats:
+    """East, north, up [m] of positions moved along the track and to its left, shape (instants, 3).
+
+    Ahead is the run's first direction of travel. The track is that of the site where one is given, else
+    what the run's own positions show, averaged over 10 m.
+    """
+    way = _own_way(run, solution) if site is None else _site_way(run, solution, site)
+    s_m = np.interp(t_ns.astype(np.float64), way.t_ns.astype(np.float64), way.s_m)
+    here, there = way.places(s_m), way.places(s_m + ahead_m)
+    ahead, behind = way.places(s_m + _BIN_M), way.places(s_m - _BIN_M)
+    east, north, up = _local_m(here, there)
+    course_e, course_n, _ = _local_m(behind, ahead)
+    norm = np.hypot(course_e, course_n)
+    return np.column_stack([east - left_m * course_n / norm, north + left_m * course_e / norm, up])
+
+
+def _own_way(run: RunLog, solution: str) -> _Way:
+    """From the run's own positions, by odometer distance where recorded, else by the way the positions make."""
+    fixes = _fixes(run, solution)
+    t_ns = fixes["t"].to_physical().to_numpy()
+    places = [fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")]
+    places[2] = np.nan_to_num(places[2])
+    s_m = _odometer_m(run, t_ns)
+    if s_m is None:
+        s_m = _way_of_positions_m(*places)
+    cell = np.floor(s_m / _BIN_M).astype(np.int64)
+    cells, of_epoch = np.unique(cell, return_inverse=True)
+    if cells.size < 3:
+        raise InputError("the train moves too little to know its track", place=run.run_id, expected="30 m or more")
+    count = np.bincount(of_epoch)
+    means = [np.bincount(of_epoch, weights=values) / count for values in (s_m, *places)]
+    return _Way(t_ns, s_m, *means)
+
+
+def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
+    """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
+    ordered, _ = clean(run)
+    fixes = ordered.gnss.filter(pl.col("solution") == solution)
+    found = match(fixes, ordered.odometer, site, Vehicle(), MatchingConfig(), FixSigma(), ordered.balise_reads)
+    epochs = found.epochs.filter(pl.col("path_m").is_not_null())
+    if epochs["leg"].n_unique() != 1:
+        raise InputError("the path changes direction at a switch", place=run.run_id, remedy="Inject without --site.")
+    s_m = epochs["path_m"].to_numpy()
+    axis = np.arange(s_m.min() - _BEYOND_M, s_m.max() + _BEYOND_M, _BIN_M / 2.0)
+    leg = np.full(axis.size, epochs["leg"][0], dtype=np.int64)
+    elements, measures = found.path.locate(leg, axis)
+    places = _on_track(site.track, elements.tolist(), measures)
+    return _Way(epochs["t"].to_physical().to_numpy(), s_m, axis, *places)
+
+
+# How far a position may be displaced beyond the ends of the run and still follow the track.
+_BEYOND_M = 5000.0
+
+
+def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats) -> tuple[Floats, Floats, Floats]:
+    names = np.array(elements, dtype=object)
+    result = np.full((3, names.size), np.nan)
+    for element in dict.fromkeys(elements):
+        rows = np.flatnonzero(names == element)
+        points = track.filter(pl.col("netelement_id") == element)
+        at = points["measure_m"].to_numpy()
+        for axis, name in enumerate(("latitude_deg", "longitude_deg", "height_m")):
+            values = np.nan_to_num(points[name].to_numpy().astype(np.float64))
+            result[axis, rows] = _interpolated(measures[rows], at, values)
+    return result[0], result[1], result[2]
+
+
+def _fixes(run: RunLog, solution: str) -> pl.DataFrame:
+    fixes = run.gnss.filter(
+        (pl.col("solution") == solution) & pl.col("latitude_deg").is_not_null() & (pl.col("fix") != "none")
+    )
+    if fixes.is_empty():
+        raise InputError("has no positions", place=f"{run.run_id}: gnss, solution {solution}")
+    return fixes.sort("t", maintain_order=True)
+
+
+def _odometer_m(run: RunLog, t_ns: Ints) -> Floats | None:
+    """Odometer distance at instants, growing in the first direction of travel."""
+    if run.odometer is None:
+        return None
+    moves = run.odometer.filter(pl.col("distance_m").is_not_null()).sort("t", maintain_order=True)
+    if moves.is_empty():
+        return None
+    distance = moves["distance_m"].to_numpy()
+    gone = np.flatnonzero(np.abs(distance - distance[0]) > 2.0 * _BIN_M)
+    sign = np.sign(distance[gone[0]] - distance[0]) if gone.size else 1.0
+    stamps = moves["t"].to_physical().to_numpy().astype(np.float64)
+    along: Floats = np.interp(t_ns.astype(np.float64), stamps, sign * (distance - distance[0]))
+    return along
+
+
+def _way_of_positions_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+    """Length of the polyline through positions at least 10 m apart; those between are placed by share of time."""
+    kept = [0]
+    for i in range(1, latitude_deg.size):
+        pair = [values[[kept[-1], i]] for values in (latitude_deg, longitude_deg, height_m)]
+        if distances_m(*pair)[0] >= _BIN_M:
+            kept.append(i)
+    if kept[-1] != latitude_deg.size - 1 and len(kept) > 1:
+        # What is left at the end belongs to the last step, as noise of a train that stands or its last metres.
+        kept[-1] = latitude_deg.size - 1
+    lengths = distances_m(latitude_deg[kept], longitude_deg[kept], height_m[kept])
+    return np.interp(np.arange(latitude_deg.size), kept, np.concatenate(([0.0], np.cumsum(lengths))))
+
+
+def _interpolated(x: Floats, at: Floats, values: Floats) -> Floats:
+    """Linear interpolation that goes on beyond the ends with the mean slope of the outer cells."""
+    order = np.argsort(at, kind="stable")
+    at, values = at[order], values[order]
+    inside = np.interp(x, at, values)
+    some = min(_OUTER_CELLS, at.size - 1)
+    first = (values[some] - values[0]) / (at[some] - at[0])
+    last = (values[-1] - values[-1 - some]) / (at[-1] - at[-1 - some])
+    return np.where(
+        x < at[0], values[0] + first * (x - at[0]), np.where(x > at[-1], values[-1] + last * (x - at[-1]), inside)
+    )
+
+
+def _local_m(
+    origin: tuple[Floats, Floats, Floats], point: tuple[Floats, Floats, Floats]
+) -> tuple[Floats, Floats, Floats]:
+    """Vector between near places in the horizon of the first [m]."""
+    latitude = np.radians(origin[0])
+    meridian_m, normal_m = curvature_radii_m(latitude)
+    east = np.radians(point[1] - origin[1]) * (normal_m + origin[2]) * np.cos(latitude)
+    north = np.radians(point[0] - origin[0]) * (meridian_m + origin[2])
+    return east, north, point[2] - origin[2]
