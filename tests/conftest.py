@@ -1,0 +1,47 @@
+"""What tests of several areas share: a small site with small runs on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from datasets.demo import demo_scenario
+from datasets.trial import build_run, build_site, write_run_log, write_site
+from schemas.run import RunLog
+
+_LENGTH_S = 40
+
+
+@dataclass(frozen=True)
+class SmallTrial:
+    """Four short cuts of one journey, and the site they are on."""
+
+    site: Path
+    runs: Path
+
+    @property
+    def paths(self) -> list[Path]:
+        return sorted(self.runs.iterdir())
+
+
+def cut(run: RunLog, run_id: str, begin_s: int, length_s: int = _LENGTH_S) -> RunLog:
+    """The part of a run from `begin_s` after its start."""
+    start = run.gnss["t"].min() + pl.duration(seconds=begin_s)  # type: ignore[operator]
+    inside = pl.col("t").is_between(start, start + pl.duration(seconds=length_s))
+    odometer = run.odometer.filter(inside) if run.odometer is not None else None
+    return RunLog(run_id=run_id, gnss=run.gnss.filter(inside), odometer=odometer)
+
+
+@pytest.fixture(scope="session")
+def small_trial(tmp_path_factory: pytest.TempPathFactory) -> SmallTrial:
+    folder = tmp_path_factory.mktemp("small-trial")
+    scenario = demo_scenario()
+    spec = next(run for run in scenario.runs if run.id == "outage")
+    run = build_run(scenario, spec)
+    write_site(build_site(scenario), folder / "site")
+    for number in range(4):
+        write_run_log(cut(run, f"run{number}", 40 + 15 * number), folder / "runs")
+    return SmallTrial(folder / "site", folder / "runs")

@@ -1,0 +1,192 @@
+"""What stands on disk after a run is written, whole or interrupted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import dataframely as dy
+import polars as pl
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline import storage, store
+from schemas.config import Configuration
+from schemas.errors import OutputError, UsageError
+from schemas.run import RunTables
+from schemas.tables import CONTRACT_VERSION, TABLES
+
+METADATA = {"software": "balise test", "config_digest": "c", "log_digest": "l"}
+
+
+def tables_of(run_id: str, solutions: tuple[str, ...] = ("primary",)) -> RunTables:
+    """A run without content but for its `runs` rows."""
+    blank = {"status": "ok", "config_digest": "c", "input_digest": "i", "software": "s", "contract": "1"}
+    rows = [
+        {
+            name: _value(name, column, {**blank, "solution": solution})
+            for name, column in TABLES["runs"].columns().items()
+        }
+        for solution in solutions
+    ]
+    runs = pl.DataFrame(rows, schema=TABLES["runs"].create_empty().schema)
+    return RunTables(
+        run_id=run_id, runs=runs, **{name: table.create_empty() for name, table in TABLES.items() if name != "runs"}
+    )
+
+
+def _value(name: str, column: dy.Column, known: dict[str, str]) -> object:
+    if name in known:
+        return known[name]
+    return None if column.nullable else 0
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_layout_and_metadata(tmp_path: Path) -> None:
+    store.write_run(tables_of("r1"), tmp_path, METADATA)
+    assert sorted(files_in(tmp_path)) == sorted(f"{name}/run_id=r1/{name}.parquet" for name in TABLES)
+    found = pq.read_metadata(tmp_path / "runs/run_id=r1/runs.parquet")
+    metadata = {key.decode(): value.decode() for key, value in found.metadata.items() if key.startswith(b"balise.")}
+    expected = {**METADATA, "table": "runs", "contract": CONTRACT_VERSION}
+    assert metadata == {f"balise.{key}": value for key, value in expected.items()}
+    assert found.row_group(0).column(0).compression == "ZSTD"
+
+
+def test_same_content_same_bytes(tmp_path: Path) -> None:
+    store.write_run(tables_of("r1"), tmp_path / "a", METADATA)
+    store.write_run(tables_of("r1"), tmp_path / "b", dict(reversed(METADATA.items())))
+    store.write_run(tables_of("r1"), tmp_path / "b", METADATA)
+    assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
+
+
+@pytest.mark.parametrize("run_id", ["r1", "007", "2024-01-02", "a b", "ü%20", "a=b", "x;y:z"])
+def test_any_run_id_comes_back(tmp_path: Path, run_id: str) -> None:
+    store.write_run(tables_of(run_id), tmp_path, METADATA)
+    assert store.run_ids(tmp_path) == [run_id]
+    assert store.read_table(tmp_path, "runs").collect()["run_id"].to_list() == [run_id]
+    assert store.read_table(tmp_path, "runs", run_id).collect()["run_id"].to_list() == [run_id]
+
+
+def test_tables_of_several_runs(tmp_path: Path) -> None:
+    for run_id in ("b", "a"):
+        store.write_run(tables_of(run_id, ("gps", "egnos")), tmp_path, METADATA)
+    runs = store.read_table(tmp_path, "runs").collect()
+    assert runs.select("run_id", "solution").rows() == [("a", "gps"), ("a", "egnos"), ("b", "gps"), ("b", "egnos")]
+    assert dict(runs.schema) == {"run_id": pl.String(), **TABLES["runs"].create_empty().schema}
+    assert store.completed_runs(tmp_path)["a"]["log_digest"] == "l"
+
+
+def test_empty_result_has_the_schema(tmp_path: Path) -> None:
+    hazards = store.read_table(tmp_path, "hazards").collect()
+    assert hazards.height == 0
+    assert hazards.columns == ["run_id", *TABLES["hazards"].column_names()]
+
+
+def test_run_without_marker_does_not_count(tmp_path: Path) -> None:
+    for run_id in ("a", "b"):
+        store.write_run(tables_of(run_id), tmp_path, METADATA)
+    (tmp_path / "runs/run_id=b/runs.parquet").unlink()
+    leftover = tmp_path / "epochs/run_id=a/.epochs.parquet.0123.tmp"
+    leftover.write_bytes(b"cut short")
+    assert store.run_ids(tmp_path) == ["a"]
+    store.sweep(tmp_path)
+    assert not any("run_id=b" in name for name in files_in(tmp_path) if not name.startswith("runs"))
+    assert not leftover.exists()
+    assert len(files_in(tmp_path)) == len(TABLES)
+
+
+@pytest.mark.parametrize("failing", range(5))
+def test_interrupted_write_leaves_no_half_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
+    calls = 0
+    stage = storage.stage
+
+    def stage_or_stop(address: Path, content: bytes) -> tuple[storage.Address, storage.Address]:
+        nonlocal calls
+        calls += 1
+        if calls == failing + 1:
+            raise KeyboardInterrupt
+        return stage(address, content)
+
+    monkeypatch.setattr(storage, "stage", stage_or_stop)
+    with pytest.raises(KeyboardInterrupt):
+        store.write_run(tables_of("r"), tmp_path, METADATA)
+    assert files_in(tmp_path) == {}
+
+
+def test_redo_is_unmarked_until_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.write_run(tables_of("r"), tmp_path, METADATA)
+
+    def stop(staged: list[tuple[storage.Address, storage.Address]]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(storage, "commit", stop)
+    with pytest.raises(KeyboardInterrupt):
+        store.write_run(tables_of("r"), tmp_path, METADATA)
+    assert store.run_ids(tmp_path) == []
+
+
+def test_output_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file is in the way")
+    with pytest.raises(OutputError, match=r"out.*cannot be written: Not a directory.*--out"):
+        store.write_run(tables_of("r"), tmp_path / "out", METADATA)
+
+
+def test_breach_of_the_contract_is_refused(tmp_path: Path) -> None:
+    tables = tables_of("r")
+    broken = tables.runs.with_columns(availability=pl.lit(1.5))
+    with pytest.raises(dy.exc.ValidationError):
+        store.write_run(RunTables(**{**tables.__dict__, "runs": broken}), tmp_path, METADATA)
+    assert files_in(tmp_path) == {}
+
+
+def test_nan_is_refused(tmp_path: Path) -> None:
+    tables = tables_of("r")
+    broken = tables.runs.with_columns(distance_m=pl.lit(float("nan")))
+    with pytest.raises(dy.exc.ValidationError):
+        store.write_run(RunTables(**{**tables.__dict__, "runs": broken}), tmp_path, METADATA)
+
+
+def test_unknown_names(tmp_path: Path) -> None:
+    store.write_run(tables_of("r"), tmp_path, METADATA)
+    with pytest.raises(UsageError, match="no table"):
+        store.read_table(tmp_path, "epoch")
+    with pytest.raises(UsageError, match="no such run"):
+        store.read_table(tmp_path, "epochs", "other")
+
+
+def test_config_is_written_resolved(tmp_path: Path) -> None:
+    store.write_config(tmp_path, Configuration())
+    assert "ci_limit_m = 14.0" in (tmp_path / "config.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "clean"),
+    [
+        ("s3://key:secret@bucket/run", "s3://bucket/run"),
+        ("https://store/run?X-Amz-Signature=abc refused", "https://store/run refused"),
+        ("key AKIAIOSFODNN7EXAMPLE refused", "key  refused"),
+        ("/data/run.mcap: damaged", "/data/run.mcap: damaged"),
+    ],
+)
+def test_secrets_are_taken_out(text: str, clean: str) -> None:
+    assert storage.redacted(text) == clean
+
+
+def test_remote_store_holds_the_same_bytes(tmp_path: Path) -> None:
+    out = "memory://store-test/out"
+    for run_id in ("a", "b c"):
+        store.write_run(tables_of(run_id), out, METADATA)
+        store.write_run(tables_of(run_id), tmp_path, METADATA)
+    assert store.run_ids(out) == ["a", "b c"]
+    assert store.completed_runs(out) == store.completed_runs(tmp_path)
+    local = store.read_table(tmp_path, "runs").collect()
+    assert store.read_table(out, "runs").collect().equals(local)
+    for name in TABLES:
+        place = str(store.table_address(out, name, "b c"))
+        assert storage.read_many([place])[place] == Path(store.table_address(tmp_path, name, "b c")).read_bytes()
+    storage.remove(store.table_address(out, "runs", "a"))
+    store.sweep(out)
+    assert store.run_ids(out) == ["b c"]
+    assert storage.read_many([str(store.table_address(out, "epochs", "a"))]) == {}

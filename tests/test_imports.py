@@ -1,0 +1,78 @@
+"""The house rules of architecture: imports run one way, and no module is a drawer for everything."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LAYERS = ("schemas", "pipeline", "datasets", "cli")
+DRAWERS = {"utils", "util", "tools", "common", "helpers", "helper", "misc"}
+
+
+def _sources() -> list[Path]:
+    packages = [path for layer in LAYERS[:3] for path in sorted((ROOT / layer).rglob("*.py"))]
+    return [*packages, ROOT / "cli.py"]
+
+
+def _imported(source: Path, top_level_only: bool = False) -> set[str]:
+    tree = ast.parse(source.read_text(encoding="utf-8"))
+    nodes = tree.body if top_level_only else ast.walk(tree)
+    names: set[str] = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{source}: relative import"
+            inner = {f"{node.module}.{alias.name}" for alias in node.names}
+            modules = {name for name in inner if _is_module(name)}
+            names |= modules if modules == inner else {node.module, *modules}
+    return names
+
+
+def _is_module(name: str) -> bool:
+    path = ROOT / name.replace(".", "/")
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def _layer(name: str) -> int:
+    return LAYERS.index(name.partition(".")[0])
+
+
+@pytest.mark.parametrize("source", _sources(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_imports_run_one_way(source: Path) -> None:
+    own = _layer(source.relative_to(ROOT).as_posix().removesuffix(".py").replace("/", "."))
+    upward = {name for name in _imported(source) if name.partition(".")[0] in LAYERS and _layer(name) > own}
+    assert upward == set()
+
+
+def test_no_drawers() -> None:
+    assert [path for path in _sources() if path.stem in DRAWERS or path.parent.name in DRAWERS] == []
+
+
+def test_no_import_cycles() -> None:
+    modules = {_module(path): path for path in _sources()}
+    graph = {
+        name: {found for found in _imported(path, top_level_only=True) if found in modules and found != name}
+        for name, path in modules.items()
+    }
+    assert _cyclic(graph) == {}
+
+
+def _cyclic(graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """What remains after taking away, again and again, the modules that need no other or that none needs."""
+    needed = set().union(*graph.values()) if graph else set()
+    inner = {name: needs & graph.keys() for name, needs in graph.items() if needs & graph.keys() and name in needed}
+    return inner if len(inner) == len(graph) else _cyclic(inner)
+
+
+def test_cycles_are_seen() -> None:
+    chain = {"top": {"a"}, "a": {"b"}, "b": {"c"}, "c": set[str]()}
+    assert _cyclic(chain) == {}
+    assert _cyclic({**chain, "c": {"a"}}) == {"a": {"b"}, "b": {"c"}, "c": {"a"}}
+
+
+def _module(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix().removesuffix(".py").replace("/", ".").removesuffix(".__init__")
