@@ -1,0 +1,23 @@
+"""Published experiments at their own size, and what was added to them; `balise experiment NAME --out DIR`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from datasets.experiment.diagnostics import write_experiment
+from datasets.experiment.findings import write_findings
+from datasets.experiment.ranges import write_ranges
+
+
+class Experiment(Protocol):
+    """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given."""
+
+    def __call__(self, out: Path, repetitions: int | None = None, seed: int = 1, jobs: int = 1) -> list[Path]: ...
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "diagnostics": write_experiment,
+    "findings": write_findings,
+    "pseudorange": write_ranges,
+}
