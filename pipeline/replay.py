@@ -14,7 +14,8 @@ from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, TravelledPath, match
 from pipeline.monitors.bank import MonitorBank
-from pipeline.monitors.single import NO_RANGES, blind_monitor, channel_monitor, doppler_monitor
+from pipeline.monitors.pseudorange import pseudorange_monitor
+from pipeline.monitors.single import channel_monitor, doppler_monitor
 from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.conform import conform
@@ -150,11 +151,13 @@ def _single_monitors(
     context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
+    satellites = context.run.satellites
+    ranges = None if satellites is None else satellites.filter(pl.col("solution") == solution)
     compared = matches[other].epochs if other in matches and other != solution else None
     return {
         "along_doppler": doppler_monitor(aligned, context.config, context.factor),
         "channel": channel_monitor(aligned, compared, context.factor),
-        "pseudorange": blind_monitor(aligned.height, NO_RANGES),
+        "pseudorange": pseudorange_monitor(aligned, ranges, context.config),
     }
 
 
