@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import polars as pl
 
 from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
-from pipeline.matching.leg import Visit, leg_of, nearest_on_leg, path_at
+from pipeline.matching.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
 from pipeline.track import Track
@@ -19,9 +17,9 @@ from schemas.enums import Navigability
 
 
 def path_on_chain(
-    fixes: Fixes, odometer: pl.DataFrame | None, track: Track, visits: Sequence[Visit], config: MatchingConfig
+    fixes: Fixes, odometer: pl.DataFrame | None, track: Track, leg: Leg, config: MatchingConfig
 ) -> tuple[TravelledPath, Assignment]:
-    leg = leg_of(track, visits)
+    """The part of a chain that the run covers, oriented as the run began; nothing is in doubt on it."""
     feet = nearest_on_leg(fixes.points.take(np.flatnonzero(fixes.valid)), leg)
     near = feet.distance_m <= config.reach_m
     if not near.any():
@@ -29,7 +27,7 @@ def path_on_chain(
     position = np.full(len(fixes), np.nan)
     position[fixes.valid] = np.where(near, path_at(leg, feet), np.nan)
     used = np.unique(leg.visit[feet.segment[near]])
-    part = list(visits[int(used[0]) : int(used[-1]) + 1])
+    part = list(leg.visits[int(used[0]) : int(used[-1]) + 1])
     if not grows_with(position, fixes.t_ns, odometer, config.orientation_distance_m):
         part = [Visit(visit.element, not visit.forward) for visit in reversed(part)]
     ones = np.ones(len(fixes))

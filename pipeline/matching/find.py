@@ -74,6 +74,11 @@ def find_path(
     return path, assignment, _ambiguous(fixes, trellis, found, doubt, config)
 
 
+def no_doubt() -> pl.DataFrame:
+    """No stretch of doubt."""
+    return pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
+
+
 def _trellis(
     fixes: Fixes, odometer: pl.DataFrame | None, network: Network, pinned: Ints, config: MatchingConfig
 ) -> Trellis:

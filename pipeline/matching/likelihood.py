@@ -64,7 +64,8 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     return Likelihood(
         variance_m2=variance,
         fresh_m2=fresh,
-        keep=np.sqrt(1.0 - fresh / variance),
+        # A survey's error may as well stay what it is: only the position's own error is sure to return.
+        keep=np.sqrt(1.0 - gnss_m2 * renewed / variance),
         fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2) + heading * fresh / variance,
         heading=heading,
         outlier=config.outlier_probability,

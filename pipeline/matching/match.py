@@ -9,12 +9,14 @@ import polars as pl
 
 from pipeline.geodesy import Ints
 from pipeline.matching.chain import path_on_chain, whole_chain
-from pipeline.matching.epochs import epoch_frame
-from pipeline.matching.find import AMBIGUOUS_COLUMNS, find_path
+from pipeline.matching.epochs import Assignment, epoch_frame
+from pipeline.matching.find import find_path, no_doubt
 from pipeline.matching.fixes import Fixes, fixes_of
+from pipeline.matching.leg import leg_of
 from pipeline.matching.network import network_of
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.residuals import biases
+from pipeline.matching.route import network_along, visits_of
 from pipeline.track import Track, track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
@@ -48,17 +50,28 @@ def match(
     arrays = fixes_of(fixes, fix_sigma)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    track = track_of(site.track)
-    chain = whole_chain(track, site.links)
-    if chain is not None:
-        path, found = path_on_chain(arrays, odometer, track, chain, config)
-        ambiguous = pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
-    else:
-        pinned = pins_of(arrays, site, track, balise_reads)
-        network = network_of(track, site.links)
-        path, found, ambiguous = find_path(arrays, odometer, network, pinned, config)
+    path, found, ambiguous = _path(arrays, odometer, site, config, balise_reads)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     return Match(epochs, path, biases(epochs), ambiguous)
+
+
+def _path(
+    fixes: Fixes,
+    odometer: pl.DataFrame | None,
+    site: Site,
+    config: MatchingConfig,
+    balise_reads: pl.DataFrame | None,
+) -> tuple[TravelledPath, Assignment, pl.DataFrame]:
+    """A route or a site that leaves no choice needs no search, unless it comes back to where it was."""
+    track = track_of(site.track)
+    visits = whole_chain(track, site.links) if site.route is None else visits_of(track, site.route)
+    if visits is not None:
+        leg = leg_of(track, visits)
+        if not leg.returns:
+            return *path_on_chain(fixes, odometer, track, leg, config), no_doubt()
+    network = network_of(track, site.links) if visits is None else network_along(track, visits)
+    pinned = pins_of(fixes, site, network.track, balise_reads)
+    return find_path(fixes, odometer, network, pinned, config)
 
 
 def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame | None) -> Ints:
