@@ -1,0 +1,68 @@
+"""Results as bytes, for tests that hold two campaigns against each other."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeline.campaign import Plan, RunOutcome, Summary, make_plan
+from schemas.tables import TABLES
+from tests.conftest import SmallTrial
+
+ROOT = Path(__file__).parents[2]
+
+
+def result_bytes(out: Path) -> dict[str, bytes]:
+    """Every table of a result by its place; neither log nor configuration."""
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for table in TABLES
+        for path in sorted((out / table).rglob("*"))
+        if path.is_file()
+    }
+
+
+def plan_of(trial: SmallTrial, out: Path | str, runs: Sequence[Path] | None = None) -> Plan:
+    named = [str(path) for path in runs] if runs is not None else [str(trial.runs)]
+    return make_plan(named, trial.site, out)
+
+
+def command(trial: SmallTrial, out: Path | str, *arguments: str, runs: Sequence[Path] | None = None) -> list[str]:
+    named = [str(path) for path in runs] if runs is not None else [str(trial.runs)]
+    return [
+        *(sys.executable, "-m", "cli", "replay", *named),
+        *("--site", str(trial.site), "--out", str(out), *arguments),
+    ]
+
+
+def start(arguments: Sequence[str]) -> subprocess.Popen[str]:
+    """A campaign in a process group of its own, as a terminal starts it."""
+    return subprocess.Popen(
+        arguments,
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+
+
+def run(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(arguments, cwd=ROOT, text=True, capture_output=True, timeout=120, check=False)
+
+
+def wait_for(condition: Callable[[], bool], limit_s: float = 60.0) -> None:
+    """Wait until something is so; a test that waits in vain fails."""
+    until = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.02)
+
+
+def by_run(summary: Summary) -> dict[str, RunOutcome]:
+    return {outcome.run_id: outcome for outcome in summary.outcomes}

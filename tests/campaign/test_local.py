@@ -1,0 +1,233 @@
+"""Campaigns on this machine: the same tables however they are done, and nothing done twice."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from pipeline import store
+from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
+from pipeline.ingest import read_run
+from schemas.config import Configuration, IngestConfig, LdsConfig
+from schemas.enums import RunStatus
+from schemas.errors import OutputError, UsageError
+from schemas.run import RunLog
+from tests.campaign.compare import by_run, plan_of, result_bytes
+from tests.conftest import SmallTrial
+
+
+class Spy:
+    """A watch that acts on the workers."""
+
+    def __init__(self, act: Callable[[str, float], None]) -> None:
+        self.act = act
+        self.seen: list[RunOutcome] = []
+
+    def begin(self, plan: Plan) -> None:
+        self.seen.clear()
+
+    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
+        for run_id, age_s in under_way:
+            self.act(run_id, age_s)
+
+    def finished(self, outcome: RunOutcome) -> None:
+        self.seen.append(outcome)
+
+    def end(self, summary: Summary) -> None:
+        assert len(self.seen) == len(summary.outcomes)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(small_trial: SmallTrial, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Each run replayed by itself, in this process."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    for path in small_trial.paths:
+        run_campaign(plan_of(small_trial, out, [path]))
+    return out
+
+
+def one_run(trial: SmallTrial, folder: Path) -> Path:
+    """A copy of one run that a test may change."""
+    return Path(shutil.copytree(trial.paths[0], folder / trial.paths[0].name))
+
+
+def test_any_number_of_jobs_gives_the_same_bytes(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
+    summary = run_campaign(plan_of(small_trial, tmp_path / "two", small_trial.paths[::-1]), jobs=2)
+    assert [outcome.status for outcome in summary.outcomes] == [RunStatus.OK] * 4
+    assert result_bytes(tmp_path / "two") == result_bytes(undisturbed)
+    assert len(result_bytes(undisturbed)) == 4 * 5
+
+
+def test_failed_runs_do_not_stop_the_others(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
+    damaged = [tmp_path / f"damaged{number}.mcap" for number in range(3)]
+    for path in damaged:
+        path.write_bytes(b"\x89MCAP0\r\n cut")
+    out = tmp_path / "out"
+    summary = run_campaign(plan_of(small_trial, out, [*damaged, *small_trial.paths]), jobs=2)
+    assert summary.count(RunStatus.OK) == 4
+    outcomes = by_run(summary)
+    for path in damaged:
+        assert outcomes[path.stem].status is RunStatus.FAILED
+        assert str(path) in (outcomes[path.stem].error or "")
+    row = store.read_table(out, "runs", "damaged0").collect().row(0, named=True)
+    assert row["status"] == "failed"
+    assert row["error"].startswith("damaged0.mcap: ")
+    kept = {name: data for name, data in result_bytes(out).items() if "damaged" not in name}
+    assert kept == result_bytes(undisturbed)
+
+
+def test_complete_runs_are_skipped(small_trial: SmallTrial, tmp_path: Path) -> None:
+    run, out = one_run(small_trial, tmp_path), tmp_path / "out"
+    first = run_campaign(plan_of(small_trial, out, [run]))
+    again = run_campaign(plan_of(small_trial, out, [run]))
+    forced = run_campaign(plan_of(small_trial, out, [run]), force=True)
+    assert [summary.skipped for summary in (first, again, forced)] == [0, 1, 0]
+    assert [summary.count(RunStatus.OK) for summary in (first, again, forced)] == [1, 1, 1]
+
+
+def test_skipped_failures_are_still_failures(small_trial: SmallTrial, tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"not a log")
+    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "bad.mcap"])
+    run_campaign(plan)
+    again = by_run(run_campaign(plan))["bad"]
+    assert (again.status, again.skipped) == (RunStatus.FAILED, True)
+    assert again.error
+
+
+def test_what_changed_is_replayed_again(small_trial: SmallTrial, tmp_path: Path) -> None:
+    run, site, out = one_run(small_trial, tmp_path), tmp_path / "site", tmp_path / "out"
+    shutil.copytree(small_trial.site, site)
+    trial = SmallTrial(site, tmp_path)
+
+    def skipped(config: Configuration | None = None) -> int:
+        plan = plan_of(trial, out, [run])
+        return run_campaign(Plan(tuple(_with(plan, config)), plan.out, plan.config, plan.vehicle)).skipped
+
+    assert skipped() == 0
+    stat = (run / "odometer.parquet").stat()
+    shutil.copy(small_trial.paths[1] / "odometer.parquet", run / "odometer.parquet")
+    os.utime(run / "odometer.parquet", ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert [skipped(), skipped()] == [0, 1]
+    other = Configuration(lds=LdsConfig(ci_limit_m=13.0))
+    assert [skipped(other), skipped(other)] == [0, 1]
+    assert (out / "runs/run_id=run0/runs.parquet").exists()
+    (site / "balises.parquet").unlink()
+    assert [skipped(), skipped()] == [0, 1]
+
+
+def _with(plan: Plan, config: Configuration | None) -> list[worker.RunJob]:
+    from dataclasses import replace
+
+    return [replace(job, config=config or job.config) for job in plan.jobs]
+
+
+def test_clock_and_file_times_decide_nothing(
+    small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, out = one_run(small_trial, tmp_path), tmp_path / "out"
+    ticks = iter(range(2_000_000_000, 0, -1))
+    monkeypatch.setattr("time.time", lambda: float(next(ticks)))
+    assert run_campaign(plan_of(small_trial, out, [run])).count(RunStatus.OK) == 1
+    os.utime(run / "gnss.parquet", (0, 0))
+    assert run_campaign(plan_of(small_trial, out, [run])).skipped == 1
+
+
+def test_log_that_changes_while_it_is_read(
+    small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, out = one_run(small_trial, tmp_path), tmp_path / "out"
+
+    def read_and_append(path: Path, config: IngestConfig) -> RunLog:
+        log = read_run(path, config)
+        with (run / "gnss.parquet").open("ab") as file:
+            file.write(b"more")
+        return log
+
+    with monkeypatch.context() as patched:
+        patched.setattr(worker, "read_run", read_and_append)
+        changed = by_run(run_campaign(plan_of(small_trial, out, [run])))["run0"]
+    assert changed.status is RunStatus.FAILED
+    assert "changed while it was read" in (changed.error or "")
+    shutil.copy(small_trial.paths[0] / "gnss.parquet", run / "gnss.parquet")
+    again = by_run(run_campaign(plan_of(small_trial, out, [run])))["run0"]
+    assert (again.status, again.skipped) == (RunStatus.OK, False)
+
+
+def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    with monkeypatch.context() as patched:
+        patched.setattr(worker, "replay", broken)
+        outcome = by_run(run_campaign(plan))["run0"]
+    assert outcome.defect
+    assert "ZeroDivisionError" in (outcome.trace or "")
+    assert by_run(run_campaign(plan))["run0"].status is RunStatus.OK
+
+
+def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
+    killed: list[int] = []
+
+    def kill_first(run_id: str, _: float) -> None:
+        if not killed:
+            killed.extend(child.pid or 0 for child in multiprocessing.active_children()[:1])
+            for pid in killed:
+                os.kill(pid, signal.SIGKILL)
+
+    summary = run_campaign(plan_of(small_trial, tmp_path), jobs=2, watches=[Spy(kill_first)])
+    assert killed
+    assert summary.count(RunStatus.OK) == 4
+    assert result_bytes(tmp_path) == result_bytes(undisturbed)
+
+
+def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "deadly.mcap")
+    deaths: set[int] = set()
+
+    def kill_it(run_id: str, _: float) -> None:
+        if run_id == "deadly":
+            for child in multiprocessing.active_children():
+                deaths.add(child.pid or 0)
+                child.kill()
+
+    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "deadly.mcap", *small_trial.paths[:1]])
+    summary = by_run(run_campaign(plan, jobs=1, watches=[Spy(kill_it)]))
+    assert summary["deadly"].status is RunStatus.FAILED
+    assert "worker died" in (summary["deadly"].error or "")
+    assert summary["run0"].status is RunStatus.OK
+    assert len(deaths) >= 2
+    assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
+
+
+def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "hanging.mcap")
+    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths])
+    summary = by_run(run_campaign(plan, jobs=2, time_limit_s=8.0))
+    assert summary["hanging"].status is RunStatus.FAILED
+    assert "time limit of 8 s" in (summary["hanging"].error or "")
+    assert [summary[f"run{number}"].status for number in range(4)] == [RunStatus.OK] * 4
+
+
+def test_output_held_by_another_campaign(small_trial: SmallTrial, tmp_path: Path) -> None:
+    from pipeline.campaign.lock import locked
+
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    with locked(tmp_path), pytest.raises(OutputError, match="another campaign is writing here"):
+        run_campaign(plan)
+    assert run_campaign(plan).count(RunStatus.OK) == 1
+
+
+def test_changed_software_is_refused(small_trial: SmallTrial, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    other = replace(plan, jobs=tuple(replace(job, software_digest="other") for job in plan.jobs))
+    with pytest.raises(UsageError, match="another version of the program"):
+        run_campaign(other)

@@ -1,0 +1,67 @@
+"""Which runs a command means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from pipeline.campaign import find_runs
+from schemas.errors import UsageError
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    for name in ("b.mcap", "a.mcap", "notes.txt", ".hidden.mcap"):
+        (tmp_path / name).touch()
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "gnss.parquet").touch()
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "odometer.parquet").touch()
+    (tmp_path / "empty").mkdir()
+    return tmp_path
+
+
+def test_a_folder_of_runs(logs: Path) -> None:
+    assert list(find_runs([str(logs)])) == ["a", "b", "c", "d"]
+
+
+def test_one_run_of_either_kind(logs: Path) -> None:
+    assert find_runs([str(logs / "a.mcap"), str(logs / "c")]) == {"a": str(logs / "a.mcap"), "c": str(logs / "c")}
+
+
+def test_globs_and_repetition(logs: Path) -> None:
+    assert list(find_runs([str(logs / "*.mcap"), str(logs / "a.mcap")])) == ["a", "b"]
+
+
+def test_relative_paths_become_absolute(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(logs)
+    assert find_runs(["a.mcap"]) == {"a": str(logs / "a.mcap")}
+
+
+@pytest.mark.parametrize("name", ["none.mcap", "*.bag", "nowhere/"])
+def test_nothing_found(logs: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="no such run"):
+        find_runs([str(logs / name)])
+
+
+def test_folder_without_runs(logs: Path) -> None:
+    with pytest.raises(UsageError, match="holds no run"):
+        find_runs([str(logs / "empty")])
+
+
+def test_two_logs_of_one_name_are_refused(logs: Path) -> None:
+    (logs / "c" / "a.mcap").touch()
+    with pytest.raises(UsageError, match="same run id 'a'"):
+        find_runs([str(logs / "a.mcap"), str(logs / "c" / "a.mcap")])
+
+
+def test_addresses() -> None:
+    store = fsspec.filesystem("memory")
+    for name in ("/find/x/gnss.parquet", "/find/y.mcap", "/find/z.txt"):
+        store.pipe_file(name, b"")
+    assert find_runs(["memory://find"]) == {"x": "memory://find/x", "y": "memory://find/y.mcap"}
+    assert list(find_runs(["memory://find/*.mcap"])) == ["y"]
+    with pytest.raises(UsageError, match="no such run"):
+        find_runs(["memory://find/*.bag"])
