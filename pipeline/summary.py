@@ -247,7 +247,7 @@ def _balises(passages: pl.DataFrame, failure_limit_m: float) -> Row:
     virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
     accepted = virtual.filter(pl.col("status") == PassageStatus.ACCEPTED)
     return {
-        "balises_on_path": passed(virtual).height,
+        "balises_on_path": virtual.filter(is_passage()).height,
         "balises_accepted": accepted.height,
         "balises_rejected": virtual.filter(pl.col("status").is_in(_REJECTED)).height,
         "balises_missed": virtual.filter(pl.col("status") == PassageStatus.MISSED).height,
@@ -257,13 +257,14 @@ def _balises(passages: pl.DataFrame, failure_limit_m: float) -> Row:
     }
 
 
-def passed(passages: pl.DataFrame) -> pl.DataFrame:
-    """The passages without the offers beyond them: those where the evidence knows no true crossing.
+def is_passage() -> pl.Expr:
+    """A row of `passages` that is no offer beyond the passages of the train.
 
-    An offer without evidence (no location error) counts as a passage.
+    An offer beyond is one for which the evidence knows no true crossing; an offer without evidence
+    (no location error) counts as a passage.
     """
     beyond = pl.col("t_true").is_null() & pl.col("t_offered").is_not_null() & pl.col("location_error_m").is_not_null()
-    return passages.filter(~beyond)
+    return ~beyond
 
 
 def missed_detection() -> pl.Expr:

@@ -1,0 +1,202 @@
+"""What a campaign's runs say together: per run, per balise, and how accurate balises were found.
+
+All functions take tables of many runs with their `run_id`, and give the same result in any order of rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import polars as pl
+
+from pipeline.safety.episodes import independent_episodes
+from pipeline.statistics import Estimate, clopper_pearson, poisson_rate
+from pipeline.summary import is_passage
+from schemas.campaign import CampaignAccuracy, CampaignBalises, ThrVerdict, campaign_runs_schema
+from schemas.config import Configuration, SafetyConfig
+from schemas.conform import conform
+from schemas.enums import BaliseKind, FailureMode, LinkingError, PassageStatus, RunStatus
+
+SPEED_BAND_KMH = 40.0
+DEFAULT_LOCATION_ACCURACY_M = 12.0
+"""Q_LOCACC where the balise table names none (CONTRACT section 2)."""
+
+_RUN = ["run_id", "solution"]
+
+
+def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
+    """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
+    joined = runs.join(_faults_per_run(hazards, safety), on=_RUN, how="left", maintain_order="left").with_columns(
+        pl.col("faults", "failures", "missed", *(f"within_{level}" for level in safety.service_levels)).fill_null(0),
+        hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
+    )
+    seen = pl.when(pl.col("evidence").is_not_null()).then(pl.col("hours")).otherwise(0.0)
+    table = joined.with_columns(hours_seen=seen).pipe(
+        _with_estimates,
+        ("hazard_rate", "_per_h", poisson_rate, "faults", "hours_seen"),
+        ("missed_share", "", clopper_pearson, "missed", "failures"),
+        ("unsafe_share", "", clopper_pearson, "unsafe_accepted", "balises_accepted"),
+        ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
+    )
+    for level in safety.service_levels:
+        table = table.with_columns(_verdict(level, safety.allowed_time_to_detect_s(level)))
+    return conform(table.sort(_RUN), campaign_runs_schema(safety.service_levels))
+
+
+def _faults_per_run(hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
+    failed = pl.col("failed")
+    within = {
+        f"within_{level}": (failed & (pl.col("hazardous_s") <= safety.allowed_time_to_detect_s(level))).sum()
+        for level in safety.service_levels
+    }
+    counts = {"faults": pl.len(), "failures": failed.sum(), "missed": pl.col("missed").sum(), **within}
+    return independent_episodes(hazards).group_by(_RUN).agg(**{k: v.cast(pl.Int64) for k, v in counts.items()})
+
+
+def _verdict(level: str, allowed_s: float) -> list[pl.Expr]:
+    blind = pl.col("evidence").is_null() | (pl.col("status") == RunStatus.FAILED)
+    kept = pl.col(f"within_{level}") == pl.col("failures")
+    verdict = (
+        pl.when(pl.col("failures") > 0)
+        .then(pl.when(kept).then(pl.lit(ThrVerdict.KEPT.value)).otherwise(pl.lit(ThrVerdict.EXCEEDED.value)))
+        .when(blind)
+        .then(pl.lit(ThrVerdict.UNKNOWN.value))
+        .otherwise(pl.lit(ThrVerdict.NO_FAILURE.value))
+    )
+    return [pl.lit(allowed_s).alias(f"allowed_{level}_s"), verdict.alias(f"verdict_{level}")]
+
+
+Estimator = tuple[str, str, Callable[[int, float], Estimate] | Callable[[int, int], Estimate], str, str]
+
+
+def _with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
+    """Columns `name, name_low, name_high` from events and what they are held against, row by row."""
+    series = []
+    for name, ending, estimate, events, against in estimates:
+        pairs = frame.select(events, against).iter_rows()
+        found = [estimate(*pair) for pair in pairs]
+        for part, values in (
+            ("", [item.value for item in found]),
+            ("_low", [item.low for item in found]),
+            ("_high", [item.high for item in found]),
+        ):
+            series.append(pl.Series(f"{name}{part}{ending}", values, dtype=pl.Float64))
+    return frame.with_columns(series)
+
+
+def _spread(name: str = "location_error") -> dict[str, pl.Expr]:
+    """Mean, sigma, 95 % and largest of the location errors [m] of acceptances."""
+    error = pl.col("location_error_m").filter(pl.col("status") == PassageStatus.ACCEPTED)
+    return {
+        f"{name}_mean_m": error.mean(),
+        f"{name}_sigma_m": error.std(),
+        f"{name}_p95_m": error.abs().quantile(0.95, interpolation="linear"),
+        f"{name}_max_m": error.abs().max(),
+    }
+
+
+def _counts(failure_limit_m: float) -> dict[str, pl.Expr]:
+    status, mode, error = pl.col("status"), pl.col("failure_mode"), pl.col("location_error_m")
+    accepted, passage = status == PassageStatus.ACCEPTED, is_passage()
+    counts = {
+        "passages": passage,
+        "accepted": accepted,
+        "accepted_passages": accepted & passage,
+        "rejected": status.cast(pl.String).str.starts_with("rejected_"),
+        "missed": status == PassageStatus.MISSED,
+        "not_available": status == PassageStatus.NOT_AVAILABLE,
+        "deletions": (mode == FailureMode.DELETION) & passage,
+        "insertions": mode == FailureMode.INSERTION,
+        "linking_errors": pl.col("linking_error") != LinkingError.NONE,
+        "accepted_judged": accepted & error.is_not_null(),
+        "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
+        "suspect_after_the_fact": pl.col("suspect_after_the_fact"),
+    }
+    return {name: condition.sum().cast(pl.Int64) for name, condition in counts.items()}
+
+
+def campaign_balises(passages: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """Per balise and solution: how often accepted, lost or accepted unsafely, with exact bounds.
+
+    Deletions and acceptances are shares of the trains that passed; unsafe acceptances are shares of
+    the acceptances whose location error is known.
+    """
+    table = (
+        _in_order(passages)
+        .group_by("solution", "balise_id", "kind", maintain_order=True)
+        .agg(
+            pl.col("netelement_id", "measure_m").first(),
+            runs=pl.col("run_id").n_unique().cast(pl.Int64),
+            **_counts(config.hazards.failure_limit_m),
+            **_spread(),
+        )
+        .pipe(
+            _with_estimates,
+            ("accepted_share", "", clopper_pearson, "accepted_passages", "passages"),
+            ("deletion_rate", "", clopper_pearson, "deletions", "passages"),
+            ("unsafe_rate", "", clopper_pearson, "unsafe_accepted", "accepted_judged"),
+        )
+    )
+    return conform(table.sort("solution", "kind", "balise_id"), CampaignBalises)
+
+
+def _in_order(passages: pl.DataFrame) -> pl.DataFrame:
+    """Rows by run, in each run as they stand: sums of floats then do not depend on the order of runs."""
+    return passages.sort("run_id", maintain_order=True)
+
+
+def with_speed(passages: pl.DataFrame, epochs: pl.DataFrame) -> pl.DataFrame:
+    """Passages of one run and solution with `speed_mps` of the epoch at or before the offer, null without one."""
+    speeds = epochs.select("t", pl.col("speed_mps").abs()).drop_nulls().sort("t")
+    offered = passages.with_row_index("row").sort("t_offered", nulls_last=True)
+    joined = offered.join_asof(speeds, left_on="t_offered", right_on="t", strategy="backward")
+    return joined.sort("row").drop("row", "t", strict=False)
+
+
+def campaign_accuracy(
+    passages: pl.DataFrame, config: Configuration, location_accuracy_m: float = DEFAULT_LOCATION_ACCURACY_M
+) -> pl.DataFrame:
+    """Location error of accepted VBs over all, by net element and by speed, against Q_LOCACC and the CI limit.
+
+    `passages` with `speed_mps` as from `with_speed`; bands of 40 km/h from 0.
+    """
+    accepted = _in_order(passages).filter(
+        (pl.col("kind") == BaliseKind.VIRTUAL)
+        & (pl.col("status") == PassageStatus.ACCEPTED)
+        & pl.col("location_error_m").is_not_null()
+    )
+    groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
+    parts = [
+        _accuracy(accepted.with_columns(grouped_by=pl.lit(name), group=group), config, location_accuracy_m)
+        for name, group in groups.items()
+    ]
+    return conform(pl.concat(parts), CampaignAccuracy)
+
+
+def _speed_band() -> pl.Expr:
+    low = (pl.col("speed_mps") * 3.6 / SPEED_BAND_KMH).floor().cast(pl.Int64) * int(SPEED_BAND_KMH)
+    band = pl.format(
+        "{}-{}", low.cast(pl.String).str.zfill(3), (low + int(SPEED_BAND_KMH)).cast(pl.String).str.zfill(3)
+    )
+    return band.fill_null("unknown")
+
+
+def _accuracy(accepted: pl.DataFrame, config: Configuration, location_accuracy_m: float) -> pl.DataFrame:
+    keys = ["solution", "grouped_by", "group"]
+    size, limit_m = pl.col("location_error_m").abs(), config.lds.ci_limit_m
+    counted = (
+        accepted.group_by(keys, maintain_order=True)
+        .agg(
+            accepted_judged=pl.len().cast(pl.Int64),
+            **_spread(),
+            within_location_accuracy=(size <= location_accuracy_m).sum().cast(pl.Int64),
+            within_ci_limit=(size <= limit_m).sum().cast(pl.Int64),
+        )
+        .with_columns(location_accuracy_m=pl.lit(location_accuracy_m), ci_limit_m=pl.lit(limit_m))
+    )
+    table = _with_estimates(
+        counted,
+        ("within_location_accuracy_share", "", clopper_pearson, "within_location_accuracy", "accepted_judged"),
+        ("within_ci_limit_share", "", clopper_pearson, "within_ci_limit", "accepted_judged"),
+    )
+    return table.select(list(CampaignAccuracy.columns())).sort(keys)

@@ -1,0 +1,123 @@
+"""Contracts of the tables that a campaign derives from those of its runs (CONTRACT section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import StrEnum
+
+import dataframely as dy
+
+from schemas.columns import count, one_of, real, text
+from schemas.config import SafetyConfig
+from schemas.enums import BaliseKind
+from schemas.tables import Runs
+
+
+class ThrVerdict(StrEnum):
+    """Whether the position failures of a run were negated within the allowed T_D (TVB eq. 7)."""
+
+    KEPT = "kept"
+    EXCEEDED = "exceeded"
+    NO_FAILURE = "no_failure"
+    UNKNOWN = "unknown"
+
+
+def _estimate(name: str, meaning: str, unit: str = "1", ending: str = "") -> dict[str, dy.Column]:
+    """A figure with its exact two-sided 95 % bounds."""
+    return {
+        f"{name}{ending}": real(unit, meaning, min=0),
+        f"{name}_low{ending}": real(unit, f"{meaning}: lower 95 % bound", min=0),
+        f"{name}_high{ending}": real(unit, f"{meaning}: upper 95 % bound", min=0),
+    }
+
+
+def _spread(name: str, meaning: str) -> dict[str, dy.Column]:
+    return {
+        f"{name}_mean_m": real("m", f"mean {meaning}"),
+        f"{name}_sigma_m": real("m", f"standard deviation of the {meaning}", min=0),
+        f"{name}_p95_m": real("m", f"95 % of |{meaning}|", min=0),
+        f"{name}_max_m": real("m", f"largest |{meaning}|", min=0),
+    }
+
+
+def _level_columns(level: str) -> dict[str, dy.Column]:
+    return {
+        f"allowed_{level}_s": real("s", f"allowed T_D of the service level {level} (TVB eq. 7)", min=0),
+        f"within_{level}": count(f"failures negated within the allowed T_D of {level}"),
+        f"verdict_{level}": one_of(ThrVerdict, f"kept, exceeded, nothing to judge, or no truth, for {level}"),
+    }
+
+
+def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
+    """Contract of `campaign/runs.parquet`; the service levels are those of the configuration."""
+    columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
+    columns |= _estimate("hazard_rate", "faults per hour", "1/h", "_per_h")
+    columns |= {"failures": count("faults with a position failure")}
+    columns |= _estimate("missed_share", "share of failures not negated within the budget")
+    columns |= _estimate("unsafe_share", "share of accepted VBs beyond the failure limit")
+    columns |= _estimate("outage_rate", "outages per hour", "1/h", "_per_h")
+    for level in levels:
+        columns |= _level_columns(level)
+    doc = "One row per run and solution: its `runs` row, rates with exact bounds, and the verdict per service level."
+    return type("CampaignRuns", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
+
+
+CampaignRuns = campaign_runs_schema(SafetyConfig().service_levels)
+
+
+def _campaign_balises_schema() -> type[dy.Schema]:
+    columns: dict[str, dy.Column] = {
+        "solution": text("solution"),
+        "balise_id": text("balise"),
+        "kind": one_of(BaliseKind, "virtual or physical"),
+        "netelement_id": text("net element of the balise"),
+        "measure_m": real("m", "measure of the balise"),
+        "runs": count("runs that met it"),
+        "passages": count("times that a train passed it"),
+        "accepted": count("times that the LDS accepted it"),
+        **_estimate("accepted_share", "share of passages at which it was accepted"),
+        "rejected": count("offers rejected"),
+        "missed": count("passages without a detection in the window"),
+        "not_available": count("passages without a position"),
+        "deletions": count("passages with the ETCS failure mode deletion"),
+        **_estimate("deletion_rate", "share of passages with the failure mode deletion"),
+        "insertions": count("rows with the ETCS failure mode insertion"),
+        "linking_errors": count("linking errors at it"),
+        "accepted_judged": count("acceptances of known location error"),
+        "unsafe_accepted": count("of these beyond the failure limit"),
+        **_estimate("unsafe_rate", "share of judged acceptances beyond the failure limit"),
+        "suspect_after_the_fact": count("accepted between a fault's onset and its detection"),
+        **_spread("location_error", "location error of acceptances"),
+    }
+    doc = "One row per balise and solution over all runs of the campaign."
+    return type("CampaignBalises", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
+
+
+CampaignBalises = _campaign_balises_schema()
+
+
+def _accuracy_schema() -> type[dy.Schema]:
+    columns: dict[str, dy.Column] = {
+        "solution": text("solution"),
+        "grouped_by": text("what the group has in common: all, netelement_id or speed_band_kmh"),
+        "group": text("the net element or speed band"),
+        "accepted_judged": count("acceptances of known location error"),
+        **_spread("location_error", "location error of acceptances"),
+        "location_accuracy_m": real("m", "Q_LOCACC that they are held against", min=0),
+        "within_location_accuracy": count("of these within Q_LOCACC"),
+        **_estimate("within_location_accuracy_share", "share within Q_LOCACC"),
+        "ci_limit_m": real("m", "limit of the confidence interval", min=0),
+        "within_ci_limit": count("of these within the limit"),
+        **_estimate("within_ci_limit_share", "share within the limit"),
+    }
+    doc = "Location error of accepted virtual balises over a campaign, by net element and speed."
+    return type("CampaignAccuracy", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
+
+
+CampaignAccuracy = _accuracy_schema()
+
+CAMPAIGN_TABLES: dict[str, type[dy.Schema]] = {
+    "campaign_runs": CampaignRuns,
+    "campaign_balises": CampaignBalises,
+    "campaign_accuracy": CampaignAccuracy,
+}

@@ -1,0 +1,180 @@
+"""Campaign tables from a few rows worked by hand."""
+
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_runs, with_speed
+from pipeline.statistics import clopper_pearson, poisson_rate
+from schemas.campaign import CampaignAccuracy, CampaignBalises, campaign_runs_schema
+from schemas.config import Configuration, SafetyConfig, ServiceLevel
+from schemas.tables import Runs
+from tests.summary.tables import NS, epochs, hazards, passages, table
+
+CONFIG = Configuration()
+
+
+def runs(ids: list[str], **columns: Any) -> pl.DataFrame:
+    plain: dict[str, Any] = {"solution": "primary", "status": "ok", "duration_s": 1800.0, "evidence": "reference"}
+    return table(Runs, len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
+
+
+def faults(ids: list[str], **columns: Any) -> pl.DataFrame:
+    plain: dict[str, Any] = {"t_onset": [k * NS for k in range(len(ids))], "budget_s": 1.675, "solution": "primary"}
+    return hazards(len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
+
+
+def met(ids: list[str], **columns: Any) -> pl.DataFrame:
+    plain: dict[str, Any] = {
+        "solution": "primary",
+        "balise_id": "VB1",
+        "kind": "virtual",
+        "netelement_id": "ne1",
+        "measure_m": 500.0,
+        "status": "accepted",
+        "failure_mode": "none",
+        "linking_error": "none",
+        "t_offered": [k * NS for k in range(len(ids))],
+        "t_true": [k * NS for k in range(len(ids))],
+        "location_error_m": 1.0,
+    }
+    return passages(len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
+
+
+class TestRuns:
+    def test_rates_bounds_and_verdicts(self) -> None:
+        catalogue = runs(
+            ["b", "a", "c", "d"],
+            evidence=["reference", "reference", None, None],
+            status=["ok", "ok", "ok", "failed"],
+            balises_accepted=[10, 10, 10, 0],
+            unsafe_accepted=[1, 0, 0, 0],
+            outages=[3, 0, 0, 0],
+            duration_s=[1800.0, 1800.0, 1800.0, None],
+        )
+        found = campaign_runs(
+            catalogue,
+            faults(["b", "b"], t_failure=[NS, 2 * NS], t_negated=[2 * NS, None], hazardous_s=[1.0, None]),
+            CONFIG.safety,
+        )
+        campaign_runs_schema(CONFIG.safety.service_levels).validate(found)
+        assert found["run_id"].to_list() == ["a", "b", "c", "d"]
+        row = found.row(1, named=True)
+        rate, share = poisson_rate(2, 0.5), clopper_pearson(1, 2)
+        assert row["hazard_rate_per_h"] == 4.0
+        assert (row["hazard_rate_low_per_h"], row["hazard_rate_high_per_h"]) == (rate.low, rate.high)
+        assert (row["failures"], row["missed_share"]) == (2, 0.5)
+        assert (row["missed_share_low"], row["missed_share_high"]) == (share.low, share.high)
+        assert (row["unsafe_share"], row["outage_rate_per_h"]) == (0.1, 6.0)
+        assert (row["allowed_lpv200_s"], row["within_lpv200"]) == (pytest.approx(0.5025), 0)
+        assert (row["within_npa"], row["verdict_npa"]) == (1, "exceeded")
+        assert found["verdict_lpv200"].to_list() == ["no_failure", "exceeded", "unknown", "unknown"]
+        assert found["hazard_rate_per_h"].to_list() == [0.0, 4.0, None, None]
+        assert found["outage_rate_per_h"].to_list()[3] is None
+
+    def test_kept_by_one_level_and_not_by_another(self) -> None:
+        found = campaign_runs(
+            runs(["a"]), faults(["a"], t_failure=[NS], t_negated=[2 * NS], hazardous_s=[1.0]), CONFIG.safety
+        ).row(0, named=True)
+        assert (found["verdict_npa"], found["verdict_lpv200"]) == ("kept", "exceeded")
+        assert found["verdict_egnos_observed"] == "kept"
+
+    def test_a_failure_without_truth_in_the_row_is_still_a_failure(self) -> None:
+        found = campaign_runs(runs(["a"], evidence=None), faults(["a"], t_failure=[NS]), CONFIG.safety)
+        assert found["verdict_npa"].to_list() == ["exceeded"]
+
+    def test_levels_are_those_of_the_configuration(self) -> None:
+        safety = SafetyConfig(service_levels={"own": ServiceLevel(integrity_risk=1e-7, exposure_s=360.0)})
+        found = campaign_runs(runs(["a"]), faults([]), safety)
+        assert {name for name in found.columns if name.startswith("verdict_")} == {"verdict_own"}
+
+    def test_no_runs(self) -> None:
+        assert campaign_runs(runs([]), faults([]), CONFIG.safety).height == 0
+
+
+class TestBalises:
+    def test_shares_are_of_the_passages(self) -> None:
+        found = campaign_balises(
+            met(
+                ["a", "a", "b", "c", "d", "e"],
+                status=["accepted", "accepted", "accepted", "missed", "rejected_window", "not_available"],
+                t_true=[0, None, NS, NS, NS, NS],
+                t_offered=[0, NS, NS, None, NS, None],
+                location_error_m=[1.0, 30.0, -3.0, None, 40.0, None],
+                failure_mode=["none", "insertion", "none", "deletion", "insertion", "deletion"],
+                linking_error=["none", "none", "none", "missed", "early", "missed"],
+                suspect_after_the_fact=[False, True, False, False, False, False],
+            ),
+            CONFIG,
+        )
+        CampaignBalises.validate(found)
+        row = found.row(0, named=True)
+        assert (row["runs"], row["passages"], row["accepted"]) == (5, 5, 3)
+        assert row["accepted_share"] == pytest.approx(2 / 5)
+        assert (row["rejected"], row["missed"], row["not_available"], row["linking_errors"]) == (1, 1, 1, 3)
+        deletion, unsafe = clopper_pearson(2, 5), clopper_pearson(1, 3)
+        assert (row["deletions"], row["deletion_rate"]) == (2, 0.4)
+        assert (row["deletion_rate_low"], row["deletion_rate_high"]) == (deletion.low, deletion.high)
+        assert (row["unsafe_accepted"], row["accepted_judged"]) == (1, 3)
+        assert (row["unsafe_rate_low"], row["unsafe_rate_high"]) == (unsafe.low, unsafe.high)
+        assert (row["insertions"], row["suspect_after_the_fact"]) == (2, 1)
+        assert row["location_error_mean_m"] == pytest.approx(28 / 3)
+        assert row["location_error_sigma_m"] == pytest.approx(18.0093, abs=1e-4)
+        assert (row["location_error_p95_m"], row["location_error_max_m"]) == (pytest.approx(27.3), 30.0)
+
+    def test_without_evidence_nothing_is_known_of_unsafe_acceptances(self) -> None:
+        row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None), CONFIG).row(0, named=True)
+        assert (row["passages"], row["accepted"], row["accepted_judged"]) == (2, 2, 0)
+        assert (row["unsafe_rate"], row["unsafe_rate_high"], row["location_error_mean_m"]) == (None, None, None)
+
+    def test_solutions_and_kinds_apart_and_in_order(self) -> None:
+        frame = pl.concat(
+            [
+                met(["a"], solution="primary", balise_id="VB2"),
+                met(["a"], solution="gps"),
+                met(["a"], solution="primary"),
+                met(["a"], kind="physical", balise_id="BG9"),
+            ]
+        )
+        found = campaign_balises(frame, CONFIG)
+        assert found.select("solution", "balise_id").rows() == [
+            ("gps", "VB1"), ("primary", "VB1"), ("primary", "VB2"), ("primary", "BG9"),
+        ]  # fmt: skip
+
+    def test_any_order_of_runs_gives_the_same_table(self) -> None:
+        parts = [met([run] * 3, location_error_m=[0.1 * k, 0.3, 1 / 3]) for k, run in enumerate("abcdefg")]
+        forth, back = pl.concat(parts), pl.concat(parts[::-1])
+        assert campaign_balises(forth, CONFIG).equals(campaign_balises(back, CONFIG))
+
+    def test_nothing(self) -> None:
+        assert campaign_balises(met([]), CONFIG).height == 0
+
+
+class TestAccuracy:
+    def test_by_element_and_speed(self) -> None:
+        frame = met(
+            ["a", "a", "a", "b", "b", "b"],
+            netelement_id=["ne1", "ne2", "ne1", "ne1", "ne1", "ne1"],
+            location_error_m=[1.0, -13.0, 2.0, 15.0, None, 99.0],
+            status=["accepted"] * 5 + ["rejected_window"],
+        ).with_columns(speed_mps=pl.Series([0.0, 11.2, 11.0, None, 5.0, 5.0]))
+        found = campaign_accuracy(frame, CONFIG)
+        CampaignAccuracy.validate(found)
+        rows = {(row["grouped_by"], row["group"]): row for row in found.iter_rows(named=True)}
+        assert set(rows) == {
+            ("all", ""), ("netelement_id", "ne1"), ("netelement_id", "ne2"),
+            ("speed_band_kmh", "000-040"), ("speed_band_kmh", "040-080"), ("speed_band_kmh", "unknown"),
+        }  # fmt: skip
+        assert rows["all", ""]["accepted_judged"] == 4
+        assert (rows["all", ""]["within_location_accuracy"], rows["all", ""]["within_ci_limit"]) == (2, 3)
+        assert rows["all", ""]["within_ci_limit_share_low"] == clopper_pearson(3, 4).low
+        assert rows["netelement_id", "ne1"]["location_error_max_m"] == 15.0
+        assert rows["speed_band_kmh", "000-040"]["location_error_mean_m"] == 1.5
+        assert rows["netelement_id", "ne2"]["location_error_sigma_m"] is None
+
+    def test_speed_is_that_of_the_epoch_before_the_offer(self) -> None:
+        frame = met(["a"] * 4, t_offered=[5 * NS, None, round(2.9 * NS), -NS])
+        found = with_speed(frame, epochs([0, 1, 2, 3, 4], speed_mps=[1.0, 2.0, -3.0, 4.0, None]))
+        assert found["speed_mps"].to_list() == [4.0, None, 3.0, None]
+        assert found.drop("speed_mps").equals(frame)
