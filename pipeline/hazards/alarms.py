@@ -33,8 +33,7 @@ def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: Ha
     if hazard_id is not None:
         suspect = judged[hazard_id].suspect
     else:
-        left = verdict is Verdict.TRUE
-        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, left)
+        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, verdict)
     return {
         "t_start": span.start_ns,
         "t_end": span.end_ns,

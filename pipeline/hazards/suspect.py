@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
-from schemas.enums import Evidence, Suspect
+from schemas.enums import Evidence, Suspect, Verdict
 
 # How far back an alarm's cause may lie: a raw monitor answers at once, the slowest EWMA after minutes.
 _LOOKBACKS_S = (1.0, 30.0, 300.0)
@@ -68,14 +68,17 @@ def witnesses_of(
     )
 
 
-def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, ...], left_truth: bool) -> Suspect:
-    """Who caused the alarm over epochs `first..last`; `left_truth`: the position was wrong by the verdict."""
+def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, ...], verdict: Verdict) -> Suspect:
+    """Who caused the alarm over epochs `first..last`, in the order in which the evidence speaks."""
+    if verdict is Verdict.TRUE:
+        return suspect_of_error(w, first, last, monitors)
+    vote = doppler_vote(w, first, last)
+    if odometer_left_truth(w, first, last) or vote is Suspect.ODOMETER:
+        return Suspect.ODOMETER
+    if vote is Suspect.GNSS and verdict is Verdict.UNKNOWN:
+        return Suspect.GNSS
     if w.doubtful_track[first : last + 1].any():
         return Suspect.TRACK
-    if left_truth:
-        return suspect_of_error(w, first, last, monitors)
-    if odometer_left_truth(w, first, last) or doppler_sides_with_position(w, first, last):
-        return Suspect.ODOMETER
     if _beyond(w.error_cross_m, w.noise_cross_m, first, last) or _beyond(w.error_up_m, w.noise_up_m, first, last):
         return Suspect.GNSS
     across = all(name.startswith(_ACROSS) for name in monitors)
@@ -92,14 +95,14 @@ def suspect_of_error(w: Witnesses, first: int, last: int, monitors: tuple[str, .
     decides between the two; without it monitors across the track speak against the position.
     """
     part = slice(first, last + 1)
-    if w.doubtful_track[part].any():
-        return Suspect.TRACK
     known = np.isfinite(w.error_m[part])
     if known.any() and w.by_reference[part][known].all():
         return Suspect.GNSS
     sides = doppler_vote(w, first, last)
     if sides is not None:
         return sides
+    if w.doubtful_track[part].any():
+        return Suspect.TRACK
     return Suspect.GNSS if any(name.startswith(_ACROSS) for name in monitors) else Suspect.UNKNOWN
 
 
@@ -134,10 +137,6 @@ def _truth_variance(w: Witnesses, rows: Ints) -> float:
         return 0.0
     rough = np.diff(w.truth_m[rows], 2)
     return float((1.4826 * np.median(np.abs(rough - np.median(rough)))) ** 2 / 6.0)
-
-
-def doppler_sides_with_position(w: Witnesses, first: int, last: int) -> bool:
-    return doppler_vote(w, first, last) is Suspect.ODOMETER
 
 
 def doppler_vote(w: Witnesses, first: int, last: int) -> Suspect | None:

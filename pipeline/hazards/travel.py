@@ -32,9 +32,11 @@ class Travel:
         by_reference = np.diff(reference_m)
         steps = np.where(np.isfinite(by_reference), by_reference, by_odometer)
         known = np.isfinite(steps)
-        distance = np.concatenate(([0.0], np.cumsum(np.where(known, steps, 0.0))))
-        stretch = np.concatenate(([0], np.cumsum(~known)))
-        return distance, stretch.astype(np.int64)
+        size = self.distance_m.size
+        distance, stretch = np.zeros(size), np.zeros(size, dtype=np.int64)
+        distance[1:] = np.cumsum(np.where(known, steps, 0.0))
+        stretch[1:] = np.cumsum(~known)
+        return distance, stretch
 
 
 def odometer_travel(epochs: pl.DataFrame, at_ns: Ints) -> Travel:
