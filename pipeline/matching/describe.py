@@ -1,0 +1,103 @@
+"""What a site holds, in figures for `inspect`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.matching.network import Network, network_of
+from pipeline.track import Track, track_of
+from schemas.run import Finding, Site
+
+
+@dataclass(frozen=True)
+class SiteDescription:
+    """Figures of a site; lengths and spacings in metres, `box_deg` south, west, north, east.
+
+    `parts` counts connected pieces of network, `switches` ends from which more than one way leads on.
+    """
+
+    elements: int
+    points: int
+    length_m: float
+    longest_m: float
+    shortest_m: float
+    dimensions: str
+    spacing_median_m: float
+    spacing_max_m: float
+    sigma_median_m: float | None
+    without_sigma: int
+    relations: dict[str, int]
+    parts: int
+    switches: int
+    open_ends: int
+    balises: dict[str, int]
+    route_elements: int | None
+    box_deg: tuple[float, float, float, float]
+    findings: tuple[Finding, ...]
+
+
+def describe_site(site: Site) -> SiteDescription:
+    """Figures and findings of a site."""
+    track = track_of(site.track)
+    network = network_of(track, site.links)
+    spacing = _spacing_m(track)
+    known = track.sigma_m[np.isfinite(track.sigma_m)]
+    kinds = [] if site.balises is None else site.balises["kind"].cast(str).to_list()
+    ways = [len(edges) for edges in network.successors]
+    return SiteDescription(
+        elements=len(track.ids),
+        points=len(track.measure_m),
+        length_m=float(track.length_m.sum()),
+        longest_m=float(track.length_m.max()),
+        shortest_m=float(track.length_m.min()),
+        dimensions=_dimensions(track),
+        spacing_median_m=float(np.median(spacing)),
+        spacing_max_m=float(spacing.max()),
+        sigma_median_m=float(np.median(known)) if len(known) else None,
+        without_sigma=int(np.isnan(track.sigma_m).sum()),
+        relations=dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
+        parts=_parts(network),
+        switches=sum(count > 1 for count in ways),
+        open_ends=sum(count == 0 for count in ways),
+        balises=dict(sorted(Counter(kinds).items())),
+        route_elements=None if site.route is None else site.route.height,
+        box_deg=(
+            float(track.latitude_deg.min()),
+            float(track.longitude_deg.min()),
+            float(track.latitude_deg.max()),
+            float(track.longitude_deg.max()),
+        ),
+        findings=site.findings,
+    )
+
+
+def _spacing_m(track: Track) -> np.ndarray:
+    """Distance between neighbouring points of each element, by measure."""
+    return np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
+
+
+def _dimensions(track: Track) -> str:
+    flat = [bool(np.isnan(track.height_m[part]).any()) for _, _, part in track.elements()]
+    if all(flat):
+        return "2-D"
+    return "3-D" if not any(flat) else f"mixed: {sum(flat)} of {len(flat)} elements 2-D"
+
+
+def _parts(network: Network) -> int:
+    """Connected pieces of the network, whatever the navigability."""
+    group = list(range(network.count))
+    for oriented, edges in enumerate(network.successors):
+        for edge in edges:
+            one, other = _root(group, oriented // 2), _root(group, edge.to // 2)
+            group[max(one, other)] = min(one, other)
+    return len({_root(group, element) for element in group})
+
+
+def _root(group: list[int], element: int) -> int:
+    while group[element] != element:
+        group[element] = group[group[element]]
+        element = group[element]
+    return element
