@@ -55,14 +55,18 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
 def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
     """A table as Parquet, held to its contract."""
     checked = TABLES[table].validate(frame, cast=True).select(TABLES[table].column_names())
-    described = {"table": table, "contract": CONTRACT_VERSION, **metadata}
+    return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata})
+
+
+def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str]) -> bytes:
+    """A frame as Parquet with its metadata; the same content always gives the same bytes."""
     buffer = io.BytesIO()
-    checked.rechunk().write_parquet(
+    frame.rechunk().write_parquet(
         buffer,
         compression="zstd",
         compression_level=_COMPRESSION_LEVEL,
         row_group_size=_ROWS_PER_GROUP,
-        metadata={f"{PREFIX}{key}": described[key] for key in sorted(described)},
+        metadata={f"{PREFIX}{key}": metadata[key] for key in sorted(metadata)},
     )
     return buffer.getvalue()
 

@@ -6,6 +6,7 @@ All of them give `concurrent.futures` futures, so that the campaign loop is the 
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -257,6 +258,8 @@ def _connect(scheduler: str) -> Any:
         from distributed import Client
     except ImportError:
         raise UsageError("--scheduler needs Dask", remedy="Install `balise[cluster]`.") from None
+    # Dask logs tracebacks of lost connections; the campaign says in one message what was lost.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError):

@@ -15,6 +15,7 @@ from typing import Protocol
 
 from pipeline import store
 from pipeline.campaign.engines import Engine, Result, engine_for
+from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.plan import Plan, RunJob, with_previous
 from pipeline.campaign.worker import RunOutcome, fail_run
@@ -114,9 +115,11 @@ def run_campaign(
         store.write_config(plan.out, plan.config)
         engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
         try:
-            return _watched(plan, engine, time_limit_s, watches)
+            summary = _watched(plan, engine, time_limit_s, watches)
         finally:
             engine.close()
+        write_campaign(plan.out, plan.config)
+        return summary
 
 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:
@@ -227,6 +230,3 @@ def _listening(state: _State, in_process: bool) -> Iterator[None]:
     finally:
         for signum, handler in before.items():
             signal.signal(signum, handler)
-
-
-__all__ = ["TIME_LIMIT_S", "Interrupted", "Summary", "Watch", "run_campaign"]

@@ -26,6 +26,11 @@ def result_bytes(out: Path) -> dict[str, bytes]:
     }
 
 
+def campaign_bytes(out: Path) -> dict[str, bytes]:
+    """The tables over all runs."""
+    return {path.name: path.read_bytes() for path in sorted((out / "campaign").iterdir())}
+
+
 def plan_of(trial: SmallTrial, out: Path | str, runs: Sequence[Path] | None = None) -> Plan:
     named = [str(path) for path in runs] if runs is not None else [str(trial.runs)]
     return make_plan(named, trial.site, out)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import store
-from tests.campaign.compare import command, result_bytes, run, start, wait_for
+from tests.campaign.compare import campaign_bytes, command, result_bytes, run, start, wait_for
 from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
 
@@ -55,6 +55,7 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     again = run(command(small_trial, out, "--jobs", "2"))
     assert again.returncode == 0, again.stderr
     assert result_bytes(out) == whole
+    assert campaign_bytes(out) == campaign_bytes(undisturbed)
 
 
 def test_sudden_death_of_the_parent(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import polars as pl
 import pytest
 
 from pipeline import store
@@ -18,7 +19,7 @@ from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog
-from tests.campaign.compare import by_run, plan_of, result_bytes
+from tests.campaign.compare import by_run, campaign_bytes, plan_of, result_bytes
 from tests.conftest import SmallTrial
 
 
@@ -62,6 +63,16 @@ def test_any_number_of_jobs_gives_the_same_bytes(small_trial: SmallTrial, undist
     assert [outcome.status for outcome in summary.outcomes] == [RunStatus.OK] * 4
     assert result_bytes(tmp_path / "two") == result_bytes(undisturbed)
     assert len(result_bytes(undisturbed)) == 4 * 5
+    assert campaign_bytes(tmp_path / "two") == campaign_bytes(undisturbed)
+
+
+def test_campaign_tables_stand_for_all_complete_runs(small_trial: SmallTrial, undisturbed: Path) -> None:
+    runs = pl.read_parquet(undisturbed / "campaign/runs.parquet")
+    assert runs["run_id"].to_list() == ["run0", "run1", "run2", "run3"]
+    passages = store.read_table(undisturbed, "passages").collect()
+    balises = pl.read_parquet(undisturbed / "campaign/balises.parquet")
+    assert balises["accepted"].sum() == passages.filter(pl.col("status") == "accepted").height
+    assert set(balises["balise_id"]) == set(passages["balise_id"])
 
 
 def test_failed_runs_do_not_stop_the_others(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:

@@ -1,0 +1,31 @@
+"""What a campaign adds to its runs: the tables over all of them (CONTRACT section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import polars as pl
+
+from pipeline import storage, store
+from pipeline.campaign_tables import campaign_balises, campaign_runs
+from pipeline.ingest.files import Address, join
+from schemas.config import Configuration, digest_of
+from schemas.tables import CONTRACT_VERSION
+from schemas.version import SOFTWARE
+
+
+def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFrame]:
+    """Derive `OUT/campaign/runs.parquet` and `balises.parquet` from all complete runs of the result."""
+    runs, hazards, passages = (store.read_table(out, name).collect() for name in ("runs", "hazards", "passages"))
+    tables = {
+        "runs": campaign_runs(runs, hazards, config.safety),
+        "balises": campaign_balises(passages, config),
+    }
+    metadata = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config)}
+    for name, table in tables.items():
+        storage.write_bytes(join(join(out, "campaign"), f"{name}.parquet"), _bytes(table, name, metadata))
+    return tables
+
+
+def _bytes(table: pl.DataFrame, name: str, metadata: Mapping[str, str]) -> bytes:
+    return store.parquet_bytes(table, {"table": f"campaign/{name}", **metadata})

@@ -1,0 +1,133 @@
+"""Logs, site and results in an object store that answers with errors and slowly."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+from werkzeug.serving import BaseWSGIServer, make_server
+
+from pipeline import storage, store
+from pipeline.campaign import make_plan, run_campaign
+from pipeline.campaign.lock import locked
+from schemas.enums import RunStatus
+from schemas.errors import OutputError
+from schemas.tables import TABLES
+from tests.campaign.compare import result_bytes
+from tests.campaign.test_local import undisturbed
+from tests.conftest import SmallTrial
+
+__all__ = ["undisturbed"]
+
+SECRET = "not-for-anybodys-eyes"
+
+
+class Moody:
+    """A store in front of the store: every so often it refuses, or thinks before it answers."""
+
+    def __init__(self) -> None:
+        self.inner = DomainDispatcherApplication(create_backend_app)
+        self.refuse_each = 0
+        self.asked = 0
+        self.refused = 0
+        self.guard = threading.Lock()
+
+    def __call__(self, environ: dict[str, Any], respond: Callable[..., Any]) -> Iterable[bytes]:
+        with self.guard:
+            self.asked += 1
+            refuse = self.refuse_each > 0 and self.asked % self.refuse_each == 0
+            self.refused += refuse
+        if refuse:
+            time.sleep(0.05)
+            respond("503 Slow Down", [("Content-Type", "application/xml")])
+            return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"]
+        answer: Iterable[bytes] = self.inner(environ, respond)
+        return answer
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[Moody]:
+    patch = pytest.MonkeyPatch()
+    moody = Moody()
+    server: BaseWSGIServer = make_server("127.0.0.1", 0, moody, threaded=True)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+    patch.setenv("AWS_ACCESS_KEY_ID", "somebody")
+    patch.setenv("AWS_SECRET_ACCESS_KEY", SECRET)
+    patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    yield moody
+    patch.undo()
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture(scope="module")
+def bucket(s3: Moody, small_trial: SmallTrial) -> str:
+    """The small trial in a bucket."""
+    import s3fs
+
+    remote = s3fs.S3FileSystem(use_listings_cache=False)
+    remote.mkdir("trials")
+    remote.put(f"{small_trial.site}/", "trials/site/", recursive=True)
+    remote.put(f"{small_trial.runs}/", "trials/runs/", recursive=True)
+    return "s3://trials"
+
+
+def remote_bytes(out: str) -> dict[str, bytes]:
+    names = [
+        str(Path(str(store.table_address("", table, run_id)))) for table in TABLES for run_id in store.run_ids(out)
+    ]
+    found = storage.read_many([f"{out}/{name}" for name in names])
+    return {place.removeprefix(f"{out}/"): data for place, data in found.items()}
+
+
+def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -> None:
+    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/out")
+    assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
+    assert remote_bytes(f"{bucket}/out") == result_bytes(undisturbed)
+    again = run_campaign(plan, jobs=2)
+    assert (again.skipped, again.count(RunStatus.OK)) == (4, 4)
+    local = run_campaign(make_plan([f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
+    assert local.count(RunStatus.OK) == 1
+    runs = store.read_table(f"{bucket}/out", "runs").collect()
+    assert runs["run_id"].to_list() == ["run0", "run1", "run2", "run3"]
+
+
+def test_store_that_refuses_now_and_then(
+    s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(s3, "refuse_each", 4)
+    plan = make_plan([f"{bucket}/runs/run*"], f"{bucket}/site", f"{bucket}/moody")
+    assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
+    monkeypatch.setattr(s3, "refuse_each", 0)
+    assert s3.refused > 0
+    assert remote_bytes(f"{bucket}/moody") == result_bytes(undisturbed)
+
+
+def test_store_that_is_not_there(bucket: str, small_trial: SmallTrial) -> None:
+    plan = make_plan([str(small_trial.paths[0])], small_trial.site, "s3://no-such-bucket/out")
+    with pytest.raises(OutputError, match="no-such-bucket") as caught:
+        run_campaign(plan)
+    assert SECRET not in str(caught.value)
+
+
+def test_one_campaign_at_a_time(bucket: str) -> None:
+    out = f"{bucket}/held"
+    with locked(out), pytest.raises(OutputError, match="another campaign is writing here"), locked(out):
+        pass
+    with locked(out):
+        pass
+
+
+def test_lock_of_a_dead_campaign_is_taken_over(bucket: str) -> None:
+    storage.write_bytes(f"{bucket}/dead/.lock", b"somebody 7")
+    with locked(f"{bucket}/dead"):
+        assert b"somebody" not in storage.read_many([f"{bucket}/dead/.lock"])[f"{bucket}/dead/.lock"]
+    assert storage.read_many([f"{bucket}/dead/.lock"]) == {}
