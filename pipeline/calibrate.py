@@ -1,0 +1,123 @@
+"""What recorded fault-free runs tell of a vehicle and of its monitors (`balise calibrate`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+import tomli_w
+
+from pipeline.align import threshold_factor
+from pipeline.calibration.sigmas import SigmaFit, regress_sigmas, sigma_table, worst_fit
+from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
+from pipeline.clean import clean
+from pipeline.matching import match
+from pipeline.odometer import odometer_track, polarity
+from pipeline.odometer_filter import error_model
+from pipeline.replay import replay
+from schemas.config import Configuration, Vehicle
+from schemas.errors import InputError
+from schemas.run import RunLog, Site
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """`vehicle`: the vehicle file; `runs`: scale and latency run by run; `sigmas`: regression by monitor.
+
+    `sigma_intercept_m`, `sigma_slope`: for `[monitors]` of the configuration, from the loudest monitor; None
+    where no monitor was evaluated.
+    """
+
+    vehicle: Vehicle
+    runs: pl.DataFrame
+    sigmas: pl.DataFrame
+    sigma_intercept_m: float | None
+    sigma_slope: float | None
+
+    def monitors_toml(self) -> str:
+        """The part of a configuration file that follows from the regression."""
+        if self.sigma_slope is None or self.sigma_intercept_m is None:
+            return ""
+        values = {"sigma_intercept_m": self.sigma_intercept_m, "sigma_slope": self.sigma_slope}
+        return tomli_w.dumps({"monitors": values})
+
+
+def calibrate(
+    logs: Sequence[RunLog],
+    site: Site,
+    vehicle: Vehicle | None = None,
+    config: Configuration | None = None,
+    solution: str = "primary",
+) -> Calibration:
+    """Vehicle and monitor sigmas from fault-free runs over one site.
+
+    `vehicle` brings lever arms and heights; what it says of scale and latency is measured anew. Raises `InputError`
+    where no run can be compared with an odometer.
+    """
+    config, base = config or Configuration(), vehicle or Vehicle()
+    estimates = [(log.run_id, _estimate(log, site, base, config, solution)) for log in logs]
+    found = [estimate for _, estimate in estimates if estimate is not None]
+    if not found:
+        raise InputError(
+            "no run gives odometer scale and latency",
+            place=", ".join(log.run_id for log in logs),
+            expected=f"GNSS of solution `{solution}` on the track, and an odometer, while the speed changes",
+            remedy="Calibrate on longer runs that stop and start.",
+        )
+    fitted = _vehicle(base, found)
+    fits = _monitor_fits(logs, site, fitted, config, solution)
+    worst = worst_fit(fits)
+    return Calibration(
+        vehicle=fitted,
+        runs=_run_table(estimates),
+        sigmas=sigma_table(fits),
+        sigma_intercept_m=None if worst is None else worst.intercept_m,
+        sigma_slope=None if worst is None else worst.slope,
+    )
+
+
+def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> RunEstimate | None:
+    run, _ = clean(log)
+    fixes = run.gnss.filter(pl.col("solution") == solution)
+    if run.odometer is None or run.odometer.height < 2 or fixes.is_empty():
+        return None
+    epochs = match(
+        fixes, run.odometer, site, vehicle, config.matching, config.fix_sigma, run.balise_reads
+    ).epochs.filter("fix_valid", "on_track")
+    track = odometer_track(run.odometer, config.align.odometer_gap_s, config.monitors.odometer_sigma_mps)
+    t_s = track.seconds(epochs["t"].dt.timestamp("ns").to_numpy())
+    path_m = epochs["path_m"].to_numpy().astype(np.float64)
+    sign = polarity(track, t_s, path_m, config.matching.orientation_distance_m)
+    shares, taus_s = error_model(config.monitors)
+    sigma_m = epochs["sigma_along_m"].to_numpy().astype(np.float64)
+    return estimate_run(Observations(t_s, path_m, sigma_m), track.oriented(sign), shares, taus_s)
+
+
+def _vehicle(base: Vehicle, found: Sequence[RunEstimate]) -> Vehicle:
+    scale = pooled(np.array([one.scale for one in found]), np.array([one.scale_sigma for one in found]))
+    latency = pooled(np.array([one.latency_s for one in found]), np.array([one.latency_sigma_s for one in found]))
+    return base.model_copy(
+        update={
+            "odometer_scale": scale.value,
+            "odometer_scale_sigma": scale.sigma,
+            "gnss_latency_s": latency.value,
+            "gnss_latency_sigma_s": latency.sigma,
+        }
+    )
+
+
+def _monitor_fits(
+    logs: Sequence[RunLog], site: Site, vehicle: Vehicle, config: Configuration, solution: str
+) -> list[SigmaFit]:
+    """Sigmas as the bank shows them when it runs with the vehicle just measured."""
+    epochs = [replay(log, site, vehicle, config).epochs.filter(pl.col("solution") == solution) for log in logs]
+    return regress_sigmas(epochs, threshold_factor(config.monitors.false_alarm_probability))
+
+
+def _run_table(estimates: Sequence[tuple[str, RunEstimate | None]]) -> pl.DataFrame:
+    names = ("scale", "scale_sigma", "latency_s", "latency_sigma_s", "misfit", "points")
+    rows = [(run_id, *(None if one is None else getattr(one, name) for name in names)) for run_id, one in estimates]
+    schema = {"run_id": pl.String} | dict.fromkeys(names, pl.Float64) | {"points": pl.Int64}
+    return pl.DataFrame(rows, schema=schema, orient="row")

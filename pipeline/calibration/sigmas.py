@@ -1,0 +1,132 @@
+"""Sigmas of the monitors on fault-free runs, by regression (DIAG: thresholds vary with sigma of the position).
+
+The bank predicts each monitor's sigma from sigma_axis of its own axis (DIAG regresses all three axes on the
+along-track sigma; a receiver that states all three needs no such stand-in). Measured over predicted is
+
+    ratio(sigma_axis) = b + a / sigma_axis
+
+where the position's true sigma is a + b sigma_axis; a = 0, b = 1 says that receiver and model are right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from scipy.optimize import nnls
+
+from schemas.tables import AXES, BANK_MONITORS, SCALES
+
+Array = npt.NDArray[np.float64]
+
+_BINS = 12
+_LEAST_EPOCHS = 100
+# With a sigma that hardly varies, intercept and slope cannot be told apart.
+_LEAST_SPREAD = 0.05
+_BLOCKS_OF_ONE_RUN = 8
+
+
+@dataclass(frozen=True)
+class SigmaFit:
+    """Position sigma = `intercept_m` + `slope` * stated sigma, as a monitor shows it; standard errors beside."""
+
+    monitor: str
+    epochs: int
+    ratio: float
+    ratio_error: float
+    intercept_m: float
+    intercept_error_m: float
+    slope: float
+    slope_error: float
+
+
+def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float) -> list[SigmaFit]:
+    """One fit per monitor of the bank that was evaluated often enough; `runs`: epochs tables of fault-free runs.
+
+    `factor` is k_T, by which thresholds exceed sigmas. Errors are jackknifed over runs, or over stretches of a
+    few runs, as epochs are correlated.
+    """
+    fits = []
+    for monitor in BANK_MONITORS:
+        axis = next(name for name in AXES if monitor.removeprefix(name + "_") in SCALES)
+        pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, len(runs))]
+        samples = np.concatenate(pieces) if pieces else np.zeros((0, 2))
+        if len(samples) >= _LEAST_EPOCHS:
+            fits.append(_fit_with_errors(monitor, pieces))
+    return fits
+
+
+def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int) -> list[Array]:
+    """Rows (sigma of the axis, value over predicted sigma) of evaluated epochs, in blocks for the jackknife."""
+    sigma = f"sigma_{axis}_m"
+    chosen = run.filter(pl.col(f"{monitor}_state") != "not_evaluated").select(
+        pl.col(sigma), (factor * pl.col(f"{monitor}_value") / pl.col(f"{monitor}_threshold")).alias("ratio")
+    )
+    rows = chosen.drop_nulls().filter(pl.col(sigma) > 0).to_numpy()
+    blocks = 1 if runs >= _BLOCKS_OF_ONE_RUN else -(-_BLOCKS_OF_ONE_RUN // runs)
+    return [block for block in np.array_split(rows, blocks) if len(block)]
+
+
+def _fit_with_errors(monitor: str, pieces: list[Array]) -> SigmaFit:
+    whole = _fit(np.concatenate(pieces))
+    without = np.array(
+        [
+            _fit(np.concatenate([piece for j, piece in enumerate(pieces) if j != i]))
+            for i in range(len(pieces))
+            if len(pieces) > 1
+        ]
+    )
+    count = len(pieces)
+    errors = (
+        np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+        if count > 1
+        else np.full(3, np.nan)
+    )
+    return SigmaFit(
+        monitor,
+        sum(len(piece) for piece in pieces),
+        float(whole[0]),
+        float(errors[0]),
+        float(whole[1]),
+        float(errors[1]),
+        float(whole[2]),
+        float(errors[2]),
+    )
+
+
+def _fit(samples: Array) -> Array:
+    """Overall ratio, intercept [m] and slope from rows (sigma, ratio): weighted least squares over bins of sigma."""
+    sigma, squares = samples[:, 0], samples[:, 1] ** 2
+    overall = float(np.sqrt(squares.mean()))
+    if sigma.std() < _LEAST_SPREAD * sigma.mean():
+        return np.array([overall, 0.0, overall])
+    edges = np.unique(np.quantile(sigma, np.linspace(0.0, 1.0, _BINS + 1)))
+    place = np.clip(np.searchsorted(edges, sigma, side="right") - 1, 0, edges.size - 2)
+    count = np.bincount(place, minlength=edges.size - 1).astype(np.float64)
+    filled = count > 0
+    measured = np.sqrt(np.bincount(place, squares, count.size)[filled] / count[filled])
+    inverse = np.bincount(place, 1.0 / sigma, count.size)[filled] / count[filled]
+    weight = np.sqrt(count[filled])
+    design = np.column_stack([inverse, np.ones(inverse.size)])
+    (intercept, slope), _ = nnls(design * weight[:, None], measured * weight)
+    return np.array([overall, intercept, slope])
+
+
+def sigma_table(fits: Sequence[SigmaFit]) -> pl.DataFrame:
+    """The fits as a table; errors are null where one piece of data gives none."""
+    names = list(SigmaFit.__dataclass_fields__)
+    rows = [tuple(getattr(fit, name) for name in names) for fit in fits]
+    schema = {name: pl.String if name == "monitor" else pl.Float64 for name in names} | {"epochs": pl.Int64}
+    return pl.DataFrame(rows, schema=schema, orient="row").with_columns(pl.selectors.float().fill_nan(None))
+
+
+def worst_fit(fits: Sequence[SigmaFit]) -> SigmaFit | None:
+    """The fit that the configuration should follow: the monitor that is proven to be the loudest.
+
+    One that is quieter than predicted costs detection only, a louder one false alarms. Proven is what remains of
+    the ratio after two standard errors, as among twelve monitors one always looks loud by chance.
+    """
+    return max(fits, key=lambda fit: fit.ratio - 2.0 * float(np.nan_to_num(fit.ratio_error)), default=None)

@@ -1,0 +1,164 @@
+"""Odometer scale and GNSS latency of a vehicle, with their uncertainty, from runs known to be fault-free.
+
+Along the path, GNSS position against odometer distance D is
+
+    x(t) = offset + scale * D(t - latency) + correlated GNSS errors + random walk of the odometer
+
+and generalised least squares under the monitor bank's own error model (DIAG Table 1) gives scale and latency with
+a covariance that respects the correlation. Unlike the causal filter of a replay this looks at whole runs, which
+is right only because they are not the runs to be diagnosed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.odometer import OdometerTrack
+from pipeline.odometer_filter import SPEED_SPAN_S
+
+Array = npt.NDArray[np.float64]
+
+# Points of one dense covariance, and the least time between them: user errors last 100 s, accelerations a few seconds.
+_BLOCK_POINTS = 900
+_LEAST_STEP_S = 2.0
+_LEAST_POINTS = 20
+# Keeps the covariance well conditioned where epochs repeat.
+_WHITE_SHARE = 0.001
+_ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class RunEstimate:
+    """One run's scale and latency [s]; `misfit` is the root of chi-square per degree of freedom.
+
+    Sigmas are widened by the misfit where it exceeds 1.
+    """
+
+    scale: float
+    scale_sigma: float
+    latency_s: float
+    latency_sigma_s: float
+    misfit: float
+    points: int
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Usable epochs of one run: time [s on the odometer's scale], path position and its sigma [m]."""
+
+    t_s: Array
+    path_m: Array
+    sigma_m: Array
+
+
+def estimate_run(
+    seen: Observations, track: OdometerTrack, shares: Array, taus_s: Array, latency_s: float = 0.0
+) -> RunEstimate | None:
+    """Scale and latency of one run, none where too little of it can be compared.
+
+    `track` must grow with the path. Solved by Gauss-Newton steps from `latency_s`.
+    """
+    blocks = _blocks(seen, track)
+    if not blocks:
+        return None
+    covariances = [_covariance(block, track, shares, taus_s) for block in blocks]
+    estimate = np.array([1.0, latency_s])
+    for _ in range(_ITERATIONS):
+        normal, right, left_over, freedom = _accumulate(blocks, covariances, track, estimate)
+        if np.linalg.matrix_rank(normal) < normal.shape[0]:
+            return None
+        estimate = estimate + np.linalg.solve(normal, right)
+    misfit = float(np.sqrt(max(left_over, 0.0) / max(freedom, 1)))
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * max(1.0, misfit)
+    points = sum(block.t_s.size for block in blocks)
+    return RunEstimate(float(estimate[0]), float(sigma[0]), float(estimate[1]), float(sigma[1]), misfit, points)
+
+
+def _blocks(seen: Observations, track: OdometerTrack) -> list[Observations]:
+    """Thinned observations in pieces of unbroken odometry, each with an offset of its own."""
+    known = track.known_at(seen.t_s) & track.known_at(seen.t_s - 1.0) & track.known_at(seen.t_s - SPEED_SPAN_S)
+    known &= track.known_at(np.minimum(seen.t_s + SPEED_SPAN_S, track.t_s[-1]))
+    rows = np.flatnonzero(known & np.isfinite(seen.path_m) & np.isfinite(seen.sigma_m) & (seen.sigma_m > 0))
+    rows = rows[_thinned(seen.t_s[rows])]
+    pieces: list[Observations] = []
+    for piece in np.split(rows, np.flatnonzero(np.diff(track.stretch_at(seen.t_s[rows]))) + 1):
+        for part in np.array_split(piece, max(1, -(-piece.size // _BLOCK_POINTS))):
+            if part.size >= _LEAST_POINTS:
+                pieces.append(Observations(seen.t_s[part], seen.path_m[part], seen.sigma_m[part]))
+    return pieces
+
+
+def _thinned(t_s: Array) -> npt.NDArray[np.int64]:
+    """Indices at least `_LEAST_STEP_S` apart."""
+    if t_s.size == 0:
+        return np.zeros(0, dtype=np.int64)
+    slot = np.floor((t_s - t_s[0]) / _LEAST_STEP_S + 1e-6).astype(np.int64)
+    return np.flatnonzero(np.diff(slot, prepend=-1))
+
+
+def _covariance(block: Observations, track: OdometerTrack, shares: Array, taus_s: Array) -> Array:
+    """Covariance of GNSS minus odometer [m^2]: Gauss-Markov sources, a white rest, the odometer's random walk."""
+    lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
+    correlation = sum(share * np.exp(-lag / tau) for share, tau in zip(shares, taus_s, strict=True))
+    gnss = np.outer(block.sigma_m, block.sigma_m) * correlation
+    since = block.t_s - block.t_s[0]
+    walk = track.white_rate_m2_per_s * np.minimum(since[:, None], since[None, :])
+    result: Array = gnss + walk + np.diag(_WHITE_SHARE * block.sigma_m**2)
+    return result
+
+
+def _accumulate(
+    blocks: list[Observations], covariances: list[Array], track: OdometerTrack, estimate: Array
+) -> tuple[Array, Array, float, int]:
+    """Normal equations of (scale, latency), offsets eliminated; remaining chi-square before the step, its freedom."""
+    normal, right = np.zeros((2, 2)), np.zeros(2)
+    left_over, freedom = 0.0, -2
+    for block, covariance in zip(blocks, covariances, strict=True):
+        design, miss = _linearised(block, track, estimate)
+        factor = np.linalg.cholesky(covariance)
+        white = np.linalg.solve(factor, np.column_stack([np.ones(miss.size), design, miss]))
+        offset = white[:, 0] / np.linalg.norm(white[:, 0])
+        free = white[:, 1:] - np.outer(offset, offset @ white[:, 1:])
+        normal += free[:, :2].T @ free[:, :2]
+        right += free[:, :2].T @ free[:, 2]
+        left_over += float(free[:, 2] @ free[:, 2])
+        freedom += miss.size - 1
+    if np.linalg.matrix_rank(normal) == normal.shape[0]:
+        left_over -= float(right @ np.linalg.solve(normal, right))
+    return normal, right, left_over, freedom
+
+
+def _linearised(block: Observations, track: OdometerTrack, estimate: Array) -> tuple[Array, Array]:
+    """Columns of scale and latency, and what is observed over what is expected."""
+    scale, latency_s = estimate
+    at = block.t_s - latency_s
+    distance = track.distance_at(at)
+    # Centred, as a speed from the odometer noise of the same second would bias the latency.
+    speed = (track.distance_at(at + SPEED_SPAN_S) - track.distance_at(at - SPEED_SPAN_S)) / (2.0 * SPEED_SPAN_S)
+    return np.column_stack([distance - distance[0], -scale * speed]), block.path_m - scale * distance
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """A value for the next run of the vehicle, and how far that run may lie from it."""
+
+    value: float
+    sigma: float
+
+
+def pooled(values: Array, sigmas: Array) -> Pooled:
+    """Runs together (DerSimonian and Laird 1986): the sigma includes the scatter between runs.
+
+    Wheels wear and sensors drift, so a further run may differ by more than each run's own uncertainty.
+    """
+    weight = 1.0 / sigmas**2
+    mean = float(weight @ values / weight.sum())
+    scatter = float(weight @ (values - mean) ** 2)
+    spare = weight.sum() - float(weight @ weight) / weight.sum()
+    between = max(0.0, (scatter - (values.size - 1)) / spare) if values.size > 1 else 0.0
+    weight = 1.0 / (sigmas**2 + between)
+    mean = float(weight @ values / weight.sum())
+    return Pooled(mean, float(np.sqrt(1.0 / weight.sum() + between)))

@@ -1,0 +1,96 @@
+"""Regression of monitor sigmas, and the whole of `calibrate` on synthetic fault-free runs."""
+
+import tomllib
+
+import numpy as np
+import polars as pl
+import pytest
+
+from datasets.demo import demo_scenario
+from datasets.trial import build_run, build_site
+from pipeline.calibrate import calibrate
+from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
+from schemas.errors import InputError
+from schemas.run import RunLog, Site
+
+FACTOR = 5.0
+
+
+def monitored(seed: int, intercept: float, slope: float, spread: float = 0.8) -> pl.DataFrame:
+    """A run of one monitor whose values have sigma (intercept + slope s) / s of the predicted one."""
+    rng = np.random.default_rng(seed)
+    sigma = 1.0 + spread * rng.random(20_000)
+    predicted = 0.3 * sigma
+    value = rng.standard_normal(sigma.size) * predicted * (intercept + slope * sigma) / sigma
+    frame = pl.DataFrame(
+        {
+            "sigma_along_m": sigma,
+            "sigma_cross_m": sigma,
+            "sigma_up_m": sigma,
+            "along_raw_value": value,
+            "along_raw_threshold": FACTOR * predicted,
+            "along_raw_state": "pass",
+        }
+    )
+    others = [name for name in ALL if name != "along_raw"]
+    return frame.with_columns(
+        *(pl.lit(None, pl.Float64).alias(f"{name}_{part}") for name in others for part in ("value", "threshold")),
+        *(pl.lit("not_evaluated").alias(f"{name}_state") for name in others),
+    )
+
+
+ALL = [
+    f"{axis}_{scale}" for axis in ("along", "cross", "up") for scale in ("raw", "ewma_0p1", "ewma_0p01", "ewma_0p001")
+]
+
+
+def test_intercept_and_slope_are_found() -> None:
+    fits = regress_sigmas([monitored(seed, 0.4, 1.5) for seed in range(3)], FACTOR)
+    assert [fit.monitor for fit in fits] == ["along_raw"]
+    assert fits[0].intercept_m == pytest.approx(0.4, abs=4 * fits[0].intercept_error_m)
+    assert fits[0].slope == pytest.approx(1.5, abs=4 * fits[0].slope_error)
+    assert 0 < fits[0].slope_error < 0.1
+
+
+def test_a_constant_sigma_gives_a_slope_alone() -> None:
+    (fit,) = regress_sigmas([monitored(1, 0.0, 2.0, spread=0.0)], FACTOR)
+    assert fit.intercept_m == 0.0
+    assert fit.slope == pytest.approx(2.0, rel=0.02)
+
+
+def test_the_loudest_proven_monitor_decides() -> None:
+    (fit,) = regress_sigmas([monitored(1, 0.0, 1.2)], FACTOR)
+    lucky = type(fit)("up_raw", 100, 1.4, 0.5, 0.0, 0.0, 1.4, 0.5)
+    assert worst_fit([lucky, fit]) is fit
+    assert worst_fit([]) is None
+    assert sigma_table([fit, lucky]).height == 2
+
+
+@pytest.fixture(scope="module")
+def fault_free() -> tuple[list[RunLog], Site]:
+    scenario = demo_scenario()
+    runs = tuple(scenario.runs[0].model_copy(update={"id": f"clean{k}"}) for k in range(2))
+    scenario = scenario.model_copy(update={"runs": runs})
+    return [build_run(scenario, run) for run in runs], build_site(scenario)
+
+
+def test_calibration_finds_the_simulated_vehicle(fault_free: tuple[list[RunLog], Site]) -> None:
+    """The demonstration's vehicle: scale 1.0015, latency 50 ms; receiver and bank agree, so the slope is 1."""
+    logs, site = fault_free
+    result = calibrate(logs, site)
+    vehicle = result.vehicle
+    assert vehicle.odometer_scale == pytest.approx(1.0015, abs=4 * (vehicle.odometer_scale_sigma or 0))
+    assert vehicle.gnss_latency_s == pytest.approx(0.05, abs=4 * (vehicle.gnss_latency_sigma_s or 0))
+    assert 0 < (vehicle.odometer_scale_sigma or 0) < 2e-4
+    assert 0 < (vehicle.gnss_latency_sigma_s or 0) < 0.03
+    assert result.runs["run_id"].to_list() == ["clean0", "clean1"]
+    assert result.sigmas.height == 12
+    assert result.sigma_slope == pytest.approx(1.0, abs=0.1)
+    settings = tomllib.loads(result.monitors_toml())
+    assert settings["monitors"]["sigma_slope"] == result.sigma_slope
+
+
+def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]) -> None:
+    logs, site = fault_free
+    with pytest.raises(InputError, match="no run gives"):
+        calibrate([logs[0].with_streams(odometer=None)], site)

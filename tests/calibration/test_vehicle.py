@@ -1,0 +1,99 @@
+"""Scale and latency against known truth, with honest uncertainty; pooling worked by hand."""
+
+import numpy as np
+import pytest
+
+from pipeline.calibration.vehicle import Observations, estimate_run, pooled
+from pipeline.odometer import OdometerTrack
+from pipeline.odometer_filter import error_model
+from schemas.config import MonitorConfig
+
+SHARES, TAUS_S = error_model(MonitorConfig())
+SCALE, LATENCY_S, SIGMA_M = 1.004, 0.12, 1.2
+
+
+def simulated_run(seed: int, duration_s: int = 1500, moving: bool = True) -> tuple[Observations, OdometerTrack]:
+    """A train that speeds up and brakes between 5 and 45 m/s; odometer at 10 Hz, positions at 2 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, duration_s, 0.1)
+    speed = 25.0 + 20.0 * np.sin(2 * np.pi * t / 240.0) if moving else np.full(t.size, 25.0)
+    true = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * 0.1)])
+    walk = np.cumsum(rng.normal(0.0, 0.05 * np.sqrt(0.1), t.size))
+    at = np.arange(20.0, duration_s - 20.0, 0.5)
+    error = np.zeros(at.size)
+    for share, tau in zip(SHARES, TAUS_S, strict=True):
+        phi = np.exp(-0.5 / tau)
+        noise = rng.standard_normal(at.size)
+        unit = np.empty(at.size)
+        unit[0] = noise[0]
+        for k in range(1, at.size):
+            unit[k] = phi * unit[k - 1] + np.sqrt(1 - phi**2) * noise[k]
+        error += np.sqrt(share) * SIGMA_M * unit
+    position = np.interp(at - LATENCY_S, t, true) + error + 500.0
+    none = np.zeros(t.size, dtype=bool)
+    track = OdometerTrack(0, t, true / SCALE + walk, np.zeros(t.size, dtype=np.int64), none[1:], none, 0.05**2)
+    return Observations(at, position, np.full(at.size, SIGMA_M)), track
+
+
+def test_truth_lies_within_the_stated_uncertainty() -> None:
+    """20 runs: standardised errors have mean 0 and spread 1, misfit is 1."""
+    results = [estimate_run(*simulated_run(seed), SHARES, TAUS_S) for seed in range(20)]
+    found = [one for one in results if one is not None]
+    assert len(found) == 20
+    scale = np.array([(one.scale - SCALE) / one.scale_sigma for one in found])
+    latency = np.array([(one.latency_s - LATENCY_S) / one.latency_sigma_s for one in found])
+    for standardised in (scale, latency):
+        assert abs(standardised.mean()) < 3.0 / np.sqrt(20)
+        assert 0.5 < standardised.std() < 1.6
+    assert np.mean([one.misfit for one in found]) == pytest.approx(1.0, abs=0.1)
+    assert all(one.latency_sigma_s < 0.05 and one.scale_sigma < 3e-4 for one in found)
+
+
+def test_start_of_the_search_does_not_matter() -> None:
+    seen, track = simulated_run(3)
+    one = estimate_run(seen, track, SHARES, TAUS_S)
+    other = estimate_run(seen, track, SHARES, TAUS_S, latency_s=0.5)
+    assert one is not None
+    assert other is not None
+    assert other.latency_s == pytest.approx(one.latency_s, abs=1e-6)
+
+
+def test_louder_noise_than_stated_widens_the_uncertainty() -> None:
+    seen, track = simulated_run(4)
+    honest = estimate_run(seen, track, SHARES, TAUS_S)
+    boastful = estimate_run(Observations(seen.t_s, seen.path_m, seen.sigma_m / 5.0), track, SHARES, TAUS_S)
+    assert honest is not None
+    assert boastful is not None
+    assert boastful.misfit > 1.5
+    assert boastful.scale_sigma > 0.3 * honest.scale_sigma
+
+
+def test_lost_distance_is_bridged_by_separate_offsets() -> None:
+    seen, track = simulated_run(5)
+    jump = (track.t_s >= 700.0).astype(np.int64)
+    broken = OdometerTrack(
+        0, track.t_s, track.distance_m + 300.0 * jump, jump, track.pause, track.slip, track.white_rate_m2_per_s
+    )
+    whole, parts = (estimate_run(seen, one, SHARES, TAUS_S) for one in (track, broken))
+    assert whole is not None
+    assert parts is not None
+    assert parts.scale == pytest.approx(whole.scale, abs=4 * whole.scale_sigma)
+    assert parts.scale_sigma > whole.scale_sigma
+
+
+def test_too_little_data_gives_nothing() -> None:
+    seen, track = simulated_run(6, duration_s=60)
+    few = Observations(seen.t_s[:10], seen.path_m[:10], seen.sigma_m[:10])
+    assert estimate_run(few, track, SHARES, TAUS_S) is None
+
+
+def test_pooling_by_hand() -> None:
+    """Equal sigmas, runs that agree: the mean with sigma / sqrt(n). Runs that differ: their scatter stays."""
+    agree = pooled(np.array([1.0, 1.0, 1.0, 1.0]), np.full(4, 0.2))
+    assert (agree.value, agree.sigma) == (pytest.approx(1.0), pytest.approx(0.1))
+    # Two runs at -1 and 1 with sigma 0.1: between = (Q - 1) / (sum w - sum w^2 / sum w) = (200 - 1) / 100.
+    differ = pooled(np.array([-1.0, 1.0]), np.full(2, 0.1))
+    assert differ.value == pytest.approx(0.0)
+    assert differ.sigma == pytest.approx(np.sqrt((0.01 + 1.99) / 2.0 + 1.99))
+    alone = pooled(np.array([3.0]), np.array([0.4]))
+    assert (alone.value, alone.sigma) == (pytest.approx(3.0), pytest.approx(0.4))
