@@ -10,14 +10,16 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import earth_centred_m, points_of
+from pipeline.geodesy import points_of
 from pipeline.track import GAP_COUNTS_M, Track, geometric_measures_m, track_of
+from schemas.enums import Navigability
 from schemas.run import Finding
 
 # Ends that a relation joins: up to `GAP_COUNTS_M` is survey noise; above, the gap is a finding and counts as
 # track; beyond this the path position would be wrong by a position failure, so the site is refused.
 GAP_LIMIT_M = 20.0
 NEAR_ENDS_M = 5.0
+HEIGHT_STEP_M = 0.5
 SHORT_ELEMENT_M = 1.0
 LENGTH_TOLERANCE = 1e-3
 LENGTH_TOLERANCE_M = 0.5
@@ -132,21 +134,26 @@ def chord_errors_m(track: Track, part: slice) -> np.ndarray:
 
 
 def _end_position(track: Track, name: str, position: int) -> np.ndarray:
-    vertex = track.end(track.index[name], position)
-    height = np.nan_to_num(track.height_m[[vertex]])
-    place = earth_centred_m(track.latitude_deg[[vertex]], track.longitude_deg[[vertex]], height)
-    return np.asarray(place[0])
+    """Place of an end, heights left out: not every element has them."""
+    vertex = [track.end(track.index[name], position)]
+    return np.asarray(points_of(track.latitude_deg[vertex], track.longitude_deg[vertex]).surface[0])
 
 
 def _check_gaps(track: Track, found: Remarks) -> None:
-    for a, position_a, b, position_b, _ in found.links.iter_rows():
+    """Ends that a relation joins must meet, in place and, where both have one, in height."""
+    for a, position_a, b, position_b, navigability in found.links.iter_rows():
         gap = float(np.linalg.norm(_end_position(track, a, position_a) - _end_position(track, b, position_b)))
         text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
-        if gap > GAP_LIMIT_M:
+        if gap > GAP_LIMIT_M and navigability != Navigability.NONE.value:
             found.breaches.append(f"links: {text}; expected at most {GAP_LIMIT_M:g} m")
         elif gap > GAP_COUNTS_M:
             remedy = "The straight line between them counts as track; survey the missing piece."
             found.findings.append(Finding("warning", "links", text, remedy))
+        ends = [track.end(track.index[a], position_a), track.end(track.index[b], position_b)]
+        step = float(np.abs(np.diff(track.height_m[ends])[0]))
+        if step > HEIGHT_STEP_M:
+            text = f"end {position_a} of {a} and end {position_b} of {b} differ by {step:.1f} m in height"
+            found.findings.append(Finding("warning", "links", text, "Mend the heights."))
 
 
 def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
