@@ -139,25 +139,30 @@ def _contract(schema: type[Schema], **columns: object) -> pl.DataFrame:
 
 def _log(segment: Path, name: str) -> tuple[Floats, Floats]:
     folder = segment / "processed_log" / name
+    return _array(folder / "t"), _array(folder / "value")
+
+
+def _array(path: Path) -> Floats:
     try:
-        return np.load(folder / "t"), np.load(folder / "value")
+        values: Floats = np.load(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot be read: {error}", place=str(folder), expected="arrays t and value") from None
+        raise InputError(f"cannot be read: {error}", place=str(path), expected="a comma2k19 segment") from None
+    return values
 
 
 def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
     """Times on the device's clock, and positions in WGS 84."""
     folder = segment / "global_pose"
     to_wgs84 = pyproj.Transformer.from_crs(4978, 4979, always_xy=True)
-    longitude, latitude, height = to_wgs84.transform(*np.load(folder / "frame_positions").T)
+    longitude, latitude, height = to_wgs84.transform(*_array(folder / "frame_positions").T)
     places = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
-    return np.load(folder / "frame_times"), places
+    return _array(folder / "frame_times"), places
 
 
 def _utc_offset_s(segment: Path) -> float:
     """What is added to the device's clock: both are known for the first frame."""
-    week, second = np.load(segment / "global_pose" / "frame_gps_times")[0]
-    boot_s = float(np.load(segment / "global_pose" / "frame_times")[0])
+    week, second = _array(segment / "global_pose" / "frame_gps_times")[0]
+    boot_s = float(_array(segment / "global_pose" / "frame_times")[0])
     return float(_GPS_EPOCH_S + week * _WEEK_S + second - _LEAP_S) - boot_s
 
 

@@ -1,0 +1,82 @@
+"""The demonstration finds what it injects, and its comparison can say no."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from datasets.comparison import checks_table, compare, describe_faults
+from datasets.demo import DemoResult, demo, demo_scenario
+from datasets.trial import build_run
+from schemas.run import RunTables
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
+    return demo(tmp_path_factory.mktemp("demo"))
+
+
+def test_the_replay_finds_what_was_injected(result: DemoResult) -> None:
+    differs = result.checks.filter(~pl.col("agrees"))
+    assert differs.rows() == []
+    assert result.agrees
+
+
+def test_another_seed_shows_the_same(tmp_path: Path) -> None:
+    assert demo(tmp_path, seed=1).checks.filter(~pl.col("agrees")).rows() == []
+
+
+def test_the_demo_line_is_long_and_hilly_and_its_balises_are_spaced_as_on_railways() -> None:
+    line = demo_scenario().line
+    assert sum(element.length_m for element in line.elements) >= 25_000
+    assert len(line.elements) >= 3
+    assert len({section.grade for section in line.sections}) >= 3
+    places = sorted(balise.at_m for balise in line.balises)
+    assert len(places) >= 10
+    assert all(600.0 <= b - a <= 2500.0 for a, b in pairwise(places))
+    assert {run.log for run in demo_scenario().runs} >= {"json", "parquet"}
+
+
+def tables_of(result: DemoResult, run_id: str) -> RunTables:
+    return next(tables for tables in result.tables if tables.run_id == run_id)
+
+
+@pytest.mark.parametrize(
+    ("run_id", "spoil"),
+    [
+        ("jump_two", {"hazards": lambda t: t.head(1)}),
+        ("jump_two", {"hazards": lambda t: t.with_columns(detected=pl.lit(False))}),
+        (
+            "jump_two",
+            {
+                "hazards": lambda t: t.with_columns(
+                    t_onset=pl.col("t_onset") + pl.duration(milliseconds=300, time_unit="ns")
+                )
+            },
+        ),
+        ("clean", {"passages": lambda t: t.head(5)}),
+        ("clean", {"passages": lambda t: pl.concat([t, t.head(1)])}),
+        ("outage", {"passages": lambda t: t.with_columns(status=pl.lit("accepted", t["status"].dtype))}),
+        ("slip", {"alarms": lambda t: t.clear()}),
+        ("odometer_scale", {"runs": lambda t: t.with_columns(odometer_scale=pl.lit(1.002))}),
+        ("clean", {"runs": lambda t: t.with_columns(status=pl.lit("partial", t["status"].dtype))}),
+    ],
+)
+def test_a_spoilt_result_differs(result: DemoResult, run_id: str, spoil: dict) -> None:  # type: ignore[type-arg]
+    scenario = result.scenario
+    spec = next(run for run in scenario.runs if run.id == run_id)
+    run, tables = build_run(scenario, spec), tables_of(result, run_id)
+    assert checks_table(compare(spec, run, tables))["agrees"].all()
+    spoilt = replace(tables, **{name: change(getattr(tables, name)) for name, change in spoil.items()})
+    assert not checks_table(compare(spec, run, spoilt))["agrees"].all()
+
+
+def test_faults_in_words(result: DemoResult) -> None:
+    words = dict(result.checks.select("run_id", "injected").unique().iter_rows())
+    assert words["clean"] == "none"
+    assert words["jump_two"] == "step along +1300 for 3 s"
+    assert describe_faults(None) == "none"
