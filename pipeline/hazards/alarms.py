@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools
+from pipeline.hazards.arrays import NS_PER_S, Bools, Ints, runs_of
 from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
 from schemas.tables import Alarms
+
+# Streams rarely begin and end with the same epoch: so little without truth says nothing against it.
+_BLIND_S = 1.0
 
 
 def alarms_table(
@@ -59,7 +62,7 @@ def hazard_of(span: AlarmSpan, judged: list[Judged]) -> int | None:
 def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     """False when |e| stayed below max(5 m, 3 sigma) from 300 s before the alarm to its end.
 
-    Epochs with a position but no truth, or an error that the evidence cannot resolve, leave it unknown.
+    More than a second of positions without truth, or an error that the evidence cannot resolve, leave it unknown.
     """
     since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = slice(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
@@ -70,5 +73,11 @@ def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
         proved = beyond & (error > w.bound_m[part])
     if proved.any():
         return Verdict.TRUE
-    unknown = beyond.any() or bool((position & ~np.isfinite(error)).any()) or not np.isfinite(error).any()
+    blind = _longest_s(position & ~np.isfinite(error), w.t_ns[part]) > _BLIND_S
+    unknown = beyond.any() or blind or not np.isfinite(error).any()
     return Verdict.UNKNOWN if unknown else Verdict.FALSE
+
+
+def _longest_s(mask: Bools, t_ns: Ints) -> float:
+    firsts, lasts = runs_of(mask)
+    return float((t_ns[lasts] - t_ns[firsts]).max()) / NS_PER_S if firsts.size else 0.0

@@ -21,6 +21,7 @@ from pipeline.hazards.passages import (
     location_errors,
     positions_at,
     suspicious_passages,
+    wrongly_offered,
 )
 from pipeline.hazards.passing import true_passings
 from pipeline.hazards.rows import Judged, Locate, hazards_table
@@ -124,7 +125,8 @@ def _passages(
     gap_s = linking_gap_s(series.period_s, config.lds.crossing_gap_s)
     positioned = positions_at(epochs, t_true, gap_s)
     error = location_errors(passages, epochs, truth, gap_s)
-    return judge_passages(passages, error, t_true, links, suspicious, positioned, config.hazards)
+    wrong = wrongly_offered(passages, error, epochs, truth, config.hazards)
+    return judge_passages(passages, error, wrong, t_true, links, suspicious, positioned)
 
 
 def _epochs(

@@ -30,14 +30,17 @@ class Links:
 def judge_passages(
     passages: pl.DataFrame,
     error: Floats,
+    wrong: Bools,
     t_true: list[int | None],
     links: Links,
     suspicious: Bools,
     positioned: Bools,
-    config: HazardConfig,
 ) -> pl.DataFrame:
-    """Passages with the columns of the truth filled in. `positioned`: a position was there when the train passed."""
-    mode, cause = _modes(passages, error, links, positioned, config)
+    """Passages with the columns of the truth filled in.
+
+    `wrong`: offered early or late beyond the limit; `positioned`: a position was there when the train passed.
+    """
+    mode, cause = _modes(passages, wrong, error, links, positioned)
     filled = passages.with_columns(
         pl.Series("t_true", t_true, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
         pl.Series("location_error_m", error, nan_to_null=True),
@@ -69,6 +72,18 @@ def location_errors(passages: pl.DataFrame, epochs: pl.DataFrame, truth: pl.Data
         near = np.clip(np.searchsorted(x, at), 0, x.size - 1)
         error[rows[mine]] = (balise[mine] - train) * direction[near]
     return error
+
+
+def wrongly_offered(
+    passages: pl.DataFrame, error: Floats, epochs: pl.DataFrame, truth: pl.DataFrame, config: HazardConfig
+) -> Bools:
+    """Location errors beyond the shift limit that the evidence can resolve."""
+    offered = passages["t_offered"].dt.timestamp("ns").fill_null(0).to_numpy()
+    near = np.clip(np.searchsorted(times_ns(epochs), offered), 0, max(epochs.height - 1, 0))
+    bound = np.nan_to_num(floats(truth, "truth_bound_m")[near]) if epochs.height else np.zeros(error.size)
+    with np.errstate(invalid="ignore"):
+        beyond: Bools = np.abs(error) > np.maximum(config.shift_limit_m, bound)
+    return beyond
 
 
 def link_passages(passages: pl.DataFrame, judged: list[Judged], series: Series) -> Links:
@@ -132,7 +147,7 @@ def positions_at(epochs: pl.DataFrame, t_true: list[int | None], gap_s: float) -
 
 
 def _modes(
-    passages: pl.DataFrame, error: Floats, links: Links, positioned: Bools, config: HazardConfig
+    passages: pl.DataFrame, wrong: Bools, error: Floats, links: Links, positioned: Bools
 ) -> tuple[list[str], list[str]]:
     """ETCS failure mode and its cause: insertion where offered early or by a jump, deletion where not
     offered inside its window or before it.
@@ -143,8 +158,7 @@ def _modes(
     modes, causes = [], []
     for row in range(passages.height):
         mode, cause = FailureMode.NONE, Cause.NONE
-        wrong = bool(abs(error[row]) > config.shift_limit_m)
-        if links.jumped[row] or (wrong and error[row] > 0):
+        if links.jumped[row] or (wrong[row] and error[row] > 0):
             mode, cause = FailureMode.INSERTION, Cause.POSITION
         elif status[row] == PassageStatus.NOT_AVAILABLE.value:
             mode, cause = FailureMode.DELETION, Cause.NO_POSITION
@@ -152,7 +166,7 @@ def _modes(
             mode = FailureMode.DELETION
             cause = Cause.POSITION if positioned[row] else Cause.NO_POSITION
         elif late[row]:
-            mode, cause = FailureMode.DELETION, Cause.POSITION if wrong else Cause.NONE
+            mode, cause = FailureMode.DELETION, Cause.POSITION if wrong[row] else Cause.NONE
         modes.append(mode.value)
         causes.append(cause.value)
     return modes, causes

@@ -36,10 +36,16 @@ def lds_states(
     config: HazardConfig,
     lds: LdsConfig,
 ) -> pl.Series:
-    """P2 negated; P3 diagnosis faulty; P1 error beyond the failure limit; P0. Null without a truth."""
-    known = np.isfinite(error_along_m)
-    state = np.where(np.abs(error_along_m) > config.failure_limit_m, _code(LdsState.P1), _code(LdsState.P0))
-    state[~known] = -1
+    """P2 negated; P3 diagnosis faulty; P1 error beyond the failure limit; P0.
+
+    Null without a truth, and where an error beyond the limit is less than the evidence can resolve.
+    """
+    size, bound = np.abs(error_along_m), floats(truth, "truth_bound_m")
+    with np.errstate(invalid="ignore"):
+        failed = size > config.failure_limit_m
+        unresolved = failed & (size <= bound)
+    state = np.where(failed, _code(LdsState.P1), _code(LdsState.P0))
+    state[unresolved | ~np.isfinite(size)] = -1
     faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(epochs, truth, passages, lds)
     state[faulty] = _code(LdsState.P3)
     state[flags(epochs, "negated")] = _code(LdsState.P2)

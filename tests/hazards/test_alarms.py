@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import polars as pl
 import pytest
 
-from tests.hazards.synthetic import Journey, judge, seconds
+from pipeline.hazards import classify, establish_truth
+from schemas.config import Configuration
+from tests.hazards.synthetic import Journey, judge, locate, seconds, truth_of
 
 
 def alarms(journey):
@@ -59,12 +62,6 @@ def test_no_truth_leaves_the_verdict_unknown():
 
 
 def judge_without_odometer(journey):
-    import polars as pl
-
-    from pipeline.hazards import classify, establish_truth
-    from schemas.config import Configuration
-    from tests.hazards.synthetic import locate
-
     config = Configuration()
     nothing = pl.lit(None, pl.Float64)
     epochs = journey.epochs().with_columns(odometer_m=nothing, scale_sigma=nothing, odometer_white_m2_per_s=nothing)
@@ -87,12 +84,6 @@ def test_only_cross_monitors_with_a_reference_that_clears_the_position_point_at_
 
 
 def test_ambiguous_track_is_suspected():
-    import polars as pl
-
-    from pipeline.hazards import classify
-    from schemas.config import Configuration
-    from tests.hazards.synthetic import locate, truth_of
-
     journey = Journey(fails={"cross_raw": ((50.0, 51.0),)})
     doubtful = journey.within(((49.0, 52.0),))
     epochs = journey.epochs().with_columns(
@@ -102,3 +93,15 @@ def test_ambiguous_track_is_suspected():
         "primary", epochs, truth_of(journey), journey.passages(), journey.balises(), None, locate, Configuration()
     )
     assert result.alarms["suspect"].to_list() == ["track"]
+
+
+def test_truth_that_is_missing_for_longer_than_a_second_leaves_the_verdict_open():
+    journey = Journey(fails={"along_raw": ((50.0, 51.0),)})
+    config, passages = Configuration(), journey.passages()
+    nothing = pl.lit(None, pl.Float64)
+    epochs = journey.epochs().with_columns(odometer_m=nothing)
+    for first_s, verdict in ((0.5, "false"), (3.0, "unknown")):
+        reference = journey.reference_frame().slice(round(first_s * 20))
+        truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
+        result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+        assert result.alarms["verdict"].to_list() == [verdict]

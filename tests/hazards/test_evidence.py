@@ -47,7 +47,11 @@ def test_only_what_exceeds_the_odometers_confidence_is_a_hazard():
     # V2 (500 m) accepted at 25 s; 22 m from 55 s on: V6 (1300 m) offered 778 m after it, 5 + 38.9 m cover that.
     journey = Journey(steps=((55.0, 75.0, 19.5),), ramps=((56.0, 75.0, 0.5),), accepted=VBS_ACCEPTED)
     assert judge(journey).hazards.height == 1
-    assert judge(journey.but(reference=False)).hazards.height == 0
+    by_odometer = judge(journey.but(reference=False))
+    assert by_odometer.hazards.height == 0
+    # 24 m at 65 s: beyond the limit, within 5 m + 5 % of 800 m: neither sound nor failed.
+    assert judge(journey).epochs_columns["lds_state"][650] == "P1"
+    assert by_odometer.epochs_columns["lds_state"][650] is None
 
 
 def test_truth_is_interpolated_to_the_time_of_validity():
