@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import polars as pl
 
+from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from schemas.errors import InputError
 
@@ -101,26 +102,29 @@ def protobuf_descriptor(channel: Channel) -> Any:
     return _protobuf_decoder(channel)(b"").DESCRIPTOR
 
 
-def decode_columns(
-    channel: Channel, payloads: Iterable[bytes], types: Mapping[str, pl.DataType], numbers: Iterable[int]
-) -> pl.DataFrame:
-    """One column per field path, decoded message by message; `numbers` are their places in the file."""
+def decode_columns(channel: Channel, messages: Messages, types: Mapping[str, pl.DataType]) -> pl.DataFrame:
+    """One column per field path, decoded message by message."""
     decode = decoder_for(channel)
-    takers = [(path, *_taker(path), _coercion(dtype)) for path, dtype in types.items()]
+    takers = [(path, _taker(path), _COERCIONS[type(dtype)]) for path, dtype in types.items()]
     values: dict[str, list[Value]] = {path: [] for path in types}
-    for number, payload in zip(numbers, payloads, strict=True):
+    for row in range(len(messages)):
         try:
-            message = decode(payload)
-            for path, _, take, coerce in takers:
+            message = decode(messages.payload(row))
+            for path, take, coerce in takers:
                 values[path].append(coerce(take(message)))
         except NotDecodable as error:
-            raise InputError(
-                f"message {number} cannot be decoded: {error}",
-                place=channel.place,
-                remedy="Record the log again or map other fields.",
-            ) from None
+            raise undecodable(channel, messages, row, error) from None
     return pl.DataFrame(
         [pl.Series(path, column, dtype=types[path]) for path, column in values.items()], strict=True
+    )
+
+
+def undecodable(channel: Channel, messages: Messages, row: int, error: NotDecodable) -> InputError:
+    """The error for one message, named by the time at which it was recorded."""
+    return InputError(
+        f"the message of log time {messages.times('log_time')[row]} ns cannot be decoded: {error}",
+        place=channel.place,
+        remedy="Record the log again, or map other fields.",
     )
 
 
@@ -134,7 +138,7 @@ def parse_path(path: str) -> list[str | int]:
     return steps
 
 
-def _taker(path: str) -> tuple[list[str | int], Callable[[Value], Value]]:
+def _taker(path: str) -> Callable[[Value], Value]:
     steps = parse_path(path)
 
     def take(message: Value) -> Value:
@@ -145,7 +149,7 @@ def _taker(path: str) -> tuple[list[str | int], Callable[[Value], Value]]:
                 return None
         return value
 
-    return steps, take
+    return take
 
 
 def child(value: Value, step: str | int) -> Value:
@@ -160,10 +164,6 @@ def child(value: Value, step: str | int) -> Value:
         if known is None or (known.has_presence and not value.HasField(step)):
             return None
     return getattr(value, step, None)
-
-
-def _coercion(dtype: pl.DataType) -> Callable[[Value], Value]:
-    return _COERCIONS[type(dtype)]
 
 
 def _as_float(value: Value) -> float | None:

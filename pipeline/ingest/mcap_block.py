@@ -26,30 +26,65 @@ MESSAGE_HEAD = np.dtype(
     }
 )
 MESSAGE_HEAD_SIZE = MESSAGE_HEAD.itemsize
+_MESSAGE = int(Op.MESSAGE)
 _FIXED_FIELDS = MESSAGE_HEAD_SIZE - HEAD_SIZE
-_INDEX_ENTRY = np.dtype([("log_time", "<i8"), ("offset", "<u8")])
-
 OnRecord = Callable[[int, memoryview, int], None]
 
 
 @dataclass(frozen=True)
-class Block:
-    """Messages of a block in order of the file: one entry per message, payloads inside `data`."""
+class Messages:
+    """Messages of one channel in a block, in order of the file: where their payloads lie in `data`.
+
+    `ordinal` orders messages of all channels of the log as they stand in the file.
+    """
 
     data: Bytes
-    channel: npt.NDArray[np.uint16]
     start: Ints
     length: Ints
-    log_time: Ints
-    publish_time: Ints
-    first_ordinal: int
+    ordinal: Ints
+    heads: npt.NDArray[Any]  # of more messages than these, where `picked` tells which
+    picked: Ints | None = None
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def times(self, name: str) -> Ints:
+        """`log_time` or `publish_time` [ns]."""
+        times: Ints = self.heads[name].astype(np.int64)
+        if self.picked is not None:
+            times = times[self.picked]
+        if len(times) and times.min() < 0:
+            raise Damage(0, "a time of a message is beyond the year 2262")
+        return times
+
+    def payload(self, row: int) -> bytes:
+        first = int(self.start[row])
+        return self.data[first : first + int(self.length[row])].tobytes()
+
+    def chosen(self, rows: npt.NDArray[Any]) -> Messages:
+        """Some of them, by mask or number."""
+        if rows.dtype == np.bool_:
+            rows = np.flatnonzero(rows)
+        picked = rows if self.picked is None else self.picked[rows]
+        return Messages(
+            self.data, self.start[rows], self.length[rows], self.ordinal[rows], self.heads, picked
+        )
+
+
+Block = dict[int, Messages]  # by channel
 
 
 def gathered(data: Bytes, starts: Ints, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     """Values of `dtype` that stand at arbitrary byte offsets; the offsets must have been checked."""
     kind = np.dtype(dtype)
-    every_offset = np.ndarray((len(data) - kind.itemsize + 1,), kind, data.data, strides=(1,))
-    return every_offset[starts]
+    return stretches_of(data, starts, kind.itemsize).reshape(-1).view(kind)
+
+
+def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
+    """`width` bytes from each of these offsets on, one row each."""
+    # As plain bytes: numpy gathers structured values five times slower, field by field.
+    every_offset = np.ndarray((len(data) - width + 1,), f"V{width}", data.data, strides=(1,))
+    return every_offset[starts].view(np.uint8).reshape(-1, width)
 
 
 def decompressed(chunk: ChunkRecord, limit: int) -> Bytes:
@@ -91,22 +126,40 @@ def _lz4(chunk: ChunkRecord) -> Any:
     return records
 
 
-def message_offsets(
-    data: Bytes, indexes: Sequence[tuple[int, memoryview]], offset: int, on_record: OnRecord
-) -> Ints:
-    """Offsets of all message records of a chunk, in order; other records go to `on_record`.
+def chunk_messages(
+    data: Bytes,
+    indexes: Sequence[tuple[int, memoryview]],
+    offset: int,
+    first_ordinal: int,
+    on_record: OnRecord,
+) -> Block:
+    """All messages of a chunk; other records go to `on_record`.
 
     Taken from the chunk's message indexes where it has them, and proved: the records tile the chunk
     exactly. Without indexes, or with empty ones, the chunk is walked record by record.
     """
     filled = [(channel, entries) for channel, entries in indexes if len(entries)]
     if not filled:
-        return np.array(_walk(data, 0, len(data), offset, on_record), dtype=np.int64)
-    return _indexed(data, filled, offset, on_record)
+        starts = np.array(_walk(data, 0, len(data), offset, on_record), dtype=np.int64)
+        return block_of(data, starts, offset, first_ordinal)
+    if len(data) < MESSAGE_HEAD_SIZE:
+        raise Damage(offset, "a message index points outside its chunk")
+    named = [_indexed(data, channel, entries, offset) for channel, entries in filled]
+    others = _between(data, [part[:2] for part in named], offset, on_record)
+    if len(others):
+        _check_unindexed(data, others, {channel for channel, _ in filled}, offset)
+        starts = np.concatenate([others, *(start for start, _, _ in named)])
+        return block_of(data, np.sort(starts), offset, first_ordinal)
+    if len({channel for channel, _ in filled}) < len(filled):
+        raise Damage(offset, "a chunk has two message indexes for one channel")
+    return {
+        channel: _messages(data, *_in_order(start, heads), offset, first_ordinal)
+        for (channel, _), (start, _, heads) in zip(filled, named, strict=True)
+    }
 
 
 def _walk(data: Bytes, start: int, end: int, offset: int, on_record: OnRecord) -> list[int]:
-    """Record by record from `start` to exactly `end`."""
+    """Record by record from `start` to exactly `end`; the offsets of messages."""
     unpack, messages, view = HEAD.unpack_from, [], memoryview(data.data)
     message, room = int(Op.MESSAGE), end - HEAD_SIZE
     while start < end:
@@ -125,45 +178,45 @@ def _walk(data: Bytes, start: int, end: int, offset: int, on_record: OnRecord) -
 
 
 def _indexed(
-    data: Bytes, indexes: Sequence[tuple[int, memoryview]], offset: int, on_record: OnRecord
-) -> Ints:
-    entries = np.concatenate([np.frombuffer(entries, _INDEX_ENTRY) for _, entries in indexes])
-    channels = np.repeat(
-        np.array([channel for channel, _ in indexes], dtype=np.uint16),
-        [len(entries) // 16 for _, entries in indexes],
-    )
-    if entries["offset"].max() > max(len(data) - MESSAGE_HEAD_SIZE, 0) or len(data) < MESSAGE_HEAD_SIZE:
+    data: Bytes, channel: int, entries: memoryview, offset: int
+) -> tuple[Ints, Ints, npt.NDArray[Any]]:
+    """Starts, ends and heads of the messages that an index names, held against what stands there."""
+    pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
+    if pairs[:, 1].max() > len(data) - MESSAGE_HEAD_SIZE:
         raise Damage(offset, "a message index points outside its chunk")
-    order = np.argsort(entries["offset"], kind="stable")
-    starts = entries["offset"][order].astype(np.int64)
+    starts = pairs[:, 1].astype(np.int64)
     heads = gathered(data, starts, MESSAGE_HEAD)
-    agrees = (heads["opcode"] == Op.MESSAGE) & (heads["channel"] == channels[order])
-    if not (agrees & (heads["log_time"] == entries["log_time"][order])).all():
+    agrees = (heads["opcode"] == _MESSAGE) & (heads["channel"] == channel)
+    agrees &= heads["log_time"] == pairs[:, 0].view(np.int64)
+    if not agrees.all():
         raise Damage(offset, "a message index disagrees with its chunk")
-    if heads["length"].max() > len(data):
+    lengths = heads["length"]
+    if lengths.max() > len(data):
         raise Damage(offset, "a record runs past the end of its chunk")
-    ends = starts + HEAD_SIZE + heads["length"].astype(np.int64)
-    return _tiled(data, starts, ends, {channel for channel, _ in indexes}, offset, on_record)
+    return starts, starts + lengths.astype(np.int64) + HEAD_SIZE, heads
 
 
-def _tiled(
-    data: Bytes, starts: Ints, ends: Ints, indexed: set[int], offset: int, on_record: OnRecord
+def _between(
+    data: Bytes, named: Sequence[tuple[Ints, Ints]], offset: int, on_record: OnRecord
 ) -> Ints:
-    """All offsets, once what lies between the indexed messages is walked and nothing overlaps."""
-    gap_starts = np.concatenate([[0], ends])
-    gap_ends = np.concatenate([starts, [len(data)]])
-    if (gap_starts > gap_ends).any():
-        raise Damage(offset, "records of a chunk overlap, or its message index names one twice")
+    """Messages that no index names; proves that all records together tile the chunk exactly.
+
+    Records that follow each other without gap: sorted, each end but the last is the next start.
+    """
+    starts = np.sort(np.concatenate([start for start, _ in named]))
+    ends = np.sort(np.concatenate([end for _, end in named]))
+    gaps = [(0, int(starts[0])), (int(ends[-1]), len(data))]
+    if not np.array_equal(starts[1:], ends[:-1]):
+        if (starts[1:] < ends[:-1]).any():
+            raise Damage(offset, "records of a chunk overlap, or its message index names one twice")
+        inner = np.flatnonzero(starts[1:] > ends[:-1])
+        gaps += [(int(ends[gap]), int(starts[gap + 1])) for gap in inner]
+    if gaps[1][0] > len(data):
+        raise Damage(offset, "a record runs past the end of its chunk")
     found = [
-        start
-        for gap in np.flatnonzero(gap_starts < gap_ends)
-        for start in _walk(data, int(gap_starts[gap]), int(gap_ends[gap]), offset, on_record)
+        start for first, last in sorted(gaps) for start in _walk(data, first, last, offset, on_record)
     ]
-    if not found:
-        return starts
-    extra = np.array(found, dtype=np.int64)
-    _check_unindexed(data, extra, indexed, offset)
-    return np.sort(np.concatenate([starts, extra]))
+    return np.array(found, dtype=np.int64)
 
 
 def _check_unindexed(data: Bytes, starts: Ints, indexed: set[int], offset: int) -> None:
@@ -174,22 +227,36 @@ def _check_unindexed(data: Bytes, starts: Ints, indexed: set[int], offset: int) 
         raise Damage(offset, "a message index lacks messages of its chunk")
 
 
+def _in_order(starts: Ints, heads: npt.NDArray[Any]) -> tuple[Ints, npt.NDArray[Any]]:
+    """By place in the file (an index is sorted by log time)."""
+    if (starts[1:] > starts[:-1]).all():
+        return starts, heads
+    order = np.argsort(starts)
+    return starts[order], heads[order]
+
+
 def block_of(data: Bytes, starts: Ints, offset: int, first_ordinal: int) -> Block:
-    """The messages at these record offsets, their lengths checked against the header."""
-    if len(starts) and (starts.max() > len(data) - MESSAGE_HEAD_SIZE):
+    """The messages at these record offsets, by channel."""
+    if not len(starts):
+        return {}
+    if starts.max() > len(data) - MESSAGE_HEAD_SIZE:
         raise Damage(offset, "a message is shorter than its header")
-    heads = gathered(data, starts, MESSAGE_HEAD) if len(starts) else np.zeros(0, MESSAGE_HEAD)
-    lengths = heads["length"].astype(np.int64)
-    if len(starts) and lengths.min() < _FIXED_FIELDS:
+    heads = gathered(data, starts, MESSAGE_HEAD)
+    channels = heads["channel"]
+    found = np.flatnonzero(np.bincount(channels)).tolist()
+    if len(found) == 1:
+        return {found[0]: _messages(data, starts, heads, offset, first_ordinal)}
+    return {
+        channel: _messages(data, starts[mine], heads[mine], offset, first_ordinal)
+        for channel in found
+        for mine in (channels == channel,)
+    }
+
+
+def _messages(
+    data: Bytes, starts: Ints, heads: npt.NDArray[Any], offset: int, first_ordinal: int
+) -> Messages:
+    lengths = heads["length"].astype(np.int64) - _FIXED_FIELDS
+    if lengths.min() < 0:
         raise Damage(offset, "a message is shorter than its header")
-    if len(starts) and (heads["log_time"].min() < 0 or heads["publish_time"].min() < 0):
-        raise Damage(offset, "a time of a message is beyond the year 2262")
-    return Block(
-        data=data,
-        channel=np.ascontiguousarray(heads["channel"]),
-        start=starts + MESSAGE_HEAD_SIZE,
-        length=lengths - _FIXED_FIELDS,
-        log_time=np.ascontiguousarray(heads["log_time"]),
-        publish_time=np.ascontiguousarray(heads["publish_time"]),
-        first_ordinal=first_ordinal,
-    )
+    return Messages(data, starts + MESSAGE_HEAD_SIZE, lengths, starts + first_ordinal, heads)

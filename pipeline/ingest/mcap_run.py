@@ -6,16 +6,15 @@ import hashlib
 import zlib
 from collections.abc import Mapping
 
-import numpy as np
 import polars as pl
 
 from pipeline.ingest import files
 from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.generic import NotDecodable, decoder_for
+from pipeline.ingest.generic import NotDecodable, decoder_for, undecodable
 from pipeline.ingest.inventory import fields_of
-from pipeline.ingest.mcap_block import Block
+from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_records import Damage
 from pipeline.ingest.mcap_walk import McapWalk
@@ -36,36 +35,27 @@ class McapStreams:
         self.readers: dict[int, list[SourceReader]] = {}
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        for channel_id in np.flatnonzero(np.bincount(block.channel)).tolist():
+        for channel_id, messages in block.items():
             readers = self.readers.get(channel_id)
             if readers is None:
-                readers = self.readers[channel_id] = self._readers(block, channels[channel_id])
-            if readers:
-                rows = np.flatnonzero(block.channel == channel_id)
-                for reader in readers:
-                    reader.add(block, rows)
+                readers = self.readers[channel_id] = self._readers(messages, channels[channel_id])
+            for reader in readers:
+                reader.add(messages)
 
-    def _readers(self, block: Block, channel: Channel) -> list[SourceReader]:
+    def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
         found = candidates(channel, self._config)
         if not found:
             return []
-        sample = sample_of(block, channel)
+        sample = sample_of(messages, channel)
         return [SourceReader(source_of(sample, candidate)) for candidate in found]
 
 
-def sample_of(block: Block, channel: Channel) -> Sample:
+def sample_of(messages: Messages, channel: Channel) -> Sample:
     """The fields of the channel's first message."""
-    row = int(np.argmax(block.channel == channel.id))
-    start = int(block.start[row])
-    payload = block.data[start : start + int(block.length[row])].tobytes()
     try:
-        return Sample(channel, fields_of(decoder_for(channel)(payload)))
+        return Sample(channel, fields_of(decoder_for(channel)(messages.payload(0))))
     except NotDecodable as error:
-        raise InputError(
-            f"message {block.first_ordinal + row} cannot be decoded: {error}",
-            place=channel.place,
-            remedy="Record the log again.",
-        ) from None
+        raise undecodable(channel, messages, 0, error) from None
 
 
 def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:

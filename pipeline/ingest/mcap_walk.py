@@ -16,13 +16,14 @@ import numpy as np
 
 from pipeline.ingest import mcap_records as records
 from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.mcap_block import Block, block_of, decompressed, message_offsets
+from pipeline.ingest.mcap_block import Block, block_of, chunk_messages, decompressed
 from pipeline.ingest.mcap_model import Channel, Schema
 from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, Damage, Op
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
 _RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
-_SMALL_RECORD = 64 * 1024 * 1024  # no record but chunks and attachments is larger
+_SLACK = 1024 * 1024  # what does not compress grows a little
+_ATTACHMENT_HEAD = 64 * 1024  # holds times, name and media type of an attachment
 
 
 @dataclass
@@ -116,6 +117,7 @@ class McapWalk:
     def _loose_messages(self, position: int) -> tuple[Block, int]:
         """Messages outside of chunks, as many as are in memory and follow each other."""
         first = HEAD.unpack_from(self._window.at(position, HEAD_SIZE))[1]
+        self._check_size("message", first, position)
         self._window.at(position, HEAD_SIZE + first)
         view = self._window.available(position)
         starts, at, room, message = [], 0, len(view) - HEAD_SIZE, int(Op.MESSAGE)
@@ -127,9 +129,9 @@ class McapWalk:
                 break
             starts.append(at)
             at = following
-        data = np.frombuffer(view, dtype=np.uint8)
+        data = np.frombuffer(view[:at], dtype=np.uint8)
         block = block_of(data, np.array(starts, dtype=np.int64), position, self._ordinal)
-        return self._counted(block, position), position + at
+        return self._counted(block, position, at), position + at
 
     def _record(self, opcode: int, length: int, position: int) -> int | None:
         """Meet one record; the position of the next, none after the closing magic."""
@@ -142,11 +144,18 @@ class McapWalk:
         if opcode not in _HANDLERS:
             self._other_record(opcode, position)
             return following
-        if opcode != Op.CHUNK and length > _SMALL_RECORD:
-            raise Damage(position, f"a {Op(opcode).name} record declares {length} bytes")
+        self._check_size(Op(opcode).name, length, position)
         body = self._window.at(position + HEAD_SIZE, length)
         _HANDLERS[opcode](self, body, position)
         return following
+
+    def _check_size(self, name: str, length: int, position: int) -> None:
+        """No record that is loaded whole may be larger than a chunk (attachments are passed by)."""
+        limit = self._limit + _SLACK
+        if length > limit:
+            raise Damage(
+                position, f"a {name} record declares {length} bytes, over the limit of {limit} ([ingest] chunk_limit_mib)"
+            )
 
     def _other_record(self, opcode: int, position: int) -> None:
         """Unknown opcodes are skipped, by specification; known ones stand where they must not."""
@@ -185,7 +194,7 @@ class McapWalk:
         self._pending.indexes.append(records.parse_message_index(body, position))
 
     def _attachment(self, length: int, position: int) -> None:
-        head = self._window.at(position + HEAD_SIZE, min(length, _SMALL_RECORD))
+        head = self._window.at(position + HEAD_SIZE, min(length, _ATTACHMENT_HEAD))
         records.parse_attachment_lengths(head, length, position)
         self._attachments += 1
 
@@ -203,8 +212,8 @@ class McapWalk:
         chunk = pending.chunk
         data = decompressed(chunk, self._limit)
         self.chunks_without_crc += chunk.crc == 0
-        offsets = message_offsets(data, pending.indexes, chunk.offset, self._chunk_record)
-        block = self._counted(block_of(data, offsets, chunk.offset, self._ordinal), chunk.offset)
+        met = chunk_messages(data, pending.indexes, chunk.offset, self._ordinal, self._chunk_record)
+        block = self._counted(met, chunk.offset, len(data))
         self._met.append(
             ChunkSummary(
                 chunk.start_ns, chunk.end_ns, chunk.offset, pending.length, chunk.compression,
@@ -224,24 +233,22 @@ class McapWalk:
         else:
             self.unknown_records += 1
 
-    def _counted(self, block: Block, offset: int) -> Block:
-        counts = np.bincount(block.channel)
-        for channel_id in np.flatnonzero(counts):
-            if int(channel_id) not in self.channels:
+    def _counted(self, block: Block, offset: int, size: int) -> Block:
+        for channel_id, messages in block.items():
+            if channel_id not in self.channels:
                 raise Damage(offset, f"a message belongs to the unknown channel {channel_id}")
-            self.message_counts[int(channel_id)] += int(counts[channel_id])
-        self._ordinal += len(block.start)
-        if len(block.start):
-            low, high = int(block.log_time.min()), int(block.log_time.max())
+            self.message_counts[channel_id] += len(messages)
+            times = messages.heads["log_time"]
+            low, high = int(times.min()), int(times.max())
             old = self._span_ns or (low, high)
             self._span_ns = (min(old[0], low), max(old[1], high))
+        self._ordinal += size
         return block
 
     def _summary_record(self, opcode: int, length: int, position: int) -> int | None:
         if opcode in _DATA_OPS:
             raise Damage(position, f"a {Op(opcode).name} record stands after the end of the data")
-        if length > _SMALL_RECORD:
-            raise Damage(position, f"a record of the summary declares {length} bytes")
+        self._check_size("summary", length, position)
         whole = self._window.at(position, HEAD_SIZE + length)
         body = whole[HEAD_SIZE:]
         if opcode == Op.FOOTER:
@@ -259,7 +266,7 @@ class McapWalk:
     def _check_statistics(self, told: records.Statistics, position: int) -> None:
         counts = {channel: count for channel, count in told.by_channel.items() if count}
         pairs = [
-            ("messages", told.messages, self._ordinal),
+            ("messages", told.messages, self.message_counts.total()),
             ("chunks", told.chunks, len(self._met)),
             ("attachments", told.attachments, self._attachments),
             ("metadata records", told.metadata, self._metadata),

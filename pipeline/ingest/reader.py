@@ -9,17 +9,21 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.generic import decode_columns
-from pipeline.ingest.mcap_block import Block, Ints
+from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
-from pipeline.ingest.template import Part, TemplateDecoder, Unfit, Values
+from pipeline.ingest.template import Part, Rows, Template, TemplateDecoder, Unfit, Values, joined_rows
+from schemas.errors import InputError
 
 ORDINAL = "(ordinal)"  # place of a message in the file
 
 
+_ROWS = 32_768  # messages of one layout whose fields are taken together
+
+
 class Decoder(Protocol):
-    def decode(self, block: Block, rows: Ints) -> tuple[list[Part], Ints]: ...
+    def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]: ...
 
 
 def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder | None:
@@ -55,32 +59,55 @@ class SourceReader:
         self._columns: dict[str, list[Values]] = {
             name: [] for name in (ORDINAL, *self._times, *source.types)
         }
+        self._template: Template | None = None
+        self._waiting: list[Rows] = []
+        self._waiting_rows = 0
 
-    def add(self, block: Block, rows: Ints) -> None:
-        """Decode these messages of the block."""
-        parts, left = self._decoder.decode(block, rows) if self._decoder else ([], rows)
-        for done, values in parts:
-            self._keep(block, done, values)
-        if len(left):
-            self.slow_messages += len(left)
-            self._keep(block, left, self._one_by_one(block, left))
+    def add(self, messages: Messages) -> None:
+        """Decode these messages."""
+        parts, left = self._decoder.decode(messages) if self._decoder else ([], [messages])
+        for part in parts:
+            self._note(part.messages)
+            if part.template is None:
+                self._take_fields()
+                self._keep(part.values)
+                continue
+            if self._template is not part.template:
+                self._take_fields()
+            # Only the bytes that are needed: to hold the part would hold its whole chunk in memory.
+            self._template = part.template
+            self._waiting.append(part.rows)
+            self._waiting_rows += len(part.messages)
+            if self._waiting_rows >= _ROWS:
+                self._take_fields()
+        for rest in left:
+            self._take_fields()
+            self.slow_messages += len(rest)
+            self._note(rest)
+            self._keep(decode_columns(self.source.channel, rest, self.source.types).to_dict())
 
-    def _one_by_one(self, block: Block, rows: Ints) -> Mapping[str, Any]:
-        bounds = zip(block.start[rows].tolist(), block.length[rows].tolist(), strict=True)
-        payloads = (block.data[start : start + length].tobytes() for start, length in bounds)
-        numbers = (block.first_ordinal + rows).tolist()
-        return decode_columns(self.source.channel, payloads, self.source.types, numbers).to_dict()
-
-    def _keep(self, block: Block, rows: Ints, values: Mapping[str, Values]) -> None:
-        self._columns[ORDINAL].append(block.first_ordinal + rows)
+    def _note(self, messages: Messages) -> None:
+        self._columns[ORDINAL].append(messages.ordinal)
         for name in self._times:
-            times = block.log_time if name == LOG_TIME else block.publish_time
-            self._columns[name].append(times[rows])
-        for path in self.source.types:
-            self._columns[path].append(values[path])
+            self._columns[name].append(messages.times("log_time" if name == LOG_TIME else "publish_time"))
+
+    def _take_fields(self) -> None:
+        """The fields of the messages of one layout that were only checked so far."""
+        waiting, self._waiting, self._waiting_rows = self._waiting, [], 0
+        if self._template is None or not waiting:
+            return
+        try:
+            self._keep(self._template.values(joined_rows(waiting)))
+        except Unfit as error:
+            raise InputError(f"holds what cannot be decoded: {error}", place=self.source.channel.place) from None
+
+    def _keep(self, values: Mapping[str, Any]) -> None:
+        for path, dtype in self.source.types.items():
+            self._columns[path].append(_typed(values[path], dtype))
 
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""
+        self._take_fields()
         ordinals = np.concatenate(self._columns[ORDINAL])
         order = None if (np.diff(ordinals) > 0).all() else np.argsort(ordinals)
         types: dict[str, pl.DataType] = {name: pl.Int64() for name in (ORDINAL, *self._times)}
@@ -92,10 +119,21 @@ class SourceReader:
         return pl.DataFrame(series)
 
 
+_KINDS = {pl.Float64: np.float64, pl.Int64: np.int64, pl.Boolean: np.bool_}
+
+
+def _typed(values: Values, dtype: pl.DataType) -> Values:
+    """In the type asked for, on its own memory."""
+    if isinstance(values, pl.Series):
+        return values.cast(dtype)
+    if values.dtype == np.uint64 and len(values) and values.max() >= 2**63 and dtype == pl.Int64():
+        raise InputError("holds a number beyond 64 bits with sign", found=str(values.max()))
+    return np.ascontiguousarray(values.astype(_KINDS[type(dtype)]))
+
+
 def _joined(name: str, parts: list[Values], dtype: pl.DataType) -> pl.Series:
-    """One column of what the parts hold, in the type asked for."""
+    """One column of what the parts hold."""
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if len(arrays) == len(parts):
-        kind = {pl.Float64: np.float64, pl.Int64: np.int64, pl.Boolean: np.bool_}[type(dtype)]
-        return pl.Series(name, np.concatenate([part.astype(kind, copy=False) for part in arrays]))
-    return pl.concat([pl.Series(name, part).cast(dtype) for part in parts], rechunk=True)
+        return pl.Series(name, np.concatenate(arrays))
+    return pl.concat([pl.Series(name, part, dtype=dtype) for part in parts], rechunk=True)

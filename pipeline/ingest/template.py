@@ -7,7 +7,7 @@ that shaped the walk (length prefixes, tags) are the same there; that is checked
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from pipeline.ingest.mcap_block import Block, Bytes, Ints, gathered
+from pipeline.ingest.mcap_block import Bytes, Ints, Messages, stretches_of
 
 _MOST_TEMPLATES = 256  # layouts of one channel; beyond, messages are decoded one by one
 _MOST_PER_LENGTH = 16
@@ -28,6 +28,38 @@ class Unfit(Exception):
     """A message or field that has no fixed layout, or not the type asked for."""
 
 
+class Rows:
+    """What a layout needs of messages of one length, side by side: stretches of bytes of each."""
+
+    def __init__(self, count: int, stretches: Sequence[tuple[int, Bytes]]) -> None:
+        self.count = count  # each stretch: its offset in the message, and one row of bytes per message
+        self.stretches = stretches
+
+    def at(self, offset: int, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """The values of `dtype` at this offset of every message."""
+        for first, content in self.stretches:
+            width = content.shape[1]
+            if first <= offset < first + width:
+                return np.ndarray(
+                    (self.count,), dtype, content.data, offset=offset - first, strides=(width,)
+                )
+        raise AssertionError("a layout asks for bytes that it did not name")
+
+    def chosen(self, rows: Bools) -> Rows:
+        return Rows(int(rows.sum()), [(first, content[rows]) for first, content in self.stretches])
+
+
+def joined_rows(parts: Sequence[Rows]) -> Rows:
+    """Messages of one layout together."""
+    if len(parts) == 1:
+        return parts[0]
+    stretches = [
+        (first, np.concatenate([part.stretches[number][1] for part in parts]))
+        for number, (first, _) in enumerate(parts[0].stretches)
+    ]
+    return Rows(sum(part.count for part in parts), stretches)
+
+
 @dataclass(frozen=True)
 class Fixed:
     """A number of fixed width."""
@@ -35,8 +67,12 @@ class Fixed:
     offset: int
     dtype: str
 
-    def values(self, data: Bytes, starts: Ints) -> Values:
-        return gathered(data, starts + self.offset, self.dtype)
+    @property
+    def end(self) -> int:
+        return self.offset + int(self.dtype[2:])
+
+    def values(self, rows: Rows) -> Values:
+        return rows.at(self.offset, self.dtype)
 
 
 @dataclass(frozen=True)
@@ -45,8 +81,12 @@ class Flag:
 
     offset: int
 
-    def values(self, data: Bytes, starts: Ints) -> Values:
-        return data[starts + self.offset] != 0
+    @property
+    def end(self) -> int:
+        return self.offset + 1
+
+    def values(self, rows: Rows) -> Values:
+        return rows.at(self.offset, "u1") != 0
 
 
 @dataclass(frozen=True)
@@ -59,10 +99,14 @@ class Varint:
     signed: bool
     zigzag: bool = False
 
-    def values(self, data: Bytes, starts: Ints) -> Values:
-        total = np.zeros(len(starts), dtype=np.uint64)
+    @property
+    def end(self) -> int:
+        return self.offset + self.width
+
+    def values(self, rows: Rows) -> Values:
+        total = np.zeros(rows.count, dtype=np.uint64)
         for place in range(self.width):
-            septet = (data[starts + self.offset + place] & 0x7F).astype(np.uint64)
+            septet = (rows.at(self.offset + place, "u1") & 0x7F).astype(np.uint64)
             total |= septet << np.uint64(7 * place)
         if self.zigzag:
             return (total >> np.uint64(1)).astype(np.int64) ^ -(total & np.uint64(1)).astype(np.int64)
@@ -78,13 +122,16 @@ class Text:
     offset: int
     length: int
 
-    def values(self, data: Bytes, starts: Ints) -> Values:
-        count = len(starts)
+    @property
+    def end(self) -> int:
+        return self.offset + self.length
+
+    def values(self, rows: Rows) -> Values:
         if self.length == 0:
-            return pl.Series([""], dtype=pl.String).new_from_index(0, count)
-        content = np.ascontiguousarray(gathered(data, starts + self.offset, f"V{self.length}"))
-        offsets = np.arange(count + 1, dtype=np.int64) * self.length
-        texts = pa.LargeStringArray.from_buffers(count, pa.py_buffer(offsets), pa.py_buffer(content))
+            return pl.Series([""], dtype=pl.String).new_from_index(0, rows.count)
+        content = np.ascontiguousarray(rows.at(self.offset, f"V{self.length}"))
+        offsets = np.arange(rows.count + 1, dtype=np.int64) * self.length
+        texts = pa.LargeStringArray.from_buffers(rows.count, pa.py_buffer(offsets), pa.py_buffer(content))
         try:
             texts.validate(full=True)  # refuses what is not UTF-8
         except pa.ArrowInvalid:
@@ -99,8 +146,16 @@ class Constant:
     value: float | str | bool | None
     dtype: pl.DataType
 
-    def values(self, data: Bytes, starts: Ints) -> Values:
-        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, len(starts))
+    @property
+    def offset(self) -> int:
+        return 0
+
+    @property
+    def end(self) -> int:
+        return 0  # takes no bytes of the message
+
+    def values(self, rows: Rows) -> Values:
+        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, rows.count)
 
 
 Field = Fixed | Flag | Varint | Text | Constant
@@ -126,18 +181,28 @@ class Template:
 
     checks: Sequence[tuple[int, int, int]]
     fields: Mapping[str, Field]
+    stretches: Sequence[tuple[int, int]]
 
-    def matching(self, data: Bytes, starts: Ints) -> Bools:
-        agree = np.ones(len(starts), dtype=np.bool_)
+    def rows(self, data: Bytes, starts: Ints) -> Rows:
+        return Rows(
+            len(starts), [(first, stretches_of(data, starts + first, end - first)) for first, end in self.stretches]
+        )
+
+    def matching(self, rows: Rows) -> Bools:
+        agree = np.ones(rows.count, dtype=np.bool_)
         for offset, mask, expected in self.checks:
-            words = gathered(data, starts + offset, "<u8")
+            words = rows.at(offset, "<u8")
             if mask != _ALL:
-                words &= np.uint64(mask)
+                words = words & np.uint64(mask)
             agree &= words == np.uint64(expected)
         return agree
 
+    def values(self, rows: Rows) -> dict[str, Values]:
+        return {path: item.values(rows) for path, item in self.fields.items()}
+
 
 _ALL = 2**64 - 1
+_NEAR = 64  # bytes between two fields that are cheaper to copy along than to go for twice
 
 
 def template_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) -> Template:
@@ -151,11 +216,33 @@ def template_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) 
         if mask:
             word = int.from_bytes(payload[offset : offset + 8], "little")
             checks.append((offset, mask, word & mask))
-    return Template(checks, dict(fields))
+    extents = [(offset, offset + 8) for offset, _, _ in checks]
+    extents += [(item.offset, item.end) for item in fields.values() if item.end > item.offset]
+    return Template(checks, dict(fields), _stretches(extents))
+
+
+def _stretches(extents: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Extents that overlap or are near each other, as one."""
+    merged: list[tuple[int, int]] = []
+    for first, end in sorted(extents):
+        if merged and first <= merged[-1][1] + _NEAR:
+            merged[-1] = (merged[-1][0], max(merged[-1][1], end))
+        else:
+            merged.append((first, end))
+    return merged
 
 
 Walk = Callable[[bytes], Template]
-Part = tuple[Ints, Mapping[str, Values]]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Decoded messages, or messages whose layout is proved and whose fields are still to be taken."""
+
+    messages: Messages
+    values: Mapping[str, Values] = field(default_factory=dict)
+    template: Template | None = None
+    rows: Rows = field(default_factory=lambda: Rows(0, []))
 
 
 class TemplateDecoder:
@@ -166,41 +253,37 @@ class TemplateDecoder:
         self._templates: dict[int, list[Template]] = {}
         self._count = 0
 
-    def decode(self, block: Block, rows: Ints) -> tuple[list[Part], Ints]:
-        """Parts of the rows with their fields, and the rows that no layout fits."""
+    def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]:
+        """Messages whose layout is known, and those that no layout fits."""
         parts: list[Part] = []
-        left: list[Ints] = []
-        for length, group in _by_length(block.length, rows):
-            left.append(self._decode_group(block, length, group, parts))
-        return parts, np.concatenate(left) if left else rows[:0]
+        left = [
+            rest
+            for length, group in _by_length(messages)
+            if len(rest := self._decode_group(length, group, parts))
+        ]
+        return parts, left
 
-    def _decode_group(self, block: Block, length: int, rows: Ints, parts: list[Part]) -> Ints:
+    def _decode_group(self, length: int, messages: Messages, parts: list[Part]) -> Messages:
         known = self._templates.setdefault(length, [])
         tried = 0
-        while len(rows):
-            if tried == len(known) and not self._learn(block, int(rows[0]), known):
-                return rows
+        while len(messages):
+            if tried == len(known) and not self._learn(messages.payload(0), known):
+                break
             template = known[tried]
             tried += 1
-            agree = template.matching(block.data, block.start[rows])
-            hits = rows if agree.all() else rows[agree]
-            if len(hits):
-                starts = block.start[hits]
-                try:
-                    values = {
-                        path: field.values(block.data, starts) for path, field in template.fields.items()
-                    }
-                except Unfit:
-                    return rows
-                parts.append((hits, values))
-            rows = rows[:0] if len(hits) == len(rows) else rows[~agree]
-        return rows
+            rows = template.rows(messages.data, messages.start)
+            agree = template.matching(rows)
+            if agree.all():
+                parts.append(Part(messages, template=template, rows=rows))
+                return messages.chosen(~agree)
+            if agree.any():
+                parts.append(Part(messages.chosen(agree), template=template, rows=rows.chosen(agree)))
+                messages = messages.chosen(~agree)
+        return messages
 
-    def _learn(self, block: Block, row: int, known: list[Template]) -> bool:
+    def _learn(self, payload: bytes, known: list[Template]) -> bool:
         if self._count >= _MOST_TEMPLATES or len(known) >= _MOST_PER_LENGTH:
             return False
-        start = int(block.start[row])
-        payload = block.data[start : start + int(block.length[row])].tobytes()
         try:
             known.append(self._walk(payload))
         except Unfit:
@@ -209,12 +292,14 @@ class TemplateDecoder:
         return True
 
 
-def _by_length(lengths: Ints, rows: Ints) -> list[tuple[int, Ints]]:
-    """Rows grouped by the length of their payload."""
-    chosen = lengths[rows]
-    if not len(chosen):
-        return []
-    low, high = int(chosen.min()), int(chosen.max())
+def _by_length(messages: Messages) -> list[tuple[int, Messages]]:
+    """Messages grouped by the length of their payload."""
+    lengths = messages.length
+    low, high = int(lengths.min()), int(lengths.max())
     if low == high:
-        return [(low, rows)]
-    return [(int(length), rows[chosen == length]) for length in np.unique(chosen)]
+        return [(low, messages)]
+    met = np.flatnonzero(np.bincount(lengths - low)) + low if high - low < _COUNTABLE else np.unique(lengths)
+    return [(int(length), messages.chosen(lengths == length)) for length in met]
+
+
+_COUNTABLE = 1 << 16
