@@ -1,0 +1,111 @@
+"""NMEA 0183: GGA with RMC or ZDA for the date, GST for accuracy, gathered by time of day."""
+
+from __future__ import annotations
+
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Any
+
+import numpy as np
+
+from pipeline.receivers.epochs import Epoch, Gathered
+from schemas.enums import Fix
+
+_KNOT_MPS = 1852.0 / 3600.0
+_FIXES = {
+    0: Fix.NONE,
+    1: Fix.AUTONOMOUS,
+    2: Fix.DIFFERENTIAL,
+    3: Fix.AUTONOMOUS,
+    4: Fix.RTK_FIXED,
+    5: Fix.RTK_FLOAT,
+    6: Fix.ESTIMATED,
+}
+# Differential corrections whose station is an SBAS satellite: 120-158 as PRN, 33-64 as NMEA satellite number.
+_SBAS_PRNS, _SBAS_NUMBERS, _NUMBER_TO_PRN = range(120, 159), range(33, 65), 87
+_HALF_DAY_S = 43_200
+
+
+class NmeaDecoder:
+    """Keeps the day while sentences go by: most of them only tell the time of day."""
+
+    def __init__(self) -> None:
+        self._day: date | None = None
+        self._latest: time | None = None
+
+    def decode(self, gathered: Gathered, message: Any, _raw: bytes) -> None:
+        decoder = {"GGA": _position, "RMC": _motion, "GST": _accuracy, "ZDA": _nothing}.get(message.msgID)
+        if decoder is None or not isinstance(getattr(message, "time", None), time):
+            return
+        self._follow(message)
+        epoch = gathered.at((self._day, message.time))
+        if self._day is not None:
+            moment = datetime.combine(self._day, message.time, tzinfo=UTC)
+            epoch.t_ns = int(moment.replace(microsecond=0).timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+        decoder(epoch, message)
+
+    def _follow(self, message: Any) -> None:
+        """The day of this sentence: as it says itself, or the last one, past midnight the next."""
+        if message.msgID == "RMC" and isinstance(message.date, date):
+            self._day = message.date
+        elif message.msgID == "ZDA" and message.year:
+            self._day = date(int(message.year), int(message.month), int(message.day))
+        elif self._day is not None and self._latest is not None:
+            back_s = _seconds(self._latest) - _seconds(message.time)
+            self._day += timedelta(days=1) if back_s > _HALF_DAY_S else timedelta(0)
+        self._latest = message.time
+
+
+def settle_first_day(gathered: Gathered) -> None:
+    """Sentences before the first date belong to the epoch of the same time that has one, or are dropped."""
+    dated = {key[1]: epoch for key, epoch in gathered.epochs.items() if isinstance(key, tuple) and key[0] is not None}
+    for key in [key for key in gathered.epochs if isinstance(key, tuple) and key[0] is None]:
+        early = gathered.epochs.pop(key)
+        same = dated.get(key[1])
+        if same is None:
+            gathered.drop("time without a date")
+        else:
+            same.gnss = early.gnss | same.gnss
+
+
+def _seconds(moment: time) -> int:
+    return moment.hour * 3600 + moment.minute * 60 + moment.second
+
+
+def _position(epoch: Epoch, m: Any) -> None:
+    """GGA: height over the ellipsoid is height over the geoid plus the separation."""
+    fix = _FIXES.get(int(m.quality or 0), Fix.NONE)
+    station = int(m.diffStation) if str(m.diffStation).isdigit() else None
+    prn = station + _NUMBER_TO_PRN if station is not None and station in _SBAS_NUMBERS else station
+    if fix is Fix.DIFFERENTIAL and prn in _SBAS_PRNS:
+        fix = Fix.SBAS
+        epoch.gnss |= {"sbas_prn": prn, "sbas_age_s": m.diffAge if isinstance(m.diffAge, float) else None}
+    epoch.gnss |= {"fix": fix.value, "satellites": int(m.numSV) if m.numSV != "" else None}
+    if fix is Fix.NONE or m.lat == "":
+        return
+    epoch.gnss |= {"latitude_deg": m.lat, "longitude_deg": m.lon}
+    if isinstance(m.alt, float) and isinstance(m.sep, float):
+        epoch.gnss["height_m"] = m.alt + m.sep
+
+
+def _motion(epoch: Epoch, m: Any) -> None:
+    if m.status == "A" and isinstance(m.spd, float) and isinstance(m.cog, float):
+        course, speed = np.radians(m.cog), m.spd * _KNOT_MPS
+        epoch.gnss |= {"vel_e_mps": float(speed * np.sin(course)), "vel_n_mps": float(speed * np.cos(course))}
+
+
+def _accuracy(epoch: Epoch, m: Any) -> None:
+    if all(isinstance(value, float) for value in (m.stdLat, m.stdLong, m.stdAlt)):
+        epoch.gnss |= {"cov_ee_m2": m.stdLong**2, "cov_nn_m2": m.stdLat**2, "cov_uu_m2": m.stdAlt**2}
+        epoch.gnss |= _correlation(m) | {"cov_eu_m2": 0.0, "cov_nu_m2": 0.0}
+
+
+def _correlation(m: Any) -> dict[str, float]:
+    """GST gives the error ellipse: its orientation is that of the major axis, from true north."""
+    if not all(isinstance(value, float) for value in (m.stdMajor, m.stdMinor, m.orient)):
+        return {"cov_en_m2": 0.0}
+    angle = np.radians(m.orient)
+    return {"cov_en_m2": float((m.stdMajor**2 - m.stdMinor**2) * np.sin(angle) * np.cos(angle))}
+
+
+def _nothing(_epoch: Epoch, _m: Any) -> None:
+    """ZDA gives only the date."""

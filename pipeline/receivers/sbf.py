@@ -1,0 +1,131 @@
+"""Septentrio SBF: PVTGeodetic or PVTCartesian with their covariances and DOP (HPL, VPL), gathered by GPS time."""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+from typing import Any
+
+import numpy as np
+from pyproj import Transformer
+
+from pipeline.ingest.timescale import utc_from_gps
+from pipeline.receivers.epochs import Epoch, Gathered
+from schemas.enums import Fix
+
+_GPS_EPOCH_S = 315_964_800
+_WEEK_MS = 604_800_000
+_NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
+_DO_NOT_USE = -2e10
+_FIXES = {
+    0: Fix.NONE,
+    1: Fix.AUTONOMOUS,
+    2: Fix.DIFFERENTIAL,
+    3: Fix.AUTONOMOUS,
+    4: Fix.RTK_FIXED,
+    5: Fix.RTK_FLOAT,
+    6: Fix.SBAS,
+    7: Fix.RTK_FIXED,
+    8: Fix.RTK_FLOAT,
+    10: Fix.DIFFERENTIAL,
+}
+_SBAS_PRNS = range(120, 159)
+_NOT_KNOWN_U16 = 65535
+
+
+def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
+    """Add what this block says to its epoch; blocks of no interest are passed over."""
+    decoder = _DECODERS.get(message.identity)
+    if decoder is None:
+        return
+    tow_ms, week = struct.unpack_from("<IH", raw, 8)
+    if tow_ms == _NO_TOW or week == _NO_WEEK:
+        gathered.drop("time not valid")
+        return
+    epoch = gathered.at((week, tow_ms))
+    gps_ns = (_GPS_EPOCH_S * 1000 + week * _WEEK_MS + tow_ms) * 1_000_000
+    epoch.t_ns = int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0])
+    decoder(epoch, message)
+
+
+def _solution(epoch: Epoch, m: Any) -> bool:
+    """What both PVT blocks share; true where they hold a position."""
+    fix = _FIXES.get(m.Type, Fix.NONE) if m.Error == 0 else Fix.NONE
+    epoch.gnss |= {"fix": fix.value, "satellites": m.NrSV if m.NrSV != 255 else None}
+    if m.ReferenceID in _SBAS_PRNS:
+        epoch.gnss["sbas_prn"] = m.ReferenceID
+        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if m.MeanCorrAge < _NOT_KNOWN_U16 / 100 else None
+    return fix is not Fix.NONE
+
+
+def _geodetic(epoch: Epoch, m: Any) -> None:
+    if _solution(epoch, m) and m.Latitude != _DO_NOT_USE:
+        place = {"latitude_deg": float(np.degrees(m.Latitude)), "longitude_deg": float(np.degrees(m.Longitude))}
+        epoch.gnss |= place | {"height_m": m.Height}
+        epoch.gnss |= _known({"vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu})
+
+
+def _cartesian(epoch: Epoch, m: Any) -> None:
+    if not _solution(epoch, m) or m.X == _DO_NOT_USE:
+        return
+    longitude, latitude, height = _to_geodetic().transform(m.X, m.Y, m.Z)
+    epoch.gnss |= {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
+    if m.Vx != _DO_NOT_USE:
+        east, north, up = _east_north_up(latitude, longitude) @ np.array([m.Vx, m.Vy, m.Vz])
+        epoch.gnss |= {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
+
+
+def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
+    values = (m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt)
+    _put_covariance(epoch, values)
+
+
+def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
+    """Turned into east, north, up where the epoch's position is known (SBF writes it first)."""
+    latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
+    if latitude is None or longitude is None or m.Cov_xx == _DO_NOT_USE:
+        return
+    turn = _east_north_up(latitude, longitude)
+    xx, yy, zz, xy, xz, yz = m.Cov_xx, m.Cov_yy, m.Cov_zz, m.Cov_xy, m.Cov_xz, m.Cov_yz
+    local = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+    _put_covariance(epoch, (local[0, 0], local[0, 1], local[0, 2], local[1, 1], local[1, 2], local[2, 2]))
+
+
+def _put_covariance(epoch: Epoch, values: tuple[float, ...]) -> None:
+    names = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
+    epoch.gnss |= _known({name: float(value) for name, value in zip(names, values, strict=True)})
+
+
+def _protection(epoch: Epoch, m: Any) -> None:
+    epoch.gnss |= _known({"hpl_m": m.HPL, "vpl_m": m.VPL})
+
+
+def _known(values: dict[str, float]) -> dict[str, float]:
+    """Septentrio marks what it does not know with -2e10."""
+    return {name: value for name, value in values.items() if value != _DO_NOT_USE}
+
+
+@cache
+def _to_geodetic() -> Transformer:
+    return Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+
+
+def _east_north_up(latitude_deg: float, longitude_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Rotation from earth-fixed axes to east, north, up."""
+    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
+    return np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+
+
+_DECODERS = {
+    "PVTGeodetic": _geodetic,
+    "PVTCartesian": _cartesian,
+    "PosCovGeodetic": _geodetic_covariance,
+    "PosCovCartesian": _cartesian_covariance,
+    "DOP": _protection,
+}
