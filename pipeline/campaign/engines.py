@@ -258,12 +258,18 @@ def _connect(scheduler: str) -> Any:
         from distributed import Client
     except ImportError:
         raise UsageError("--scheduler needs Dask", remedy="Install `balise[cluster]`.") from None
-    # Dask logs tracebacks of lost connections; the campaign says in one message what was lost.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _hush()
     try:
         return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError):
         raise lost_scheduler(scheduler) from None
+
+
+def _hush() -> None:
+    """Dask logs tracebacks of lost connections; the campaign says in one message what was lost."""
+    for name in list(logging.root.manager.loggerDict):
+        if name == "distributed" or name.startswith("distributed."):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> Engine:
