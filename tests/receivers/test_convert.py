@@ -76,8 +76,9 @@ def test_sbf_geodetic_with_egnos():
     assert (row["fix"], row["sbas_prn"], row["sbas_age_s"]) == ("sbas", 123, 2.78)
     covariance = messages(SBFReader, path, "PosCovGeodetic")[0]
     assert row["cov_en_m2"] == pytest.approx(covariance.Cov_latlon)
-    # The package shows UTC too: it takes the 18 leap seconds off.
-    assert str(row["t"])[11:19] == str(block.TOW)[:8] == "14:07:09"
+    # 482,847 s of the GPS week are Friday 14:07:27; UTC is 18 s behind.
+    assert block.TOW == 482_847_000
+    assert str(row["t"])[:19] == "2025-05-23 14:07:09"
 
 
 @needs_samples
