@@ -154,7 +154,8 @@ def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
     """Times on the device's clock, and positions in WGS 84."""
     folder = segment / "global_pose"
     to_wgs84 = pyproj.Transformer.from_crs(4978, 4979, always_xy=True)
-    longitude, latitude, height = to_wgs84.transform(*_array(folder / "frame_positions").T)
+    x_m, y_m, z_m = _array(folder / "frame_positions").T
+    longitude, latitude, height = to_wgs84.transform(x_m, y_m, z_m)
     places = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
     return _array(folder / "frame_times"), places
 
@@ -188,11 +189,15 @@ def _comma_gnss(t_s: Floats, value: Floats, offset_s: float) -> pl.DataFrame:
 
 def _comma_site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
     """Poses at least 5 m apart, joined to one net element."""
-    along = np.concatenate(([0.0], np.cumsum(distances_m(*places.values()))))
+    along = np.concatenate(
+        ([0.0], np.cumsum(distances_m(places["latitude_deg"], places["longitude_deg"], places["height_m"])))
+    )
     cell = np.floor(along / _TRACK_STEP_M)
     kept = np.concatenate(([0], np.flatnonzero(np.diff(cell) > 0) + 1))
     track = {name: values[kept] for name, values in places.items()}
-    measure = np.concatenate(([0.0], np.cumsum(distances_m(*track.values()))))
+    measure = np.concatenate(
+        ([0.0], np.cumsum(distances_m(track["latitude_deg"], track["longitude_deg"], track["height_m"])))
+    )
     table = _contract(Track, netelement_id=_COMMA_ELEMENT, measure_m=measure, **track, sigma_m=_POSE_SIGMA_M)
     balises = [(_COMMA_ELEMENT, at_m) for at_m in balises_at_m]
     return Site(table, Links.create_empty(), virtual_balises(balises) if balises else None)

@@ -61,6 +61,8 @@ def observe_sky(
 
     The sky is that of `place` (latitude, longitude, height) all along: over a line of 30 km directions change
     by no more than a tenth of a degree. Residuals are measured minus computed at the published position.
+    A satellite that comes or goes moves the position at once, as in a receiver that does not smooth; the raw
+    monitors may see that as the step it is.
     """
     ranges = track_satellites(spec, place, first_ns, t_ns, step_s, faults, rng)
     observed, tables = [], []

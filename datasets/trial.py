@@ -117,19 +117,24 @@ def write_site(site: Site, folder: Path) -> None:
 
 
 def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
-    """One run as a folder of Parquet files, or as an MCAP log in the encoding `json`, `protobuf` or `cdr`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """One run under its own name: a folder of Parquet files, or an MCAP log (`json`, `protobuf`, `cdr`)."""
+    path = folder / (run.run_id if log == "parquet" else f"{run.run_id}.mcap")
+    write_run_as(run, path, log)
+    return path
+
+
+def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
+    """One run at a path: `*.mcap` (JSON unless said otherwise, which keeps everything), else a folder of Parquet."""
+    log = log or ("json" if path.suffix == ".mcap" else "parquet")
+    path.parent.mkdir(parents=True, exist_ok=True)
     if log != "parquet":
-        path = folder / f"{run.run_id}.mcap"
         write_mcap(run, path, encoding=log)
-        return path
-    path = folder / run.run_id
+        return
     path.mkdir(exist_ok=True)
     for name in STREAMS:
         table = run.stream(name)
         if table is not None:
             table.write_parquet(path / f"{name}.parquet")
-    return path
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:
