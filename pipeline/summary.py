@@ -25,6 +25,7 @@ from pipeline.timeline import (
     uptime,
 )
 from schemas.config import Configuration
+from schemas.conform import conform
 from schemas.enums import BaliseKind, Evidence, Hazard, LdsState, PassageStatus, RunStatus, Verdict
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
@@ -107,7 +108,7 @@ def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.Dat
 def _frame(row: Mapping[str, object]) -> pl.DataFrame:
     dtypes = {name: column.dtype for name, column in Runs.columns().items()}
     values = {name: [_known(row.get(name))] for name in dtypes}
-    return Runs.validate(pl.DataFrame(values, schema=dtypes))
+    return conform(pl.DataFrame(values, schema=dtypes), Runs)
 
 
 def _known(value: object) -> object:
