@@ -11,7 +11,8 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.ingest.files import Address, is_url, join
-from schemas.config import Settings, to_toml
+from schemas.config import Settings
+from schemas.conform import conform, to_toml
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -54,7 +55,7 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
 
 def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) -> bytes:
     """A table as Parquet, held to its contract."""
-    checked = TABLES[table].validate(frame, cast=True).select(TABLES[table].column_names())
+    checked = conform(frame, TABLES[table])
     return parquet_bytes(checked, {"table": table, "contract": CONTRACT_VERSION, **metadata})
 
 
