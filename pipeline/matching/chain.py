@@ -11,6 +11,7 @@ from pipeline.matching.fixes import Fixes
 from pipeline.matching.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
+from pipeline.matching.steps import travelled
 from pipeline.track import Track
 from schemas.config import MatchingConfig
 from schemas.enums import Navigability
@@ -28,7 +29,8 @@ def path_on_chain(
     position[fixes.valid] = np.where(near, path_at(leg, feet), np.nan)
     used = np.unique(leg.visit[feet.segment[near]])
     part = list(leg.visits[int(used[0]) : int(used[-1]) + 1])
-    if not grows_with(position, fixes.t_ns, odometer, config.orientation_distance_m):
+    way = travelled(fixes, odometer)
+    if not grows_with(position, np.arange(len(fixes)), way, config.orientation_distance_m):
         part = [Visit(visit.element, not visit.forward) for visit in reversed(part)]
     ones = np.ones(len(fixes))
     path = TravelledPath(track, (leg_of(track, part),))

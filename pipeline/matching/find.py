@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
@@ -11,24 +9,18 @@ from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, segments_of
 from pipeline.matching.decode import Decoded, aligned, decode, legs_of, positions_m
 from pipeline.matching.diagnosis import off_the_network
+from pipeline.matching.doubt import Doubt, doubt_of, stretches
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.likelihood import likelihood_of
 from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
-from pipeline.matching.search import Found, search
+from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from schemas.config import MatchingConfig
 
-AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
-    "t_start": pl.Datetime("ns", "UTC"),
-    "t_end": pl.Datetime("ns", "UTC"),
-    "netelement_id": pl.String,
-    "other_netelement_id": pl.String,
-    "probability": pl.Float64,
-}
 # An element past whose end a position lies by more is no candidate, unless the track ends there.
 _BEYOND_M = 15.0
 _BEYOND_SIGMAS = 4.0
@@ -36,17 +28,6 @@ _BEYOND_SIGMAS = 4.0
 _FAR = 3.0
 # A position this close to a track lies near it whatever else is around [m].
 _CLOSE_M = 10.0
-# Elements of the path this many before or after the one in question are the same way, not another.
-_NEIGHBOURS = 2
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """Per step: how probable the path is, by all and by earlier steps, and the best other element (-1: none)."""
-
-    posterior: Floats
-    gate: Floats
-    other: Ints
 
 
 def find_path(
@@ -63,20 +44,14 @@ def find_path(
     trellis = _trellis(fixes, odometer, network, pinned, config)
     found = search(trellis)
     decoded = aligned(trellis, decode(trellis, found.best))
-    epoch = trellis.steps.epoch
     at = positions_m(decoded, legs_of(trellis, decoded))
-    if not grows_with(at, fixes.t_ns[epoch], odometer, config.orientation_distance_m):
+    if not grows_with(at, trellis.steps.epoch, travelled(fixes, odometer), config.orientation_distance_m):
         decoded = decoded.turned(network, range(len(decoded.chains)))
     legs = legs_of(trellis, decoded)
-    doubt = _doubt(trellis, found, decoded)
+    doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
-    return path, assignment, _ambiguous(fixes, trellis, found, doubt, config)
-
-
-def no_doubt() -> pl.DataFrame:
-    """No stretch of doubt."""
-    return pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
+    return path, assignment, stretches(fixes, trellis, found, doubt, config)
 
 
 def _trellis(
@@ -139,35 +114,6 @@ def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
     return np.asarray((proved >= 0) & here[candidates.step] & (candidates.element != proved))
 
 
-def _doubt(trellis: Trellis, found: Found, decoded: Decoded) -> Doubt:
-    """Probability of all states that are on the path about where the path is."""
-    own = np.zeros(len(trellis.oriented), dtype=bool)
-    elements = (trellis.oriented // 2).tolist()
-    first = trellis.first.tolist()
-    around: dict[tuple[int, int], set[int]] = {}
-    for step, key in enumerate(zip(decoded.leg.tolist(), decoded.number.tolist(), strict=True)):
-        known = around.get(key)
-        if known is None:
-            chain = decoded.chains[key[0]]
-            here = key[1] - chain.low
-            known = {one // 2 for one in chain.oriented[max(0, here - _NEIGHBOURS) : here + _NEIGHBOURS + 1]}
-            around[key] = known
-        for state in range(first[step], first[step + 1]):
-            own[state] = elements[state] in known
-    other = np.where(own, -1.0, found.forward + found.posterior)
-    count = np.diff(trellis.first)
-    worst = np.lexsort((other, np.repeat(np.arange(len(count)), count)))[trellis.first[1:] - 1]
-    return Doubt(
-        posterior=_share(found.posterior * own, trellis.first),
-        gate=_share(found.forward * own, trellis.first),
-        other=np.where(other[worst] >= 0, trellis.oriented[worst] // 2, -1),
-    )
-
-
-def _share(values: Floats, first: Ints) -> Floats:
-    return np.clip(np.add.reduceat(values, first[:-1]), 0.0, 1.0)
-
-
 def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: Doubt) -> Assignment:
     """Every epoch takes over from the step before it; a new leg begins right after the step before it."""
     last = np.searchsorted(steps.epoch, np.arange(len(fixes)), side="right") - 1
@@ -177,26 +123,3 @@ def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: D
     last = np.maximum(last, 0)
     leg = np.where(exact, decoded.leg[last], decoded.leg[following])
     return Assignment(leg, at_m[last], doubt.posterior[last], doubt.gate[last])
-
-
-def _ambiguous(fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, config: MatchingConfig) -> pl.DataFrame:
-    """Stretches where either probability of the path is below the configured one."""
-    probability = np.minimum(doubt.posterior, doubt.gate)
-    unsure = probability < config.ambiguity_probability
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], unsure, [False]]).astype(np.int8)))
-    ids = trellis.network.track.ids
-    rows = []
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        worst = begin + int(np.argmin(probability[begin:end]))
-        other = int(doubt.other[worst])
-        until = trellis.steps.epoch[end] - 1 if end < len(trellis) else trellis.steps.epoch[-1]
-        rows.append(
-            (
-                int(fixes.t_ns[trellis.steps.epoch[begin]]),
-                int(fixes.t_ns[until]),
-                ids[int(trellis.oriented[found.best[worst]]) // 2],
-                ids[other] if other >= 0 else None,
-                float(probability[worst]),
-            )
-        )
-    return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")

@@ -9,8 +9,9 @@ import polars as pl
 
 from pipeline.geodesy import Ints
 from pipeline.matching.chain import path_on_chain, whole_chain
+from pipeline.matching.doubt import no_doubt
 from pipeline.matching.epochs import Assignment, epoch_frame
-from pipeline.matching.find import find_path, no_doubt
+from pipeline.matching.find import find_path
 from pipeline.matching.fixes import Fixes, fixes_of
 from pipeline.matching.leg import leg_of
 from pipeline.matching.network import network_of

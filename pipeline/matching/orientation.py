@@ -3,34 +3,42 @@
 from __future__ import annotations
 
 import numpy as np
-import polars as pl
 
 from pipeline.geodesy import Floats, Ints
+from pipeline.matching.steps import Travelled
 
 
-def grows_with(position_m: Floats, t_ns: Ints, odometer: pl.DataFrame | None, distance_m: float) -> bool:
-    """Whether the run's first `distance_m` of net movement went with the given position.
+def grows_with(position_m: Floats, epoch: Ints, way: Travelled, distance_m: float) -> bool:
+    """Whether the run's first `distance_m` of net movement went with the given positions (NaN: not known).
 
-    The odometer says when that distance was covered, and the positions say which way: so a jump of the
-    GNSS at the start does not turn the run around. Without an odometer the positions say both.
+    The odometer says between which epochs that distance was covered, the positions which way it went: the
+    median over starts within twice the distance, so that a GNSS that jumps back at the start does not turn
+    the run round. Without an odometer the positions say both.
     """
     known = np.flatnonzero(np.isfinite(position_m))
     if len(known) == 0:
         return True
-    known = known[_from_moving(known, t_ns, odometer, distance_m)]
-    moved = position_m[known] - position_m[known[0]]
-    far = np.flatnonzero(np.abs(moved) >= distance_m)
-    return bool(moved[far[0]] > 0) if len(far) else bool(moved[-1] >= 0)
+    position, rows = position_m[known], epoch[known]
+    moved = _moved_by_odometer(position, rows, way, distance_m)
+    if moved is not None:
+        return moved > 0
+    away = position - position[0]
+    far = np.flatnonzero(np.abs(away) >= distance_m)
+    return bool(away[far[0]] > 0) if len(far) else bool(away[-1] >= 0)
 
 
-def _from_moving(known: Ints, t_ns: Ints, odometer: pl.DataFrame | None, distance_m: float) -> Ints:
-    """Which known epochs to judge: the first, and those after the odometer has covered the distance."""
-    everything = np.arange(len(known))
-    if odometer is None or odometer["distance_m"].null_count() == odometer.height or odometer.height < 2:
-        return everything
-    clean = odometer.drop_nulls("distance_m")
-    at = np.interp(t_ns[known], clean["t"].to_physical().to_numpy(), clean["distance_m"].to_numpy())
-    covered = np.flatnonzero(np.abs(at - at[0]) >= distance_m)
+def _moved_by_odometer(position_m: Floats, rows: Ints, way: Travelled, distance_m: float) -> float | None:
+    """Median displacement while the odometer covered the distance, none where it did not or is not known."""
+    start = np.full(len(rows), rows[0])
+    since = way.between(start, rows)
+    covered = np.flatnonzero(np.abs(since) >= distance_m)
     if len(covered) == 0:
-        return everything
-    return np.concatenate([[0], everything[covered[0] :]])
+        return None
+    sense = np.sign(since[covered[0]])
+    forward = sense * since
+    beyond = np.flatnonzero(forward >= 2.0 * distance_m)
+    starts = np.arange(beyond[0] if len(beyond) else covered[0])
+    later = np.searchsorted(np.maximum.accumulate(forward), forward[starts] + distance_m)
+    within = later < len(rows)
+    moved = position_m[later[within]] - position_m[starts[within]]
+    return (float(np.median(moved)) or None) if len(moved) else None

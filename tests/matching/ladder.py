@@ -30,9 +30,9 @@ class Journey:
 
 
 def degrees(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-    """Places east and north of the origin [m] as latitude and longitude; right to 1e-4 of the distance."""
-    latitude = ORIGIN_DEG[0] + np.degrees(y_m / 6_365_000.0)
-    return latitude, ORIGIN_DEG[1] + np.degrees(x_m / (6_388_800.0 * np.cos(np.radians(ORIGIN_DEG[0]))))
+    """Places east and north of the origin [m] as latitude and longitude; right to 1e-6 of the distance within 3 km."""
+    latitude = ORIGIN_DEG[0] + np.degrees(y_m / 6_372_955.9)
+    return latitude, ORIGIN_DEG[1] + np.degrees(x_m / (6_390_702.0 * np.cos(np.radians(ORIGIN_DEG[0]))))
 
 
 def lateral_m(x_m: Floats) -> Floats:
@@ -55,9 +55,7 @@ def ladder(sigma_m: float | None = 0.02) -> Site:
         columns = {"measure_m": x - start, "latitude_deg": latitude, "longitude_deg": longitude}
         frames.append(pl.DataFrame({"netelement_id": [name] * len(x), **columns}))
     blank = pl.lit(None, dtype=pl.Float64)
-    track = pl.concat(frames).with_columns(
-        blank.alias("height_m"), pl.lit(sigma_m, dtype=pl.Float64).alias("sigma_m")
-    )
+    track = pl.concat(frames).with_columns(blank.alias("height_m"), pl.lit(sigma_m, dtype=pl.Float64).alias("sigma_m"))
     rows = [("A1", 1, "A2", 0), ("A1", 1, "X", 0), ("X", 1, "B2", 0), ("B1", 1, "B2", 0)]
     links = pl.DataFrame([(*row, "both") for row in rows], schema=list(Links.columns()), orient="row")
     return Site(Track.validate(track, cast=True), Links.validate(links, cast=True))
