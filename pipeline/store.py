@@ -11,8 +11,8 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.ingest.files import Address, is_url, join
-from schemas.config import Settings
-from schemas.conform import conform, to_toml
+from schemas.config import Settings, to_toml
+from schemas.conform import conform
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import CONTRACT_VERSION, TABLES
