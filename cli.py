@@ -157,6 +157,147 @@ def safety(config: ConfigFile = None, as_json: Json = False) -> None:
         print()
 
 
+@app.command()
+def inspect(
+    path: Annotated[str, typer.Argument(help="A site, or a result of `balise replay`.")], as_json: Json = False
+) -> None:
+    """What a site or a result holds, and what is remarkable in it."""
+    from pipeline.inspection import inspect_path
+    from pipeline.present import show_table
+
+    tables = inspect_path(path)
+    if as_json:
+        _print_json(tables)
+        return
+    for name, table in tables.items():
+        show_table(table, name)
+        print()
+
+
+@app.command()
+def inject(
+    run: Annotated[str, typer.Argument(help="A recorded run.")],
+    fault: Annotated[Path, typer.Option("--fault", help="Fault file (TOML).")],
+    out: Annotated[Path, typer.Option("--out", help="The run to write: a folder, or a file *.mcap.")],
+    site: Annotated[str | None, typer.Option("--site", help="Site, for faults along its track.")] = None,
+    config: ConfigFile = None,
+) -> None:
+    """Add a known fault to a recorded run, so that detection is measured on real noise."""
+    from datasets.inject import inject_all, load_faults
+    from datasets.trial import write_run_as
+    from pipeline.ingest import read_run
+    from pipeline.ingest.site import read_site
+
+    settings, _ = _settings(config, None)
+    faults = load_faults(fault)
+    log = read_run(run, settings.ingest)
+    write_run_as(inject_all(log, faults, None if site is None else read_site(site)), out)
+    print(f"{len(faults)} faults injected into {run}: {out}")
+
+
+@app.command()
+def convert(
+    logs: Annotated[list[Path], typer.Argument(help="UBX, SBF, NMEA, or CSV with a mapping in --config.")],
+    to: Annotated[Path, typer.Option("--to", help="The run to write: a folder, or a file *.mcap.")],
+    config: ConfigFile = None,
+) -> None:
+    """Make a run of receiver logs."""
+    from datasets.trial import write_run_as
+    from pipeline.receivers import convert as convert_logs
+
+    settings, _ = _settings(config, None)
+    converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
+    write_run_as(converted.run, to)
+    print(f"{converted.run.gnss.height} epochs in {to}")
+    for reason, count in converted.dropped.items():
+        print(f"not used: {count} x {reason}")
+
+
+@app.command()
+def calibrate(
+    runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, globs.")],
+    site: Site,
+    out: Annotated[Path, typer.Option("--out", help="Vehicle file to write.")],
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    as_json: Json = False,
+) -> None:
+    """Measure odometer scale, GNSS latency and the monitors' sigmas on fault-free runs."""
+    from pipeline.calibrate import calibrate as measure
+    from pipeline.campaign import find_runs
+    from pipeline.ingest import read_run
+    from pipeline.ingest.site import read_site
+    from pipeline.present import show_table
+    from pipeline.storage import write_bytes
+    from schemas.config import to_toml
+
+    settings, train = _settings(config, vehicle)
+    logs = [read_run(address, settings.ingest) for address in find_runs(runs).values()]
+    found = measure(logs, read_site(site), train, settings)
+    write_bytes(out, to_toml(found.vehicle).encode())
+    if as_json:
+        _print_json({"vehicle": found.vehicle.model_dump(), "runs": found.runs, "sigmas": found.sigmas})
+        return
+    show_table(found.runs, "Scale and latency")
+    show_table(found.sigmas, "Sigma of the monitors")
+    print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
+
+
+@app.command()
+def experiment(
+    name: Annotated[str, typer.Argument(help="`list` shows the names.")],
+    out: OutFolder = Path("experiment-out"),
+    repetitions: Annotated[int | None, typer.Option(min=1, help="Instead of the published number.")] = None,
+    seed: int = 1,
+    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0 takes one per core.")] = 0,
+) -> None:
+    """Run a published experiment again, at its own size."""
+    from datasets.experiment import EXPERIMENTS
+    from schemas.errors import UsageError
+
+    if name == "list":
+        print("\n".join(EXPERIMENTS))
+        return
+    if name not in EXPERIMENTS:
+        raise UsageError("is no experiment", place=name, expected=", ".join(EXPERIMENTS))
+    for path in EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1):
+        print(path)
+
+
+@app.command()
+def sql(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    query: Annotated[str, typer.Argument(help="One SELECT.")],
+    as_json: Json = False,
+) -> None:
+    """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
+    from pipeline.present import show_table
+    from pipeline.query import run_sql
+
+    answer = run_sql(out, query)
+    if as_json:
+        _print_json(answer)
+    else:
+        show_table(answer)
+
+
+@app.command()
+def diff(
+    out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    out_b: Annotated[str, typer.Argument(help="Another one.")],
+    as_json: Json = False,
+) -> None:
+    """What changed between two results; exit status 1 on a difference."""
+    from pipeline.diff.results import diff_results
+
+    found = diff_results(out_a, out_b)
+    if as_json:
+        _print_json(found.as_dict())
+    else:
+        print(found.text())
+    raise typer.Exit(OK if found.same else RUNS_NOT_OK)
+
+
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
@@ -257,7 +398,9 @@ def _write_demo(out: Path, result: Any) -> None:
     from schemas.version import SOFTWARE
 
     for tables in result.tables:
-        write_run(tables, out / "tables", {"software": SOFTWARE})
+        row = tables.runs.row(0, named=True)
+        digests = {name: row[name] for name in ("config_digest", "input_digest")}
+        write_run(tables, out / "tables", {"software": SOFTWARE, **digests})
 
 
 if __name__ == "__main__":
