@@ -1,0 +1,15 @@
+"""What changed between two tables, and between two results."""
+
+from pipeline.diff.hazards import HazardChange, compare_hazards
+from pipeline.diff.results import ResultDiff, RunDiff, diff_results
+from pipeline.diff.tables import Difference, compare_tables
+
+__all__ = [
+    "Difference",
+    "HazardChange",
+    "ResultDiff",
+    "RunDiff",
+    "compare_hazards",
+    "compare_tables",
+    "diff_results",
+]

@@ -1,0 +1,143 @@
+"""Two results against each other: runs, hazards matched by time and class, and every other value."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from pipeline import storage, store
+from pipeline.diff.hazards import HAZARD_WINDOW_S, HazardChange, compare_hazards
+from pipeline.diff.tables import Difference, compare_tables
+from pipeline.ingest.files import Address, is_url
+from schemas.errors import UsageError
+from schemas.tables import TABLES
+
+_KEYS: dict[str, tuple[str, ...]] = {
+    "passages": ("solution", "kind", "balise_id"),
+    "alarms": ("solution", "alarm_id"),
+    "epochs": ("solution", "t"),
+    "runs": ("solution",),
+}
+# How a result was made is told, but it is no change of the result.
+_PROVENANCE = ("config_digest", "input_digest", "software", "contract")
+
+
+@dataclass(frozen=True)
+class RunDiff:
+    """What changed in one run. `made_otherwise`: digests and versions that differ, which is no change."""
+
+    run_id: str
+    hazards: tuple[HazardChange, ...] = ()
+    differences: tuple[Difference, ...] = ()
+    made_otherwise: tuple[str, ...] = ()
+
+    @property
+    def same(self) -> bool:
+        return not (self.hazards or self.differences)
+
+    def as_dict(self) -> dict[str, object]:
+        return {
+            "run_id": self.run_id,
+            "hazards": [item.as_dict() for item in self.hazards],
+            "differences": [item.as_dict() for item in self.differences],
+        }
+
+
+@dataclass(frozen=True)
+class ResultDiff:
+    """What changed from result A to result B: `runs` holds the changed ones only."""
+
+    compared: int
+    only_in_a: tuple[str, ...] = ()
+    only_in_b: tuple[str, ...] = ()
+    runs: tuple[RunDiff, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def same(self) -> bool:
+        return not (self.only_in_a or self.only_in_b or self.runs)
+
+    def text(self) -> str:
+        """For people: one line per finding, the verdict last."""
+        lines = [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
+        for run in self.runs:
+            lines += [f"{run.run_id}:", *(f"  {finding}" for finding in (*run.hazards, *run.differences))]
+        lines += [f"note: {note}" for note in self.notes]
+        verdict = "all the same" if not self.runs else f"{len(self.runs)} changed"
+        lines.append(f"{self.compared} runs compared: {verdict}")
+        return "\n".join(lines)
+
+    def as_dict(self) -> dict[str, object]:
+        """For programs: plain values, as JSON holds them."""
+        return {
+            "same": self.same,
+            "compared": self.compared,
+            "only_in_a": list(self.only_in_a),
+            "only_in_b": list(self.only_in_b),
+            "runs": [run.as_dict() for run in self.runs],
+            "notes": list(self.notes),
+        }
+
+
+def diff_results(out_a: Address, out_b: Address, hazard_window_s: float = HAZARD_WINDOW_S) -> ResultDiff:
+    """Compare two results run by run; files of the same bytes are not opened.
+
+    Hazards of the same solution and class at most `hazard_window_s` [s] apart are the same hazard.
+    """
+    runs_a, runs_b = (_runs(out) for out in (out_a, out_b))
+    common = [run for run in runs_a if run in set(runs_b)]
+    found = [_diff_run(out_a, out_b, run, hazard_window_s) for run in common]
+    return ResultDiff(
+        compared=len(common),
+        only_in_a=tuple(run for run in runs_a if run not in set(runs_b)),
+        only_in_b=tuple(run for run in runs_b if run not in set(runs_a)),
+        runs=tuple(run for run in found if not run.same),
+        notes=_notes(found),
+    )
+
+
+def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
+    counts = Counter(column for run in runs for column in run.made_otherwise)
+    return tuple(f"{column} differs in {counts[column]} runs" for column in _PROVENANCE if counts[column])
+
+
+def _runs(out: Address) -> list[str]:
+    runs = store.run_ids(out)
+    if not runs:
+        place = storage.redacted(str(out))
+        raise UsageError("holds no complete run", place=place, expected="the output folder of `balise replay`")
+    return runs
+
+
+def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> RunDiff:
+    hazards: list[HazardChange] = []
+    differences: list[Difference] = []
+    for table, contract in TABLES.items():
+        a, b = (_content(out, table, run_id) for out in (out_a, out_b))
+        if a == b:
+            continue
+        frame_a, frame_b = (pl.read_parquet(io.BytesIO(content)) for content in (a, b))
+        if table == "hazards":
+            found, hazards = compare_hazards(frame_a, frame_b, window_s)
+        else:
+            found = compare_tables(frame_a, frame_b, contract, _KEYS[table])
+        differences += found
+    made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]
+    changed = [item for item in differences if item not in made]
+    return RunDiff(run_id, tuple(hazards), tuple(changed), tuple(item.column for item in made))
+
+
+def _content(out: Address, table: str, run_id: str) -> bytes:
+    address = store.table_address(out, table, run_id)
+    if is_url(address):
+        content = storage.read_many([str(address)]).get(str(address))
+    else:
+        content = Path(address).read_bytes() if Path(address).exists() else None
+    if content is None:
+        place = storage.redacted(str(address))
+        raise UsageError("is missing from a complete run", place=place, remedy="Replay the run again with --force.")
+    return content

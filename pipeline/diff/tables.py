@@ -1,0 +1,137 @@
+"""What changed between two results: schemas and whole numbers exactly, floats by their column's tolerance.
+
+The tolerance is absolute and stands in the contract (`metadata["tolerance"]`); there is no relative
+one, which would call positions tens of metres apart the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import dataframely as dy
+import polars as pl
+
+Kind = Literal["schema", "rows", "values"]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One difference between two tables; `rows` counts the rows concerned."""
+
+    table: str
+    kind: Kind
+    column: str
+    message: str
+    rows: int = 0
+
+    def __str__(self) -> str:
+        place = f"{self.table}.{self.column}" if self.column else self.table
+        return f"{place}: {self.message}"
+
+    def as_dict(self) -> dict[str, object]:
+        return asdict(self)
+
+
+def compare_tables(
+    a: pl.DataFrame, b: pl.DataFrame, contract: type[dy.Schema], keys: tuple[str, ...] = ()
+) -> list[Difference]:
+    """The differences of `b` against `a`; none means the same.
+
+    Rows are compared as they stand, or by `keys` where given, so that one row more is one
+    difference. A column without a tolerance in the contract is compared exactly. NaN, which no
+    table may hold, is always a difference.
+    """
+    name = contract.__name__.lower()
+    differences = _schema_differences(name, a, b)
+    common = [column for column in a.columns if b.schema.get(column) == a.schema[column]]
+    if not set(keys) <= set(common):
+        return differences
+    if keys:
+        counted, a, b = _paired(name, a, b, keys)
+        differences += counted
+    elif a.height != b.height:
+        rows = abs(a.height - b.height)
+        return [*differences, Difference(name, "rows", "", f"{a.height} rows became {b.height}", rows)]
+    columns = contract.columns()
+    for column in common:
+        found = _values_differ(a[column], b[column], tolerance_of(columns.get(column)))
+        if found is not None:
+            message, rows = found
+            differences.append(Difference(name, "values", column, message, rows))
+    return differences
+
+
+def tolerance_of(column: dy.Column | None) -> float:
+    """Absolute tolerance of a column [its unit]; zero where the contract names none."""
+    tolerance = (column.metadata or {}).get("tolerance", 0.0) if column is not None else 0.0
+    return float(tolerance)
+
+
+def _schema_differences(table: str, a: pl.DataFrame, b: pl.DataFrame) -> list[Difference]:
+    found = [Difference(table, "schema", column, "column is lost") for column in a.columns if column not in b.columns]
+    found += [Difference(table, "schema", column, "column is new") for column in b.columns if column not in a.columns]
+    both = [column for column in a.columns if column in b.columns]
+    if both != [column for column in b.columns if column in a.columns]:
+        found.append(Difference(table, "schema", "", "columns stand in another order"))
+    for column in both:
+        if a.schema[column] != b.schema[column]:
+            found.append(Difference(table, "schema", column, f"{a.schema[column]} became {b.schema[column]}"))
+    return found
+
+
+def _paired(
+    table: str, a: pl.DataFrame, b: pl.DataFrame, keys: tuple[str, ...]
+) -> tuple[list[Difference], pl.DataFrame, pl.DataFrame]:
+    """The rows that stand in both, in the order of `a`; a key that stands twice counts by its turn."""
+    by = [*keys, "_turn"]
+    a, b = (frame.with_columns(_turn=pl.int_range(pl.len()).over(list(keys))) for frame in (a, b))
+    lost, new = _joined(a, b, by, "anti"), _joined(b, a, by, "anti")
+    found = []
+    for word, rows in (("lost", lost), ("new", new)):
+        if rows.height:
+            first = ", ".join(f"{key} {_text(rows[key][0])}" for key in keys)
+            found.append(Difference(table, "rows", "", f"{rows.height} rows {word}, first: {first}", rows.height))
+    kept = _joined(a, b, by, "semi")
+    partners = _joined(kept.select(by), b, by, "left").select(b.columns)
+    return found, kept.drop("_turn"), partners.drop("_turn")
+
+
+def _joined(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti", "semi", "left"]) -> pl.DataFrame:
+    return a.join(b, on=by, how=how, nulls_equal=True, maintain_order="left")
+
+
+def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, int] | None:
+    """What differs, and in how many rows."""
+    differs = _float_mask(a, b, tolerance) if a.dtype.is_float() else a.ne_missing(b)
+    rows = int(differs.sum())
+    if rows == 0:
+        return None
+    first = differs.arg_true()[0]
+    message = f"{_count(rows, a.len())} differ, first row {first}: {_text(a[first])} became {_text(b[first])}"
+    if a.dtype.is_float():
+        largest = (a - b).abs().filter(differs).drop_nans().max()
+        if isinstance(largest, float):
+            message += f"; by up to {largest:.3g}, tolerance {tolerance:.3g}"
+    return message, rows
+
+
+def _float_mask(a: pl.Series, b: pl.Series, tolerance: float) -> pl.Series:
+    frame = pl.DataFrame({"a": a.alias("a"), "b": b.alias("b")})
+    x, y = pl.col("a"), pl.col("b")
+    apart = (x != y) & ~((x - y).abs() <= tolerance)
+    broken = x.is_nan().fill_null(value=False) | y.is_nan().fill_null(value=False)
+    unknown = x.is_null() != y.is_null()
+    return frame.select((apart.fill_null(value=False) | broken | unknown).alias("differs")).to_series()
+
+
+def _count(rows: int, of: int) -> str:
+    return f"{rows} of {of} rows"
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, pl.Series):
+        return str(value.to_list())
+    return repr(value) if isinstance(value, float) else str(value)

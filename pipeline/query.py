@@ -1,0 +1,76 @@
+"""SQL over the tables of a campaign.
+
+Polars answers, not DuckDB: it is there already, and over the small files of ten thousand runs it is
+the quicker of the two (1.0 s against 1.8 s for a count of hazards by class, two cores). The files
+are plain Hive-partitioned Parquet, so DuckDB reads them from outside all the same.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import polars as pl
+
+from pipeline import storage, store
+from pipeline.ingest.files import Address, exists, is_url, join
+from schemas.campaign import CAMPAIGN_TABLES
+from schemas.errors import UsageError
+from schemas.tables import TABLES
+
+
+def run_sql(out: Address, sql: str) -> pl.DataFrame:
+    """The answer to one SELECT over the complete runs of a result.
+
+    Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, and those of the
+    campaign where they are written. A condition on `run_id` reads the files of these runs only.
+    """
+    tables = _tables(out, sql)
+    try:
+        with warnings.catch_warnings():
+            # Thousands of small files are read by as many waiting threads; polars takes it for a deadlock.
+            warnings.filterwarnings("ignore", message="POLARS_MAX_BLOCKING_THREAD_COUNT")
+            return pl.SQLContext(tables).execute(sql).collect()
+    except pl.exceptions.PolarsError as error:
+        raise UsageError(
+            f"cannot be answered: {_first_line(error)}",
+            place="SQL",
+            expected="a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES]),
+            remedy="`balise dictionary` lists the columns of each table.",
+        ) from None
+
+
+def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
+    runs = store.run_ids(out)
+    if not runs:
+        raise UsageError(
+            "holds no complete run",
+            place=storage.redacted(str(out)),
+            expected="the output folder of `balise replay`",
+        )
+    # Only what the query may name: ten thousand addresses take their time, remote tables their transfer.
+    named = [name for name in TABLES if re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
+    return {name: _scan(out, name, runs) for name in named} | _campaign_tables(out)
+
+
+def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
+    if is_url(out):
+        return store.read_table(out, table)
+    contract = dict(TABLES[table].create_empty().schema)
+    paths = [str(store.table_address(out, table, run)) for run in runs]
+    scan = pl.scan_parquet(
+        paths, glob=False, hive_partitioning=True, hive_schema={"run_id": pl.String()}, schema=contract
+    )
+    return scan.select("run_id", *contract)
+
+
+def _campaign_tables(out: Address) -> dict[str, pl.LazyFrame]:
+    """`campaign/runs.parquet` as `campaign_runs`, and so on."""
+    addresses = {
+        name: join(join(out, "campaign"), f"{name.removeprefix('campaign_')}.parquet") for name in CAMPAIGN_TABLES
+    }
+    return {name: pl.scan_parquet(address) for name, address in addresses.items() if exists(address)}
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
