@@ -1,0 +1,88 @@
+"""Measurement trains near Brussels airport, against paths reviewed by the network's own people."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from pipeline.ingest.site import read_site
+from pipeline.matching import Match, match
+from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.run import Site
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "infrabel"
+FIX = {"NARROW_INT3": "rtk_fixed", "PROPAGATED": "estimated", "SINGLE": "autonomous"}
+pytestmark = pytest.mark.skipif(not DATA.exists(), reason="the shared recordings are not beside the repository")
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "track.geojson").write_bytes((DATA / "network_airport.geojson").read_bytes())
+    return read_site(folder)
+
+
+def recording(number: int) -> pl.DataFrame:
+    log = pl.read_csv(next(DATA.glob(f"log_{number}_*.csv")))
+    return (
+        log.select(
+            pl.col("timestamp").str.to_datetime(time_unit="ns").dt.replace_time_zone("UTC").alias("t"),
+            pl.lit("primary").alias("solution"),
+            pl.col("latitude").alias("latitude_deg"),
+            pl.col("longitude").alias("longitude_deg"),
+            pl.lit(None, dtype=pl.Float64).alias("height_m"),
+            pl.col("position_type").replace_strict(FIX).alias("fix"),
+        )
+        .unique("t", keep="first")
+        .sort("t")
+    )
+
+
+def matched(number: int, network: Site) -> Match:
+    return match(recording(number), None, network, Vehicle(), MatchingConfig(), FixSigma())
+
+
+def reviewed(number: int) -> list[str]:
+    """Elements in the file; where epochs are given, in order of travel. Those without any stand at the end."""
+    document = json.loads(next(DATA.glob(f"log_{number}_*path*.geojson")).read_text())
+    return [feature["properties"]["netelement_id"] for feature in document["features"]]
+
+
+@pytest.mark.parametrize("number", [28876, 29304, 31241])
+def test_the_path_is_the_reviewed_one(number: int, network: Site) -> None:
+    assert matched(number, network).path.elements() == reviewed(number)
+
+
+def test_a_path_through_a_long_stretch_of_wrong_positions(network: Site) -> None:
+    """The reviewed file puts the three elements that no epoch fits last; they lie after 88_L_5831."""
+    expected = reviewed(28573)
+    fitted, unseen = expected[:-3], ["88_L_3955", "88_L_5977", "88_L_7820"]
+    assert sorted(expected[-3:]) == sorted(unseen)
+    at = fitted.index("88_L_5831") + 1
+    found = matched(28573, network)
+    assert found.path.elements() == fitted[:at] + unseen + fitted[at:]
+    # Epochs flagged as fixed ambiguities and yet more than 50 m from any track.
+    flagged = found.epochs.with_columns(recording(28573)["fix"]).filter(pl.col("fix") == "rtk_fixed")
+    assert flagged.filter(~pl.col("on_track")).height >= 200
+    assert found.epochs.filter(pl.col("on_track") & (pl.col("cross_track_m").abs() > 50.0)).is_empty()
+    lost = found.ambiguous.filter(pl.col("netelement_id").is_in(unseen))
+    assert lost["probability"].min() < 0.5
+
+
+def test_where_the_exact_path_is_unknown_the_doubt_is_listed(network: Site) -> None:
+    found = matched(31241, network)
+    assert found.ambiguous.height >= 3
+    assert found.ambiguous["probability"].min() < 0.5
+
+
+def test_the_constant_offset_of_map_or_antenna_is_told(network: Site) -> None:
+    """Element by element -1.0 to -3.0 m, -1.9 m over the run: no fault of the GNSS."""
+    found = matched(28876, network)
+    epochs = found.epochs["cross_track_m"]
+    assert epochs.median() == pytest.approx(-1.9, abs=0.3)
+    assert found.biases["cross_bias_m"].min() > -3.2
+    assert found.biases["cross_bias_m"].max() < -0.8
+    assert found.epochs["sigma_source"].cast(str).unique().to_list() == ["table"]
