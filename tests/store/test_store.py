@@ -133,19 +133,27 @@ def test_output_that_cannot_be_written(tmp_path: Path) -> None:
         store.write_run(tables_of("r"), tmp_path / "out", METADATA)
 
 
-def test_breach_of_the_contract_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("distance_m", pl.lit(float("nan")), "distance_m holds NaN"),
+        ("epochs", pl.lit(None, pl.Int64), "epochs holds null"),
+    ],
+)
+def test_breach_of_the_contract_is_refused(tmp_path: Path, column: str, value: pl.Expr, message: str) -> None:
     tables = tables_of("r")
-    broken = tables.runs.with_columns(availability=pl.lit(1.5))
-    with pytest.raises(ValueError, match="table Runs"):
+    broken = tables.runs.with_columns(value.alias(column))
+    with pytest.raises(ValueError, match=message):
         store.write_run(RunTables(**{**tables.__dict__, "runs": broken}), tmp_path, METADATA)
     assert files_in(tmp_path) == {}
 
 
-def test_nan_is_refused(tmp_path: Path) -> None:
+def test_unknown_enum_is_refused(tmp_path: Path) -> None:
     tables = tables_of("r")
-    broken = tables.runs.with_columns(distance_m=pl.lit(float("nan")))
-    with pytest.raises(ValueError, match="table Runs"):
+    broken = tables.runs.with_columns(status=pl.lit("fine"))
+    with pytest.raises(pl.exceptions.PolarsError, match="fine"):
         store.write_run(RunTables(**{**tables.__dict__, "runs": broken}), tmp_path, METADATA)
+    assert files_in(tmp_path) == {}
 
 
 def test_unknown_names(tmp_path: Path) -> None:

@@ -1,0 +1,200 @@
+"""Commands as a user types them: exit status, one message per error, text in a pipe, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import cli
+from tests.conftest import SmallTrial
+
+ROOT = Path(__file__).parents[2]
+
+
+class Said:
+    """What a command said and its exit status."""
+
+    def __init__(self, status: int, out: str, err: str) -> None:
+        self.status, self.out, self.err = status, out, err
+
+
+Balise = Callable[..., Said]
+
+
+@pytest.fixture
+def balise(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Balise:
+    def call(*arguments: str | Path) -> Said:
+        monkeypatch.setattr(sys, "argv", ["balise", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        assert isinstance(ended.value.code, int)
+        return Said(ended.value.code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def result(small_trial: SmallTrial, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from pipeline.campaign import make_plan, run_campaign
+
+    out = tmp_path_factory.mktemp("result")
+    for path in small_trial.paths[:2]:
+        run_campaign(make_plan([str(path)], small_trial.site, out))
+    return out
+
+
+def test_replay_one_run(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    said = balise("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path / "out")
+    assert said.status == 0
+    assert "1 of 1 runs: 1 ok, 0 partial, 0 failed" in said.out
+    assert "\x1b[" not in said.out + said.err
+    assert "\u2502" not in said.out
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("alarms", "campaign", "config.toml", "epochs", "hazards", "passages", "replay.log", "runs")
+    ]
+    quiet = balise("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path / "out", "--quiet")
+    assert (quiet.status, quiet.out, quiet.err) == (0, "", "")
+
+
+def test_replay_as_json(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"")
+    said = balise(
+        *("replay", tmp_path / "bad.mcap", "--site", small_trial.site, "--out", tmp_path / "out", "--json"),
+    )
+    assert said.status == 1
+    assert said.err == ""
+    found = json.loads(said.out)
+    assert found["planned"] == 1
+    assert [(run["run_id"], run["status"]) for run in found["runs"]] == [("bad", "failed")]
+    assert "bad.mcap" in found["runs"][0]["error"]
+
+
+def test_failed_run_is_said_and_filed(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    (tmp_path / "bad" / "sub").mkdir(parents=True)
+    (tmp_path / "bad" / "gnss.parquet").write_bytes(b"no parquet")
+    said = balise("replay", tmp_path / "bad", "--site", small_trial.site, "--out", tmp_path / "out")
+    assert said.status == 1
+    assert "gnss.parquet" in said.err
+    assert "Traceback" not in said.err
+    runs = pl.read_parquet(tmp_path / "out/runs/run_id=bad/runs.parquet")
+    assert runs["status"].to_list() == ["failed"]
+    assert str(tmp_path) not in runs["error"][0]
+
+
+USAGE_ERRORS: list[tuple[Sequence[str], str]] = [
+    (("replay",), "Missing argument"),
+    (("replay", "{run}"), "--site"),
+    (("replay", "{run}", "--site", "{tmp}/none", "--out", "{tmp}/out"), "none"),
+    (("replay", "{tmp}/none.mcap", "--site", "{site}", "--out", "{tmp}/out"), "no such run"),
+    (("replay", "{run}", "--site", "{site}", "--out", "{tmp}/file"), "cannot be written"),
+    (("replay", "{run}", "--site", "{site}", "--out", "{tmp}/out", "--config", "{tmp}/file"), "is not TOML"),
+    (("replay", "{run}", "--site", "{site}", "--out", "{tmp}/out", "--config", "{tmp}/bad.toml"), "lds.ci_limit"),
+    (("replay", "{run}", "--site", "{site}", "--out", "{tmp}/out", "--vehicle", "{tmp}/bad.toml"), "lds"),
+    (("replay", "{run}", "--site", "{site}", "--out", "{tmp}/out", "--jobs", "-1"), "--jobs"),
+    (("inspect", "{tmp}"), "neither"),
+    (("inspect", "{tmp}/none"), "does not exist"),
+    (("sql", "{tmp}", "select 1"), "no complete run"),
+    (("sql", "{result}", "select nonsense from runs"), "nonsense"),
+    (("diff", "{result}", "{tmp}"), "no complete run"),
+    (("experiment", "nonsense"), "is no experiment"),
+    (("dictionary", "--table", "nonsense"), "is no table"),
+    (("nonsense",), "No such command"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), USAGE_ERRORS, ids=lambda value: str(value)[:60])
+def test_bad_usage(
+    balise: Balise, small_trial: SmallTrial, result: Path, tmp_path: Path, arguments: Sequence[str], message: str
+) -> None:
+    (tmp_path / "file").write_text("[[ neither TOML nor a folder")
+    (tmp_path / "bad.toml").write_text("[lds]\nci_limit = 3\n")
+    known = {"run": small_trial.paths[0], "site": small_trial.site, "tmp": tmp_path, "result": result}
+    said = balise(*(argument.format(**known) for argument in arguments))
+    assert said.status == 2
+    assert message in said.err
+    assert "Traceback" not in said.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_traceback_on_request_only(balise: Balise, tmp_path: Path) -> None:
+    assert "Traceback" not in balise("inspect", tmp_path / "none").err
+    assert "Traceback" in balise("inspect", tmp_path / "none", "--debug").err
+
+
+def test_our_own_defect(balise: Balise, monkeypatch: pytest.MonkeyPatch, result: Path) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("pipeline.query.run_sql", broken)
+    said = balise("sql", result, "select 1")
+    assert said.status == 3
+    assert "a defect of this program: ZeroDivisionError" in said.err
+    assert "Traceback" not in said.err
+
+
+def test_inspect(balise: Balise, small_trial: SmallTrial, result: Path) -> None:
+    site = balise("inspect", small_trial.site)
+    assert (site.status, "15 virtual" in site.out) == (0, True)
+    runs = json.loads(balise("inspect", result, "--json").out)
+    assert [row["run_id"] for row in runs["Runs"]] == ["run0", "run1"]
+
+
+def test_sql(balise: Balise, result: Path) -> None:
+    said = balise("sql", result, "select run_id, count(*) as n from passages group by run_id order by run_id", "--json")
+    assert [row["run_id"] for row in json.loads(said.out)] == ["run0", "run1"]
+
+
+def test_diff(balise: Balise, small_trial: SmallTrial, result: Path, tmp_path: Path) -> None:
+    assert balise("diff", result, result).status == 0
+    balise("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path, "--quiet")
+    changed = balise("diff", result, tmp_path)
+    assert (changed.status, "run1: only in A" in changed.out) == (1, True)
+
+
+def test_inject(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    (tmp_path / "fault.toml").write_text('[[faults]]\nkind = "outage"\nstart_s = 10\nduration_s = 5\n')
+    said = balise("inject", small_trial.paths[0], "--fault", tmp_path / "fault.toml", "--out", tmp_path / "faulty")
+    assert said.status == 0
+    assert pl.read_parquet(tmp_path / "faulty/faults.parquet")["kind"].cast(pl.String).to_list() == ["outage"]
+
+
+def test_dictionary(balise: Balise) -> None:
+    text = balise("dictionary")
+    assert (text.status, "missed_detections" in text.out) == (0, True)
+    assert balise("dictionary", "--markdown").out.startswith("# Data dictionary")
+    columns = json.loads(balise("dictionary", "--table", "hazards", "--json").out)
+    assert {"solution", "size_m"} <= {row["column"] for row in columns}
+
+
+def test_safety(balise: Balise) -> None:
+    tables = json.loads(balise("safety", "--json").out)
+    assert "errata" in tables
+
+
+def test_version(balise: Balise) -> None:
+    assert balise("--version").out.startswith("balise ")
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = "import sys, cli\ncli._guarded(['--help'], False)\nprint([m for m in sys.modules if m in {heavy}])".format(
+        heavy={"polars", "numpy", "scipy", "pyarrow", "pydantic"}
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, text=True, capture_output=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_reader_that_goes_away(result: Path) -> None:
+    command = f"{sys.executable} -m cli dictionary | head -n 1"
+    done = subprocess.run(
+        command, shell=True, cwd=ROOT, text=True, capture_output=True, check=True, env=dict(os.environ)
+    )
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
