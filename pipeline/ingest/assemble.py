@@ -34,7 +34,8 @@ def stream_frames(decoded: Sequence[Decoded], breaches: list[Breach]) -> dict[st
 
 def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
-    rows = [_rows(part) for part in parts]
+    supplements = [part for part in parts if part.source.recipe.supplement]
+    rows = [_rows(part, supplements) for part in parts if not part.source.recipe.supplement]
     if len(rows) == 1:
         frame = rows[0]
     else:
@@ -42,7 +43,25 @@ def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) ->
     return conform(frame.drop(ORDINAL), stream, place, breaches)
 
 
-def _rows(part: Decoded) -> pl.DataFrame:
+def _supplemented(frame: pl.DataFrame, part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:
+    """With the columns that other messages of the same receiver hold for the same epochs."""
+    key = list(part.source.recipe.key)
+    for other in supplements:
+        if other.source.recipe.key != part.source.recipe.key or not _same_receiver(part, other):
+            continue
+        columns = [expression.alias(name) for name, expression in other.source.columns.items()]
+        extra = other.frame.select(*key, *columns).unique(subset=key, keep="first", maintain_order=True)
+        keys = part.frame.select(key)
+        frame = frame.hstack(keys).join(extra, on=key, how="left", maintain_order="left").drop(key)
+    return frame
+
+
+def _same_receiver(part: Decoded, other: Decoded) -> bool:
+    """Drivers publish the messages of one receiver side by side."""
+    return part.source.channel.topic.rpartition("/")[0] == other.source.channel.topic.rpartition("/")[0]
+
+
+def _rows(part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:
     source = part.source
     columns = part.frame.select(
         pl.col(ORDINAL), *(expression.alias(name) for name, expression in source.columns.items())
@@ -52,7 +71,7 @@ def _rows(part: Decoded) -> pl.DataFrame:
     except pl.exceptions.PolarsError as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
-    return _named(columns.with_columns(times), source)
+    return _supplemented(_named(columns.with_columns(times), source), part, supplements)
 
 
 def _named(frame: pl.DataFrame, source: Source) -> pl.DataFrame:

@@ -102,21 +102,30 @@ def protobuf_descriptor(channel: Channel) -> Any:
     return _protobuf_decoder(channel)(b"").DESCRIPTOR
 
 
-def decode_columns(channel: Channel, messages: Messages, types: Mapping[str, pl.DataType]) -> pl.DataFrame:
-    """One column per field path, decoded message by message."""
+def decode_columns(
+    channel: Channel, messages: Messages, types: Mapping[str, pl.DataType], rows: str = ""
+) -> tuple[pl.DataFrame, list[int]]:
+    """One column per field path, decoded message by message; with `rows` one row per element of that array.
+
+    Also returns, for each row, the number of its message.
+    """
     decode = decoder_for(channel)
     takers = [(path, _taker(path), _COERCIONS[type(dtype)]) for path, dtype in types.items()]
+    array = _taker(rows)
     values: dict[str, list[Value]] = {path: [] for path in types}
-    for row in range(len(messages)):
+    numbers: list[int] = []
+    for number in range(len(messages)):
         try:
-            message = decode(messages.payload(row))
-            for path, take, coerce in takers:
-                values[path].append(coerce(take(message)))
+            message = decode(messages.payload(number))
+            for element in array(message) or [] if rows else [message]:
+                numbers.append(number)
+                for path, take, coerce in takers:
+                    value = take(element)
+                    values[path].append(coerce(take(message) if value is None and rows else value))
         except NotDecodable as error:
-            raise undecodable(channel, messages, row, error) from None
-    return pl.DataFrame(
-        [pl.Series(path, column, dtype=types[path]) for path, column in values.items()], strict=True
-    )
+            raise undecodable(channel, messages, number, error) from None
+    series = [pl.Series(path, column, dtype=types[path]) for path, column in values.items()]
+    return pl.DataFrame(series), numbers
 
 
 def undecodable(channel: Channel, messages: Messages, row: int, error: NotDecodable) -> InputError:

@@ -18,7 +18,7 @@ from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_records import Damage
 from pipeline.ingest.mcap_walk import McapWalk
-from pipeline.ingest.plan import Sample, candidates, settle, source_of
+from pipeline.ingest.plan import Sample, candidates, is_candidate, settle, source_of
 from pipeline.ingest.reader import SourceReader
 from schemas.config import IngestConfig
 from schemas.errors import InputError
@@ -43,11 +43,10 @@ class McapStreams:
                 reader.add(messages)
 
     def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
-        found = candidates(channel, self._config)
-        if not found:
+        if not is_candidate(channel, self._config):
             return []
         sample = sample_of(messages, channel)
-        return [SourceReader(source_of(sample, candidate)) for candidate in found]
+        return [SourceReader(source_of(sample, candidate)) for candidate in candidates(sample, self._config)]
 
 
 def sample_of(messages: Messages, channel: Channel) -> Sample:

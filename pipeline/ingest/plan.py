@@ -11,8 +11,9 @@ import polars as pl
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.inventory import stamp_parts
 from pipeline.ingest.mcap_model import Channel
-from pipeline.ingest.recipes import FIX_TYPE, Recipe, recipe_for, recorded_type
-from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TimeSource, time_source
+from pipeline.ingest.recipe import FIX_TYPE, Recipe
+from pipeline.ingest.recipes import recipes_for, recorded_type
+from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, CivilTime, TimeSource, time_source
 from schemas.config import IngestConfig, StreamMapping
 from schemas.enums import Fix
 from schemas.errors import ConfigError
@@ -37,10 +38,17 @@ class Source:
     channel: Channel
     recipe: Recipe
     columns: Mapping[str, pl.Expr]
-    times: Mapping[str, TimeSource]
+    times: Mapping[str, TimeSource | CivilTime]
     types: Mapping[str, pl.DataType]
     solution: str | None = None
     breaches: tuple[Breach, ...] = ()
+    mapped: bool = False
+
+    @property
+    def dropped(self) -> bool:
+        """A driver's optional message that is not as its recipe knows it: left over, not an error."""
+        optional = self.stream == "satellites" or self.recipe.supplement
+        return bool(self.breaches) and optional and not self.mapped and not self.recipe.own
 
     @property
     def stream(self) -> Stream:
@@ -56,26 +64,39 @@ def mappings_of(config: IngestConfig, stream: Stream) -> tuple[StreamMapping, ..
     return mappings
 
 
-def candidates(channel: Channel, config: IngestConfig) -> list[Candidate]:
+def candidates(sample: Sample, config: IngestConfig) -> list[Candidate]:
     """The streams that a channel may feed: by configuration, else by its schema."""
-    known = recipe_for(channel.schema_name, channel.topic)
+    channel = sample.channel
+    known = _fitting(sample)
     found: list[Candidate] = []
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
         found += [
-            (mapped_recipe(channel, stream, mapping), mapping)
+            (mapped_recipe(sample, stream, mapping), mapping)
             for mapping in mappings
             if mapping.topic == channel.topic
         ]
-        supplement = known is not None and known.supplement
-        if known is not None and known.stream == stream and (not mappings or supplement):
+        if known is not None and known.stream == stream and (not mappings or known.supplement):
             found.append((known, None))
     return found
 
 
-def mapped_recipe(channel: Channel, stream: Stream, mapping: StreamMapping) -> Recipe:
+def is_candidate(channel: Channel, config: IngestConfig) -> bool:
+    """Whether anything may be made of the channel at all."""
+    mapped = any(mapping.topic == channel.topic for stream in STREAMS for mapping in mappings_of(config, stream))
+    return mapped or bool(recipes_for(channel.schema_name, channel.topic))
+
+
+def _fitting(sample: Sample) -> Recipe | None:
+    """The first recipe of the schema whose fields are all there, else the first at all."""
+    recipes = recipes_for(sample.channel.schema_name, sample.channel.topic)
+    whole = (recipe for recipe in recipes if not source_of(sample, (recipe, None)).breaches)
+    return next(whole, recipes[0] if recipes else None)
+
+
+def mapped_recipe(sample: Sample, stream: Stream, mapping: StreamMapping) -> Recipe:
     """The mapping over the recipe of the schema, if that is one of the same stream."""
-    base = recipe_for(channel.schema_name, channel.topic)
+    base = _fitting(sample)
     if base is None or base.stream != stream:
         fix = {"fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE)} if stream == "gnss" else {}
         base = Recipe(stream=stream, columns=fix, stamps={})
@@ -119,7 +140,7 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
     columns: dict[str, pl.Expr] = {}
     breaches: list[Breach] = []
     for name, expression in recipe.columns.items():
-        absent = [path for path in recipe.fields_of(name) if path not in sample.fields]
+        absent = [path for path in recipe.fields_of(name) if not _is_there(sample, recipe, path)]
         wanted = mapping is not None and name in mapping.fields
         if not absent or (not closed and contract[name].nullable):
             columns[name] = expression
@@ -131,7 +152,16 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
     for time in times.values():
         types |= time.types
     solution = mapping.solution if mapping else None
-    return Source(sample.channel, recipe, columns, times, types, solution, tuple(breaches))
+    return Source(sample.channel, recipe, columns, times, types, solution, tuple(breaches), mapping is not None)
+
+
+def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
+    in_element = f"{recipe.rows}[0].{path}"
+    # An array that happens to be empty in the first message says nothing about its elements.
+    return path in sample.fields or (
+        bool(recipe.rows)
+        and (in_element in sample.fields or not any(name.startswith(recipe.rows + "[") for name in sample.fields))
+    )
 
 
 def _missing_field(sample: Sample, column: str, absent: Sequence[str]) -> Breach:
@@ -145,13 +175,14 @@ def _missing_field(sample: Sample, column: str, absent: Sequence[str]) -> Breach
 
 def _times(
     sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[Breach]
-) -> dict[str, TimeSource]:
+) -> dict[str, TimeSource | CivilTime]:
     """The time of validity, and further times (end of a fault), which look like it and may be absent."""
-    if recipe.time is not None:
+    if recipe.time is not None and (mapping is None or mapping.time == "auto"):
         return {"t": recipe.time}
     (column, path), *others = (recipe.stamps or {"t": ""}).items()
     first = _time(sample, path, mapping, breaches)
-    return {column: first} | {name: first.of_field(path, other) for name, other in others}
+    extra = {name: first.of_field(path, other) for name, other in others}
+    return {column: first, **extra}
 
 
 def _time(
@@ -179,7 +210,7 @@ def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfi
     breaches = _absent_topics(topics, config, file)
     kept: list[Source] = []
     for stream in STREAMS:
-        chosen = _preferred([source for source in sources if source.stream == stream])
+        chosen = _preferred([source for source in sources if source.stream == stream and not source.dropped])
         _refuse_shared_solutions(stream, chosen)
         breaches += _competing(stream, chosen, file)
         breaches += [breach for source in chosen for breach in source.breaches]

@@ -7,7 +7,7 @@ from typing import Any
 
 import dataframely as dy
 
-from pipeline.ingest.recipes import OWN_PREFIX, OWN_SCHEMAS
+from pipeline.ingest.recipes import OWN_SCHEMAS
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
@@ -102,6 +102,3 @@ def _add_timestamp(message: Any, name: str, number: int) -> None:
         name=name, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=".google.protobuf.Timestamp"
     )
 
-
-def is_own(name: str) -> bool:
-    return name.startswith(OWN_PREFIX)

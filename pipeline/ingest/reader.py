@@ -53,7 +53,7 @@ class SourceReader:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.slow_messages = 0
-        self._decoder = decoder_of(source.channel, source.types)
+        self._decoder = None if source.recipe.rows else decoder_of(source.channel, source.types)
         used = {name for time in source.times.values() for name in time.fields}
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
         self._columns: dict[str, list[Values]] = {
@@ -83,8 +83,12 @@ class SourceReader:
         for rest in left:
             self._take_fields()
             self.slow_messages += len(rest)
-            self._note(rest)
-            self._keep(decode_columns(self.source.channel, rest, self.source.types).to_dict())
+            frame, numbers = decode_columns(
+                self.source.channel, rest, self.source.types, self.source.recipe.rows
+            )
+            if numbers:
+                self._note(rest.chosen(np.array(numbers, dtype=np.int64)))
+                self._keep(frame.to_dict())
 
     def _note(self, messages: Messages) -> None:
         self._columns[ORDINAL].append(messages.ordinal)
@@ -108,8 +112,8 @@ class SourceReader:
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""
         self._take_fields()
-        ordinals = np.concatenate(self._columns[ORDINAL])
-        order = None if (np.diff(ordinals) > 0).all() else np.argsort(ordinals)
+        ordinals = np.concatenate([np.zeros(0, np.int64), *self._columns[ORDINAL]])
+        order = None if (np.diff(ordinals) >= 0).all() else np.argsort(ordinals, kind="stable")
         types: dict[str, pl.DataType] = {name: pl.Int64() for name in (ORDINAL, *self._times)}
         types |= self.source.types
         series = []
@@ -133,6 +137,8 @@ def _typed(values: Values, dtype: pl.DataType) -> Values:
 
 def _joined(name: str, parts: list[Values], dtype: pl.DataType) -> pl.Series:
     """One column of what the parts hold."""
+    if not parts:
+        return pl.Series(name, [], dtype=dtype)
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if len(arrays) == len(parts):
         return pl.Series(name, np.concatenate(arrays))

@@ -70,3 +70,30 @@ def time_source(
     return TimeSource(
         tuple(parts), types, mapping.factors.get("t"), mapping.time_scale, mapping.time_epoch
     )
+
+
+@dataclass(frozen=True)
+class CivilTime:
+    """A UTC calendar in six fields, and nanoseconds that may be negative."""
+
+    calendar: tuple[str, str, str, str, str, str]
+    nanoseconds: str
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        return (*self.calendar, self.nanoseconds)
+
+    @property
+    def types(self) -> Mapping[str, pl.DataType]:
+        return {name: pl.Int64() for name in self.fields}
+
+    def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
+        """Times in UTC; null where the calendar is not one yet (a receiver before its first fix)."""
+        year, *others = (pl.col(field) for field in self.calendar)
+        month, day, hour, minute, second = others
+        # A leap second (60) is the first second of the next minute; datetime() knows none.
+        whole = pl.datetime(year, month, day, hour, minute, time_unit="ns", time_zone="UTC")
+        known = (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (year >= 1980)
+        at = whole.to_physical() + second * 1_000_000_000 + pl.col(self.nanoseconds)
+        t = frame.select(pl.when(known).then(at).cast(pl.Datetime("ns", "UTC")).alias(name)).to_series()
+        return t
