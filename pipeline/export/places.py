@@ -1,0 +1,167 @@
+"""Where results are on the ground: net element and measure back to WGS 84, by the surveyed track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.geodesy import SEMI_MAJOR_AXIS_M, Floats, Ints, points_of
+from pipeline.track import Track, track_of
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Positions in degrees and metres, NaN where not known; `heading_deg` of growing measure, clockwise from north."""
+
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    heading_deg: Floats
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """How path positions lie on net elements: `path_m = offset_m + sign * measure_m` on each, in order of time."""
+
+    elements: tuple[str, ...]
+    sign: Ints
+    offset_m: Floats
+    first_m: Floats
+    last_m: Floats
+
+
+def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> Ground:
+    """Places on the rails. Between survey points position is linear; beyond the ends the last chord goes on."""
+    survey = track_of(track)
+    columns = [np.full(len(measure_m), np.nan) for _ in range(4)]
+    names = netelement_id.to_frame("name").with_row_index("row")
+    for name, rows in names.drop_nulls().group_by("name", maintain_order=True):
+        number = survey.index.get(str(name[0]))
+        if number is None:
+            continue
+        index = rows["row"].to_numpy()
+        for column, values in zip(columns, _on_element(survey, number, measure_m[index]), strict=True):
+            column[index] = values
+    return Ground(*columns)
+
+
+def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Ground:
+    """Places `left_m` to the left of growing path and `above_m` over the rails.
+
+    `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.
+    """
+    heading = np.radians(ground.heading_deg)
+    east, north = -left_m * sign * np.cos(heading), left_m * sign * np.sin(heading)
+    latitude = ground.latitude_deg + np.degrees(north / SEMI_MAJOR_AXIS_M)
+    longitude = ground.longitude_deg + np.degrees(east / SEMI_MAJOR_AXIS_M / np.cos(np.radians(ground.latitude_deg)))
+    height = ground.height_m + np.nan_to_num(above_m)
+    return Ground(latitude, longitude, height, ground.heading_deg)
+
+
+def stretches_of(epochs: pl.DataFrame) -> Stretches:
+    """The stretches of net elements that a solution's epochs were matched to, each once.
+
+    Path and measure differ by a constant on an element (up to sign), so every pair of epochs there shows both.
+    """
+    known = epochs.select("netelement_id", "measure_m", "path_m").drop_nulls()
+    runs = (
+        known.with_columns(run=pl.col("netelement_id").rle_id())
+        .group_by("run", maintain_order=True)
+        .agg(
+            element=pl.col("netelement_id").first(),
+            turn=(pl.col("measure_m").diff() * pl.col("path_m").diff()).sum(),
+            measure=pl.col("measure_m").last(),
+            path=pl.col("path_m").last(),
+            low=pl.col("path_m").min(),
+            high=pl.col("path_m").max(),
+        )
+        .filter(pl.col("turn") != 0.0)
+        .with_columns(sign=pl.col("turn").sign().cast(pl.Int64))
+        .with_columns(offset=pl.col("path") - pl.col("sign") * pl.col("measure"))
+    )
+    merged = runs.group_by("element", "sign", pl.col("offset").round(0).alias("about"), maintain_order=True).agg(
+        pl.col("offset").median(), pl.col("low").min(), pl.col("high").max()
+    )
+    return Stretches(
+        tuple(merged["element"].to_list()),
+        merged["sign"].to_numpy().astype(np.int64),
+        merged["offset"].to_numpy().astype(np.float64),
+        merged["low"].to_numpy().astype(np.float64),
+        merged["high"].to_numpy().astype(np.float64),
+    )
+
+
+def ground_at(track: pl.DataFrame, stretches: Stretches, path_m: Floats, margin_m: float = 50.0) -> Ground:
+    """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
+    best, chosen = np.full(len(path_m), np.inf), np.full(len(path_m), -1, dtype=np.int64)
+    lengths = _element_ends(track)
+    for number, element in enumerate(stretches.elements):
+        low, high = _path_range(stretches, number, lengths.get(element))
+        away = np.maximum(np.maximum(low - path_m, path_m - high), 0.0)
+        nearer = (away < best) & (away <= margin_m)
+        best[nearer], chosen[nearer] = away[nearer], number
+    hit = chosen >= 0
+    measure = np.full(len(path_m), np.nan)
+    measure[hit] = stretches.sign[chosen[hit]] * (path_m[hit] - stretches.offset_m[chosen[hit]])
+    names = pl.Series([stretches.elements[number] if number >= 0 else None for number in chosen], dtype=pl.String)
+    return ground_of(track, names, measure)
+
+
+def sign_of(epochs: pl.DataFrame, stretches: Stretches) -> Floats:
+    """Per epoch +1 where its path grows with the measure, -1 against it, NaN where that is not known."""
+    table = pl.DataFrame(
+        {"netelement_id": stretches.elements, "sign": stretches.sign, "offset": stretches.offset_m},
+        schema={"netelement_id": pl.String, "sign": pl.Int64, "offset": pl.Float64},
+    )
+    rows = epochs.select("netelement_id", "measure_m", "path_m").with_row_index("row")
+    fitting = (
+        rows.join(table, on="netelement_id", how="left", maintain_order="left")
+        .with_columns(misfit=(pl.col("path_m") - pl.col("sign") * pl.col("measure_m") - pl.col("offset")).abs())
+        .sort("row", "misfit", nulls_last=True, maintain_order=True)
+        .group_by("row", maintain_order=True)
+        .first()
+    )
+    return fitting["sign"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+
+
+def plane_m(ground: Ground, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+    """East and north of an origin (latitude, longitude) in its tangent plane [m], for drawing."""
+    plane = points_of(np.array([origin[0]]), np.array([origin[1]]))
+    offset = points_of(ground.latitude_deg, ground.longitude_deg).surface - plane.surface[0]
+    return offset @ plane.east[0], offset @ plane.north[0]
+
+
+def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Latitude, longitude, height, heading of measures on one element."""
+    rows = track.vertices(number)
+    measures = track.measure_m[rows]
+    if len(measures) < 2:
+        nothing = np.full(len(measure_m), np.nan)
+        return nothing, nothing, nothing, nothing
+    segment = np.clip(np.searchsorted(measures, measure_m, side="right") - 1, 0, len(measures) - 2)
+    step = np.diff(measures)
+    share = (measure_m - measures[segment]) / np.where(step > 0, step, np.nan)[segment]
+    latitude, longitude, height = (column[rows] for column in (track.latitude_deg, track.longitude_deg, track.height_m))
+    east = np.diff(longitude) * np.cos(np.radians(latitude[:-1]))
+    heading = np.degrees(np.arctan2(east, np.diff(latitude))) % 360.0
+    along = (column[segment] + share * np.diff(column)[segment] for column in (latitude, longitude, height))
+    return (*along, heading[segment])  # type: ignore[return-value]
+
+
+def _element_ends(track: pl.DataFrame) -> dict[str, tuple[float, float]]:
+    survey = track_of(track)
+    return {
+        name: (float(survey.measure_m[rows][0]), float(survey.measure_m[rows][-1]))
+        for _, name, rows in survey.elements()
+    }
+
+
+def _path_range(stretches: Stretches, number: int, ends: tuple[float, float] | None) -> tuple[float, float]:
+    """Path positions of a whole element, not just of the epochs on it."""
+    low, high = float(stretches.first_m[number]), float(stretches.last_m[number])
+    if ends is None:
+        return low, high
+    places = [stretches.offset_m[number] + stretches.sign[number] * end for end in ends]
+    return float(min(low, *places)), float(max(high, *places))

@@ -1,0 +1,162 @@
+"""Headline figures of a campaign per solution, each with its exact bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.report.markup import UNKNOWN, number
+from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
+from pipeline.summary import missed_detection
+from schemas.config import SafetyConfig
+from schemas.enums import BaliseKind, PassageStatus, RunStatus
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure: its name, its value as text, and what bounds it."""
+
+    name: str
+    value: str
+    bounds: str = ""
+
+
+def headline(
+    runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, safety: SafetyConfig, failure_limit_m: float
+) -> list[Figure]:
+    """Figures of one solution; every table holds that solution's rows of all runs.
+
+    Rates count what the campaign contains, injected faults included, over the hours of its replayed runs.
+    """
+    hours = _total(runs, "duration_s") / 3600.0
+    return [
+        *_extent(runs, hours),
+        *_hazard_figures(hazards, hours, safety),
+        *_balise_figures(passages, failure_limit_m),
+        _false_alarms(runs),
+    ]
+
+
+def _extent(runs: pl.DataFrame, hours: float) -> list[Figure]:
+    counts = [f"{runs.filter(pl.col('status') == status).height} {status.value}" for status in RunStatus]
+    known = runs.filter(pl.col("availability").is_not_null() & pl.col("duration_s").is_not_null())
+    weight = _total(known, "duration_s")
+    moving = known.select((pl.col("availability") * pl.col("duration_s")).alias("held"))
+    mean = _total(moving, "held") / weight if weight else None
+    return [
+        Figure("runs", str(runs.height), ", ".join(counts)),
+        Figure("replayed", f"{number(hours)} h", f"{number(_total(runs, 'distance_m') / 1000.0)} km"),
+        Figure(
+            "availability of the TVB while moving",
+            UNKNOWN if mean is None else f"{mean:.2%}",
+            "mean of the runs, weighted by their duration",
+        ),
+    ]
+
+
+def _hazard_figures(hazards: pl.DataFrame, hours: float, safety: SafetyConfig) -> list[Figure]:
+    own = hazards.filter(pl.col("caused_by").is_null())
+    failures = hazards.filter(pl.col("t_failure").is_not_null())
+    missed = failures.filter(missed_detection()).height
+    upper = poisson_rate_upper(missed, hours)
+    needed = hours_still_needed(safety.thr_vb_per_h, missed, hours)
+    claim = "" if upper is None else f"; one-sided 95 %: below {number(upper)} /h"
+    return [
+        Figure(
+            "hazards",
+            str(own.height),
+            f"{_rate(poisson_rate(own.height, hours))}; {hazards.height - own.height} more follow from others",
+        ),
+        Figure(
+            "missed detections",
+            f"{missed} of {failures.height} with a failure",
+            f"{_share(clopper_pearson(missed, failures.height))}; {_rate(poisson_rate(missed, hours))}{claim}",
+        ),
+        Figure(
+            "to substantiate the THR of a VB",
+            f"{needed:.3g} h more",
+            f"without a further missed detection, for {safety.thr_vb_per_h:g} /h",
+        ),
+        Figure("longest time to detect", _seconds(hazards["time_to_detect_s"].max()), "of detected hazards"),
+        Figure("longest hazardous time", _seconds(hazards["hazardous_s"].max()), "from failure to negation"),
+    ]
+
+
+def _balise_figures(passages: pl.DataFrame, failure_limit_m: float) -> list[Figure]:
+    virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
+    accepted = virtual.filter(pl.col("status") == PassageStatus.ACCEPTED)
+    judged = accepted.filter(pl.col("location_error_m").is_not_null())
+    unsafe = judged.filter(pl.col("location_error_m").abs() > failure_limit_m).height
+    return [
+        Figure(
+            "VBs accepted",
+            f"{accepted.height} of {virtual.height} passages and offers",
+            _share(clopper_pearson(accepted.height, virtual.height)),
+        ),
+        Figure(
+            "accepted beyond the failure limit",
+            f"{unsafe} of {judged.height} of known error",
+            _share(clopper_pearson(unsafe, judged.height)),
+        ),
+    ]
+
+
+def _false_alarms(runs: pl.DataFrame) -> Figure:
+    """Only runs whose alarms were all judged say anything about false ones."""
+    judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
+    if judged.is_empty():
+        return Figure("false alarms", "not known", "no run with a truth that judges every alarm")
+    hours = _total(judged, "duration_s") / 3600.0
+    count = int(_total(judged, "false_alarms"))
+    return Figure("false alarms", f"{count} in {number(hours)} h judged", _rate(poisson_rate(count, hours)))
+
+
+@dataclass(frozen=True)
+class LevelFigures:
+    """What the hazards with a failure come to against one service level's allowed T_D."""
+
+    level: str
+    allowed_s: float
+    within: int
+    late: int
+    never: int
+    share: Estimate
+
+
+def level_figures(hazards: pl.DataFrame, safety: SafetyConfig) -> list[LevelFigures]:
+    """Hazardous time against the allowed T_D of each service level (TVB eq. 7)."""
+    failures = hazards.filter(pl.col("t_failure").is_not_null())
+    negated = failures.filter(pl.col("t_negated").is_not_null())
+    rows = []
+    for level in safety.service_levels:
+        allowed_s = safety.allowed_time_to_detect_s(level)
+        within = negated.filter(pl.col("hazardous_s") <= allowed_s).height
+        never = failures.height - negated.height
+        share = clopper_pearson(within, failures.height)
+        rows.append(LevelFigures(level, allowed_s, within, negated.height - within, never, share))
+    return rows
+
+
+def share_text(estimate: Estimate) -> str:
+    return _share(estimate)
+
+
+def _total(frame: pl.DataFrame, column: str) -> float:
+    return float(frame[column].sum())
+
+
+def _rate(rate: Estimate) -> str:
+    if rate.value is None:
+        return "rate not known"
+    return f"{number(rate.value)} /h (95 %: {number(rate.low)} to {number(rate.high)})"
+
+
+def _share(share: Estimate) -> str:
+    if share.value is None or share.low is None or share.high is None:
+        return "share not known"
+    return f"{share.value:.1%} (95 %: {share.low:.1%} to {share.high:.1%})"
+
+
+def _seconds(value: object) -> str:
+    return f"{number(float(value))} s" if isinstance(value, int | float) else "not known"

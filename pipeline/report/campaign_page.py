@@ -1,0 +1,217 @@
+"""The page of a campaign: what all runs come to, and the way to each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import polars as pl
+
+from pipeline.report.availability import availability_map
+from pipeline.report.campaign_figures import Figure, headline, level_figures, share_text
+from pipeline.report.markup import Cell, badge, cell, figure, link, number, page, pairs, section, table
+from pipeline.report.packing import Json, script_json
+from pipeline.report.run_page import Made, hazard_hash
+from schemas.enums import Hazard, RunStatus
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Tables of all runs, `run_id` in front; `pieces` as from `availability_pieces`; `hrefs` of the runs' pages."""
+
+    runs: pl.DataFrame
+    hazards: pl.DataFrame
+    passages: pl.DataFrame
+    pieces: pl.DataFrame
+    hrefs: Mapping[str, str]
+
+
+_RUN_COLUMNS = (
+    ("duration_s", "duration [s]"), ("distance_m", "distance [m]"), ("availability", "availability"),
+    ("evidence", "evidence"), ("hazards", "hazards"), ("hazards_detected", "detected"),
+    ("missed_detections", "missed detections"), ("time_to_detect_max_s", "T_D max [s]"),
+    ("hazardous_max_s", "hazardous max [s]"), ("balises_accepted", "VBs accepted"),
+    ("balises_on_path", "VBs passed"), ("unsafe_accepted", "unsafe accepted"),
+    ("location_error_p95_m", "location error 95 % [m]"), ("along_error_p95_m", "error along 95 % [m]"),
+    ("alarms", "alarms"), ("false_alarms", "false alarms"), ("exposure_max_s", "exposure max [s]"),
+    ("outages", "outages"),
+)  # fmt: skip
+_HAZARD_COLUMNS = (
+    ("failure_mode", "ETCS failure"), ("size_m", "size [m]"), ("t_onset", "onset"), ("monitor", "detected by"),
+    ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
+    ("within_budget", "within budget"), ("balise_ids", "VBs hit"), ("accepted_ids", "accepted all the same"),
+    ("suspect", "suspect"),
+)  # fmt: skip
+_PLOTS = (
+    ("classes", "Hazards by class", "Negated within the budget, too late, never; no failure: the error stayed "
+     "below the failure limit or a row that follows from another."),
+    ("detection", "Time to detect", "Share of all hazards detected, and of all failures negated, by then; vertical "
+     "lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never detected."),
+    ("location", "Location error at VBs", "Positive: offered early. Offers by what became of them."),
+    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place."),
+)  # fmt: skip
+
+
+def campaign_page(campaign: Campaign, made: Made) -> str:
+    """HTML of the campaign."""
+    solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
+    body = [
+        section("runs", "Runs", _run_counts(campaign.runs), _runs_table(campaign)),
+        *(_solution(f"s{index}", name, campaign, made, len(solutions) > 1) for index, name in enumerate(solutions)),
+        section("provenance", "Provenance", _provenance(campaign.runs), _configuration(made)),
+    ]
+    # Figures come before the long table where there are any.
+    body = [*body[1:-1], body[0], body[-1]]
+    data = {
+        "order": solutions,
+        "solutions": {name: _solution_data(name, campaign, made) for name in solutions},
+        "levels": [
+            [level, made.config.safety.allowed_time_to_detect_s(level)] for level in made.config.safety.service_levels
+        ],
+        "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
+    }
+    heading = f"<h1>Campaign of {campaign.runs['run_id'].n_unique()} runs</h1>"
+    return page("Campaign · balise", heading, "\n".join(body), script_json(data), "assets", "campaign.js")
+
+
+def _only(frame: pl.DataFrame, name: str) -> pl.DataFrame:
+    return frame.filter(pl.col("solution") == name)
+
+
+def _run_counts(runs: pl.DataFrame) -> str:
+    worst = runs.group_by("run_id").agg(pl.col("status").cast(pl.String).unique().sort())
+    counts = []
+    for status in RunStatus:
+        count = sum(status.value in states for states in worst["status"].to_list())
+        counts.append(f"{badge(status.value)} {count}")
+    return f"<p>{' '.join(counts)}</p>"
+
+
+def _runs_table(campaign: Campaign) -> str:
+    order = {status.value: place for place, status in enumerate((RunStatus.FAILED, RunStatus.PARTIAL, RunStatus.OK))}
+    runs = campaign.runs.with_columns(
+        hazards=pl.col("hazards_1a") + pl.col("hazards_1b") + pl.col("hazards_shift"),
+        order=pl.col("status").cast(pl.String).replace_strict(order, return_dtype=pl.Int64),
+    ).sort("order", "run_id", "solution")
+    rows = []
+    for row in runs.iter_rows(named=True):
+        name = Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"]))
+        status = Cell(str(row["status"]), float(row["order"]), badge(str(row["status"])))
+        reason = cell("; ".join(text for text in (row["error"], row["notes"]) if text) or None)
+        figures = [cell(None if row["status"] == "failed" else row[key]) for key, _ in _RUN_COLUMNS]
+        rows.append([name, status, reason, cell(row["solution"] or None), *figures])
+    titles = ["run", "status", "reason", "solution", *(title for _, title in _RUN_COLUMNS)]
+    return table("table-runs", "Runs, failed ones first", titles, rows)
+
+
+def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool) -> str:
+    hazards = _only(campaign.hazards, name)
+    figures = headline(
+        _only(campaign.runs, name),
+        hazards,
+        _only(campaign.passages, name),
+        made.config.safety,
+        made.config.hazards.failure_limit_m,
+    )
+    title = f"Solution {name}" if several else "Figures"
+    note = (
+        "<p>Rates count all that this campaign holds, injected faults included. Bounds are exact, 95 %, two-sided.</p>"
+    )
+    return section(
+        key,
+        title,
+        _headline(figures),
+        note,
+        _levels(key, hazards, made),
+        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
+        _hazards_table(key, hazards, campaign),
+    )
+
+
+def _headline(figures: list[Figure]) -> str:
+    items = "".join(
+        f"<div><dt>{escape(item.name)}</dt><dd><strong>{escape(item.value)}</strong><br>{escape(item.bounds)}</dd></div>"
+        for item in figures
+    )
+    return f'<dl class="headline">{items}</dl>'
+
+
+def _levels(key: str, hazards: pl.DataFrame, made: Made) -> str:
+    rows = [
+        [
+            cell(row.level),
+            cell(row.allowed_s, 4),
+            *(cell(count) for count in (row.within, row.late, row.never)),
+            cell(share_text(row.share)),
+        ]
+        for row in level_figures(hazards, made.config.safety)
+    ]
+    titles = ["service level", "allowed T_D [s]", "negated within it", "too late", "never negated", "share within it"]
+    return table(f"table-levels-{key}", "Hazards with a failure against the allowed T_D (TVB eq. 7)", titles, rows)
+
+
+def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
+    rows = []
+    for row in hazards.sort("run_id", "hazard_id").iter_rows(named=True):
+        href = campaign.hrefs[row["run_id"]] + hazard_hash(row["solution"], row["hazard_id"])
+        first = Cell(row["run_id"], row["run_id"], link(href, f"{row['run_id']} {row['hazard_id']}"))
+        kind = Cell(str(row["hazard"]), str(row["hazard"]), tone="" if row["detected"] else "bad")
+        rows.append([first, kind, *(cell(row[column]) for column, _ in _HAZARD_COLUMNS)])
+    titles = ["run and hazard", "class", *(title for _, title in _HAZARD_COLUMNS)]
+    return table(f"table-hazards-{key}", "Hazards of all runs", titles, rows)
+
+
+def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
+    hazards, passages = _only(campaign.hazards, name), _only(campaign.passages, name)
+    return {
+        "classes": [[kind.value, *_outcomes(hazards.filter(pl.col("hazard") == kind))] for kind in Hazard],
+        "hazards": hazards.height,
+        "failures": hazards["t_failure"].is_not_null().sum(),
+        "time_to_detect_s": _sorted(hazards.filter(pl.col("detected"))["time_to_detect_s"]),
+        "hazardous_s": _sorted(hazards.filter(pl.col("t_negated").is_not_null())["hazardous_s"]),
+        "location": _location(passages),
+        "map": availability_map(_only(campaign.pieces, name), made.site),
+    }
+
+
+def _outcomes(hazards: pl.DataFrame) -> list[int]:
+    """Within the budget, too late, never negated, no failure."""
+    failed = hazards.filter(pl.col("t_failure").is_not_null())
+    never = failed.filter(pl.col("t_negated").is_null()).height
+    within = failed.filter(pl.col("within_budget").fill_null(value=False)).height
+    return [within, failed.height - within - never, never, hazards.height - failed.height]
+
+
+def _sorted(values: pl.Series) -> list[float]:
+    return [round(value, 6) for value in values.drop_nulls().sort().to_list()]
+
+
+def _location(passages: pl.DataFrame) -> Json:
+    """Location errors of offers as counts per bin of 1 m up to 50 m, beyond in the last bins."""
+    known = passages.filter(pl.col("location_error_m").is_not_null())
+    counts = (
+        known.group_by(
+            status=pl.col("status").cast(pl.String),
+            at=pl.col("location_error_m").floor().clip(-51, 50).cast(pl.Int64),
+        )
+        .len("count")
+        .sort("status", "at")
+    )
+    return [list(row) for row in counts.iter_rows()]
+
+
+def _provenance(runs: pl.DataFrame) -> str:
+    names = ("software", "contract", "config_digest")
+    return pairs((name, ", ".join(runs[name].unique().sort().to_list())) for name in names)
+
+
+def _configuration(made: Made) -> str:
+    budget = f"<p>Budget of the hazards: {number(made.config.budget_s, 4)} s ({made.config.hazards.service_level}).</p>"
+    if made.config_text is None:
+        return budget + '<p class="notice partial">The result holds no config.toml: limits are the defaults.</p>'
+    text = f'<pre tabindex="0">{escape(made.config_text)}</pre>'
+    return budget + f"<details><summary>Resolved configuration (TOML)</summary>{text}</details>"

@@ -1,0 +1,116 @@
+"""Long series made short enough to send: extremes stay, changes stay, and what matters stays whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+BINS = 2500
+DETAIL_EPOCHS = 6000
+BAND_PIECES = 3000
+
+
+def kept_rows(values: Floats, whole: Flags, bins: int = BINS) -> Ints:
+    """Rows of a series to send: of each bin the smallest and largest value and where it begins or ends to be known.
+
+    `whole` marks rows that stay in any case; a series that is short anyway stays as it is.
+    """
+    count = len(values)
+    if count <= 4 * bins:
+        return np.arange(count)
+    edges = np.linspace(0, count, bins + 1).astype(np.int64)
+    known = np.isfinite(values)
+    rows = [
+        _extreme_rows(np.where(known, values, np.inf), edges, np.minimum),
+        _extreme_rows(np.where(known, values, -np.inf), edges, np.maximum),
+        _edges_of(known, edges),
+        np.flatnonzero(whole),
+        np.array([0, count - 1]),
+    ]
+    return np.unique(np.concatenate(rows))
+
+
+def _extreme_rows(values: Floats, edges: Ints, extreme: np.ufunc) -> Ints:
+    """The first row of each bin that holds the bin's extreme."""
+    peaks = extreme.reduceat(values, edges[:-1])
+    at_peak = values == np.repeat(peaks, np.diff(edges))
+    rows = np.where(at_peak, np.arange(len(values)), len(values))
+    return np.minimum.reduceat(rows, edges[:-1])
+
+
+def _edges_of(known: Flags, edges: Ints) -> Ints:
+    """Per bin the first and last change between known and unknown, both sides of it."""
+    changes = np.flatnonzero(np.diff(known)) + 1
+    if not len(changes):
+        return np.array([], dtype=np.int64)
+    bins = np.searchsorted(edges, changes, side="right")
+    first = np.flatnonzero(np.diff(bins, prepend=-1))
+    last = np.append(first[1:] - 1, len(changes) - 1)
+    chosen = changes[np.unique(np.concatenate([first, last]))]
+    return np.concatenate([chosen - 1, chosen])
+
+
+def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int = DETAIL_EPOCHS) -> Flags:
+    """Rows near the moments that matter, with a reach that is halved until no more than `limit` are left."""
+    reach_ns = reach_s * 1e9
+    near = np.zeros(len(t_ns), dtype=np.bool_)
+    if not len(moments_ns) or not len(t_ns):
+        return near
+    moments = np.sort(moments_ns)
+    after = np.clip(np.searchsorted(moments, t_ns), 0, len(moments) - 1)
+    before = np.clip(after - 1, 0, None)
+    away = np.minimum(np.abs(moments[after] - t_ns), np.abs(moments[before] - t_ns))
+    while True:
+        near = away <= reach_ns
+        if near.sum() <= limit or reach_ns < 1e6:
+            return near
+        reach_ns /= 2.0
+
+
+@dataclass(frozen=True)
+class Band:
+    """Pieces of constant state: piece i has `codes[i]` from `starts_ms[i]` to the next start, the last to `end_ms`."""
+
+    starts_ms: Ints
+    codes: Ints
+    end_ms: int
+
+
+def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = BAND_PIECES) -> Band:
+    """A state over time as pieces; `gap_code` fills what is longer than `hold_ms` after an epoch.
+
+    Codes are ordered by how bad they are. Where there are too many pieces, neighbours are drawn together and
+    the worst of them, the largest code, stands for all: an alarm of one epoch stays visible.
+    """
+    if not len(t_ms):
+        return Band(np.array([], dtype=np.int64), np.array([], dtype=np.int64), 0)
+    gaps = np.flatnonzero(np.diff(t_ms) > hold_ms)
+    times = np.concatenate([t_ms, t_ms[gaps] + hold_ms])
+    states = np.concatenate([codes, np.full(len(gaps), gap_code)])
+    order = np.argsort(times, kind="stable")
+    end_ms = int(t_ms[-1]) + hold_ms
+    starts, states = _joined(times[order], states[order])
+    if len(starts) > pieces:
+        edges = np.linspace(int(t_ms[0]), end_ms, pieces + 1).astype(np.int64)[:-1]
+        starts, states = _joined(*_worst(starts, states, edges))
+    return Band(starts, states, end_ms)
+
+
+def _joined(starts: Ints, codes: Ints) -> tuple[Ints, Ints]:
+    first = np.flatnonzero(np.diff(codes, prepend=-1))
+    return starts[first], codes[first]
+
+
+def _worst(starts: Ints, codes: Ints, edges: Ints) -> tuple[Ints, Ints]:
+    """Each bin with the worst of the pieces that reach into it."""
+    first = np.searchsorted(starts, edges, side="right") - 1
+    last = np.append(np.searchsorted(starts, edges[1:], side="left"), len(starts))
+    bounds = np.column_stack([first, last]).ravel()
+    padded = np.append(codes, -1)
+    return edges, np.maximum.reduceat(padded, bounds)[::2]

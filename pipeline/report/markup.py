@@ -1,0 +1,135 @@
+"""Pieces of HTML: text is escaped, tables can be sorted and searched by the page's script."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from html import escape
+
+UNKNOWN = "–"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is shown, what it is sorted by, and HTML instead of the text where there is some."""
+
+    text: str
+    order: float | str | None = None
+    html: str | None = None
+    tone: str = ""
+
+
+def cell(value: object, digits: int = 3) -> Cell:
+    """A value as a person reads it; numbers and instants sort by themselves."""
+    match value:
+        case None:
+            return Cell(UNKNOWN)
+        case bool():
+            return Cell("yes" if value else "no", float(value))
+        case int() | float():
+            return Cell(number(value, digits), float(value))
+        case datetime():
+            return Cell(instant(value), value.timestamp())
+        case list() | tuple():
+            text = ", ".join(str(item) for item in value)
+            return Cell(text or UNKNOWN, text)
+        case _:
+            return Cell(str(value), str(value))
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with so many significant digits, whole numbers as they are."""
+    if value is None:
+        return UNKNOWN
+    if isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e9):
+        return f"{int(value):,}".replace(",", "\u202f")
+    if abs(value) >= 10 ** (digits - 1):
+        return f"{value:,.{max(0, digits - 3)}f}".replace(",", "\u202f")
+    return f"{value:.{digits}g}"
+
+
+def instant(value: datetime) -> str:
+    """UTC to the millisecond."""
+    return value.strftime("%Y-%m-%d %H:%M:%S.") + f"{value.microsecond // 1000:03d}"
+
+
+def link(href: str, text: str, **attributes: str) -> str:
+    extra = "".join(f' {name.replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
+    return f'<a href="{escape(href)}"{extra}>{escape(text)}</a>'
+
+
+def table(identity: str, caption: str, titles: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+    """A table with sortable heads; the script adds a search field where there are more than a few rows."""
+    body = [f"<tr>{''.join(_td(item) for item in row)}</tr>" for row in rows]
+    if not body:
+        return f'<p class="none">{escape(caption)}: none.</p>'
+    heads = "".join(f'<th scope="col">{escape(title)}</th>' for title in titles)
+    return (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
+        f'<table class="data" id="{identity}"><caption>{escape(caption)}</caption>'
+        f"<thead><tr>{heads}</tr></thead><tbody>\n" + "\n".join(body) + "\n</tbody></table></div>"
+    )
+
+
+def pairs(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and values, text only."""
+    items = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in rows)
+    return f'<dl class="pairs">{items}</dl>'
+
+
+def section(identity: str, title: str, *content: str) -> str:
+    inner = "\n".join(part for part in content if part)
+    return f'<section id="{identity}"><h2>{escape(title)}</h2>\n{inner}\n</section>'
+
+
+def figure(name: str, title: str, explanation: str = "") -> str:
+    """A place for a drawing; the script fills it."""
+    note = f"<p>{escape(explanation)}</p>" if explanation else ""
+    return (
+        f'<figure id="figure-{name}"><figcaption><h3>{escape(title)}</h3>{note}</figcaption>'
+        f'<div class="plot" id="plot-{name}" role="img" aria-label="{escape(title)}"></div></figure>'
+    )
+
+
+def badge(status: str) -> str:
+    return f'<span class="badge {escape(status)}">{escape(status)}</span>'
+
+
+def page(title: str, heading: str, body: str, data: str, assets: str, script: str) -> str:
+    """A whole page. The policy forbids every request a script could make; styles and scripts lie beside it."""
+    policy = "connect-src 'none'; font-src 'none'; frame-src 'none'; object-src 'none'; form-action 'none'"
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="color-scheme" content="light dark">
+<title>{escape(title)}</title>
+<link rel="icon" href="data:,">
+<link rel="stylesheet" href="{assets}/report.css">
+</head>
+<body>
+<a class="skip" href="#content">Skip to the content</a>
+<header>{heading}</header>
+<main id="content">
+{body}
+</main>
+<noscript><p>Tables can be read without scripts; drawings need them.</p></noscript>
+<script type="application/json" id="data">{data}</script>
+<script src="{assets}/plotly.min.js"></script>
+<script src="{assets}/tables.js"></script>
+<script src="{assets}/plots.js"></script>
+<script src="{assets}/{script}"></script>
+</body>
+</html>
+"""
+
+
+def _td(item: Cell) -> str:
+    order = item.order
+    key = "" if order is None else f' data-order="{escape(repr(order) if isinstance(order, float) else order)}"'
+    kinds = [name for name in ("number" if isinstance(order, float) else "", item.tone) if name]
+    classes = f' class="{" ".join(kinds)}"' if kinds else ""
+    return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"

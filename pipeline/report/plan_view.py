@@ -1,0 +1,158 @@
+"""The run seen from above: track, GNSS positions by state, balises with their windows and passages.
+
+With a site in metres east and north of its first point; without one along the path and across it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.export.places import Ground, Stretches, beside, ground_at, ground_of, plane_m, sign_of, stretches_of
+from pipeline.report.decimate import Floats, Ints, detail_rows
+from pipeline.report.packing import Json, packed
+from pipeline.report.series import UNKNOWN, column_of
+from pipeline.track import track_of
+from schemas.enums import Direction, LdsState, PassageStatus
+from schemas.run import Site
+
+STATES = (*(state.value for state in LdsState), UNKNOWN)
+_POINTS = 8000
+_TRACK_POINTS = 3000
+_AROUND_M = 500.0
+
+
+@dataclass(frozen=True)
+class _View:
+    """How path positions and epochs become points of the drawing."""
+
+    site: Site | None
+    stretches: Stretches
+    origin: tuple[float, float]
+
+    def at(self, path_m: Floats) -> tuple[Floats, Floats]:
+        if self.site is None:
+            return path_m, np.where(np.isfinite(path_m), 0.0, np.nan)
+        return plane_m(ground_at(self.site.track, self.stretches, path_m), self.origin)
+
+    def gnss(self, epochs: pl.DataFrame) -> tuple[Floats, Floats]:
+        cross_m = column_of(epochs, "cross_track_m")
+        if self.site is None:
+            return column_of(epochs, "path_m"), cross_m
+        rails: Ground = ground_of(self.site.track, epochs["netelement_id"], column_of(epochs, "measure_m"))
+        sign = sign_of(epochs, self.stretches)
+        return plane_m(beside(rails, sign, cross_m, np.zeros(len(cross_m))), self.origin)
+
+
+def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, moments_ns: Ints) -> Json:
+    """Everything that the plan of one solution draws; lengths in metres."""
+    view = _View(site, stretches_of(epochs), _origin(site))
+    shown = epochs.filter(pl.col("path_m").is_not_null())
+    t_ns = shown["t"].to_physical().to_numpy()
+    rows = _shown_rows(t_ns, moments_ns)
+    x, y = view.gnss(shown[rows])
+    t0_ns = int(epochs["t"].to_physical()[0]) if epochs.height else 0
+    states = {name: code for code, name in enumerate(STATES)}
+    codes = shown[rows]["lds_state"].cast(pl.String).fill_null(UNKNOWN).replace_strict(states, return_dtype=pl.Int64)
+    return {
+        "geographic": site is not None,
+        "states": list(STATES),
+        "track": _track(site, x, y, view.origin) if site is not None else _axis(x),
+        "x": packed(x, "f4"),
+        "y": packed(y, "f4"),
+        "t": packed((t_ns[rows] - t0_ns) // 1_000_000, "u4"),
+        "codes": packed(codes.to_numpy(), "u1"),
+        "balises": _balises(view, passages),
+        "windows": _windows(view, passages),
+    }
+
+
+def _origin(site: Site | None) -> tuple[float, float]:
+    if site is None:
+        return 0.0, 0.0
+    first = site.track.row(0, named=True)
+    return float(first["latitude_deg"]), float(first["longitude_deg"])
+
+
+def _shown_rows(t_ns: Ints, moments_ns: Ints) -> Ints:
+    stride = max(1, -(-len(t_ns) // _POINTS))
+    near = detail_rows(t_ns, moments_ns, reach_s=30.0) if stride > 1 else np.zeros(len(t_ns), dtype=np.bool_)
+    return np.flatnonzero(near | (np.arange(len(t_ns)) % stride == 0))
+
+
+def _track(site: Site, x: Floats, y: Floats, origin: tuple[float, float]) -> list[Json]:
+    """The net elements near the run, as lines."""
+    known = np.isfinite(x)
+    if not known.any():
+        return []
+    box = [x[known].min(), x[known].max(), y[known].min(), y[known].max()]
+    survey = track_of(site.track)
+    nothing = np.full(len(survey.latitude_deg), np.nan)
+    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin)
+    lines = []
+    for _, name, rows in survey.elements():
+        a, b = east[rows], north[rows]
+        outside = (
+            a.max() < box[0] - _AROUND_M
+            or a.min() > box[1] + _AROUND_M
+            or b.max() < box[2] - _AROUND_M
+            or b.min() > box[3] + _AROUND_M
+        )
+        if not outside:
+            lines.append({"name": name, "x": packed(_thin(a), "f4"), "y": packed(_thin(b), "f4")})
+    return lines
+
+
+def _thin(values: Floats) -> Floats:
+    stride = max(1, -(-len(values) // _TRACK_POINTS))
+    return np.append(values[:-1:stride], values[-1:])
+
+
+def _axis(x: Floats) -> list[Json]:
+    known = x[np.isfinite(x)]
+    if not len(known):
+        return []
+    ends = np.array([known.min(), known.max()])
+    return [{"name": "path", "x": packed(ends, "f4"), "y": packed(np.zeros(2), "f4")}]
+
+
+def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
+    """One entry per balise and status, with how often it came to that."""
+    groups = passages.group_by("balise_id", "status", maintain_order=True).agg(
+        pl.col("path_m").first(), pl.len().alias("count"), pl.col("kind").first(), pl.col("measure_m").first(),
+        pl.col("netelement_id").first(),
+    )  # fmt: skip
+    x, y = view.at(column_of(groups, "path_m"))
+    return [
+        {
+            "id": row["balise_id"],
+            "status": row["status"],
+            "kind": row["kind"],
+            "count": row["count"],
+            "place": f"{row['netelement_id']} at {row['measure_m']:.1f} m",
+            "x": _rounded(x[number]),
+            "y": _rounded(y[number]),
+        }
+        for number, row in enumerate(groups.iter_rows(named=True))
+    ]
+
+
+def _windows(view: _View, passages: pl.DataFrame) -> list[Json]:
+    """Expectation windows laid along the path from the balise accepted last before (SUBSET-026 3.4.4.4.3)."""
+    windows: list[Json] = []
+    reference: float | None = None
+    for row in passages.sort("t_offered", nulls_last=True, maintain_order=True).iter_rows(named=True):
+        if row["window_open_m"] is not None and reference is not None and row["direction"] is not None:
+            sign = 1.0 if row["direction"] == Direction.GROWING else -1.0
+            ends = reference + sign * np.linspace(row["window_open_m"], row["window_close_m"], 12)
+            x, y = view.at(ends)
+            windows.append({"id": row["balise_id"], "x": packed(x, "f4"), "y": packed(y, "f4")})
+        if row["status"] == PassageStatus.ACCEPTED:
+            reference = row["path_m"]
+    return windows
+
+
+def _rounded(value: float) -> float | None:
+    return round(float(value), 2) if np.isfinite(value) else None

@@ -1,0 +1,299 @@
+"""The page of one run: what happened, where, when, and what the replay made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+from urllib.parse import quote
+
+import polars as pl
+
+from pipeline.report.markup import (
+    UNKNOWN,
+    Cell,
+    badge,
+    cell,
+    figure,
+    link,
+    number,
+    page,
+    pairs,
+    section,
+    table,
+)
+from pipeline.report.packing import Json, script_json
+from pipeline.report.plan_view import plan_data
+from pipeline.report.series import moments_of, reasons, time_data
+from pipeline.report.stanford import stanford_data
+from schemas.config import Configuration
+from schemas.run import RunTables, Site
+
+Row = Mapping[str, Any]
+
+_FIGURES = (
+    ("duration_s", "duration", "s"),
+    ("distance_m", "distance", "m"),
+    ("epochs", "epochs", ""),
+    ("gnss_rate_hz", "GNSS rate", "Hz"),
+    ("evidence", "truth taken from", ""),
+    ("availability", "availability of the TVB while moving", ""),
+    ("outages", "outages", ""),
+    ("longest_outage_s", "longest outage", "s"),
+    ("along_error_p95_m", "error along, 95 %", "m"),
+    ("along_error_max_m", "error along, largest", "m"),
+    ("cross_error_p95_m", "error across, 95 %", "m"),
+    ("up_error_p95_m", "error of height, 95 %", "m"),
+    ("balises_on_path", "VBs passed", ""),
+    ("balises_accepted", "accepted", ""),
+    ("balises_rejected", "rejected", ""),
+    ("balises_missed", "missed", ""),
+    ("balises_not_available", "not available", ""),
+    ("unsafe_accepted", "accepted beyond the failure limit", ""),
+    ("location_error_p95_m", "location error, 95 %", "m"),
+    ("missed_detections", "missed detections", ""),
+    ("time_to_detect_max_s", "longest time to detect", "s"),
+    ("hazardous_max_s", "longest hazardous time", "s"),
+    ("alarms", "alarms", ""),
+    ("false_alarms", "of these false", ""),
+    ("exposure_max_s", "longest exposure", "s"),
+    ("exposure_p99_s", "exposure, 99 %", "s"),
+    ("mtbf_h", "time between outages", "h"),
+    ("latency_s", "GNSS latency", "s"),
+    ("odometer_scale", "odometer scale", ""),
+    ("ambiguous_stretches", "ambiguous stretches", ""),
+    ("duplicates", "duplicated epochs", ""),
+    ("out_of_order", "epochs out of order", ""),
+)
+_HAZARD_COLUMNS = (
+    ("failure_mode", "ETCS failure"), ("timing", "offered"), ("size_m", "size [m]"), ("rate_mps", "rate [m/s]"),
+    ("t_onset", "onset"), ("t_failure", "failure"), ("t_detected", "detected"), ("monitor", "by"),
+    ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
+    ("budget_s", "budget [s]"), ("within_budget", "within budget"), ("balise_ids", "VBs hit"),
+    ("accepted_ids", "accepted all the same"), ("suspect", "suspect"), ("evidence", "evidence"),
+    ("speed_mps", "speed [m/s]"), ("caused_by", "follows from"),
+)  # fmt: skip
+_PASSAGE_COLUMNS = (
+    ("kind", "kind"), ("direction", "direction"), ("t_offered", "offered"), ("t_true", "passed"),
+    ("location_error_m", "location error [m]"), ("window_open_m", "window opens [m]"),
+    ("odometer_distance_m", "odometer [m]"), ("window_close_m", "window closes [m]"),
+    ("confidence_m", "confidence [m]"), ("linking_error", "linking error"), ("reaction", "reaction"),
+    ("failure_mode", "ETCS failure"), ("cause", "cause"), ("suspect_after_the_fact", "suspect after the fact"),
+    ("hazard_id", "hazard"),
+)  # fmt: skip
+_ALARM_COLUMNS = (
+    ("t_start", "from"), ("t_end", "to"), ("monitors", "monitors in order of failing"),
+    ("peak_ratio", "peak ratio"), ("verdict", "verdict"), ("suspect", "suspect"), ("hazard_id", "hazard"),
+)  # fmt: skip
+_PLOTS = (
+    ("plan", "Plan", "GNSS positions coloured by the state of the LDS; balises by what became of them; "
+     "thick lines are expectation windows."),
+    ("bands", "LDS mode, state, TVB and alarm", "Where nothing is drawn there was no epoch."),
+    ("speed", "Speed", ""),
+    ("along", "Error along the track", "Positive ahead of the train; the confidence interval is dashed. "
+     "Without truth: GNSS minus odometer."),
+    ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
+    ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
+     "in odometer distance; markers are the offers."),
+    ("exposure", "Exposure", "Time since the last linked TVB or accepted VB."),
+    ("monitors-along", "Monitors along the track", "Value over threshold: beyond ±1 the monitor fails."),
+    ("monitors-cross", "Monitors across the track", "Value over threshold."),
+    ("monitors-up", "Monitors of height", "Value over threshold."),
+    ("monitors-other", "Other monitors", "Value over threshold."),
+    ("states", "State of every monitor", "Not evaluated is not the same as passed."),
+    ("stanford", "Stanford diagram", "Epochs of known error: error along the track against the confidence claimed. "
+     "Below the diagonal the claim was wrong."),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Made:
+    """What stands on every page: limits, and the configuration as it was resolved."""
+
+    config: Configuration
+    config_text: str | None
+    site: Site | None
+
+
+def run_page(tables: RunTables, metadata: Mapping[str, str], made: Made) -> str:
+    """HTML of one run with all its solutions; one is shown at a time, all of them are in the page."""
+    rows = list(tables.runs.iter_rows(named=True))
+    names = [row["solution"] for row in rows if row["solution"]]
+    parts = [_solution(f"s{number}", row, tables, len(rows) > 1) for number, row in enumerate(rows)]
+    body = "\n".join([_navigation(names), *parts, _provenance(rows, metadata, made)])
+    data = {
+        "run": tables.run_id,
+        "limits": _limits(made.config),
+        "order": [row["solution"] for row in rows],
+        "solutions": {name: _solution_data(name, tables, made) for name in names},
+    }
+    status = "".join(badge(status) for status in dict.fromkeys(str(row["status"]) for row in rows))
+    heading = f"<p>{link('../index.html', 'Campaign')}</p><h1>Run {escape(tables.run_id)} {status}</h1>"
+    return page(f"{tables.run_id} · balise", heading, body, script_json(data), "../assets", "run.js")
+
+
+def _limits(config: Configuration) -> Json:
+    return {
+        "ci_limit_m": config.lds.ci_limit_m,
+        "failure_limit_m": config.hazards.failure_limit_m,
+        "shift_limit_m": config.hazards.shift_limit_m,
+        "budget_s": config.budget_s,
+    }
+
+
+def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
+    epochs, passages, hazards, alarms = (
+        frame.filter(pl.col("solution") == name)
+        for frame in (tables.epochs, tables.passages, tables.hazards, tables.alarms)
+    )
+    moments_ns = moments_of(hazards, alarms)
+    return {
+        "time": time_data(epochs, moments_ns, made.config.align.gap_reset_s),
+        "plan": plan_data(epochs, passages, made.site, moments_ns),
+        "stanford": stanford_data(epochs, made.config.lds.ci_limit_m),
+        "hazards": [_hazard_data(row) for row in hazards.iter_rows(named=True)],
+        "passages": [_passage_data(row) for row in passages.iter_rows(named=True)],
+    }
+
+
+def _hazard_data(row: Row) -> Json:
+    moments = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
+    return {
+        "id": row["hazard_id"],
+        "class": str(row["hazard"]),
+        **{name: milliseconds(row[name]) for name in moments},
+    }
+
+
+def _passage_data(row: Row) -> Json:
+    return {
+        "id": row["balise_id"],
+        "status": str(row["status"]),
+        "t_ms": milliseconds(row["t_offered"] if row["t_offered"] is not None else row["t_true"]),
+        "error_m": row["location_error_m"],
+        "open_m": row["window_open_m"],
+        "close_m": row["window_close_m"],
+        "odometer_m": row["odometer_distance_m"],
+    }
+
+
+def hazard_hash(solution: str, hazard_id: int) -> str:
+    """The part of an address that zooms a run's page to a hazard."""
+    return f"#s={quote(solution, safe='')}&h={hazard_id}"
+
+
+def milliseconds(value: Any) -> float | None:
+    """An instant as the page's scripts take it."""
+    return None if value is None else round(value.timestamp() * 1000.0, 3)
+
+
+def _navigation(names: list[str]) -> str:
+    buttons = "".join(
+        f'<button type="button" data-solution="{escape(name)}" aria-pressed="false">{escape(name)}</button>'
+        for name in names
+    )
+    chooser = f'<div role="group" aria-label="Solution">{buttons}</div>' if len(names) > 1 else ""
+    moves = (
+        ("back", "← earlier"), ("forward", "later →"), ("in", "zoom in"), ("out", "zoom out"), ("all", "whole run"),
+        ("previous", "previous hazard"), ("next", "next hazard"),
+    )  # fmt: skip
+    tools = "".join(f'<button type="button" data-move="{key}">{text}</button>' for key, text in moves)
+    if not names:
+        return ""
+    return (
+        f'<nav class="tools" aria-label="Time axis">{chooser}<div role="group" aria-label="Zoom">{tools}</div>'
+        '<p id="window" aria-live="polite"></p></nav>'
+    )
+
+
+def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
+    name = row["solution"]
+    notes = [f'<p class="notice {row["status"]}">{escape(text)}</p>' for text in (row["error"], row["notes"]) if text]
+    if not name:
+        return "".join(notes) or '<p class="notice failed">The run failed.</p>'
+    hazards, passages, alarms = (
+        frame.filter(pl.col("solution") == name) for frame in (tables.hazards, tables.passages, tables.alarms)
+    )
+    epochs = tables.epochs.filter(pl.col("solution") == name)
+    parts = [
+        section(f"figures-{key}", f"Figures of {name}" if several else "Figures", *notes, _figures(row)),
+        section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
+        _drawings(key),
+        section(f"passages-{key}", "Passages", _passages(key, passages)),
+        section(f"alarms-{key}", "Alarms", _alarms(key, alarms)),
+        section(f"reasons-{key}", "Monitors not evaluated", _reasons(key, epochs)),
+    ]
+    opening = f'<div class="solution" id="{key}" data-solution="{escape(name)}">'
+    return opening + "\n".join(parts) + "</div>"
+
+
+def _drawings(key: str) -> str:
+    figures = (figure(f"{key}-{plot}", title, note) for plot, title, note in _PLOTS)
+    return section(f"drawings-{key}", "Drawings", *figures)
+
+
+def _figures(row: Row) -> str:
+    values = []
+    for key, title, unit in _FIGURES:
+        value = row[key]
+        text = number(value, 4) if isinstance(value, int | float) else str(value or UNKNOWN)
+        values.append((title, f"{text} {unit}".strip() if value is not None else "not known"))
+    low, high = row["false_alarm_rate_low_per_h"], row["false_alarm_rate_high_per_h"]
+    known = row["false_alarm_rate_per_h"] is not None
+    rate = f"{number(row['false_alarm_rate_per_h'])} /h (95 %: {number(low)} to {number(high)})"
+    shares = ", ".join(
+        f"{state.upper()} " + ("not known" if row[f"share_{state}"] is None else format(row[f"share_{state}"], ".2%"))
+        for state in ("p0", "p1", "p2", "p3")
+    )
+    return pairs([*values, ("false alarm rate", rate if known else "not known"), ("share of time", shares)])
+
+
+def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
+    if hazards.is_empty():
+        if run["evidence"] is None:
+            return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
+        return f'<p class="none">No hazard was found; truth was taken from: {escape(str(run["evidence"]))}.</p>'
+    rows = []
+    for row in hazards.iter_rows(named=True):
+        title = f"{row['hazard_id']} {row['hazard']}"
+        anchor = link(hazard_hash(row["solution"], row["hazard_id"]), title, data_hazard=str(row["hazard_id"]))
+        first = Cell(title, float(row["hazard_id"]), anchor, "" if row["detected"] else "bad")
+        rows.append([first, *(cell(row[key]) for key, _ in _HAZARD_COLUMNS)])
+    titles = ["hazard", *(title for _, title in _HAZARD_COLUMNS)]
+    return table(f"table-hazards-{key}", "Hazards; a link zooms every drawing to its hazard", titles, rows)
+
+
+def _passages(key: str, passages: pl.DataFrame) -> str:
+    rows = [
+        [
+            cell(row["balise_id"]),
+            Cell(str(row["status"]), str(row["status"]), tone="" if row["status"] == "accepted" else "bad"),
+            *(cell(row[key], 4) for key, _ in _PASSAGE_COLUMNS),
+        ]
+        for row in passages.iter_rows(named=True)
+    ]
+    titles = ["balise", "status", *(title for _, title in _PASSAGE_COLUMNS)]
+    return table(f"table-passages-{key}", "Passages of balises", titles, rows)
+
+
+def _alarms(key: str, alarms: pl.DataFrame) -> str:
+    rows = [[cell(row[key]) for key, _ in _ALARM_COLUMNS] for row in alarms.iter_rows(named=True)]
+    return table(f"table-alarms-{key}", "Alarm episodes", [title for _, title in _ALARM_COLUMNS], rows)
+
+
+def _reasons(key: str, epochs: pl.DataFrame) -> str:
+    rows = [[cell(value) for value in row] for row in reasons(epochs)]
+    return table(f"table-reasons-{key}", "Why monitors could not judge", ["monitor", "reason", "epochs"], rows)
+
+
+def _provenance(rows: Sequence[Row], metadata: Mapping[str, str], made: Made) -> str:
+    first = rows[0]
+    named = {key: str(first[key]) for key in ("software", "contract", "config_digest", "input_digest")}
+    text = made.config_text
+    shown = (
+        f'<details><summary>Resolved configuration (TOML)</summary><pre tabindex="0">{escape(text)}</pre></details>'
+        if text is not None
+        else '<p class="notice partial">The result holds no config.toml: limits drawn here are the defaults.</p>'
+    )
+    return section("provenance", "Provenance", pairs(sorted((named | dict(metadata)).items())), shown)

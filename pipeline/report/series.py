@@ -1,0 +1,134 @@
+"""What the time axes of a run's page show, one solution at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import polars as pl
+
+from pipeline.report.decimate import Band, Flags, Floats, Ints, band, detail_rows, kept_rows
+from pipeline.report.packing import Json, packed
+from pipeline.timeline import gap_limit_s, nominal_period_s
+from schemas.enums import LdsMode, LdsState, MonitorState
+from schemas.tables import MONITORS
+
+SERIES = (
+    "speed_mps",
+    "error_along_m",
+    "error_cross_m",
+    "error_up_m",
+    "cross_track_m",
+    "vertical_m",
+    "confidence_m",
+    "exposure_s",
+    "distance_from_lrvb_m",
+    "path_m",
+)
+NO_EPOCH, UNKNOWN = "no epoch", "not known"
+MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)
+_MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
+
+
+def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
+    """Series and bands over time; times are milliseconds from `t0_ms`. Across a gap lines are broken."""
+    if epochs.is_empty():
+        return {"t0_ms": 0, "t1_ms": 0, "series": {}, "bands": [], "reasons": []}
+    t_ns = epochs["t"].to_physical().to_numpy()
+    t0_ms = int(t_ns[0] // 1_000_000)
+    t_ms = t_ns // 1_000_000 - t0_ms
+    limit_s = gap_limit_s(nominal_period_s(t_ns), gap_reset_s)
+    hold_ms = max(1, int(limit_s * 1000))
+    gaps = np.flatnonzero(np.diff(t_ms) > hold_ms) + 1
+    shown_ms = np.insert(t_ms, gaps, t_ms[gaps - 1] + hold_ms)
+    whole = detail_rows(shown_ms * 1_000_000, moments_ns - t0_ms * 1_000_000)
+    columns = {name: column_of(epochs, name) for name in SERIES} | _ratios(epochs)
+    columns["residual_m"] = _residual(epochs)
+    known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
+    return {
+        "t0_ms": t0_ms,
+        "t1_ms": int(t_ns[-1] // 1_000_000),
+        "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
+        "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
+        "reasons": reasons(epochs),
+    }
+
+
+def moments_of(*frames: pl.DataFrame) -> Ints:
+    """Every instant that hazards and alarms name [ns]."""
+    names = (*_MOMENTS, "t_start")
+    columns = [frame[name].drop_nulls() for frame in frames for name in names if name in frame.columns]
+    parts = [column.to_physical().to_numpy() for column in columns]
+    return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
+
+
+def column_of(frame: pl.DataFrame, name: str) -> Floats:
+    """A column with NaN for null."""
+    return frame[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+
+
+def reasons(epochs: pl.DataFrame) -> list[Json]:
+    """Why monitors were not evaluated, with the epochs that it was so."""
+    rows: list[Json] = []
+    for monitor in MONITORS:
+        named = epochs[f"{monitor}_reason"].drop_nulls()
+        if named.is_empty():
+            continue
+        counts = named.value_counts(sort=True, name="epochs").sort("epochs", named.name, descending=[True, False])
+        rows += [[monitor, reason, count] for reason, count in counts.head(4).iter_rows()]
+    return rows
+
+
+def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
+    """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
+    ratios = {}
+    for monitor in MONITORS:
+        value, threshold = column_of(epochs, f"{monitor}_value"), column_of(epochs, f"{monitor}_threshold")
+        evaluated = (epochs[f"{monitor}_state"] != MonitorState.NOT_EVALUATED).to_numpy() & (threshold > 0)
+        ratios[f"ratio_{monitor}"] = np.divide(value, threshold, out=np.full(len(value), np.nan), where=evaluated)
+    return ratios
+
+
+def _residual(epochs: pl.DataFrame) -> Floats:
+    """GNSS minus odometer along the path, from where both are first known [m]."""
+    both = column_of(epochs, "path_m") - column_of(epochs, "odometer_m")
+    known = np.flatnonzero(np.isfinite(both))
+    return both - both[known[0]] if len(known) else both
+
+
+def _series(t_ms: Ints, values: Floats, whole: Flags) -> Json:
+    rows = kept_rows(values, whole)
+    return {"x": packed(t_ms[rows], "u4"), "y": packed(values[rows], "f4")}
+
+
+def _states(epochs: pl.DataFrame) -> list[tuple[str, str, Sequence[str], Ints]]:
+    """Name, group and states from harmless to bad, and the code of each epoch."""
+    modes = (NO_EPOCH, LdsMode.LINKED, LdsMode.INITIALISING, LdsMode.ODOMETRY, LdsMode.FAIL_SAFE)
+    states = (NO_EPOCH, LdsState.P0, UNKNOWN, LdsState.P3, LdsState.P2, LdsState.P1)
+    rows: list[tuple[str, str, Sequence[str], Ints]] = [
+        ("LDS mode", "lds", modes, _codes(epochs["lds_mode"], modes)),
+        ("LDS state", "lds", states, _codes(epochs["lds_state"], states)),
+        ("TVB", "lds", (NO_EPOCH, "TVB", "no TVB"), 2 - epochs["tvb"].cast(pl.Int64).to_numpy()),
+        ("alarm", "lds", (NO_EPOCH, "no alarm", "alarm"), 1 + epochs["alarm"].cast(pl.Int64).to_numpy()),
+    ]
+    rows += [(name, "monitors", MONITOR_CODES, _codes(epochs[f"{name}_state"], MONITOR_CODES)) for name in MONITORS]
+    return rows
+
+
+def _codes(states: pl.Series, order: Sequence[str]) -> Ints:
+    names = [str(name) for name in order]
+    codes = pl.Series(range(len(names)), dtype=pl.Int64)
+    known = states.cast(pl.String).fill_null(UNKNOWN)
+    return known.replace_strict(pl.Series(names), codes, return_dtype=pl.Int64).to_numpy()
+
+
+def _band(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints, hold_ms: int) -> Json:
+    pieces: Band = band(t_ms, codes, hold_ms, gap_code=0)
+    return {
+        "name": name,
+        "group": group,
+        "states": [str(state) for state in states],
+        "starts": packed(pieces.starts_ms, "u4"),
+        "codes": packed(pieces.codes, "u1"),
+        "end_ms": pieces.end_ms,
+    }
