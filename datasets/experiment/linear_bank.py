@@ -1,0 +1,157 @@
+"""Any bank as one linear Gaussian system, for probabilities that plain simulation cannot reach.
+
+State: Gauss-Markov errors by source and axis, white noise on positions (a Gauss-Markov error without memory),
+then the monitors. With s(k+1) = A s(k) + B w(k+1) and w standard normal, every covariance between monitors at any
+two epochs follows from powers of A.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_discrete_lyapunov
+
+from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
+from datasets.experiment.plan import BANKS, Reading, Sensors
+from pipeline.align import threshold_factor
+
+Array = npt.NDArray[np.float64]
+
+AXES: tuple[str, ...] = ("along", "cross", "up")
+
+
+@dataclass(frozen=True)
+class BankSpec:
+    """A bank that a user may configure: EWMA weights at 1 s (1 = raw), sensors, probability, rate of epochs.
+
+    Without alphas it is the bank that goes with the reading of the odometer's noise.
+    """
+
+    alphas: tuple[float, ...] = ()
+    reading: Reading = "increments"
+    sensors: Sensors = "odometer"
+    false_alarm_probability: float = 1e-7
+    rate_hz: float = 1.0
+    odometer_m: float = 0.05
+    map_m: float = 1.0
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        return self.alphas or BANKS[self.reading]
+
+
+@dataclass(frozen=True)
+class LinearBank:
+    """Monitors along, and with track across and up; stationary, as long after a restart.
+
+    `advance` A and `noise` B as above; `sources` is the number of error states before the monitors; `slope`
+    (monitors,) final response to a range ramp of 1 m/s; `alpha` (monitors,) weight of one epoch.
+    """
+
+    spec: BankSpec
+    advance: Array
+    noise: Array
+    sources: int
+    slope: Array
+    alpha: Array
+    names: tuple[str, ...]
+    along_error: Array = field(repr=False)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Stationary covariance P of the state: P = A P A' + B B'."""
+        result: Array = solve_discrete_lyapunov(self.advance, self.noise @ self.noise.T)
+        return 0.5 * (result + result.T)
+
+    @property
+    def sigma(self) -> Array:
+        """Of each monitor [m/s]."""
+        diagonal: Array = np.sqrt(np.diag(self.covariance)[self.sources :])
+        return diagonal
+
+    @property
+    def threshold(self) -> Array:
+        """k_T sigma (DIAG eq. 17) [m/s]."""
+        return threshold_factor(self.spec.false_alarm_probability) * self.sigma
+
+    def response(self, epochs: int) -> Array:
+        """To a range ramp of 1 m/s that starts at epoch 0, at epochs 1 .. n; shape (epochs, monitors)."""
+        k = np.arange(1, epochs + 1)[:, None]
+        return np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
+
+    def covariance_with(self, monitor: int, epoch: int, epochs: int) -> Array:
+        """Covariance of all monitors at epochs 1 .. n with one monitor at one epoch (1-based), (epochs, monitors)."""
+        P, A = self.covariance, self.advance
+        result = np.empty((epochs, self.slope.size))
+        place = self.sources + monitor
+        later = P[:, place].copy()
+        for k in range(epoch, epochs + 1):
+            result[k - 1] = later[self.sources :]
+            later = A @ later
+        earlier = np.zeros(P.shape[0])
+        earlier[place] = 1.0
+        for k in range(epoch, 0, -1):
+            result[k - 1] = (P @ earlier)[self.sources :]
+            earlier = A.T @ earlier
+        return result
+
+    def start(self, runs: int, rng: np.random.Generator) -> Array:
+        """Stationary states, shape (states, runs)."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(root @ rng.standard_normal((values.size, runs)))
+
+    def paths(self, epochs: int, runs: int, rng: np.random.Generator) -> Iterator[Array]:
+        """Noise of all monitors epoch by epoch, each (monitors, runs); the same array is used again."""
+        state = self.start(runs, rng)
+        normals = np.empty((self.noise.shape[1], runs))
+        following = np.empty_like(state)
+        pushed = np.empty_like(state)
+        for _ in range(epochs):
+            rng.standard_normal(out=normals)
+            np.matmul(self.advance, state, out=following)
+            np.matmul(self.noise, normals, out=pushed)
+            following += pushed
+            state, following = following, state
+            yield state[self.sources :]
+
+
+def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> LinearBank:
+    """The system of a fixed sky and heading (DIAG eq. 1-16)."""
+    axes = AXES if spec.sensors == "odometer_and_track" else AXES[:1]
+    vectors = geometry.axes(heading_deg)[: len(axes)]
+    covariances = np.einsum("ai,jik,bk->jab", vectors, geometry.source_covariances_m2, vectors)
+    dt_s = 1.0 / spec.rate_hz
+    return _assemble(spec, axes, covariances, np.exp(-dt_s / TAUS_S), vectors @ geometry.ramp_direction)
+
+
+def _assemble(spec: BankSpec, axes: tuple[str, ...], covariances: Array, phi: Array, slope: Array) -> LinearBank:
+    count, gauss_markov = len(axes), len(SOURCES) * len(axes)
+    position_white = np.full(count, spec.map_m)
+    position_white[0] = spec.odometer_m if spec.reading == "position" else 0.0
+    sources = gauss_markov + count
+    alphas = 1.0 - (1.0 - np.array(spec.weights)) ** (1.0 / spec.rate_hz)
+    alpha = np.tile(alphas, count)
+    axis = np.repeat(np.arange(count), alphas.size)
+    states = sources + alpha.size
+    A, B = np.zeros((states, states)), np.zeros((states, sources + 1))
+    decay = np.concatenate([np.repeat(phi, count), np.zeros(count)])
+    A[:sources, :sources] = np.diag(decay)
+    colour = np.linalg.cholesky(covariances + 1e-18 * np.eye(count))
+    for j, one in enumerate(colour):
+        rows = slice(j * count, (j + 1) * count)
+        B[rows, rows] = np.sqrt(1.0 - phi[j] ** 2) * one
+    B[gauss_markov:sources, gauss_markov:sources] = np.diag(position_white)
+    gain = alpha * spec.rate_hz
+    lies_on = np.tile(np.arange(count), len(SOURCES) + 1)[None, :] == axis[:, None]
+    A[sources:, :sources] = gain[:, None] * lies_on * (decay - 1.0)
+    A[sources:, sources:] = np.diag(1.0 - alpha)
+    B[sources:, :sources] = gain[:, None] * (lies_on @ B[:sources, :sources])
+    if spec.reading == "increments":
+        B[sources:, sources] = np.where(axis == 0, gain * spec.odometer_m / np.sqrt(spec.rate_hz), 0.0)
+    names = tuple(f"{axes[a]}_{'raw' if w == 1.0 else f'{w:g}'}" for a in range(count) for w in spec.weights)
+    return LinearBank(spec, A, B, sources, slope[axis], alpha, names, slope)
