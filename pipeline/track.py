@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import Floats, Ints, distances_m
+from pipeline.geodesy import Floats, Ints, distances_m, points_of
 
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
 GAP_COUNTS_M = 0.5
@@ -45,11 +45,9 @@ class Track:
 
 def track_of(frame: pl.DataFrame) -> Track:
     """The track of a site's `track` table; points of an element stay in their order."""
-    names = frame["netelement_id"].to_list()
-    index: dict[str, int] = {}
-    for name in names:
-        index.setdefault(name, len(index))
-    codes = np.fromiter((index[name] for name in names), dtype=np.int64, count=len(names))
+    names = frame["netelement_id"].unique(maintain_order=True)
+    index = {name: number for number, name in enumerate(names.to_list())}
+    codes = frame["netelement_id"].replace_strict(names, np.arange(len(names)), return_dtype=pl.Int64).to_numpy()
     order = np.argsort(codes, kind="stable")
     first = np.searchsorted(codes[order], np.arange(len(index) + 1))
     columns = {name: _floats(frame, name)[order] for name in _NUMBERS}
@@ -65,10 +63,16 @@ def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: 
     return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
 
 
-def gap_m(track: Track, a: int, position_a: int, b: int, position_b: int) -> float:
+def end_places(track: Track) -> Floats:
+    """Earth-centred places [m] of the ends of elements at height zero: `[element, 0 start or 1 end]`."""
+    vertices = np.column_stack([track.first[:-1], track.first[1:] - 1]).ravel()
+    places = points_of(track.latitude_deg[vertices], track.longitude_deg[vertices])
+    return places.surface.reshape(-1, 2, 3)
+
+
+def gap_m(one: Floats, other: Floats) -> float:
     """Length of a gap between two ends that counts as track [m]: 0 where it is only survey noise."""
-    pair = [track.end(a, position_a), track.end(b, position_b)]
-    gap = float(distances_m(track.latitude_deg[pair], track.longitude_deg[pair], np.zeros(2))[0])
+    gap = float(np.linalg.norm(one - other))
     return gap if gap > GAP_COUNTS_M else 0.0
 
 

@@ -11,7 +11,7 @@ import polars as pl
 from scipy.spatial import cKDTree
 
 from pipeline.geodesy import points_of
-from pipeline.track import GAP_COUNTS_M, Track, geometric_measures_m, track_of
+from pipeline.track import GAP_COUNTS_M, Track, end_places, geometric_measures_m, track_of
 from schemas.enums import Navigability
 from schemas.run import Finding
 
@@ -133,16 +133,12 @@ def chord_errors_m(track: Track, part: slice) -> np.ndarray:
     return np.asarray(lengths * np.maximum(at_ends[:-1], at_ends[1:]) / 8.0)
 
 
-def _end_position(track: Track, name: str, position: int) -> np.ndarray:
-    """Place of an end, heights left out: not every element has them."""
-    vertex = [track.end(track.index[name], position)]
-    return np.asarray(points_of(track.latitude_deg[vertex], track.longitude_deg[vertex]).surface[0])
-
-
 def _check_gaps(track: Track, found: Remarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
+    places = end_places(track)
     for a, position_a, b, position_b, navigability in found.links.iter_rows():
-        gap = float(np.linalg.norm(_end_position(track, a, position_a) - _end_position(track, b, position_b)))
+        one, other = places[track.index[a], position_a], places[track.index[b], position_b]
+        gap = float(np.linalg.norm(one - other))
         text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
         if gap > GAP_LIMIT_M and navigability != Navigability.NONE.value:
             found.breaches.append(f"links: {text}; expected at most {GAP_LIMIT_M:g} m")
@@ -160,7 +156,7 @@ def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
     """Ends without any relation that lie close to another element's end."""
     ends = [(name, position) for name in track.ids for position in (0, 1)]
     joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
-    places = np.array([_end_position(track, name, position) for name, position in ends])
+    places = end_places(track).reshape(-1, 3)
     for one, other in sorted(cKDTree(places).query_pairs(NEAR_ENDS_M)):
         free = ends[one] not in joined or ends[other] not in joined
         if free and ends[one][0] != ends[other][0]:
@@ -195,9 +191,10 @@ def _check_route(track: Track, route: pl.DataFrame, found: Remarks) -> None:
         what = f"names {', '.join(unknown[:3])}, not in the track" if unknown else "is empty"
         found.breaches.append(f"route: {what}")
         return
+    places = end_places(track)
     for (a, direction_a), (b, direction_b) in itertools.pairwise(rows):
-        end = _end_position(track, a, 1 if direction_a == "AB" else 0)
-        start = _end_position(track, b, 0 if direction_b == "AB" else 1)
+        end = places[track.index[a], 1 if direction_a == "AB" else 0]
+        start = places[track.index[b], 0 if direction_b == "AB" else 1]
         gap = float(np.linalg.norm(end - start))
         if gap > GAP_LIMIT_M:
             text = f"{a} ({direction_a}) ends {gap:.0f} m from where {b} ({direction_b}) begins"

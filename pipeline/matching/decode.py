@@ -116,8 +116,8 @@ def aligned(trellis: Trellis, decoded: Decoded) -> Decoded:
 
 
 def _move(trellis: Trellis, step: int, one: int, one_m: float, other: int, other_m: float) -> Move | None:
-    way, limit = trellis.way(step)
-    return best_move(trellis.network, one, one_m, other, other_m, way, limit, trellis.config)
+    way = trellis.ways.take(np.array([step]))
+    return best_move(trellis.network, one, one_m, other, other_m, way, trellis.config)
 
 
 def _follow(chains: list[Chain], at: int, move: Move | None, other: int) -> int:
@@ -176,5 +176,4 @@ def _over_break(trellis: Trellis, decoded: Decoded, before: Leg, after: Leg, ind
     last = decoded.chains[index - 1]
     there = before.entry_m(int(decoded.number[step - 1]) - last.low) + float(decoded.place_m[step - 1])
     here = after.entry_m(int(decoded.number[step]) - decoded.chains[index].low) + float(decoded.place_m[step])
-    way, _ = trellis.way(step)
-    return there + abs(way.distance_m) - here
+    return there + abs(float(trellis.ways.distance_m[step])) - here

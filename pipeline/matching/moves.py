@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.geodesy import Floats
+from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.network import Network
 from schemas.config import MatchingConfig
 
@@ -18,59 +19,88 @@ _BARRED = 20.0
 _ODOMETER_SHARE = 0.01
 
 
-class Way(NamedTuple):
-    """How far a step is thought to have led [m]: signed along the path where `signed`, else its size."""
+@dataclass(frozen=True)
+class Ways:
+    """How far each step is thought to have led [m]: signed along the path where `signed`, else its size.
 
-    distance_m: float
-    signed: bool
+    `limit_m` is how far to search the network for it.
+    """
+
+    distance_m: Floats
+    signed: Bools
+    limit_m: Floats
+
+    def take(self, rows: Ints) -> Ways:
+        """Some of the steps, or one of them several times."""
+        return Ways(self.distance_m[rows], self.signed[rows], self.limit_m[rows])
 
 
 class Move(NamedTuple):
-    """A move with its log-probability: displacement [m] along the path, and the elements between."""
+    """Displacement [m] along the path, the elements between, and whether the element is left."""
 
-    score: float
     displacement_m: float
     between: tuple[int, ...]
     leaves: bool
 
 
+def move_scores(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, ways: Ways, config: MatchingConfig
+) -> Floats:
+    """Log-probability of the most plausible move of each pair of places, -inf where there is none.
+
+    Places are oriented elements and metres from their entries.
+    """
+    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, ways.limit_m)
+    length = network.track.length_m
+    left_m, other_left_m = length[one // 2] - one_m, length[other // 2] - other_m
+    stay = np.where(one == other, distance_scores(other_m - one_m, ways, config), -np.inf)
+    ahead = distance_scores(left_m + ahead_m + other_m, ways, config) - _BARRED * ahead_barred
+    behind = distance_scores(-(one_m + behind_m + other_left_m), ways, config) - _BARRED * behind_barred
+    ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
+    return np.maximum(stay, np.maximum(ahead, behind))
+
+
+def distance_scores(displacement_m: Floats, ways: Ways, config: MatchingConfig) -> Floats:
+    """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
+    plain = np.abs(np.abs(displacement_m) - np.abs(ways.distance_m))
+    mismatch = np.where(ways.signed, np.abs(displacement_m - ways.distance_m), plain)
+    scale = config.transition_scale_m + _ODOMETER_SHARE * np.abs(ways.distance_m)
+    return np.asarray(-np.minimum(mismatch / scale, _MISMATCH_LIMIT))
+
+
 def best_move(
-    network: Network,
-    one: int,
-    one_m: float,
-    other: int,
-    other_m: float,
-    way: Way,
-    limit_m: float,
-    config: MatchingConfig,
+    network: Network, one: int, one_m: float, other: int, other_m: float, way: Ways, config: MatchingConfig
 ) -> Move | None:
-    """The most plausible move between places (metres from the oriented elements' entries), if any."""
-    moves = []
-    if one == other:
-        displacement = other_m - one_m
-        moves.append(Move(_score(displacement, way, 0, config), displacement, (), False))
+    """The most plausible move between two places and what lies between, none where the network has none."""
+    limit_m = float(way.limit_m[0])
+    moves = [(0, Move(other_m - one_m, (), False))] if one == other else []
     ahead = network.reach(one, limit_m).get(other)
     if ahead is not None:
         displacement = network.length_m(one) - one_m + ahead.distance_m + other_m
-        score = _score(displacement, way, ahead.barred_forward, config)
-        moves.append(Move(score, displacement, ahead.between, True))
+        moves.append((ahead.barred_forward, Move(displacement, ahead.between, True)))
     behind = network.reach(other, limit_m).get(one)
     if behind is not None:
         displacement = -(one_m + behind.distance_m + network.length_m(other) - other_m)
-        score = _score(displacement, way, behind.barred_backward, config)
-        moves.append(Move(score, displacement, behind.between[::-1], True))
-    return max(moves, key=lambda move: move.score) if moves else None
+        moves.append((behind.barred_backward, Move(displacement, behind.between[::-1], True)))
+    if not moves:
+        return None
+    distances = np.array([move.displacement_m for _, move in moves])
+    scores = distance_scores(distances, way, config) - _BARRED * np.array([barred for barred, _ in moves])
+    return moves[int(np.argmax(scores))][1]
 
 
-def mismatch_scores(mismatch_m: Floats, way_m: Floats, config: MatchingConfig) -> Floats:
-    """As `_score`, for many moves over which nothing is barred."""
-    scale = config.transition_scale_m + _ODOMETER_SHARE * way_m
-    return np.maximum(-mismatch_m / scale, -_MISMATCH_LIMIT)
-
-
-def _score(displacement_m: float, way: Way, barred: int, config: MatchingConfig) -> float:
-    """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
-    size = abs(displacement_m)
-    mismatch = abs(displacement_m - way.distance_m) if way.signed else abs(size - way.distance_m)
-    scale = config.transition_scale_m + _ODOMETER_SHARE * abs(way.distance_m)
-    return -min(mismatch / scale, _MISMATCH_LIMIT) - _BARRED * barred
+def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:
+    """From exit to entry, ahead and behind, with the relations not navigable that way; inf where none leads."""
+    pairs, inverse = np.unique(one * len(network.successors) + other, return_inverse=True)
+    limit = np.zeros(len(pairs))
+    np.maximum.at(limit, inverse, limit_m)
+    table = np.full((4, len(pairs)), np.inf)
+    for index, (pair, far) in enumerate(zip(pairs.tolist(), limit.tolist(), strict=True)):
+        here, there = divmod(pair, len(network.successors))
+        ahead = network.reach(here, far).get(there)
+        if ahead is not None:
+            table[:2, index] = ahead.distance_m, ahead.barred_forward
+        behind = network.reach(there, far).get(here)
+        if behind is not None:
+            table[2:, index] = behind.distance_m, behind.barred_backward
+    return tuple(table[:, inverse])

@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.geodesy import Bools
-from pipeline.track import Track, gap_m
+from pipeline.track import Track, end_places, gap_m
 from schemas.enums import Navigability
 
 
@@ -102,18 +102,19 @@ class Network:
             heapq.heappush(queue, (reach.distance_m + barred * BARRED_DETOUR_M, edge.to, reach))
 
 
-MIN_REACH_M = 300.0
+MIN_REACH_M = 150.0
 BARRED_DETOUR_M = 10_000.0
 
 
 def network_of(track: Track, links: pl.DataFrame) -> Network:
     """The network of a site; gaps between linked ends count as track."""
     successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
+    ends = end_places(track)
     for a, position_a, b, position_b, navigability in links.iter_rows():
         if navigability == Navigability.NONE.value:
             continue
         one, other = track.index[a], track.index[b]
-        gap = gap_m(track, one, int(position_a), other, int(position_b))
+        gap = gap_m(ends[one, int(position_a)], ends[other, int(position_b)])
         there = navigability in (Navigability.AB.value, Navigability.BOTH.value)
         back = navigability in (Navigability.BA.value, Navigability.BOTH.value)
         leaving, entering = 2 * one + (1 - int(position_a)), 2 * other + int(position_b)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates
 from pipeline.matching.likelihood import Likelihood, expected_m, log_density
-from pipeline.matching.moves import Way, best_move, mismatch_scores
+from pipeline.matching.moves import Ways, distance_scores, move_scores
 from pipeline.matching.network import Network
 from pipeline.matching.steps import Steps
 from schemas.config import MatchingConfig
@@ -18,19 +18,21 @@ from schemas.config import MatchingConfig
 BREAK = -200.0
 # Steps longer than this are judged move by move, since more than one element may lie within them.
 _LONG_STEP_M = 30.0
+_SEARCH_MARGIN_M = 100.0
 
 
 @dataclass(frozen=True)
 class Trellis:
     """States in order of step; `first[k] : first[k + 1]` are those of step k; `stays[k]`: from step k - 1 to
-    k no state can change for another, so `stay` holds the log-probability of each to go on.
+    k no state can change for another, so `stay` holds the log-probability of each to go on. For the other
+    steps `pair_score` holds those of all pairs, from `pair_first[k]` on.
     """
 
     network: Network
     steps: Steps
+    ways: Ways
     like: Likelihood
     config: MatchingConfig
-    polarity: int
     first: Ints
     oriented: Ints
     candidate: Ints
@@ -39,6 +41,8 @@ class Trellis:
     initial: Floats
     stay: Floats
     stays: Bools
+    pair_first: Ints
+    pair_score: Floats
 
     def __len__(self) -> int:
         return len(self.first) - 1
@@ -46,41 +50,11 @@ class Trellis:
     def states(self, step: int) -> range:
         return range(int(self.first[step]), int(self.first[step + 1]))
 
-    def way(self, step: int) -> tuple[Way, float]:
-        """What the step's length is measured against, and how far to search the network."""
-        chord, by_odometer = float(self.steps.chord_m[step]), float(self.steps.odometer_m[step])
-        if not np.isfinite(by_odometer):
-            return Way(chord, False), 1.5 * chord + 100.0
-        limit = 1.5 * max(chord, abs(by_odometer)) + 100.0
-        if self.polarity:
-            return Way(self.polarity * by_odometer, True), limit
-        return Way(abs(by_odometer), False), limit
-
     def transitions(self, step: int) -> Floats:
         """Log-probabilities from the states of step - 1 (rows) to those of `step` (columns)."""
-        before, after = self.states(step - 1), self.states(step)
-        moves = np.array([[self._move_score(one, other, step) for other in after] for one in before])
-        rows, columns = np.array(before)[:, None], np.array(after)[None, :]
-        candidate = self.candidate[columns]
-        mean = expected_m(self.offset_m[rows], candidate, self.like)
-        offset = log_density(self.offset_m[columns], mean, self.like.fresh_m2[candidate], self.like)
-        continued = moves + offset + self.like.fixed[candidate]
-        broken = BREAK + self.initial[columns]
-        return np.asarray(np.maximum(continued, broken))
-
-    def _move_score(self, one: int, other: int, step: int) -> float:
-        way, limit = self.way(step)
-        move = best_move(
-            self.network,
-            int(self.oriented[one]),
-            float(self.place_m[one]),
-            int(self.oriented[other]),
-            float(self.place_m[other]),
-            way,
-            limit,
-            self.config,
-        )
-        return -np.inf if move is None else move.score
+        rows, columns = (int(self.first[k + 1] - self.first[k]) for k in (step - 1, step))
+        begin = int(self.pair_first[step])
+        return self.pair_score[begin : begin + rows * columns].reshape(rows, columns)
 
 
 def trellis_of(
@@ -100,12 +74,57 @@ def trellis_of(
     initial = log_density(offset, np.zeros(len(offset)), like.variance_m2[candidate], like)
     initial += (like.fixed + like.heading)[candidate]
     polarity = _polarity(steps, first, oriented, place, offset) if network.orientable else 0
+    nothing, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     draft = Trellis(
-        network, steps, like, config, polarity, first, oriented, candidate, place, offset, initial,
-        np.zeros(0), np.zeros(0, dtype=bool),
+        network, steps, _ways(steps, polarity), like, config, first, oriented, candidate, place, offset, initial,
+        nothing, none.astype(bool), none, nothing,
     )  # fmt: skip
     stays = _stays(draft)
-    return Trellis(**{**draft.__dict__, "stay": _stay_scores(draft, stays), "stays": stays})
+    pair_first, pair_score = _pair_scores(draft, np.flatnonzero(~stays)[1:])
+    stay = _stay_scores(draft, stays)
+    return replace(draft, stay=stay, stays=stays, pair_first=pair_first, pair_score=pair_score)
+
+
+def _ways(steps: Steps, polarity: int) -> Ways:
+    """What each step's length is measured against: the odometer, signed once its sign is known, else GNSS."""
+    known = np.isfinite(steps.odometer_m)
+    chord = np.nan_to_num(steps.chord_m)
+    distance = np.where(known, (polarity or 1) * steps.odometer_m, chord)
+    limit = 1.5 * np.maximum(chord, np.abs(distance)) + _SEARCH_MARGIN_M
+    return Ways(distance, known & (polarity != 0), limit)
+
+
+def _pair_scores(trellis: Trellis, steps: Ints) -> tuple[Ints, Floats]:
+    """Transitions of all the given steps: where those of each step begin, and all of them, row by row."""
+    count = np.diff(trellis.first)
+    before, after = count[steps - 1], count[steps]
+    sizes = before * after
+    begin = np.concatenate([[0], np.cumsum(sizes)])
+    step = np.repeat(steps, sizes)
+    number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
+    one = trellis.first[step - 1] + number // np.repeat(after, sizes)
+    other = trellis.first[step] + number % np.repeat(after, sizes)
+    moves = move_scores(
+        trellis.network,
+        trellis.oriented[one],
+        trellis.place_m[one],
+        trellis.oriented[other],
+        trellis.place_m[other],
+        trellis.ways.take(step),
+        trellis.config,
+    )
+    score = np.maximum(moves + _offset_scores(trellis, one, other), BREAK + trellis.initial[other])
+    first = np.zeros(len(trellis), dtype=np.int64)
+    first[steps] = begin[:-1]
+    return first, score
+
+
+def _offset_scores(trellis: Trellis, one: Ints, other: Ints) -> Floats:
+    """Log-likelihood of states given states of the step before."""
+    candidate = trellis.candidate[other]
+    mean = expected_m(trellis.offset_m[one], candidate, trellis.like)
+    density = log_density(trellis.offset_m[other], mean, trellis.like.fresh_m2[candidate], trellis.like)
+    return np.asarray(density + trellis.like.fixed[candidate])
 
 
 def _unchanged(trellis: Trellis) -> Bools:
@@ -142,23 +161,10 @@ def _stay_scores(trellis: Trellis, stays: Bools) -> Floats:
     rows = np.flatnonzero(stays[step])
     before = rows - count[step[rows]]
     displacement = trellis.place_m[rows] - trellis.place_m[before]
-    score = _stay_moves(trellis, step[rows], displacement)
-    candidate = trellis.candidate[rows]
-    mean = expected_m(trellis.offset_m[before], candidate, trellis.like)
-    score += log_density(trellis.offset_m[rows], mean, trellis.like.fresh_m2[candidate], trellis.like)
     stay = np.full(len(trellis.oriented), -np.inf)
-    stay[rows] = score + trellis.like.fixed[candidate]
+    stay[rows] = distance_scores(displacement, trellis.ways.take(step[rows]), trellis.config)
+    stay[rows] += _offset_scores(trellis, before, rows)
     return stay
-
-
-def _stay_moves(trellis: Trellis, step: Ints, displacement: Floats) -> Floats:
-    """As `moves.best_move` within one element, for many at once."""
-    by_odometer, chord = trellis.steps.odometer_m[step], trellis.steps.chord_m[step]
-    signed = trellis.polarity * by_odometer
-    size = np.where(np.isfinite(by_odometer), np.abs(by_odometer), chord)
-    plain = np.abs(np.abs(displacement) - size)
-    mismatch = np.where(np.isfinite(by_odometer) & (trellis.polarity != 0), np.abs(displacement - signed), plain)
-    return mismatch_scores(mismatch, size, trellis.config)
 
 
 def _polarity(steps: Steps, first: Ints, oriented: Ints, place_m: Floats, offset_m: Floats) -> int:
