@@ -12,7 +12,7 @@
     if (!own.hazards) { empty(id, "No hazard was found."); return; }
     const traces = OUTCOMES.map(([name, color, pattern], index) => ({
       type: "bar", name, x: own.classes.map((row) => row[0]), y: own.classes.map((row) => row[1 + index]),
-      marker: { color, pattern: { shape: pattern, fgcolor: "#ffffff", size: 7, solidity: 0.25 } },
+      marker: { color, pattern: Plots.pattern(color, pattern) },
     }));
     draw(id, traces, layout(300, { barmode: "stack", yaxis: axis("hazards", { tickformat: "d", rangemode: "tozero" }), xaxis: axis("") }));
   }

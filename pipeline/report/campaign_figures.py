@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.report.markup import UNKNOWN, number
 from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
-from pipeline.summary import missed_detection
+from pipeline.summary import is_passage, missed_detection
 from schemas.config import SafetyConfig
 from schemas.enums import BaliseKind, PassageStatus, RunStatus
 
@@ -86,13 +86,15 @@ def _hazard_figures(hazards: pl.DataFrame, hours: float, safety: SafetyConfig) -
 def _balise_figures(passages: pl.DataFrame, failure_limit_m: float) -> list[Figure]:
     virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
     accepted = virtual.filter(pl.col("status") == PassageStatus.ACCEPTED)
+    passages_known = virtual.filter(is_passage())
+    through = passages_known.filter(pl.col("status") == PassageStatus.ACCEPTED)
     judged = accepted.filter(pl.col("location_error_m").is_not_null())
     unsafe = judged.filter(pl.col("location_error_m").abs() > failure_limit_m).height
     return [
         Figure(
             "VBs accepted",
-            f"{accepted.height} of {virtual.height} passages and offers",
-            _share(clopper_pearson(accepted.height, virtual.height)),
+            f"{through.height} of {passages_known.height} passages",
+            _share(clopper_pearson(through.height, passages_known.height)),
         ),
         Figure(
             "accepted beyond the failure limit",

@@ -118,9 +118,7 @@ def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool
         made.config.hazards.failure_limit_m,
     )
     title = f"Solution {name}" if several else "Figures"
-    note = (
-        "<p>Rates count all that this campaign holds, injected faults included. Bounds are exact, 95 %, two-sided.</p>"
-    )
+    note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
     return section(
         key,
         title,

@@ -59,18 +59,15 @@ def _edges_of(known: Flags, edges: Ints) -> Ints:
 def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int = DETAIL_EPOCHS) -> Flags:
     """Rows near the moments that matter, with a reach that is halved until no more than `limit` are left."""
     reach_ns = reach_s * 1e9
-    near = np.zeros(len(t_ns), dtype=np.bool_)
     if not len(moments_ns) or not len(t_ns):
-        return near
+        return np.zeros(len(t_ns), dtype=np.bool_)
     moments = np.sort(moments_ns)
     after = np.clip(np.searchsorted(moments, t_ns), 0, len(moments) - 1)
     before = np.clip(after - 1, 0, None)
     away = np.minimum(np.abs(moments[after] - t_ns), np.abs(moments[before] - t_ns))
-    while True:
-        near = away <= reach_ns
-        if near.sum() <= limit or reach_ns < 1e6:
-            return near
+    while (away <= reach_ns).sum() > limit and reach_ns >= 1e6:
         reach_ns /= 2.0
+    return np.asarray(away <= reach_ns)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from datetime import datetime
 from html import escape
 
 UNKNOWN = "–"
+_LONG = 32
 
 
 @dataclass(frozen=True)
@@ -130,6 +131,7 @@ def page(title: str, heading: str, body: str, data: str, assets: str, script: st
 def _td(item: Cell) -> str:
     order = item.order
     key = "" if order is None else f' data-order="{escape(repr(order) if isinstance(order, float) else order)}"'
-    kinds = [name for name in ("number" if isinstance(order, float) else "", item.tone) if name]
+    shape = "number" if isinstance(order, float) else "long" if len(item.text) > _LONG else ""
+    kinds = [name for name in (shape, item.tone) if name]
     classes = f' class="{" ".join(kinds)}"' if kinds else ""
     return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"

@@ -43,8 +43,11 @@ const Plots = (() => {
   const layout = (height, extra = {}) => ({
     height, margin: { l: 70, r: 20, t: 12, b: 40 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { family: 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif', size: 12 }, hovermode: "closest",
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: "#888888", activecolor: "#0072b2" },
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 }, ...extra,
   });
+
+  const pattern = (color, shape) => ({ shape, size: 6, solidity: 0.3, bgcolor: color, fgcolor: "#ffffff" });
 
   const config = { responsive: true, displaylogo: false, scrollZoom: false,
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
@@ -61,5 +64,5 @@ const Plots = (() => {
     place.replaceChildren(note);
   }
 
-  return { COLOUR, STATE, PASSAGE, LINES, axis, config, data, draw, empty, layout, unpack };
+  return { COLOUR, STATE, PASSAGE, LINES, axis, config, data, draw, empty, layout, pattern, unpack };
 })();

@@ -4,6 +4,7 @@
   const { COLOUR, STATE, PASSAGE, LINES, axis, data, draw, empty, layout, unpack } = Plots;
   const POINTS = 1600;
   const LEAST_MS = 500;
+  const RATIO_REACH = 5;
   const state = { solution: null, index: 0, lo: 0, hi: 0, hazard: null, drawing: false };
   const prepared = new Map();
 
@@ -116,7 +117,7 @@
         if (!traces.has(label)) {
           const [color, , pattern] = STATE[label];
           traces.set(label, { type: "bar", orientation: "h", name: label.replace("_", " "), base: [], x: [], y: [],
-            marker: { color, line: { width: 0 }, pattern: { shape: pattern, size: 6, solidity: 0.25, fgcolor: "#ffffff" } },
+            marker: { color, line: { width: 0 }, pattern: Plots.pattern(color, pattern) },
             width: 0.8, hovertemplate: `%{y}: ${label.replace("_", " ")}<extra></extra>` });
         }
         const trace = traces.get(label);
@@ -156,13 +157,21 @@
   const AXES = [["raw", "raw"], ["ewma_0p1", "EWMA 0.1"], ["ewma_0p01", "EWMA 0.01"], ["ewma_0p001", "EWMA 0.001"]];
   const OTHERS = ["link_order", "link_distance", "along_doppler", "pseudorange", "channel"];
 
+  // A monitor far beyond its threshold must not flatten those that are near theirs.
+  function ratioPlot(now, name, traces) {
+    const sizes = traces.filter(Boolean).map((trace) => trace.y.reduce((most, y) => Math.max(most, Math.abs(y ?? 0)), 0));
+    const reach = Math.min(RATIO_REACH, Math.max(1.3, 1.1 * Math.max(0, ...sizes)));
+    const yaxis = axis("value / threshold", { range: [-reach, reach] });
+    timePlot(now, name, "", traces, 230, [-1, 1], { yaxis });
+  }
+
   function monitorPlots(now) {
     for (const along of ["along", "cross", "up"]) {
       const traces = AXES.map(([key, name], i) => line(now, `ratio_${along}_${key}`, name, LINES[i]));
-      timePlot(now, `monitors-${along}`, "value / threshold", traces, 230, [-1, 1]);
+      ratioPlot(now, `monitors-${along}`, traces);
     }
     const traces = OTHERS.map((name, i) => line(now, `ratio_${name}`, name.replace("_", " "), LINES[i]));
-    timePlot(now, "monitors-other", "value / threshold", traces, 230, [-1, 1]);
+    ratioPlot(now, "monitors-other", traces);
   }
 
   function mirrored(now, key, name) {

@@ -283,8 +283,11 @@ def _alarms(key: str, alarms: pl.DataFrame) -> str:
 
 
 def _reasons(key: str, epochs: pl.DataFrame) -> str:
-    rows = [[cell(value) for value in row] for row in reasons(epochs)]
-    return table(f"table-reasons-{key}", "Why monitors could not judge", ["monitor", "reason", "epochs"], rows)
+    by_reason: dict[tuple[str, int], list[str]] = {}
+    for monitor, reason, count in reasons(epochs):
+        by_reason.setdefault((reason, count), []).append(monitor)
+    rows = [[cell(reason), cell(count), cell(names)] for (reason, count), names in by_reason.items()]
+    return table(f"table-reasons-{key}", "Why monitors could not judge", ["reason", "epochs", "monitors"], rows)
 
 
 def _provenance(rows: Sequence[Row], metadata: Mapping[str, str], made: Made) -> str:

@@ -33,7 +33,7 @@ _MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_en
 def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
     """Series and bands over time; times are milliseconds from `t0_ms`. Across a gap lines are broken."""
     if epochs.is_empty():
-        return {"t0_ms": 0, "t1_ms": 0, "series": {}, "bands": [], "reasons": []}
+        return {"t0_ms": 0, "t1_ms": 0, "series": {}, "bands": []}
     t_ns = epochs["t"].to_physical().to_numpy()
     t0_ms = int(t_ns[0] // 1_000_000)
     t_ms = t_ns // 1_000_000 - t0_ms
@@ -50,7 +50,6 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
         "t1_ms": int(t_ns[-1] // 1_000_000),
         "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
         "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
-        "reasons": reasons(epochs),
     }
 
 

@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.report.packing import Json
 
-_BINS = 80
+_BINS = 56
 
 
 def stanford_data(epochs: pl.DataFrame, limit_m: float) -> Json:
