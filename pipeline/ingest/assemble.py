@@ -14,6 +14,7 @@ from pipeline.ingest.reader import ORDINAL
 from schemas.errors import InputError
 from schemas.run import STREAMS, Stream
 
+
 @dataclass(frozen=True)
 class Decoded:
     """Fields of all messages of a source, one row per message, with its times and place in the file."""
@@ -36,10 +37,8 @@ def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) ->
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     supplements = [part for part in parts if part.source.recipe.supplement]
     rows = [_rows(part, supplements) for part in parts if not part.source.recipe.supplement]
-    if len(rows) == 1:
-        frame = rows[0]
-    else:
-        frame = pl.concat(rows, how="diagonal_relaxed").sort(ORDINAL, maintain_order=True)
+    joined = pl.concat(rows, how="diagonal_relaxed")
+    frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
     return conform(frame.drop(ORDINAL), stream, place, breaches)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.template import Field, Fixed, Flag, Template, Text, Unfit, check_type, template_of
+from pipeline.ingest.template import Field, Fixed, Flag, Template, Text, UnfitError, check_type, template_of
 
 _MOST_ELEMENTS = 4096
 _HEADER_SIZE = 4  # encapsulation: representation, options
@@ -41,7 +41,7 @@ def parse_definitions(name: str, text: str) -> dict[str, Definition]:
     for index, section in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
         title = re.search(r"^MSG:\s+(\S+)\s*$", section, flags=re.MULTILINE)
         if title is None and index > 0:
-            raise Unfit("a part of the definition has no name")
+            raise UnfitError("a part of the definition has no name")
         full = title.group(1) if title else name
         package = full.split("/")[0]
         lines = [line for line in section.splitlines() if not line.startswith("MSG:")]
@@ -60,7 +60,7 @@ def _member(line: str, package: str) -> Member | None:
     if not content or (match and match["rest"].startswith("=")):
         return None
     if match is None:
-        raise Unfit(f"the definition line {content!r} is not understood")
+        raise UnfitError(f"the definition line {content!r} is not understood")
     kind = match["type"]
     if kind not in _PRIMITIVES and kind not in ("string", "wstring"):
         kind = _short(kind) if "/" in kind else f"{package}/{kind}"
@@ -79,25 +79,23 @@ class CdrWalk:
         self._root = _short(name)
         self._types = types
         if self._root not in self._definitions:
-            raise Unfit(f"no definition of {name}")
+            raise UnfitError(f"no definition of {name}")
 
     def __call__(self, payload: bytes) -> Template:
         if len(payload) < _HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
-            raise Unfit("not plain CDR")
+            raise UnfitError("not plain CDR")
         walk = _Walk(payload, self._definitions, self._types)
         walk.message(self._root, "", 0)
         missing = set(self._types) - set(walk.fields)
         if missing:
-            raise Unfit(f"no field {', '.join(sorted(missing))}")
+            raise UnfitError(f"no field {', '.join(sorted(missing))}")
         return template_of(payload, walk.static, walk.fields)
 
 
 class _Walk:
     """The state of one walk."""
 
-    def __init__(
-        self, payload: bytes, definitions: Mapping[str, Definition], types: Mapping[str, pl.DataType]
-    ) -> None:
+    def __init__(self, payload: bytes, definitions: Mapping[str, Definition], types: Mapping[str, pl.DataType]) -> None:
         self.fields: dict[str, Field] = {}
         self.static = bytearray(len(payload))
         self.static[0:2] = b"\xff\xff"
@@ -110,7 +108,7 @@ class _Walk:
 
     def message(self, name: str, path: str, depth: int) -> None:
         if name not in self._definitions or depth > 32:
-            raise Unfit(f"no definition of {name}")
+            raise UnfitError(f"no definition of {name}")
         members = self._definitions[name]
         if not members:
             self._skip(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
@@ -126,7 +124,7 @@ class _Walk:
             self._numbers(member.type, path, count)
             return
         if count > _MOST_ELEMENTS:
-            raise Unfit("too many elements")
+            raise UnfitError("too many elements")
         for index in range(count):
             self._value(member.type, f"{path}[{index}]", depth)
 
@@ -136,7 +134,7 @@ class _Walk:
         elif kind == "string":
             self._text(path)
         elif kind == "wstring":
-            raise Unfit("wide text")
+            raise UnfitError("wide text")
         else:
             self.message(kind, path, depth + 1)
 
@@ -162,7 +160,7 @@ class _Walk:
         offset = self._skip(length, 1)
         if path in self._types:
             if length == 0 or self._payload[offset + length - 1] != 0:
-                raise Unfit("a text without its closing zero")
+                raise UnfitError("a text without its closing zero")
             self.static[offset + length - 1] = 0xFF
             self.fields[path] = check_type(Text(offset, length - 1), self._types[path])
 
@@ -175,7 +173,7 @@ class _Walk:
     def _skip(self, size: int, alignment: int) -> int:
         start = self._at + -(self._at - _HEADER_SIZE) % alignment
         if start + size > len(self._payload):
-            raise Unfit("the message ends too early")
+            raise UnfitError("the message ends too early")
         self._at = start + size
         return start
 

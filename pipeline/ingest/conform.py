@@ -44,9 +44,7 @@ def extra_columns(frame: pl.DataFrame, stream: Stream) -> list[str]:
     return [name for name in frame.columns if name not in known]
 
 
-def _may_be_absent(
-    name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[Breach]
-) -> bool:
+def _may_be_absent(name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[Breach]) -> bool:
     if column.nullable or name in DEFAULTS:
         return True
     breaches.append(
@@ -61,17 +59,13 @@ def _may_be_absent(
     return False
 
 
-def _column(
-    frame: pl.DataFrame, name: str, column: dy.Column, place: str, breaches: list[Breach]
-) -> pl.Series | None:
+def _column(frame: pl.DataFrame, name: str, column: dy.Column, place: str, breaches: list[Breach]) -> pl.Series | None:
     where = f"{place}: column {name}"
     if name not in frame.columns:
         return pl.Series(name, [DEFAULTS.get(name)], dtype=column.dtype).new_from_index(0, frame.height)
     series = _converted(frame[name], column)
     if isinstance(series, str):
-        breaches.append(
-            Breach(where, "has the wrong type", found=series, expected=type_name(column), remedy=_RETYPE)
-        )
+        breaches.append(Breach(where, "has the wrong type", found=series, expected=type_name(column), remedy=_RETYPE))
         return None
     _check_values(series, column, where, breaches)
     return series
@@ -102,7 +96,7 @@ def _to_float(series: pl.Series, target: pl.DataType) -> pl.Series | str:
         return series.cast(target)
     if series.dtype.is_integer():
         low, high = series.min(), series.max()
-        if -_EXACT_INTEGER <= low and high <= _EXACT_INTEGER:  # type: ignore[operator]
+        if low >= -_EXACT_INTEGER and high <= _EXACT_INTEGER:  # type: ignore[operator]
             return series.cast(target)
         return f"{series.dtype} beyond 2^53"
     return str(series.dtype)
@@ -164,9 +158,7 @@ _CONVERSIONS: dict[type[dy.Column], Callable[[pl.Series, pl.DataType], pl.Series
 def _check_values(series: pl.Series, column: dy.Column, where: str, breaches: list[Breach]) -> None:
     if not column.nullable and series.null_count():
         rows = rows_text(series.is_null())
-        breaches.append(
-            Breach(where, "is not complete", found=f"null in {rows}", expected="a value in every row")
-        )
+        breaches.append(Breach(where, "is not complete", found=f"null in {rows}", expected="a value in every row"))
     if isinstance(column, dy.Float64) and not _all_finite(series):
         strange = ~series.is_finite().fill_null(True)
         value = series.filter(strange)[0]
@@ -188,9 +180,7 @@ def _all_finite(series: pl.Series) -> bool:
     return total is None or math.isfinite(total) or bool(series.is_finite().all())
 
 
-def _check_range(
-    series: pl.Series, column: dy.Float64 | dy.Int64, where: str, breaches: list[Breach]
-) -> None:
+def _check_range(series: pl.Series, column: dy.Float64 | dy.Int64, where: str, breaches: list[Breach]) -> None:
     low, high = series.min(), series.max()
     bounds = [(column.min, "at least"), (getattr(column, "min_exclusive", None), "more than")]
     for bound, words in bounds:

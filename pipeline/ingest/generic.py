@@ -16,7 +16,7 @@ Value = Any
 Decode = Callable[[bytes], Value]
 
 
-class NotDecodable(Exception):
+class UndecodableError(Exception):
     """A message that its own schema does not fit; `str` says why."""
 
 
@@ -40,7 +40,7 @@ def parse_json(payload: bytes) -> Value:
     try:
         return json.loads(payload, parse_constant=_refuse_literal)
     except (ValueError, RecursionError) as error:
-        raise NotDecodable(f"not JSON: {error}") from None
+        raise UndecodableError(f"not JSON: {error}") from None
 
 
 def _refuse_literal(literal: str) -> Value:
@@ -48,7 +48,7 @@ def _refuse_literal(literal: str) -> Value:
 
 
 def _protobuf_decoder(channel: Channel) -> Decode:
-    from google.protobuf.message import DecodeError
+    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
     from mcap_protobuf.decoder import DecoderFactory
 
     decode = _made(lambda: DecoderFactory().decoder_for("protobuf", channel.mcap_schema()), channel)
@@ -57,7 +57,7 @@ def _protobuf_decoder(channel: Channel) -> Decode:
         try:
             return decode(payload)
         except DecodeError as error:
-            raise NotDecodable(f"not the protobuf message of its schema: {error}") from None
+            raise UndecodableError(f"not the protobuf message of its schema: {error}") from None
 
     return checked
 
@@ -69,12 +69,12 @@ def _cdr_decoder(channel: Channel) -> Decode:
 
     def checked(payload: bytes) -> Value:
         if len(payload) < 4 or payload[0] != 0 or payload[1] not in (0, 1):
-            raise NotDecodable(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
+            raise UndecodableError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
         try:
             return decode(payload)
         except Exception as error:
             # The reader raises struct.error, UnicodeDecodeError, MemoryError and more on short messages.
-            raise NotDecodable(f"not the CDR message of its schema: {type(error).__name__}") from None
+            raise UndecodableError(f"not the CDR message of its schema: {type(error).__name__}") from None
 
     return checked
 
@@ -122,13 +122,13 @@ def decode_columns(
                 for path, take, coerce in takers:
                     value = take(element)
                     values[path].append(coerce(take(message) if value is None and rows else value))
-        except NotDecodable as error:
+        except UndecodableError as error:
             raise undecodable(channel, messages, number, error) from None
     series = [pl.Series(path, column, dtype=types[path]) for path, column in values.items()]
     return pl.DataFrame(series), numbers
 
 
-def undecodable(channel: Channel, messages: Messages, row: int, error: NotDecodable) -> InputError:
+def undecodable(channel: Channel, messages: Messages, row: int, error: UndecodableError) -> InputError:
     """The error for one message, named by the time at which it was recorded."""
     return InputError(
         f"the message of log time {messages.times('log_time')[row]} ns cannot be decoded: {error}",
@@ -180,29 +180,29 @@ def _as_float(value: Value) -> float | None:
         return value
     if isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    raise NotDecodable(f"{value!r} is not a number")
+    raise UndecodableError(f"{value!r} is not a number")
 
 
 def _as_int(value: Value) -> int | None:
     if value is None or (isinstance(value, int) and not isinstance(value, bool)):
         if value is not None and not -(2**63) <= value < 2**63:
-            raise NotDecodable(f"{value!r} is no 64-bit integer")
+            raise UndecodableError(f"{value!r} is no 64-bit integer")
         return value
     if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
         return int(value)
-    raise NotDecodable(f"{value!r} is not an integer")
+    raise UndecodableError(f"{value!r} is not an integer")
 
 
 def _as_text(value: Value) -> str | None:
     if value is None or isinstance(value, str):
         return value
-    raise NotDecodable(f"{value!r} is not a text")
+    raise UndecodableError(f"{value!r} is not a text")
 
 
 def _as_flag(value: Value) -> bool | None:
     if value is None or isinstance(value, bool):
         return value
-    raise NotDecodable(f"{value!r} is not true or false")
+    raise UndecodableError(f"{value!r} is not true or false")
 
 
 _COERCIONS: dict[type[pl.DataType], Callable[[Value], Value]] = {

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, ChunkRecord, Damage, Op
+from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, ChunkRecord, DamageError, Op
 
 Ints = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
@@ -54,7 +54,7 @@ class Messages:
         if self.picked is not None:
             times = times[self.picked]
         if len(times) and times.min() < 0:
-            raise Damage(0, "a time of a message is beyond the year 2262")
+            raise DamageError(0, "a time of a message is beyond the year 2262")
         return times
 
     def payload(self, row: int) -> bytes:
@@ -66,9 +66,7 @@ class Messages:
         if rows.dtype == np.bool_:
             rows = np.flatnonzero(rows)
         picked = rows if self.picked is None else self.picked[rows]
-        return Messages(
-            self.data, self.start[rows], self.length[rows], self.ordinal[rows], self.heads, picked
-        )
+        return Messages(self.data, self.start[rows], self.length[rows], self.ordinal[rows], self.heads, picked)
 
 
 Block = dict[int, Messages]  # by channel
@@ -90,15 +88,15 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
 def decompressed(chunk: ChunkRecord, limit: int) -> Bytes:
     """The records of a chunk, at most `limit` bytes, of exactly the declared size and checksum."""
     if chunk.size > limit:
-        raise Damage(
+        raise DamageError(
             chunk.offset,
             f"a chunk declares {chunk.size} bytes, over the limit of {limit} ([ingest] chunk_limit_mib)",
         )
     records = _decompress(chunk)
     if len(records) != chunk.size:
-        raise Damage(chunk.offset, f"a chunk holds {len(records)} bytes but declares {chunk.size}")
+        raise DamageError(chunk.offset, f"a chunk holds {len(records)} bytes but declares {chunk.size}")
     if chunk.crc and zlib.crc32(records) != chunk.crc:
-        raise Damage(chunk.offset, "the checksum of a chunk does not match its content")
+        raise DamageError(chunk.offset, "the checksum of a chunk does not match its content")
     return np.frombuffer(records, dtype=np.uint8)
 
 
@@ -106,7 +104,7 @@ def _decompress(chunk: ChunkRecord) -> Any:
     if chunk.compression == "":
         return chunk.records
     if chunk.compression not in ("zstd", "lz4"):
-        raise Damage(chunk.offset, f"a chunk has the unknown compression {chunk.compression!r}")
+        raise DamageError(chunk.offset, f"a chunk has the unknown compression {chunk.compression!r}")
     if chunk.size == 0:
         return b""
     try:
@@ -114,7 +112,7 @@ def _decompress(chunk: ChunkRecord) -> Any:
             return pa.decompress(chunk.records, chunk.size, codec="zstd")
         return _lz4(chunk)
     except (pa.ArrowException, OSError, RuntimeError, ValueError) as error:
-        raise Damage(chunk.offset, f"a chunk cannot be decompressed ({error})") from None
+        raise DamageError(chunk.offset, f"a chunk cannot be decompressed ({error})") from None
 
 
 def _lz4(chunk: ChunkRecord) -> Any:
@@ -143,7 +141,7 @@ def chunk_messages(
         starts = np.array(_walk(data, 0, len(data), offset, on_record), dtype=np.int64)
         return block_of(data, starts, offset, first_ordinal)
     if len(data) < MESSAGE_HEAD_SIZE:
-        raise Damage(offset, "a message index points outside its chunk")
+        raise DamageError(offset, "a message index points outside its chunk")
     named = [_indexed(data, channel, entries, offset) for channel, entries in filled]
     others = _between(data, [part[:2] for part in named], offset, on_record)
     if len(others):
@@ -151,7 +149,7 @@ def chunk_messages(
         starts = np.concatenate([others, *(start for start, _, _ in named)])
         return block_of(data, np.sort(starts), offset, first_ordinal)
     if len({channel for channel, _ in filled}) < len(filled):
-        raise Damage(offset, "a chunk has two message indexes for one channel")
+        raise DamageError(offset, "a chunk has two message indexes for one channel")
     return {
         channel: _messages(data, *_in_order(start, heads), offset, first_ordinal)
         for (channel, _), (start, _, heads) in zip(filled, named, strict=True)
@@ -164,11 +162,11 @@ def _walk(data: Bytes, start: int, end: int, offset: int, on_record: OnRecord) -
     message, room = int(Op.MESSAGE), end - HEAD_SIZE
     while start < end:
         if start > room:
-            raise Damage(offset, "a record is cut off by the end of its chunk")
+            raise DamageError(offset, "a record is cut off by the end of its chunk")
         opcode, length = unpack(view, start)
         following = start + HEAD_SIZE + length
         if following > end:
-            raise Damage(offset, "a record runs past the end of its chunk")
+            raise DamageError(offset, "a record runs past the end of its chunk")
         if opcode == message:
             messages.append(start)
         else:
@@ -177,28 +175,24 @@ def _walk(data: Bytes, start: int, end: int, offset: int, on_record: OnRecord) -
     return messages
 
 
-def _indexed(
-    data: Bytes, channel: int, entries: memoryview, offset: int
-) -> tuple[Ints, Ints, npt.NDArray[Any]]:
+def _indexed(data: Bytes, channel: int, entries: memoryview, offset: int) -> tuple[Ints, Ints, npt.NDArray[Any]]:
     """Starts, ends and heads of the messages that an index names, held against what stands there."""
     pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
     if pairs[:, 1].max() > len(data) - MESSAGE_HEAD_SIZE:
-        raise Damage(offset, "a message index points outside its chunk")
+        raise DamageError(offset, "a message index points outside its chunk")
     starts = pairs[:, 1].astype(np.int64)
     heads = gathered(data, starts, MESSAGE_HEAD)
     agrees = (heads["opcode"] == _MESSAGE) & (heads["channel"] == channel)
     agrees &= heads["log_time"] == pairs[:, 0].view(np.int64)
     if not agrees.all():
-        raise Damage(offset, "a message index disagrees with its chunk")
+        raise DamageError(offset, "a message index disagrees with its chunk")
     lengths = heads["length"]
     if lengths.max() > len(data):
-        raise Damage(offset, "a record runs past the end of its chunk")
+        raise DamageError(offset, "a record runs past the end of its chunk")
     return starts, starts + lengths.astype(np.int64) + HEAD_SIZE, heads
 
 
-def _between(
-    data: Bytes, named: Sequence[tuple[Ints, Ints]], offset: int, on_record: OnRecord
-) -> Ints:
+def _between(data: Bytes, named: Sequence[tuple[Ints, Ints]], offset: int, on_record: OnRecord) -> Ints:
     """Messages that no index names; proves that all records together tile the chunk exactly.
 
     Records that follow each other without gap: sorted, each end but the last is the next start.
@@ -208,23 +202,21 @@ def _between(
     gaps = [(0, int(starts[0])), (int(ends[-1]), len(data))]
     if not np.array_equal(starts[1:], ends[:-1]):
         if (starts[1:] < ends[:-1]).any():
-            raise Damage(offset, "records of a chunk overlap, or its message index names one twice")
+            raise DamageError(offset, "records of a chunk overlap, or its message index names one twice")
         inner = np.flatnonzero(starts[1:] > ends[:-1])
         gaps += [(int(ends[gap]), int(starts[gap + 1])) for gap in inner]
     if gaps[1][0] > len(data):
-        raise Damage(offset, "a record runs past the end of its chunk")
-    found = [
-        start for first, last in sorted(gaps) for start in _walk(data, first, last, offset, on_record)
-    ]
+        raise DamageError(offset, "a record runs past the end of its chunk")
+    found = [start for first, last in sorted(gaps) for start in _walk(data, first, last, offset, on_record)]
     return np.array(found, dtype=np.int64)
 
 
 def _check_unindexed(data: Bytes, starts: Ints, indexed: set[int], offset: int) -> None:
     """A channel's index is whole or absent: part of one would make a reader that trusts it lose messages."""
     if starts.max() > len(data) - MESSAGE_HEAD_SIZE:
-        raise Damage(offset, "a message is shorter than its header")
+        raise DamageError(offset, "a message is shorter than its header")
     if np.isin(gathered(data, starts, MESSAGE_HEAD)["channel"], list(indexed)).any():
-        raise Damage(offset, "a message index lacks messages of its chunk")
+        raise DamageError(offset, "a message index lacks messages of its chunk")
 
 
 def _in_order(starts: Ints, heads: npt.NDArray[Any]) -> tuple[Ints, npt.NDArray[Any]]:
@@ -240,7 +232,7 @@ def block_of(data: Bytes, starts: Ints, offset: int, first_ordinal: int) -> Bloc
     if not len(starts):
         return {}
     if starts.max() > len(data) - MESSAGE_HEAD_SIZE:
-        raise Damage(offset, "a message is shorter than its header")
+        raise DamageError(offset, "a message is shorter than its header")
     heads = gathered(data, starts, MESSAGE_HEAD)
     channels = heads["channel"]
     found = np.flatnonzero(np.bincount(channels)).tolist()
@@ -253,10 +245,8 @@ def block_of(data: Bytes, starts: Ints, offset: int, first_ordinal: int) -> Bloc
     }
 
 
-def _messages(
-    data: Bytes, starts: Ints, heads: npt.NDArray[Any], offset: int, first_ordinal: int
-) -> Messages:
+def _messages(data: Bytes, starts: Ints, heads: npt.NDArray[Any], offset: int, first_ordinal: int) -> Messages:
     lengths = heads["length"].astype(np.int64) - _FIXED_FIELDS
     if lengths.min() < 0:
-        raise Damage(offset, "a message is shorter than its header")
+        raise DamageError(offset, "a message is shorter than its header")
     return Messages(data, starts + MESSAGE_HEAD_SIZE, lengths, starts + first_ordinal, heads)

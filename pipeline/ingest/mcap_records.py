@@ -32,7 +32,7 @@ class Op(IntEnum):
     DATA_END = 0x0F
 
 
-class Damage(Exception):
+class DamageError(Exception):
     """A log that contradicts itself, at a byte offset of the file."""
 
     def __init__(self, offset: int, kind: str) -> None:
@@ -56,7 +56,7 @@ class Cursor:
     def _take(self, size: int) -> memoryview:
         end = self._at + size
         if end > len(self._body):
-            raise Damage(self._offset, f"a field runs past the end of its {self._record} record")
+            raise DamageError(self._offset, f"a field runs past the end of its {self._record} record")
         part = self._body[self._at : end]
         self._at = end
         return part
@@ -78,7 +78,7 @@ class Cursor:
         try:
             return content.decode("utf-8")
         except UnicodeDecodeError:
-            raise Damage(self._offset, f"a text of a {self._record} record is not UTF-8") from None
+            raise DamageError(self._offset, f"a text of a {self._record} record is not UTF-8") from None
 
     def rest(self) -> memoryview:
         return self._take(len(self._body) - self._at)
@@ -86,13 +86,13 @@ class Cursor:
     def finish(self) -> None:
         """Fields that later versions append to a record are none of ours; unread bytes of known ones are."""
         if self._at != len(self._body):
-            raise Damage(self._offset, f"a {self._record} record is longer than its fields")
+            raise DamageError(self._offset, f"a {self._record} record is longer than its fields")
 
     def numbers(self, entry: Struct) -> list[tuple[int, ...]]:
         """An array that is prefixed by its length in bytes."""
         content = self._take(self.u32())
         if len(content) % entry.size:
-            raise Damage(self._offset, f"an array of a {self._record} record ends inside an entry")
+            raise DamageError(self._offset, f"an array of a {self._record} record ends inside an entry")
         return list(entry.iter_unpack(content))
 
 
@@ -146,7 +146,7 @@ def parse_schema(body: memoryview, offset: int) -> Schema:
     cursor = Cursor(body, offset, "Schema")
     schema_id = cursor.u16()
     if schema_id == 0:
-        raise Damage(offset, "a Schema record has the id 0")
+        raise DamageError(offset, "a Schema record has the id 0")
     name, encoding = cursor.text(), cursor.text()
     data = bytes(cursor.data(cursor.u32()))
     cursor.finish()
@@ -185,7 +185,7 @@ def parse_message_index(body: memoryview, offset: int) -> tuple[int, memoryview]
     entries = cursor.data(cursor.u32())
     cursor.finish()
     if len(entries) % 16:
-        raise Damage(offset, "the array of a MessageIndex record ends inside an entry")
+        raise DamageError(offset, "the array of a MessageIndex record ends inside an entry")
     return channel_id, entries
 
 
@@ -219,4 +219,4 @@ def parse_attachment_lengths(head: memoryview, length: int, offset: int) -> None
     cursor.text()
     size = cursor.u64()
     if cursor._at + size + 4 != length:
-        raise Damage(offset, "the content of an Attachment record does not fill it")
+        raise DamageError(offset, "the content of an Attachment record does not fill it")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import polars as pl
 
@@ -12,11 +13,11 @@ from pipeline.ingest import files
 from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.generic import NotDecodable, decoder_for, undecodable
+from pipeline.ingest.generic import UndecodableError, decoder_for, undecodable
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
-from pipeline.ingest.mcap_records import Damage
+from pipeline.ingest.mcap_records import DamageError
 from pipeline.ingest.mcap_walk import McapWalk
 from pipeline.ingest.plan import Sample, candidates, is_candidate, settle, source_of
 from pipeline.ingest.reader import SourceReader
@@ -53,7 +54,7 @@ def sample_of(messages: Messages, channel: Channel) -> Sample:
     """The fields of the channel's first message."""
     try:
         return Sample(channel, fields_of(decoder_for(channel)(messages.payload(0))))
-    except NotDecodable as error:
+    except UndecodableError as error:
         raise undecodable(channel, messages, 0, error) from None
 
 
@@ -77,18 +78,24 @@ def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
     )
 
 
-def walk_log(path: files.Address, config: IngestConfig, streams: McapStreams, on_bytes: object) -> McapWalk:
+class BlockSink(Protocol):
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None: ...
+
+
+def walk_log(
+    path: files.Address, config: IngestConfig, streams: BlockSink, on_bytes: Callable[[bytes], object]
+) -> McapWalk:
     """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind."""
     limit = int(config.chunk_limit_mib * _MIB)
     try:
         with files.open_binary(path) as stream:
-            window = ByteWindow(stream, files.size_of(path), on_bytes)  # type: ignore[arg-type]
+            window = ByteWindow(stream, files.size_of(path), on_bytes)
             walk = McapWalk(window, str(path), limit)
             for block in walk.blocks():
                 streams.add(block, walk.channels)
             window.drain()
         _check_data_crc(path, walk)
-    except Damage as damage:
+    except DamageError as damage:
         raise InputError(
             str(damage), place=str(path), remedy="Record or copy the log again, or try `mcap recover`."
         ) from None
@@ -108,7 +115,7 @@ def _check_data_crc(path: files.Address, walk: McapWalk) -> None:
             crc = zlib.crc32(piece, crc)
             left -= len(piece)
     if crc != expected:
-        raise Damage(end, "the checksum of the data section does not match")
+        raise DamageError(end, "the checksum of the data section does not match")
 
 
 def _frames(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +18,7 @@ from pipeline.ingest import mcap_records as records
 from pipeline.ingest.byte_window import ByteWindow
 from pipeline.ingest.mcap_block import Block, block_of, chunk_messages, decompressed
 from pipeline.ingest.mcap_model import Channel, Schema
-from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, Damage, Op
+from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, DamageError, Op
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
 _RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
@@ -61,7 +61,7 @@ class McapWalk:
         self._summary_start: int | None = None
 
     def blocks(self) -> Iterator[Block]:
-        """All messages in order of the file. Stops at a cut, with `cut_at` set; raises `Damage`."""
+        """All messages in order of the file. Stops at a cut, with `cut_at` set; raises `DamageError`."""
         position = self._first_record()
         while position is not None:
             head = self._head(position)
@@ -83,16 +83,16 @@ class McapWalk:
     def _first_record(self) -> int | None:
         size = self._window.size
         if size == 0:
-            raise Damage(0, "the file is empty")
+            raise DamageError(0, "the file is empty")
         start = bytes(self._window.at(0, min(size, len(MAGIC))))
         if not MAGIC.startswith(start):
-            raise Damage(0, "the file does not start as MCAP does")
+            raise DamageError(0, "the file does not start as MCAP does")
         if size == len(start):
             self.cut_at = size
             return None
         head = self._head(len(MAGIC))
         if head is not None and head[0] != Op.HEADER:
-            raise Damage(len(MAGIC), "the first record is no Header")
+            raise DamageError(len(MAGIC), "the first record is no Header")
         return len(MAGIC) if head is not None else None
 
     def _head(self, position: int) -> tuple[int, int] | None:
@@ -101,17 +101,18 @@ class McapWalk:
         if left >= HEAD_SIZE:
             opcode, length = HEAD.unpack_from(self._window.at(position, HEAD_SIZE))
             if opcode == 0:
-                return self._zeros(position)
+                self._check_zeros(position)
+                return None
             if length <= left - HEAD_SIZE:
                 return opcode, length
         if left and self._window.ends_with(MAGIC):
-            raise Damage(position, "a record runs past the end of the file")
+            raise DamageError(position, "a record runs past the end of the file")
         self.cut_at = position
         return None
 
-    def _zeros(self, position: int) -> None:
+    def _check_zeros(self, position: int) -> None:
         if not self._window.is_zero_from(position):
-            raise Damage(position, "a record has the invalid opcode 0")
+            raise DamageError(position, "a record has the invalid opcode 0")
         self.cut_at = position
 
     def _loose_messages(self, position: int) -> tuple[Block, int]:
@@ -120,7 +121,8 @@ class McapWalk:
         self._check_size("message", first, position)
         self._window.at(position, HEAD_SIZE + first)
         view = self._window.available(position)
-        starts, at, room, message = [], 0, len(view) - HEAD_SIZE, int(Op.MESSAGE)
+        starts: list[int] = []
+        at, room, message = 0, len(view) - HEAD_SIZE, int(Op.MESSAGE)
         unpack = HEAD.unpack_from
         while at <= room and len(starts) < _RAW_BLOCK:
             opcode, length = unpack(view, at)
@@ -153,19 +155,20 @@ class McapWalk:
         """No record that is loaded whole may be larger than a chunk (attachments are passed by)."""
         limit = self._limit + _SLACK
         if length > limit:
-            raise Damage(
-                position, f"a {name} record declares {length} bytes, over the limit of {limit} ([ingest] chunk_limit_mib)"
+            raise DamageError(
+                position,
+                f"a {name} record declares {length} bytes, over the limit of {limit} ([ingest] chunk_limit_mib)",
             )
 
     def _other_record(self, opcode: int, position: int) -> None:
         """Unknown opcodes are skipped, by specification; known ones stand where they must not."""
         if opcode <= max(Op):
-            raise Damage(position, f"a {Op(opcode).name} record stands in the data section")
+            raise DamageError(position, f"a {Op(opcode).name} record stands in the data section")
         self.unknown_records += 1
 
     def _header(self, body: memoryview, position: int) -> None:
         if position != len(MAGIC):
-            raise Damage(position, "a second Header: is this two files in one?")
+            raise DamageError(position, "a second Header: is this two files in one?")
         cursor = records.Cursor(body, position, "Header")
         cursor.text()
         cursor.text()
@@ -173,14 +176,14 @@ class McapWalk:
     def _schema(self, body: memoryview, position: int) -> None:
         schema = records.parse_schema(body, position)
         if self._schemas.setdefault(schema.id, schema) != schema:
-            raise Damage(position, f"schema {schema.id} is defined a second time, differently")
+            raise DamageError(position, f"schema {schema.id} is defined a second time, differently")
 
     def _channel(self, body: memoryview, position: int) -> None:
         record = records.parse_channel(body, position)
         if self._definitions.setdefault(record.id, record) != record:
-            raise Damage(position, f"channel {record.id} ({record.topic}) is defined a second time, differently")
+            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined a second time, differently")
         if record.schema_id and record.schema_id not in self._schemas:
-            raise Damage(position, f"schema {record.schema_id} of topic {record.topic} is missing")
+            raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
         schema = self._schemas.get(record.schema_id)
         if record.id not in self.channels:
             self.channels[record.id] = Channel(record.id, record.topic, record.encoding, schema, self._file)
@@ -190,7 +193,7 @@ class McapWalk:
 
     def _message_index(self, body: memoryview, position: int) -> None:
         if self._pending is None:
-            raise Damage(position, "a message index follows no chunk")
+            raise DamageError(position, "a message index follows no chunk")
         self._pending.indexes.append(records.parse_message_index(body, position))
 
     def _attachment(self, length: int, position: int) -> None:
@@ -229,14 +232,14 @@ class McapWalk:
         elif opcode == Op.CHANNEL:
             self._channel(body, position)
         elif opcode <= max(Op):
-            raise Damage(position, f"a record of opcode {opcode} stands inside a chunk")
+            raise DamageError(position, f"a record of opcode {opcode} stands inside a chunk")
         else:
             self.unknown_records += 1
 
     def _counted(self, block: Block, offset: int, size: int) -> Block:
         for channel_id, messages in block.items():
             if channel_id not in self.channels:
-                raise Damage(offset, f"a message belongs to the unknown channel {channel_id}")
+                raise DamageError(offset, f"a message belongs to the unknown channel {channel_id}")
             self.message_counts[channel_id] += len(messages)
             times = messages.heads["log_time"]
             low, high = int(times.min()), int(times.max())
@@ -247,7 +250,7 @@ class McapWalk:
 
     def _summary_record(self, opcode: int, length: int, position: int) -> int | None:
         if opcode in _DATA_OPS:
-            raise Damage(position, f"a {Op(opcode).name} record stands after the end of the data")
+            raise DamageError(position, f"a {Op(opcode).name} record stands after the end of the data")
         self._check_size("summary", length, position)
         whole = self._window.at(position, HEAD_SIZE + length)
         body = whole[HEAD_SIZE:]
@@ -276,7 +279,7 @@ class McapWalk:
             pairs.append(("times", (told.start_ns, told.end_ns), self._span_ns))
         for name, expected, met in pairs:
             if expected != met:
-                raise Damage(position, f"the statistics speak of {expected} {name}, the file holds {met}")
+                raise DamageError(position, f"the statistics speak of {expected} {name}, the file holds {met}")
 
     def _footer(self, whole: memoryview, position: int) -> None:
         cursor = records.Cursor(whole[HEAD_SIZE:], position, "Footer")
@@ -284,17 +287,19 @@ class McapWalk:
         cursor.finish()
         met = self._summary_start if position != self._summary_start else 0
         if summary_start != met:
-            raise Damage(position, f"the footer places the summary at {summary_start}, it is at {met}")
+            raise DamageError(position, f"the footer places the summary at {summary_start}, it is at {met}")
         if crc and zlib.crc32(whole[:-4], self._crc) != crc:
-            raise Damage(position, "the checksum of the summary does not match")
+            raise DamageError(position, "the checksum of the summary does not match")
         end = position + len(whole)
-        closing = bytes(self._window.at(end, min(len(MAGIC), self._window.size - end))) if end < self._window.size else b""
+        closing = (
+            bytes(self._window.at(end, min(len(MAGIC), self._window.size - end))) if end < self._window.size else b""
+        )
         if closing != MAGIC:
             if not MAGIC.startswith(closing):
-                raise Damage(end, "the closing magic is wrong")
+                raise DamageError(end, "the closing magic is wrong")
             self.cut_at = end
         elif end + len(MAGIC) != self._window.size:
-            raise Damage(end + len(MAGIC), "the file goes on after its end: trailing data, or two files in one")
+            raise DamageError(end + len(MAGIC), "the file goes on after its end: trailing data, or two files in one")
         self._check_chunk_index(position)
 
     def _check_chunk_index(self, position: int) -> None:
@@ -302,12 +307,14 @@ class McapWalk:
         if not self._indexed:
             return
         if sorted(chunk.offset for chunk in self._indexed) != [chunk.offset for chunk in self._met]:
-            raise Damage(position, f"the chunk index names {len(self._indexed)} chunks, not the {len(self._met)} there are")
+            raise DamageError(
+                position, f"the chunk index names {len(self._indexed)} chunks, not the {len(self._met)} there are"
+            )
         if sorted(self._indexed, key=lambda chunk: chunk.offset) != self._met:
-            raise Damage(position, "the chunk index disagrees with the chunks")
+            raise DamageError(position, "the chunk index disagrees with the chunks")
 
 
-_HANDLERS = {
+_HANDLERS: dict[int, Callable[[McapWalk, memoryview, int], None]] = {
     Op.HEADER: McapWalk._header,
     Op.SCHEMA: McapWalk._schema,
     Op.CHANNEL: McapWalk._channel,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -57,24 +58,20 @@ def write_mcap(
     from mcap.writer import CompressionType, Writer
 
     losses: list[str] = []
-    topics = [
-        topic for stream in STREAMS for topic in _topics(run, stream, encoding, odometer_message, losses)
-    ]
+    topics = [topic for stream in STREAMS for topic in _topics(run, stream, encoding, odometer_message, losses)]
     kind = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
     try:
-        stream = path.open("wb") if isinstance(path, Path) else path
-        writer = Writer(
-            stream,
-            compression=kind[compression],
-            chunk_size=chunk_size or 1024 * 1024,
-            use_chunking=chunk_size is not None,
-            enable_crcs=checksums,
-        )
-        writer.start(profile="ros2" if encoding == "cdr" else "", library="balise")
-        _write(writer, topics)
-        writer.finish()
-        if isinstance(path, Path):
-            stream.close()
+        with path.open("wb") if isinstance(path, Path) else nullcontext(path) as stream:
+            writer = Writer(
+                stream,
+                compression=kind[compression],
+                chunk_size=chunk_size or 1024 * 1024,
+                use_chunking=chunk_size is not None,
+                enable_crcs=checksums,
+            )
+            writer.start(profile="ros2" if encoding == "cdr" else "", library="balise")
+            _write(writer, topics)
+            writer.finish()  # type: ignore[no-untyped-call]
     except OSError as error:
         raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
     return tuple(losses)
@@ -89,7 +86,7 @@ def _write(writer: object, topics: list[Topic]) -> None:
     # The running maximum orders streams among each other and leaves each stream's own order alone.
     ordered = heapq.merge(
         *(
-            zip(accumulate(topic.times_ns, max), [number] * len(topic.times_ns), range(len(topic.times_ns)))
+            [(t_ns, number, row) for row, t_ns in enumerate(accumulate(topic.times_ns, max))]
             for number, topic in enumerate(topics)
         )
     )
@@ -128,10 +125,7 @@ def _gnss_topics(frame: pl.DataFrame, encoding: Encoding, losses: list[str]) -> 
     losses += _lost("gnss", frame, payloads.GNSS_IN_STANDARD)
     names = frame["solution"].unique(maintain_order=True).to_list()
     parts = [(name, frame.filter(pl.col("solution") == name)) for name in names]
-    return [
-        _gnss_topic("/gnss" if len(parts) == 1 else f"/{name}", part, encoding, losses)
-        for name, part in parts
-    ]
+    return [_gnss_topic("/gnss" if len(parts) == 1 else f"/{name}", part, encoding, losses) for name, part in parts]
 
 
 def _gnss_topic(topic: str, frame: pl.DataFrame, encoding: Encoding, losses: list[str]) -> Topic:
@@ -159,9 +153,7 @@ def _odometer_topic(frame: pl.DataFrame, message: OdometerMessage, losses: list[
 
 def _lost(stream: Stream, frame: pl.DataFrame, kept: set[str]) -> list[str]:
     return [
-        f"{stream}.{name}"
-        for name in frame.columns
-        if name not in kept and frame[name].null_count() < frame.height
+        f"{stream}.{name}" for name in frame.columns if name not in kept and frame[name].null_count() < frame.height
     ]
 
 

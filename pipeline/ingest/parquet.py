@@ -64,9 +64,7 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[Breach]) ->
         return _frame(pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True), stream)
     except (pa.ArrowException, pl.exceptions.PolarsError, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        breaches.append(
-            Breach(place, f"cannot be read as Parquet ({reason})", remedy="Record or copy the file again.")
-        )
+        breaches.append(Breach(place, f"cannot be read as Parquet ({reason})", remedy="Record or copy the file again."))
         return None
 
 
@@ -77,12 +75,9 @@ def _frame(file: Any, stream: Stream) -> pl.DataFrame:
         raise ValueError("a column name stands twice")
     known = [name for name in names if name in STREAM_SCHEMAS[stream].columns()]
     groups = [
-        pl.DataFrame(pl.from_arrow(file.read_row_group(index, columns=known)))
-        for index in range(file.num_row_groups)
+        pl.DataFrame(pl.from_arrow(file.read_row_group(index, columns=known))) for index in range(file.num_row_groups)
     ]
     empty = pl.DataFrame(pl.from_arrow(file.schema_arrow.empty_table()))
     frame = pl.concat([empty.select(known), *groups], rechunk=True)
     others = [pl.lit(None).alias(name) for name in names if name not in known]
     return frame.with_columns(others)
-
-

@@ -105,8 +105,10 @@ def navsatfix_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
     """sensor_msgs/NavSatFix in little-endian CDR; unknown position or height is NaN."""
     covariance = frame.select(f"cov_{axes}_m2" for axes in dict.fromkeys(_COVARIANCE))
     known = ~covariance.select(pl.any_horizontal(pl.all().is_null())).to_series().to_numpy()
-    status = frame["fix"].cast(pl.String).replace_strict(
-        {kind.value: code for kind, code in _NAVSAT_STATUS.items()}, return_dtype=pl.Int8
+    status = (
+        frame["fix"]
+        .cast(pl.String)
+        .replace_strict({kind.value: code for kind, code in _NAVSAT_STATUS.items()}, return_dtype=pl.Int8)
     )
     fields: dict[str, tuple[str, np.ndarray]] = {
         "status": ("i1", status.to_numpy()),
@@ -125,7 +127,7 @@ def twist_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
     """geometry_msgs/TwistStamped in little-endian CDR: speed as linear x."""
     zeros = np.zeros(frame.height)
     fields = {"x": ("<f8", _floats(frame["speed_mps"]))}
-    fields |= {name: ("<f8", zeros) for name in ("y", "z", "roll", "pitch", "yaw")}
+    fields |= dict.fromkeys(("y", "z", "roll", "pitch", "yaw"), ("<f8", zeros))
     return _cdr(frame["t"], frame_id, (), fields)
 
 

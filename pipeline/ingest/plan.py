@@ -72,9 +72,7 @@ def candidates(sample: Sample, config: IngestConfig) -> list[Candidate]:
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
         found += [
-            (mapped_recipe(sample, stream, mapping), mapping)
-            for mapping in mappings
-            if mapping.topic == channel.topic
+            (mapped_recipe(sample, stream, mapping), mapping) for mapping in mappings if mapping.topic == channel.topic
         ]
         if known is not None and known.stream == stream and (not mappings or known.supplement):
             found.append((known, None))
@@ -114,9 +112,7 @@ def mapped_recipe(sample: Sample, stream: Stream, mapping: StreamMapping) -> Rec
     return replace(base, columns=columns, types=types)
 
 
-def _refuse_unknown_columns(
-    stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]
-) -> None:
+def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]) -> None:
     named = {*mapping.fields, *mapping.constants, *mapping.factors}
     unknown = sorted(named - set(contract))
     if unknown:
@@ -185,9 +181,7 @@ def _times(
     return {column: first, **extra}
 
 
-def _time(
-    sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[Breach]
-) -> TimeSource:
+def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[Breach]) -> TimeSource:
     """The time of validity: as configured, else the payload's stamp, else the log time."""
     wanted = mapping.time if mapping else "auto"
     log_time = time_source((LOG_TIME,), {LOG_TIME: "int"}, mapping)
@@ -278,11 +272,7 @@ def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Bre
 
 def _with_solutions(sources: Sequence[Source]) -> list[Source]:
     """Names of solutions: as configured, `primary` for the only topic, else after the topic."""
-    topics = {
-        source.channel.topic
-        for source in sources
-        if source.stream == "gnss" and not source.recipe.supplement
-    }
+    topics = {source.channel.topic for source in sources if source.stream == "gnss" and not source.recipe.supplement}
     return [
         source
         if source.solution is not None or source.stream not in ("gnss", "satellites")

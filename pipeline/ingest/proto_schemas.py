@@ -28,18 +28,21 @@ _TYPES: dict[type[dy.Column], int] = {
 @cache
 def descriptor_set(name: str) -> bytes:
     """The serialised FileDescriptorSet of a message, with what it depends on."""
-    from google.protobuf import timestamp_pb2
-    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+    from google.protobuf import timestamp_pb2  # type: ignore[import-untyped]
+    from google.protobuf.descriptor_pb2 import (  # type: ignore[import-untyped]
+        FileDescriptorProto,
+        FileDescriptorSet,
+    )
 
     timestamp = FileDescriptorProto()
     timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
     file = FileDescriptorProto(
         name=name.replace(".", "/") + ".proto",
-        package=name.split(".")[0],
+        package=name.split(".", maxsplit=1)[0],
         syntax="proto3",
         dependency=[timestamp.name],
     )
-    message = file.message_type.add(name=name.split(".")[-1])
+    message = file.message_type.add(name=name.rsplit(".", maxsplit=1)[-1])
     if name == LOCATION_FIX:
         _add_location_fix(message)
     else:
@@ -51,8 +54,8 @@ def descriptor_set(name: str) -> bytes:
 def message_class(name: str) -> Any:
     """The class of a message, in a pool of its own."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool
-    from google.protobuf.message_factory import GetMessageClass
+    from google.protobuf.descriptor_pool import DescriptorPool  # type: ignore[import-untyped]
+    from google.protobuf.message_factory import GetMessageClass  # type: ignore[import-untyped]
 
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(descriptor_set(name)).file:
@@ -98,7 +101,4 @@ def _add_own(message: Any, stream: Stream) -> None:
 
 
 def _add_timestamp(message: Any, name: str, number: int) -> None:
-    message.field.add(
-        name=name, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=".google.protobuf.Timestamp"
-    )
-
+    message.field.add(name=name, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=".google.protobuf.Timestamp")

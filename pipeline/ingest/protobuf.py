@@ -8,7 +8,18 @@ from typing import Any
 import polars as pl
 
 from pipeline.ingest.generic import parse_path
-from pipeline.ingest.template import Constant, Field, Fixed, Flag, Template, Text, Unfit, Varint, check_type, template_of
+from pipeline.ingest.template import (
+    Constant,
+    Field,
+    Fixed,
+    Flag,
+    Template,
+    Text,
+    UnfitError,
+    Varint,
+    check_type,
+    template_of,
+)
 
 # Wire types (protobuf encoding guide).
 _VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5
@@ -66,10 +77,10 @@ class _Walk:
         for step, subtree in tree.items():
             field = descriptor.fields_by_name.get(step) if isinstance(step, str) else None
             if field is None:
-                raise Unfit(f"no field {step}")
+                raise UnfitError(f"no field {step}")
             occurrences = met.get(field.number, [])
             if len(occurrences) > 1:
-                raise Unfit("a field stands twice")
+                raise UnfitError("a field stands twice")
             if not occurrences:
                 self._absent(field, subtree)
             elif field.is_repeated:
@@ -95,9 +106,9 @@ class _Walk:
             elif wire in (_I64, _I32):
                 at += 8 if wire == _I64 else 4
             else:
-                raise Unfit("a group or unknown wire type")
+                raise UnfitError("a group or unknown wire type")
             if at > end or number == 0:
-                raise Unfit("a field runs past its message")
+                raise UnfitError("a field runs past its message")
             met.setdefault(number, []).append((wire, start, (start, at)))
         return met
 
@@ -106,28 +117,28 @@ class _Walk:
         value = 0
         for place in range(10):
             if at >= end:
-                raise Unfit("a number runs past its message")
+                raise UnfitError("a number runs past its message")
             byte = self._payload[at]
             self.static[at] = 0xFF if exact else 0x80
             value |= (byte & 0x7F) << (7 * place)
             at += 1
             if byte < 0x80:
                 return value, at
-        raise Unfit("a number of more than ten bytes")
+        raise UnfitError("a number of more than ten bytes")
 
     def _submessage(self, field: Any, tree: Mapping[Any, Any], raw: Raw) -> None:
         if raw[0] != _LEN:
-            raise Unfit("wire type")
+            raise UnfitError("wire type")
         self.message(field.message_type, tree, raw[2])
 
     def _packed(self, field: Any, tree: Mapping[Any, Any], raw: Raw) -> None:
         """Elements of a packed array of fixed width."""
         if field.type not in _FIXED_WIDTH or raw[0] != _LEN:
-            raise Unfit("an array without fixed width")
+            raise UnfitError("an array without fixed width")
         width = int(_FIXED_WIDTH[field.type][1][2])
         start, end = raw[2]
         if (end - start) % width:
-            raise Unfit("an array that ends inside an element")
+            raise UnfitError("an array that ends inside an element")
         for index, subtree in tree.items():
             offset = start + width * index if isinstance(index, int) else end
             if offset < end:
@@ -146,7 +157,7 @@ class _Walk:
         if wire == _VARINT and field.type in _VARINTS:
             bits, signed, zigzag = _VARINTS[field.type]
             return Varint(offset, end - start, bits, signed, zigzag)
-        raise Unfit("wire type")
+        raise UnfitError("wire type")
 
     def _absent(self, field: Any, tree: Mapping[Any, Any]) -> None:
         """A field that is left out: null where presence is known or it is an array, else the default."""
@@ -169,5 +180,5 @@ class _Walk:
     def _keep(self, tree: Mapping[Any, Any], field: Field) -> None:
         path = tree.get("")
         if path is None or len(tree) > 1:
-            raise Unfit("a field is used as a message")
+            raise UnfitError("a field is used as a message")
         self.fields[path] = check_type(field, self._types[path])

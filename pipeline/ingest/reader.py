@@ -13,7 +13,7 @@ from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
-from pipeline.ingest.template import Part, Rows, Template, TemplateDecoder, Unfit, Values, joined_rows
+from pipeline.ingest.template import Part, Rows, Template, TemplateDecoder, UnfitError, Values, joined_rows
 from schemas.errors import InputError
 
 ORDINAL = "(ordinal)"  # place of a message in the file
@@ -42,7 +42,7 @@ def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder | 
             from pipeline.ingest.protobuf import ProtobufWalk
 
             return TemplateDecoder(ProtobufWalk(protobuf_descriptor(channel), types))
-    except (Unfit, UnicodeDecodeError):
+    except (UnfitError, UnicodeDecodeError):
         return None
     return None
 
@@ -56,9 +56,7 @@ class SourceReader:
         self._decoder = None if source.recipe.rows else decoder_of(source.channel, source.types)
         used = {name for time in source.times.values() for name in time.fields}
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
-        self._columns: dict[str, list[Values]] = {
-            name: [] for name in (ORDINAL, *self._times, *source.types)
-        }
+        self._columns: dict[str, list[Values]] = {name: [] for name in (ORDINAL, *self._times, *source.types)}
         self._template: Template | None = None
         self._waiting: list[Rows] = []
         self._waiting_rows = 0
@@ -83,9 +81,7 @@ class SourceReader:
         for rest in left:
             self._take_fields()
             self.slow_messages += len(rest)
-            frame, numbers = decode_columns(
-                self.source.channel, rest, self.source.types, self.source.recipe.rows
-            )
+            frame, numbers = decode_columns(self.source.channel, rest, self.source.types, self.source.recipe.rows)
             if numbers:
                 self._note(rest.chosen(np.array(numbers, dtype=np.int64)))
                 self._keep(frame.to_dict())
@@ -102,7 +98,7 @@ class SourceReader:
             return
         try:
             self._keep(self._template.values(joined_rows(waiting)))
-        except Unfit as error:
+        except UnfitError as error:
             raise InputError(f"holds what cannot be decoded: {error}", place=self.source.channel.place) from None
 
     def _keep(self, values: Mapping[str, Any]) -> None:

@@ -24,7 +24,8 @@ class Recipe:
 
     `stamps` names the fields that hold times (absent: the log time), `types` the types of fields that
     are not floats. `key` names the fields by which a `supplement` (a message that holds
-    further columns of the same epochs, such as a covariance) finds its epoch. `time` is set where the time is a calendar.
+    further columns of the same epochs, such as a covariance) finds its epoch. `time` is set where the
+    time is a calendar.
     `rows` names an array whose elements become one row each; paths are then looked up in the element
     first.
     """
@@ -62,9 +63,7 @@ def unless(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
 def covariance_enu(known: pl.Expr, path: str = "position_covariance") -> dict[str, pl.Expr]:
     """Upper triangle of a row-major east-north-up covariance [m2]."""
     places = {"ee": 0, "en": 1, "eu": 2, "nn": 4, "nu": 5, "uu": 8}
-    return {
-        f"cov_{axes}_m2": pl.when(known).then(pl.col(f"{path}[{place}]")) for axes, place in places.items()
-    }
+    return {f"cov_{axes}_m2": pl.when(known).then(pl.col(f"{path}[{place}]")) for axes, place in places.items()}
 
 
 def position_unless_no_fix(path: str, status: pl.Expr) -> pl.Expr:

@@ -88,9 +88,7 @@ OWN_SCHEMAS: dict[Stream, str] = {
     stream: OWN_PREFIX + "".join(part.capitalize() for part in stream.split("_")) for stream in STREAMS
 }
 BY_SCHEMA: dict[str, tuple[Recipe, ...]] = (
-    _COMMON
-    | recipes_drivers.BY_SCHEMA
-    | {OWN_SCHEMAS[stream]: (own_recipe(stream),) for stream in STREAMS}
+    _COMMON | recipes_drivers.BY_SCHEMA | {OWN_SCHEMAS[stream]: (own_recipe(stream),) for stream in STREAMS}
 )
 OWN_TOPICS: dict[str, Stream] = {f"/{stream}": stream for stream in STREAMS}
 

@@ -116,9 +116,7 @@ def _ublox_columns(h_acc: str, v_acc: str, velocity: tuple[str, str, str], satel
 
 def _ubx_nav_pvt() -> Recipe:
     """ublox_ubx_msgs/msg/UBXNavPVT: flags taken apart into fields."""
-    fix = _ublox_fix(
-        pl.col("gps_fix.fix_type"), pl.col("gnss_fix_ok"), pl.col("diff_soln"), pl.col("carr_soln.status")
-    )
+    fix = _ublox_fix(pl.col("gps_fix.fix_type"), pl.col("gnss_fix_ok"), pl.col("diff_soln"), pl.col("carr_soln.status"))
     return Recipe(
         stream="gnss",
         stamps={"t": "header.stamp"},
@@ -243,9 +241,7 @@ BY_SCHEMA: dict[str, tuple[Recipe, ...]] = {
     "ublox_ubx_msgs/msg/UBXNavSat": (
         _nav_sat({"t": "header.stamp"}, "sv_info", pl.col("flags.sv_used"), {"flags.sv_used": pl.Boolean()}),
     ),
-    "ublox_msgs/msg/NavSAT": (
-        _nav_sat({}, "sv", (pl.col("flags") & 8) == 8, {"flags": pl.Int64()}),
-    ),
+    "ublox_msgs/msg/NavSAT": (_nav_sat({}, "sv", (pl.col("flags") & 8) == 8, {"flags": pl.Int64()}),),
     "novatel_oem7_msgs/msg/BESTPOS": (_bestpos(),),
     "gps_msgs/msg/GPSFix": (_gps_fix(),),
 }

@@ -58,18 +58,14 @@ class TimeSource:
         return (first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round().cast(pl.Int64)
 
 
-def time_source(
-    parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamMapping | None
-) -> TimeSource:
+def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamMapping | None) -> TimeSource:
     """How the stamp made of these fields is read."""
     by_kind: dict[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
     records = (LOG_TIME, PUBLISH_TIME)
     types = {path: by_kind[kinds[path]] for path in parts if path not in records}
     if mapping is None:
         return TimeSource(tuple(parts), types)
-    return TimeSource(
-        tuple(parts), types, mapping.factors.get("t"), mapping.time_scale, mapping.time_epoch
-    )
+    return TimeSource(tuple(parts), types, mapping.factors.get("t"), mapping.time_scale, mapping.time_epoch)
 
 
 @dataclass(frozen=True)
@@ -95,5 +91,5 @@ class CivilTime:
         whole = pl.datetime(year, month, day, hour, minute, time_unit="ns", time_zone="UTC")
         known = (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (year >= 1980)
         at = whole.to_physical() + second * 1_000_000_000 + pl.col(self.nanoseconds)
-        t = frame.select(pl.when(known).then(at).cast(pl.Datetime("ns", "UTC")).alias(name)).to_series()
-        return t
+        instant = pl.when(known).then(at).cast(pl.Datetime("ns", "UTC"))
+        return frame.select(instant.alias(name)).to_series()

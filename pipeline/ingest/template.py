@@ -24,7 +24,7 @@ Values = npt.NDArray[Any] | pl.Series
 Bools = npt.NDArray[np.bool_]
 
 
-class Unfit(Exception):
+class UnfitError(Exception):
     """A message or field that has no fixed layout, or not the type asked for."""
 
 
@@ -40,9 +40,7 @@ class Rows:
         for first, content in self.stretches:
             width = content.shape[1]
             if first <= offset < first + width:
-                return np.ndarray(
-                    (self.count,), dtype, content.data, offset=offset - first, strides=(width,)
-                )
+                return np.ndarray((self.count,), dtype, content.data, offset=offset - first, strides=(width,))
         raise AssertionError("a layout asks for bytes that it did not name")
 
     def chosen(self, rows: Bools) -> Rows:
@@ -86,7 +84,8 @@ class Flag:
         return self.offset + 1
 
     def values(self, rows: Rows) -> Values:
-        return rows.at(self.offset, "u1") != 0
+        flags: Bools = rows.at(self.offset, "u1") != 0
+        return flags
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ class Text:
         try:
             texts.validate(full=True)  # refuses what is not UTF-8
         except pa.ArrowInvalid:
-            raise Unfit("a text is not UTF-8") from None
+            raise UnfitError("a text is not UTF-8") from None
         return pl.Series(pl.from_arrow(texts))
 
 
@@ -172,7 +171,7 @@ def check_type(field: Field, dtype: pl.DataType) -> Field:
     }
     if isinstance(field, Constant) or fits[type(dtype)]:
         return field
-    raise Unfit(f"not of type {dtype}")
+    raise UnfitError(f"not of type {dtype}")
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ _NEAR = 64  # bytes between two fields that are cheaper to copy along than to go
 def template_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) -> Template:
     """A template from one message; `static` masks the bits that shape the layout."""
     if len(payload) < 8:
-        raise Unfit("too short")
+        raise UnfitError("too short")
     offsets = [*range(0, len(payload) - 8, 8), len(payload) - 8]
     checks = []
     for offset in offsets:
@@ -256,11 +255,7 @@ class TemplateDecoder:
     def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]:
         """Messages whose layout is known, and those that no layout fits."""
         parts: list[Part] = []
-        left = [
-            rest
-            for length, group in _by_length(messages)
-            if len(rest := self._decode_group(length, group, parts))
-        ]
+        left = [rest for length, group in _by_length(messages) if len(rest := self._decode_group(length, group, parts))]
         return parts, left
 
     def _decode_group(self, length: int, messages: Messages, parts: list[Part]) -> Messages:
@@ -286,7 +281,7 @@ class TemplateDecoder:
             return False
         try:
             known.append(self._walk(payload))
-        except Unfit:
+        except UnfitError:
             return False
         self._count += 1
         return True

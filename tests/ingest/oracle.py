@@ -88,9 +88,7 @@ def _covariance(values, kind: int) -> dict[str, float | None]:
 
 
 def _frame(rows: list[dict[str, object]]) -> pl.DataFrame:
-    schema = {
-        name: pl.Int64 if name == "t" else pl.String if name == "fix" else pl.Float64 for name in rows[0]
-    }
+    schema = {name: pl.Int64 if name == "t" else pl.String if name == "fix" else pl.Float64 for name in rows[0]}
     return pl.DataFrame(rows, schema=schema)
 
 

@@ -83,7 +83,9 @@ def header() -> bytes:
 
 
 def schema(schema_id: int = 1, name: str = "balise.Gnss", encoding: str = "jsonschema", data: bytes = b"{}") -> bytes:
-    return record(0x03, struct.pack("<H", schema_id) + text(name) + text(encoding) + struct.pack("<I", len(data)) + data)
+    return record(
+        0x03, struct.pack("<H", schema_id) + text(name) + text(encoding) + struct.pack("<I", len(data)) + data
+    )
 
 
 def channel(channel_id: int = 1, schema_id: int = 1, topic: str | bytes = "/gnss", encoding: str = "json") -> bytes:
@@ -107,9 +109,13 @@ def position(number: int = 0, **fields: object) -> bytes:
     return json.dumps({key: value for key, value in (values | fields).items() if value is not None}).encode()
 
 
-def chunk(records: bytes, compression: str = "", crc: int | None = None, size: int | None = None, packed: bytes | None = None) -> bytes:
+def chunk(
+    records: bytes, compression: str = "", crc: int | None = None, size: int | None = None, packed: bytes | None = None
+) -> bytes:
     data = packed if packed is not None else records
-    body = struct.pack("<QQQI", START_NS, START_NS, len(records) if size is None else size, zlib.crc32(records) if crc is None else crc)
+    body = struct.pack(
+        "<QQQI", START_NS, START_NS, len(records) if size is None else size, zlib.crc32(records) if crc is None else crc
+    )
     return record(0x06, body + text(compression) + struct.pack("<Q", len(data)) + data)
 
 

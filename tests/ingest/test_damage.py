@@ -161,7 +161,10 @@ def test_message_indexes(tmp_path):
 
 
 def test_unknown_opcodes_are_skipped(tmp_path):
-    log = read(tmp_path, whole(record(0x80, b"private"), definitions(), record(0x42, b""), chunk(record(0x90, b"z") + some_messages())))
+    log = read(
+        tmp_path,
+        whole(record(0x80, b"private"), definitions(), record(0x42, b""), chunk(record(0x90, b"z") + some_messages())),
+    )
     assert log.gnss.height == 3
 
 
@@ -174,7 +177,18 @@ def test_one_topic_on_several_channels(tmp_path):
     assert log.gnss["solution"].unique().to_list() == ["primary"]
 
 
-@pytest.mark.parametrize("payload", [b'{"t":{"sec":1,"nsec":0},"latitude_deg":NaN,"longitude_deg":4,"fix":"sbas"}', b"", b" ", b"[]", b"{} {}", b'{"a":', b"\xff\xfe"])
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"t":{"sec":1,"nsec":0},"latitude_deg":NaN,"longitude_deg":4,"fix":"sbas"}',
+        b"",
+        b" ",
+        b"[]",
+        b"{} {}",
+        b'{"a":',
+        b"\xff\xfe",
+    ],
+)
 def test_bad_json(tmp_path, payload):
     content = whole(definitions(), some_messages(), message(payload), some_messages())
     assert "/gnss" in refused(tmp_path, content)
@@ -186,7 +200,9 @@ def test_json_with_line_breaks_and_missing_keys(tmp_path):
     assert log.gnss["latitude_deg"].to_list() == [50.0, 50.001, 50.002]
     assert log.gnss["height_m"].to_list() == [None, None, 7.0]
     assert log.notes.slow_path_messages == 3
-    assert "null in row 1" in refused(tmp_path, whole(definitions(), message(position(0)), message(position(1, fix=None))))
+    assert "null in row 1" in refused(
+        tmp_path, whole(definitions(), message(position(0)), message(position(1, fix=None)))
+    )
 
 
 def damaged_summary(content: bytes, opcode: int, change) -> bytes:
@@ -333,9 +349,7 @@ def big_endian_twist(payload: bytes) -> bytes:
     rest = 16 + length
     rest += -(rest - 4) % 8
     values = struct.unpack_from("<6d", payload, rest)
-    return (
-        b"\x00\x00\x00\x00" + struct.pack(">iII", sec, nsec, length) + payload[16:rest] + struct.pack(">6d", *values)
-    )
+    return b"\x00\x00\x00\x00" + struct.pack(">iII", sec, nsec, length) + payload[16:rest] + struct.pack(">6d", *values)
 
 
 def test_no_gnss_names_what_there_is(tmp_path):

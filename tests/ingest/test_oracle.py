@@ -44,7 +44,9 @@ fixes = st.lists(
     max_size=25,
 )  # fmt: skip
 speeds = st.lists(
-    st.fixed_dictionaries({"stamp": stamps, "speed": finite, "frame": names, "child": names, "log_time": st.integers(0, 2**62)}),
+    st.fixed_dictionaries(
+        {"stamp": stamps, "speed": finite, "frame": names, "child": names, "log_time": st.integers(0, 2**62)}
+    ),
     max_size=25,
 )
 containers = st.fixed_dictionaries(

@@ -1,0 +1,261 @@
+"""What a log holds, what would be made of it, and what is left over: for `balise inspect`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import polars as pl
+
+from pipeline.ingest import files
+from pipeline.ingest.generic import UndecodableError, decoder_for
+from pipeline.ingest.inventory import fields_of
+from pipeline.ingest.mcap_block import Block, Messages
+from pipeline.ingest.mcap_model import Channel
+from pipeline.ingest.mcap_run import walk_log
+from pipeline.ingest.plan import Sample, candidates, source_of
+from pipeline.ingest.run import read_run
+from schemas.config import IngestConfig
+from schemas.errors import BaliseError, InputError
+from schemas.run import STREAMS, IngestNotes, RunLog, Stream
+
+_GAP_PERIODS = 1.5
+
+
+@dataclass(frozen=True)
+class StreamSummary:
+    """One stream, of GNSS one solution: `rate_hz` from the median step, gaps longer than 1.5 steps."""
+
+    stream: Stream
+    solution: str | None
+    rows: int
+    t_start_ns: int | None
+    t_end_ns: int | None
+    rate_hz: float | None
+    gaps: int
+    longest_gap_s: float | None
+    duplicates: int
+    out_of_order: int
+    fix_mix: Mapping[str, int]
+    columns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """One topic of an MCAP file; `mapping` is stream column to recorded fields, empty where left over."""
+
+    topic: str
+    schema: str
+    encoding: str
+    messages: int
+    rate_hz: float | None
+    stream: Stream | None
+    mapping: Mapping[str, str]
+    fields: Mapping[str, str]
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class LogDescription:
+    """What `balise inspect` shows of a log; `problems` is what keeps it from being replayed."""
+
+    path: str
+    kind: str
+    size_bytes: int
+    streams: tuple[StreamSummary, ...]
+    topics: tuple[TopicSummary, ...]
+    left_over: tuple[str, ...]
+    notes: IngestNotes
+    problems: tuple[str, ...]
+    starting_config: str
+
+
+def describe_log(path: files.Address, config: IngestConfig) -> LogDescription:
+    """Describe a run; a log that cannot be replayed is described as far as it can be read."""
+    is_mcap = files.name_of(path).endswith(".mcap")
+    topics = _topics(path, config) if is_mcap else ()
+    run: RunLog | None = None
+    problems: tuple[str, ...] = ()
+    try:
+        run = read_run(path, config)
+    except BaliseError as error:
+        problems = (str(error),)
+    summaries = tuple(_summaries(run)) if run else ()
+    notes = run.notes if run else IngestNotes()
+    left = tuple(topic.topic for topic in topics if topic.stream is None) or notes.skipped_topics
+    return LogDescription(
+        path=str(path),
+        kind="mcap" if is_mcap else "parquet",
+        size_bytes=_size(path, is_mcap),
+        streams=summaries,
+        topics=topics,
+        left_over=left,
+        notes=notes,
+        problems=problems,
+        starting_config=starting_config(topics),
+    )
+
+
+def _size(path: files.Address, is_file: bool) -> int:
+    if is_file:
+        return files.size_of(path)
+    names = [name for name in files.list_dir(path) if name.endswith(".parquet")]
+    return sum(files.size_of(files.join(path, name)) for name in names)
+
+
+def _summaries(run: RunLog) -> list[StreamSummary]:
+    summaries = []
+    for stream in STREAMS:
+        frame = run.stream(stream)
+        if frame is None:
+            continue
+        if stream != "gnss":
+            summaries.append(_summary(stream, None, frame))
+            continue
+        names = frame["solution"].unique(maintain_order=True).to_list()
+        summaries += [_summary(stream, name, frame.filter(pl.col("solution") == name)) for name in names]
+    return summaries
+
+
+def _summary(stream: Stream, solution: str | None, frame: pl.DataFrame) -> StreamSummary:
+    # Satellites share the time of their epoch: an epoch is one step.
+    t_ns = frame.to_series(0).to_physical().drop_nulls().to_numpy()
+    steps = np.diff(t_ns)
+    ordered = np.diff(np.unique(t_ns))
+    step = float(np.median(ordered)) if len(ordered) else None
+    late = ordered[ordered > _GAP_PERIODS * step] if step else ordered[:0]
+    mix = frame["fix"].value_counts().sort("fix") if stream == "gnss" else None
+    return StreamSummary(
+        stream=stream,
+        solution=solution,
+        rows=frame.height,
+        t_start_ns=int(t_ns.min()) if len(t_ns) else None,
+        t_end_ns=int(t_ns.max()) if len(t_ns) else None,
+        rate_hz=1e9 / step if step else None,
+        gaps=len(late),
+        longest_gap_s=float(late.max()) / 1e9 if len(late) else None,
+        duplicates=int((steps == 0).sum()) if stream != "satellites" else 0,
+        out_of_order=int((steps < 0).sum()),
+        fix_mix=dict(mix.iter_rows()) if mix is not None else {},
+        columns=tuple(name for name in frame.columns if frame[name].null_count() < frame.height),
+    )
+
+
+@dataclass
+class _Met:
+    """What the walk has met of one channel."""
+
+    channel: Channel
+    fields: Mapping[str, str]
+    messages: int = 0
+    span_ns: list[int] = field(default_factory=list)
+
+
+class _Census:
+    """Counts messages of all channels and looks at the first of each."""
+
+    def __init__(self) -> None:
+        self.met: dict[int, _Met] = {}
+
+    def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        for channel_id, messages in block.items():
+            if channel_id not in self.met:
+                self.met[channel_id] = _Met(channels[channel_id], _fields(channels[channel_id], messages))
+            met = self.met[channel_id]
+            times = messages.times("log_time")
+            met.messages += len(messages)
+            met.span_ns += [int(times.min()), int(times.max())]
+
+
+def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
+    try:
+        return fields_of(decoder_for(channel)(messages.payload(0)))
+    except (UndecodableError, InputError):
+        return {}
+
+
+def _topics(path: files.Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """All topics as far as the log can be read; damage is a problem that reading reports."""
+    census = _Census()
+    try:
+        walk_log(path, config, census, lambda _: None)
+    except InputError:
+        if not census.met:
+            return ()
+    return tuple(_topic(census.met[channel_id], config) for channel_id in sorted(census.met))
+
+
+def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
+    sample = Sample(met.channel, met.fields)
+    span_s = (max(met.span_ns) - min(met.span_ns)) / 1e9
+    sources = [source_of(sample, candidate) for candidate in candidates(sample, config)] if met.fields else []
+    source = next((source for source in sources if not source.dropped), None)
+    mapping = {}
+    if source is not None:
+        mapping = {name: " + ".join(time.fields) for name, time in source.times.items()}
+        mapping |= {
+            name: ", ".join(expression.meta.root_names()) or "constant" for name, expression in source.columns.items()
+        }
+    return TopicSummary(
+        topic=met.channel.topic,
+        schema=met.channel.schema_name,
+        encoding=met.channel.encoding,
+        messages=met.messages,
+        rate_hz=(met.messages - 1) / span_s if span_s > 0 else None,
+        stream=source.stream if source else None,
+        mapping=mapping,
+        fields=met.fields,
+        remark=source.recipe.remark if source else "",
+    )
+
+
+# Names that loggers give to what a stream needs, by column.
+_GUESSES: dict[Stream, dict[str, str]] = {
+    "gnss": {
+        "latitude_deg": r"lat(itude)?(_deg)?",
+        "longitude_deg": r"lo?ng?(itude)?(_deg)?",
+        "height_m": r"(alt(itude)?|height|hgt)(_m)?",
+    },
+    "odometer": {
+        "speed_mps": r"(speed|velocity|v)(_mps)?",
+        "distance_m": r"(distance|odometer|dist)(_m)?",
+    },
+}
+_NEEDED = {"gnss": {"latitude_deg", "longitude_deg"}, "odometer": set()}
+
+
+def starting_config(topics: Sequence[TopicSummary]) -> str:
+    """Configuration text that maps what is left over, as far as names allow a guess; to be checked."""
+    parts = [part for topic in topics if topic.stream is None and topic.fields for part in (_suggestion(topic),)]
+    if not parts:
+        return ""
+    return "# Check every line: names tell neither units nor what a height refers to.\n\n" + "\n".join(parts)
+
+
+def _suggestion(topic: TopicSummary) -> str:
+    for stream, guesses in _GUESSES.items():
+        found = {column: path for column, name in guesses.items() if (path := _named(topic.fields, name))}
+        if found and _NEEDED[stream] <= set(found):
+            pairs = ", ".join(f'{column} = "{path}"' for column, path in found.items())
+            return (
+                f'[[ingest.{stream}]]\ntopic = "{topic.topic}"\nfields = {{ {pairs} }}\n'
+                'time = "auto"  # or "log", "publish", "field:PATH"\n'
+                f"# other fields: {_others(topic.fields, set(found.values()))}\n"
+            )
+    return (
+        f'# [[ingest.STREAM]]\n# topic = "{topic.topic}"  # {topic.schema or "no schema"}\n'
+        f"# fields: {_others(topic.fields, set())}\n"
+    )
+
+
+def _named(fields: Mapping[str, str], pattern: str) -> str | None:
+    """The field of that name, the outermost first."""
+    numbers = [path for path, kind in fields.items() if kind in ("int", "float")]
+    fitting = [path for path in numbers if re.fullmatch(pattern, path.split(".")[-1], re.IGNORECASE)]
+    return min(fitting, key=lambda path: (path.count("."), path), default=None)
+
+
+def _others(fields: Mapping[str, str], used: set[str]) -> str:
+    return ", ".join(path for path in list(fields)[:30] if path not in used)
