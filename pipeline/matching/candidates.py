@@ -12,8 +12,8 @@ from pipeline.matching.network import Network
 from pipeline.matching.segments import on_segments
 from pipeline.track import Track
 
-# Search points along every element, ends included, are at most this far apart.
-PROBE_SPACING_M = 25.0
+# Every place on an element has a search point within this distance along it.
+PROBE_SPACING_M = 40.0
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,7 @@ def segments_of(track: Track) -> Segments:
 def candidates_of(points: Points, network: Network, segments: Segments, reach_m: float) -> Candidates:
     """For every point the nearest place on each element whose distance is within reach [m]."""
     tree = cKDTree(points.surface)
-    radius = np.hypot(reach_m, PROBE_SPACING_M / 2.0) + 1.0
-    pairs = tree.sparse_distance_matrix(segments.tree, radius, output_type="ndarray")
+    pairs = tree.sparse_distance_matrix(segments.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
     step, segment = pairs["i"].astype(np.int64), segments.probe_segment[pairs["j"]]
     order = np.lexsort((pairs["v"], segments.element[segment], step))
     step, segment = step[order], segment[order]
@@ -186,12 +185,12 @@ def _downhill(points: Points, segments: Segments, step: Ints, segment: Ints) -> 
 def _probes(start: Floats, end: Floats, element: Ints) -> tuple[Floats, Ints]:
     """Search points: along long segments several, along runs of short ones only some."""
     lengths = np.linalg.norm(end - start, axis=1)
-    pieces = np.maximum(1, np.ceil(lengths / PROBE_SPACING_M)).astype(np.int64)
+    pieces = np.maximum(1, np.ceil(lengths / (0.25 * PROBE_SPACING_M))).astype(np.int64)
     segment = np.repeat(np.arange(len(start)), pieces)
     number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     fraction = (number + 0.5) / pieces[segment]
     place = np.cumsum(lengths)[segment] - lengths[segment] * (1.0 - fraction)
-    bucket = np.floor(place / (PROBE_SPACING_M / 2.0))
+    bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
     new = np.ones(len(segment), dtype=bool)
     new[1:] = (bucket[1:] != bucket[:-1]) | (element[segment[1:]] != element[segment[:-1]])
     kept = np.flatnonzero(new)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import Floats, Ints
+from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.decode import Decoded
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
@@ -36,14 +36,11 @@ class Doubt:
 
 def doubt_of(trellis: Trellis, found: Found, decoded: Decoded) -> Doubt:
     """Probability of all states that are on the path about where the path is."""
-    own = np.zeros(len(trellis.oriented), dtype=bool)
-    elements, first = (trellis.oriented // 2).tolist(), trellis.first.tolist()
-    for step, known in enumerate(_elements_about(decoded)):
-        for state in range(first[step], first[step + 1]):
-            own[state] = elements[state] in known
-    other = np.where(own, -1.0, found.forward + found.posterior)
     count = np.diff(trellis.first)
-    worst = np.lexsort((other, np.repeat(np.arange(len(count)), count)))[trellis.first[1:] - 1]
+    step = np.repeat(np.arange(len(count)), count)
+    own = _on_path(trellis, decoded, step)
+    other = np.where(own, -1.0, found.forward + found.posterior)
+    worst = np.lexsort((other, step))[trellis.first[1:] - 1]
     return Doubt(
         posterior=_share(found.posterior * own, trellis.first),
         gate=_share(found.forward * own, trellis.first),
@@ -73,20 +70,29 @@ def no_doubt() -> pl.DataFrame:
     return pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
 
 
-def _elements_about(decoded: Decoded) -> list[set[int]]:
-    """Per step the elements of the path about it; where a leg ends, those of the next one too."""
-    around: dict[tuple[int, int], set[int]] = {}
-    keys = list(zip(decoded.leg.tolist(), decoded.number.tolist(), strict=True))
-    for leg, number in keys:
-        if (leg, number) not in around:
-            chain = decoded.chains[leg]
-            here = number - chain.low
-            part = chain.oriented[max(0, here - _NEIGHBOURS) : here + _NEIGHBOURS + 1]
-            around[leg, number] = {oriented // 2 for oriented in part}
-    about = [around[key] for key in keys]
-    for step in np.flatnonzero(np.diff(decoded.leg)).tolist():
-        about[step] = about[step + 1] = around[keys[step]] | around[keys[step + 1]]
-    return about
+def _on_path(trellis: Trellis, decoded: Decoded, step: Ints) -> Bools:
+    """States on elements of the path about where the path is at their step; where a leg ends, also those
+    of the step beyond.
+    """
+    count = trellis.network.count
+    keys, key = np.unique(np.column_stack([decoded.leg, decoded.number]), axis=0, return_inverse=True)
+    allowed = np.concatenate(
+        [index * count + _elements_about(decoded, *pair) for index, pair in enumerate(keys.tolist())]
+    )
+    element = trellis.oriented // 2
+    own = np.isin(key[step] * count + element, allowed)
+    for border in np.flatnonzero(np.diff(decoded.leg)).tolist():
+        for here, there in ((border, border + 1), (border + 1, border)):
+            states = slice(int(trellis.first[here]), int(trellis.first[here + 1]))
+            own[states] |= np.isin(key[there] * count + element[states], allowed)
+    return np.asarray(own)
+
+
+def _elements_about(decoded: Decoded, leg: int, number: int) -> Ints:
+    chain = decoded.chains[leg]
+    here = number - chain.low
+    part = chain.oriented[max(0, here - _NEIGHBOURS) : here + _NEIGHBOURS + 1]
+    return np.array(part, dtype=np.int64) // 2
 
 
 def _share(values: Floats, first: Ints) -> Floats:

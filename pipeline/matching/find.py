@@ -44,10 +44,11 @@ def find_path(
     trellis = _trellis(fixes, odometer, network, pinned, config)
     found = search(trellis)
     decoded = aligned(trellis, decode(trellis, found.best))
-    at = positions_m(decoded, legs_of(trellis, decoded))
-    if not grows_with(at, trellis.steps.epoch, travelled(fixes, odometer), config.orientation_distance_m):
-        decoded = decoded.turned(network, range(len(decoded.chains)))
     legs = legs_of(trellis, decoded)
+    way, at = travelled(fixes, odometer), positions_m(decoded, legs)
+    if not grows_with(at, trellis.steps.epoch, way, config.orientation_distance_m):
+        decoded = decoded.turned(network, range(len(decoded.chains)))
+        legs = legs_of(trellis, decoded)
     doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -76,30 +76,37 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
 
     Gaps that the site check let pass count as straight track, so that path and odometer agree.
     """
-    parts: list[_Part] = []
-    position = start_m
-    for number, visit in enumerate(visits):
-        part = _element(track, visit, number, position)
-        if parts:
-            bridge = _bridge(parts[-1], part, position)
-            if bridge is not None:
-                parts.append(bridge)
-                position = float(bridge.path_end_m[-1])
-                part = _element(track, visit, number, position)
-        parts.append(part)
-        position = float(part.path_end_m[-1])
-    joined = {item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(_Part)}
-    start, end = joined.pop("start"), joined.pop("end")
-    heading, turn = _headings(start, end, joined.pop("east"), joined.pop("north"))
-    line = polyline_of(start, end)
+    vertex = np.concatenate([_vertices(track, visit) for visit in visits])
+    count = np.array([track.first[visit.element + 1] - track.first[visit.element] for visit in visits])
+    visit = np.repeat(np.arange(len(visits)), count)
+    places = points_of(track.latitude_deg[vertex], track.longitude_deg[vertex])
+    step = np.linalg.norm(np.diff(places.surface, axis=0), axis=1)
+    border = visit[1:] != visit[:-1]
+    gap = np.where(border & (step > GAP_COUNTS_M), step, 0.0)
+    measure = track.measure_m[vertex]
+    grown = np.where(border, gap, np.abs(np.diff(measure)))
+    path = start_m + np.concatenate([[0.0], np.cumsum(grown)])
+    kept = np.flatnonzero(~border | (gap > 0))
+    head, tail = kept, kept + 1
+    heading, turn = _headings(places, head)
+    line = polyline_of(places.surface[head], places.surface[tail])
+    height, sigma = track.height_m[vertex], track.sigma_m[vertex]
     return Leg(
         visits=tuple(visits),
         line=line,
-        returns=_returns(line, joined["path_start_m"]),
+        visit=visit[tail],
+        path_start_m=path[head],
+        path_end_m=path[tail],
+        # A gap belongs to the element after it, at that element's very start.
+        measure_start_m=np.where(border[head], measure[tail], measure[head]),
+        measure_end_m=measure[tail],
+        height_start_m=height[head],
+        height_end_m=height[tail],
+        sigma_m=np.fmax(np.where(border[head], sigma[tail], sigma[head]), sigma[tail]),
         heading_deg=np.degrees(heading) % 360.0,
         turn_start_rad=np.concatenate([[0.0], turn]),
         turn_end_rad=np.concatenate([turn, [0.0]]),
-        **joined,
+        returns=_returns(line, path[head]),
     )
 
 
@@ -150,71 +157,16 @@ def _returns(line: Polyline, path_start_m: Floats) -> bool:
     return bool((np.abs(path_m[pairs[:, 0]] - path_m[pairs[:, 1]]) > HINT_WINDOW_M).any())
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Segments of one element, or of one gap between two."""
-
-    start: Floats
-    end: Floats
-    east: Floats
-    north: Floats
-    visit: Ints
-    path_start_m: Floats
-    path_end_m: Floats
-    measure_start_m: Floats
-    measure_end_m: Floats
-    height_start_m: Floats
-    height_end_m: Floats
-    sigma_m: Floats
+def _vertices(track: Track, visit: Visit) -> Ints:
+    part = np.arange(track.first[visit.element], track.first[visit.element + 1])
+    return part if visit.forward else part[::-1]
 
 
-def _element(track: Track, visit: Visit, number: int, position_m: float) -> _Part:
-    part = track.vertices(visit.element)
-    step = 1 if visit.forward else -1
-    places = points_of(track.latitude_deg[part][::step], track.longitude_deg[part][::step])
-    measure, height = track.measure_m[part][::step], track.height_m[part][::step]
-    sigma = track.sigma_m[part][::step]
-    path = position_m + np.abs(measure - measure[0])
-    return _Part(
-        start=places.surface[:-1],
-        end=places.surface[1:],
-        east=places.east[:-1],
-        north=places.north[:-1],
-        visit=np.full(len(path) - 1, number),
-        path_start_m=path[:-1],
-        path_end_m=path[1:],
-        measure_start_m=measure[:-1],
-        measure_end_m=measure[1:],
-        height_start_m=height[:-1],
-        height_end_m=height[1:],
-        sigma_m=np.fmax(sigma[:-1], sigma[1:]),
-    )
-
-
-def _bridge(before: _Part, after: _Part, position_m: float) -> _Part | None:
-    """The straight line over a gap, belonging to the element after it; none where there is no gap."""
-    gap = float(np.linalg.norm(after.start[0] - before.end[-1]))
-    if gap <= GAP_COUNTS_M:
-        return None
-    return _Part(
-        start=before.end[-1:],
-        end=after.start[:1],
-        east=after.east[:1],
-        north=after.north[:1],
-        visit=after.visit[:1],
-        path_start_m=np.array([position_m]),
-        path_end_m=np.array([position_m + gap]),
-        measure_start_m=after.measure_start_m[:1],
-        measure_end_m=after.measure_start_m[:1],
-        height_start_m=before.height_end_m[-1:],
-        height_end_m=after.height_start_m[:1],
-        sigma_m=after.sigma_m[:1],
-    )
-
-
-def _headings(start: Floats, end: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
+def _headings(places: Points, head: Ints) -> tuple[Floats, Floats]:
     """Heading of each segment, clockwise from north, and the left turn between neighbours [rad]."""
-    along = end - start
-    heading = np.arctan2(np.einsum("ij,ij->i", along, east), np.einsum("ij,ij->i", along, north))
+    along = places.surface[head + 1] - places.surface[head]
+    east = np.einsum("ij,ij->i", along, places.east[head])
+    north = np.einsum("ij,ij->i", along, places.north[head])
+    heading = np.arctan2(east, north)
     turn = -np.diff(heading)
     return heading, np.asarray((turn + np.pi) % (2.0 * np.pi) - np.pi)

@@ -45,7 +45,11 @@ class Network:
     successors: list[list[Edge]]
     usable: list[bool]
     orientable: bool
+    pairs: frozenset[tuple[int, int]] = field(init=False)
     _known: dict[int, tuple[float, dict[int, Reach]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.pairs = frozenset((one, edge.to) for one, edges in enumerate(self.successors) for edge in edges)
 
     @property
     def count(self) -> int:
@@ -66,9 +70,7 @@ class Network:
 
     def linked(self, one: int, other: int) -> bool:
         """Whether one is a direct successor of the other, either way round."""
-        return any(edge.to == other for edge in self.successors[one]) or any(
-            edge.to == one for edge in self.successors[other]
-        )
+        return (one, other) in self.pairs or (other, one) in self.pairs
 
     def linked_ends(self) -> Bools:
         """Per element, whether a relation leads on from its start and from its end."""

@@ -47,10 +47,10 @@ def search(trellis: Trellis) -> Found:
         else:
             back.append(np.argmax(best[:, None] + block.transitions, axis=0))
             best = np.max(best[:, None] + block.transitions, axis=0)
-            alpha = _log_sum(alpha[:, None] + block.transitions, axis=0)
+            alpha = np.logaddexp.reduce(alpha[:, None] + block.transitions, axis=0)
         gained = _gained(trellis, block, count)
         filtered = alpha + gained
-        filtered -= _log_sum(filtered, axis=1)[:, None]
+        filtered -= np.logaddexp.reduce(filtered, axis=1, keepdims=True)
         forward[rows] = filtered.ravel()
         alpha, best = filtered[-1], best + gained[-1]
         best = best - best.max()
@@ -86,7 +86,7 @@ def _backward(trellis: Trellis, blocks: list[_Block]) -> Floats:
     after: Floats | None = None
     for block in reversed(blocks):
         count = int(trellis.first[block.begin + 1] - trellis.first[block.begin])
-        beta = np.zeros(count) if after is None else _log_sum(after + beta[None, :], axis=1)
+        beta = np.zeros(count) if after is None else np.logaddexp.reduce(after + beta[None, :], axis=1)
         beta = beta - beta.max()
         gained = _gained(trellis, block, count)
         later = beta + gained[-1] - gained
@@ -110,8 +110,3 @@ def _normalised(log_values: Floats, first: Ints) -> Floats:
     count = np.diff(first)
     values = np.exp(log_values - np.repeat(np.maximum.reduceat(log_values, first[:-1]), count))
     return np.asarray(values / np.repeat(np.add.reduceat(values, first[:-1]), count))
-
-
-def _log_sum(values: Floats, axis: int) -> Floats:
-    top = np.max(values, axis=axis, keepdims=True)
-    return np.asarray(np.log(np.sum(np.exp(values - top), axis=axis)) + np.squeeze(top, axis=axis))

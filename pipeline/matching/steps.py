@@ -84,21 +84,30 @@ def steps_of(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig
 
 def _believable(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Bools:
     """Steps that the train can have reached from the last believed one; after `jump_hold_s` any."""
-    place, t_s = fixes.points.surface[rows], fixes.t_s[rows]
-    sigma = np.sqrt(0.5 * (fixes.cov_ee_m2[rows] + fixes.cov_nn_m2[rows]))
-    by_odometer, stretch = way.distance_m[rows], way.stretch[rows]
-    believed = np.zeros(len(rows), dtype=bool)
-    last = 0
-    for row in range(len(rows)):
-        apart = float(np.sqrt(((place[row] - place[last]) ** 2).sum()))
-        elapsed = float(t_s[row] - t_s[last])
-        moved = abs(float(by_odometer[row] - by_odometer[last]))
-        known = np.isfinite(moved) and stretch[row] == stretch[last]
-        limit = moved * (1 + _ODOMETER_SHARE) if known else elapsed * _TOP_SPEED_MPS
-        limit += _JUMP_MARGIN_M + _JUMP_SIGMAS * float(sigma[row] + sigma[last])
-        if apart <= limit or elapsed > config.jump_hold_s:
-            believed[row], last = True, row
+    believed = np.ones(len(rows), dtype=bool)
+    doubtful = np.flatnonzero(~_reachable(fixes, rows[:-1], rows[1:], way, config))
+    while len(doubtful):
+        # Follow the first doubtful step until one is believed again; from there the pairs above hold.
+        last = int(doubtful[0])
+        later = np.flatnonzero(
+            _reachable(fixes, np.full(len(rows) - last - 1, rows[last]), rows[last + 1 :], way, config)
+        )
+        again = last + 1 + int(later[0]) if len(later) else len(rows)
+        believed[last + 1 : again] = False
+        doubtful = doubtful[doubtful >= again]
     return believed
+
+
+def _reachable(fixes: Fixes, rows: Ints, others: Ints, way: Travelled, config: MatchingConfig) -> Bools:
+    """Whether the train can have been at the positions of both epochs, by odometer or else by top speed."""
+    apart = np.linalg.norm(fixes.points.surface[others] - fixes.points.surface[rows], axis=1)
+    elapsed = fixes.t_s[others] - fixes.t_s[rows]
+    moved = np.abs(way.between(rows, others))
+    variance = 0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)
+    sigma = np.sqrt(variance[rows]) + np.sqrt(variance[others])
+    limit = np.where(np.isfinite(moved), moved * (1 + _ODOMETER_SHARE), elapsed * _TOP_SPEED_MPS)
+    limit += _JUMP_MARGIN_M + _JUMP_SIGMAS * sigma
+    return np.asarray((apart <= limit) | (elapsed > config.jump_hold_s))
 
 
 def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
