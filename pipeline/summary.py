@@ -204,19 +204,24 @@ def _distance_m(epochs: pl.DataFrame) -> float | None:
     return float(stretches["path_m"].sum())
 
 
+def usable() -> pl.Expr:
+    """An epoch with a position on the track."""
+    return pl.col("path_m").is_not_null() & pl.col("on_track")
+
+
+def trusted(config: Configuration) -> pl.Expr:
+    """An epoch whose position is valid, confident and unambiguous (CONTRACT section 3, `mtbf_h`)."""
+    confident = pl.col("confidence_m") <= config.lds.ci_limit_m
+    return usable() & confident & (pl.col("gate_probability") >= config.matching.ambiguity_probability)
+
+
 def _positions(epochs: pl.DataFrame, clock: _Clock, config: Configuration) -> Row:
     """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8)."""
-    usable = pl.col("path_m").is_not_null() & pl.col("on_track")
-    trusted = (
-        usable
-        & (pl.col("confidence_m") <= config.lds.ci_limit_m)
-        & (pl.col("gate_probability") >= config.matching.ambiguity_probability)
-    )
-    lost = outages_s(clock.t_ns, _flags(epochs, usable), clock.limit_s)
+    lost = outages_s(clock.t_ns, _flags(epochs, usable()), clock.limit_s)
     distance = _floats(epochs, "odometer_m")
     speed = _floats(epochs, "speed_mps")
     moving = moved(clock.t_ns, distance, speed, config.matching.deadband_mps)
-    mtbf_h = uptime(clock.t_ns, _flags(epochs, trusted), clock.limit_s).mean_time_between_losses_h
+    mtbf_h = uptime(clock.t_ns, _flags(epochs, trusted(config)), clock.limit_s).mean_time_between_losses_h
     return {
         "availability": availability(clock.t_ns, _flags(epochs, pl.col("tvb")), moving, clock.limit_s),
         "outages": len(lost),

@@ -116,8 +116,64 @@ def _accuracy_schema() -> type[dy.Schema]:
 
 CampaignAccuracy = _accuracy_schema()
 
+
+def _figures_schema() -> type[dy.Schema]:
+    columns: dict[str, dy.Column] = {
+        "solution": text("solution"),
+        "runs": count("runs that were replayed"),
+        "runs_failed": count("runs that could not be, of all solutions"),
+        "hours": real("h", "recorded time", min=0),
+        "hours_with_evidence": real("h", "of this in runs with any evidence", min=0),
+        "hours_with_truth": real("h", "of this in runs with a reference or balise reads", min=0),
+        "hazards": count("faults; the rows that belong to one fault count once"),
+        **_estimate("hazard_rate", "faults per hour with evidence", "1/h", "_per_h"),
+        "failures": count("faults with a position failure"),
+        "missed": count("of these not negated within the budget"),
+        **_estimate("missed_share", "share of failures not negated within the budget"),
+        "missed_rate_upper_per_h": real("1/h", "one-sided 95 % upper bound of missed failures per hour", min=0),
+        "hours_judged": real("h", "time in runs whose alarms all have a verdict", min=0),
+        "false_alarms": count("false alarms in it"),
+        **_estimate("false_alarm_rate", "false alarms per judged hour", "1/h", "_per_h"),
+        "accepted": count("virtual balises accepted"),
+        "unsafe_accepted": count("of these beyond the failure limit"),
+        "outages": count("stretches without a usable position"),
+        **_estimate("outage_rate", "outages per hour", "1/h", "_per_h"),
+        "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
+        "hours_needed": real("h", "hours that show THR_VB at 95 % with this many misses", min=0),
+        "hours_still_needed": real("h", "of these still to run without a further miss", min=0),
+    }
+    doc = "One row per solution: what the campaign measured, with exact bounds, and what it cannot show."
+    return type("CampaignFigures", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
+
+
+CampaignFigures = _figures_schema()
+
+
+class CampaignDetection(dy.Schema):
+    """Measured hazardous time and T_D against the allowed T_D of every service level (TVB eq. 7)."""
+
+    solution = text("solution")
+    service_level = text("service level of the configuration")
+    allowed_s = real("s", "allowed T_D", min=0)
+    failures = count("faults with a position failure")
+    within = count("of these negated within the allowed T_D")
+    within_share = real("1", "share of failures negated within it", min=0)
+    within_share_low = real("1", "share of failures negated within it: lower 95 % bound", min=0)
+    within_share_high = real("1", "share of failures negated within it: upper 95 % bound", min=0)
+    never_negated = count("failures that were never negated; the quantiles leave them out")
+    hazardous_median_s = real("s", "median of the hazardous time", min=0)
+    hazardous_p95_s = real("s", "95 % of the hazardous time", min=0)
+    hazardous_max_s = real("s", "longest hazardous time", min=0)
+    detected = count("faults that a monitor detected")
+    time_to_detect_median_s = real("s", "median of T_D")
+    time_to_detect_p95_s = real("s", "95 % of T_D")
+    time_to_detect_max_s = real("s", "largest T_D")
+
+
 CAMPAIGN_TABLES: dict[str, type[dy.Schema]] = {
     "campaign_runs": CampaignRuns,
     "campaign_balises": CampaignBalises,
     "campaign_accuracy": CampaignAccuracy,
+    "campaign_figures": CampaignFigures,
+    "campaign_detection": CampaignDetection,
 }

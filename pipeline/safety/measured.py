@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataframely as dy
 import polars as pl
 
 from pipeline.safety.episodes import independent_episodes
@@ -13,7 +14,9 @@ from pipeline.statistics import (
     poisson_rate,
     poisson_rate_upper,
 )
+from schemas.campaign import CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
+from schemas.conform import conform
 from schemas.enums import Evidence, RunStatus
 
 Row = dict[str, object]
@@ -30,38 +33,9 @@ def columns_of(name: str, estimate: Estimate, unit: str = "") -> Row:
     }
 
 
-_FIGURES: dict[str, pl.DataType | type[pl.DataType]] = {
-    "solution": pl.String,
-    "runs": pl.Int64,
-    "runs_failed": pl.Int64,
-    "hours": pl.Float64,
-    "hours_with_evidence": pl.Float64,
-    "hours_with_truth": pl.Float64,
-    "hazards": pl.Int64,
-    "hazard_rate_per_h": pl.Float64,
-    "hazard_rate_low_per_h": pl.Float64,
-    "hazard_rate_high_per_h": pl.Float64,
-    "failures": pl.Int64,
-    "missed": pl.Int64,
-    "missed_share": pl.Float64,
-    "missed_share_low": pl.Float64,
-    "missed_share_high": pl.Float64,
-    "missed_rate_upper_per_h": pl.Float64,
-    "hours_judged": pl.Float64,
-    "false_alarms": pl.Int64,
-    "false_alarm_rate_per_h": pl.Float64,
-    "false_alarm_rate_low_per_h": pl.Float64,
-    "false_alarm_rate_high_per_h": pl.Float64,
-    "accepted": pl.Int64,
-    "unsafe_accepted": pl.Int64,
-    "outages": pl.Int64,
-    "outage_rate_per_h": pl.Float64,
-    "outage_rate_low_per_h": pl.Float64,
-    "outage_rate_high_per_h": pl.Float64,
-    "thr_vb_per_h": pl.Float64,
-    "hours_needed": pl.Float64,
-    "hours_still_needed": pl.Float64,
-}
+def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
+    dtypes = {name: column.dtype for name, column in contract.columns().items()}
+    return conform(pl.DataFrame(rows, schema=dtypes), contract)
 
 
 def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
@@ -80,7 +54,7 @@ def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyCo
         | _figures(part, episodes.filter(pl.col("solution") == solution), config.thr_vb_per_h)
         for (solution,), part in sorted(done.group_by("solution"), key=lambda item: str(item[0][0]))
     ]
-    return pl.DataFrame(rows, schema=_FIGURES)
+    return _table(rows, CampaignFigures)
 
 
 def _hours(runs: pl.DataFrame) -> float:
@@ -117,26 +91,6 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
     }
 
 
-_BY_LEVEL: dict[str, pl.DataType | type[pl.DataType]] = {
-    "solution": pl.String,
-    "service_level": pl.String,
-    "allowed_s": pl.Float64,
-    "failures": pl.Int64,
-    "within": pl.Int64,
-    "within_share": pl.Float64,
-    "within_share_low": pl.Float64,
-    "within_share_high": pl.Float64,
-    "never_negated": pl.Int64,
-    "hazardous_median_s": pl.Float64,
-    "hazardous_p95_s": pl.Float64,
-    "hazardous_max_s": pl.Float64,
-    "detected": pl.Int64,
-    "time_to_detect_median_s": pl.Float64,
-    "time_to_detect_p95_s": pl.Float64,
-    "time_to_detect_max_s": pl.Float64,
-}
-
-
 def detection_by_level(hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
     """Measured T_D and hazardous time against the allowed T_D of every service level (TVB eq. 7).
 
@@ -151,7 +105,7 @@ def detection_by_level(hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFr
         for solution in solutions
         for level in config.service_levels
     ]
-    return pl.DataFrame(rows, schema=_BY_LEVEL)
+    return _table(rows, CampaignDetection)
 
 
 def _quantiles(values: pl.Series, name: str) -> Row:
