@@ -1,0 +1,72 @@
+"""One hour of ROS 2 log to all tables on disk, against reading the log, and against the obvious notebook."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import zstandard
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+
+from benchmarks.notebook import notebook
+from benchmarks.results import Figure, best_of, stopwatch
+from benchmarks.trials import write_cdr_trial
+from pipeline.campaign import make_plan, run_campaign
+from schemas.enums import RunStatus
+
+TIMES_READING = 8.0
+TIMES_NOTEBOOK = 30.0
+MEMORY_ONE_HOUR_MB, MEMORY_TEN_HOURS_MB = 600.0, 2500.0
+
+
+def measure(folder: Path) -> list[Figure]:
+    """Figures of one hour; memory of one and ten hours in processes of their own."""
+    hour = folder / "one-hour"
+    log, site = write_cdr_trial(hour, 1.0, balises=20), hour / "site"
+    plan = make_plan([str(log)], site, hour / "out")
+    if run_campaign(plan, force=True).count(RunStatus.OK) != 1:
+        raise RuntimeError(f"the run of {log} is not ok: its time means nothing")
+    replay_s = best_of(3, lambda: run_campaign(plan, force=True))
+    reading_s = best_of(3, lambda: read_and_decompress(log))
+    with stopwatch() as by_notebook:
+        notebook(log, site, hour / "notebook")
+    with stopwatch() as command:
+        peak_mb = _command_peak_mb(log, site, hour / "command")
+    ten = folder / "ten-hours"
+    ten_mb = _command_peak_mb(write_cdr_trial(ten, 10.0, balises=200), ten / "site", ten / "out")
+    return [
+        Figure("log of one hour", log.stat().st_size / 1e6, "MB"),
+        Figure("read and decompress", reading_s, "s"),
+        Figure("log to tables, warm", replay_s, "s"),
+        Figure("log to tables / read and decompress", replay_s / reading_s, "times", TIMES_READING),
+        Figure("obvious notebook", by_notebook.seconds, "s"),
+        Figure("notebook / log to tables", by_notebook.seconds / replay_s, "times", TIMES_NOTEBOOK, "above"),
+        Figure("whole command", command.seconds, "s"),
+        Figure("peak memory, one hour", peak_mb, "MB", MEMORY_ONE_HOUR_MB),
+        Figure("peak memory, ten hours", ten_mb, "MB", MEMORY_TEN_HOURS_MB),
+    ]
+
+
+def read_and_decompress(log: Path) -> int:
+    """Bytes of all chunks of a log, decompressed and thrown away: what no reader can do without."""
+    total = 0
+    with log.open("rb") as file:
+        for record in StreamReader(file, emit_chunks=True, skip_magic=False).records:
+            if isinstance(record, Chunk):
+                total += len(zstandard.decompress(record.data, max_output_size=record.uncompressed_size))
+    return total
+
+
+def _command_peak_mb(log: Path, site: Path, out: Path) -> float:
+    """Peak memory of the command on one run [MB]; it replays in its own process."""
+    code = (
+        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL); "
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)"
+    )
+    balise = [sys.executable, "-m", "cli", "replay", str(log), "--site", str(site), "--out", str(out)]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *balise, "--force", "--quiet"], check=True, capture_output=True, text=True
+    )
+    return float(done.stdout)
