@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.report.markup import UNKNOWN, number
+from pipeline.safety.episodes import independent_episodes
 from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
-from pipeline.summary import is_passage, missed_detection
+from pipeline.summary import is_passage
 from schemas.config import SafetyConfig
 from schemas.enums import BaliseKind, PassageStatus, RunStatus
 
@@ -27,18 +28,18 @@ def headline(
 ) -> list[Figure]:
     """Figures of one solution; every table holds that solution's rows of all runs.
 
-    Rates count what the campaign contains, injected faults included, over the hours of its replayed runs.
+    Rates count what the campaign contains, injected faults included.
     """
-    hours = _total(runs, "duration_s") / 3600.0
     return [
-        *_extent(runs, hours),
-        *_hazard_figures(hazards, hours, safety),
+        *_extent(runs),
+        *_hazard_figures(runs, hazards, safety),
         *_balise_figures(passages, failure_limit_m),
         _false_alarms(runs),
     ]
 
 
-def _extent(runs: pl.DataFrame, hours: float) -> list[Figure]:
+def _extent(runs: pl.DataFrame) -> list[Figure]:
+    hours = _total(runs, "duration_s") / 3600.0
     counts = [f"{runs.filter(pl.col('status') == status).height} {status.value}" for status in RunStatus]
     known = runs.filter(pl.col("availability").is_not_null() & pl.col("duration_s").is_not_null())
     weight = _total(known, "duration_s")
@@ -55,18 +56,21 @@ def _extent(runs: pl.DataFrame, hours: float) -> list[Figure]:
     ]
 
 
-def _hazard_figures(hazards: pl.DataFrame, hours: float, safety: SafetyConfig) -> list[Figure]:
-    own = hazards.filter(pl.col("caused_by").is_null())
-    failures = hazards.filter(pl.col("t_failure").is_not_null())
-    missed = failures.filter(missed_detection()).height
+def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> list[Figure]:
+    """Rates count faults, not rows, over the hours in which there was a truth to see them by."""
+    hours = _total(runs.filter(pl.col("evidence").is_not_null()), "duration_s") / 3600.0
+    faults = independent_episodes(hazards)
+    failures = faults.filter(pl.col("failed"))
+    missed = failures.filter(pl.col("missed")).height
     upper = poisson_rate_upper(missed, hours)
     needed = hours_still_needed(safety.thr_vb_per_h, missed, hours)
     claim = "" if upper is None else f"; one-sided 95 %: below {number(upper)} /h"
     return [
+        Figure("hours with a truth", f"{number(hours)} h", "in which a hazard could be seen at all"),
         Figure(
-            "hazards",
-            str(own.height),
-            f"{_rate(poisson_rate(own.height, hours))}; {hazards.height - own.height} more follow from others",
+            "faults that led to hazards",
+            f"{faults.height} in {hazards.height} rows",
+            _rate(poisson_rate(faults.height, hours)),
         ),
         Figure(
             "missed detections",
@@ -127,9 +131,9 @@ class LevelFigures:
 
 
 def level_figures(hazards: pl.DataFrame, safety: SafetyConfig) -> list[LevelFigures]:
-    """Hazardous time against the allowed T_D of each service level (TVB eq. 7)."""
-    failures = hazards.filter(pl.col("t_failure").is_not_null())
-    negated = failures.filter(pl.col("t_negated").is_not_null())
+    """Hazardous time of each fault with a failure against the allowed T_D of each service level (TVB eq. 7)."""
+    failures = independent_episodes(hazards).filter(pl.col("failed"))
+    negated = failures.filter(pl.col("hazardous_s").is_not_null())
     rows = []
     for level in safety.service_levels:
         allowed_s = safety.allowed_time_to_detect_s(level)

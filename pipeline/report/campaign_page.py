@@ -149,7 +149,9 @@ def _levels(key: str, hazards: pl.DataFrame, made: Made) -> str:
         for row in level_figures(hazards, made.config.safety)
     ]
     titles = ["service level", "allowed T_D [s]", "negated within it", "too late", "never negated", "share within it"]
-    return table(f"table-levels-{key}", "Hazards with a failure against the allowed T_D (TVB eq. 7)", titles, rows)
+    return table(
+        f"table-levels-{key}", "Faults with a position failure against the allowed T_D (TVB eq. 7)", titles, rows
+    )
 
 
 def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:

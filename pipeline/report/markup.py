@@ -27,11 +27,11 @@ def cell(value: object, digits: int = 3) -> Cell:
         case None:
             return Cell(UNKNOWN)
         case bool():
-            return Cell("yes" if value else "no", float(value))
+            return Cell("yes" if value else "no", "yes" if value else "no")
         case int() | float():
             return Cell(number(value, digits), float(value))
         case datetime():
-            return Cell(instant(value), value.timestamp())
+            return Cell(instant(value), value.isoformat())
         case list() | tuple():
             text = ", ".join(str(item) for item in value)
             return Cell(text or UNKNOWN, text)
@@ -62,10 +62,11 @@ def link(href: str, text: str, **attributes: str) -> str:
 
 def table(identity: str, caption: str, titles: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
     """A table with sortable heads; the script adds a search field where there are more than a few rows."""
-    body = [f"<tr>{''.join(_td(item) for item in row)}</tr>" for row in rows]
-    if not body:
+    cells = [list(row) for row in rows]
+    if not cells:
         return f'<p class="none">{escape(caption)}: none.</p>'
-    heads = "".join(f'<th scope="col">{escape(title)}</th>' for title in titles)
+    body = [f"<tr>{''.join(_td(item) for item in row)}</tr>" for row in cells]
+    heads = "".join(_th(title, [row[column] for row in cells]) for column, title in enumerate(titles))
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
         f'<table class="data" id="{identity}"><caption>{escape(caption)}</caption>'
@@ -126,6 +127,11 @@ def page(title: str, heading: str, body: str, data: str, assets: str, script: st
 </body>
 </html>
 """
+
+
+def _th(title: str, cells: Sequence[Cell]) -> str:
+    kind = ' class="number"' if any(isinstance(item.order, float) for item in cells) else ""
+    return f'<th scope="col"{kind}>{escape(title)}</th>'
 
 
 def _td(item: Cell) -> str:

@@ -1,9 +1,11 @@
 "use strict";
 // What all drawings share. Colours are those of Okabe and Ito; no meaning hangs on colour alone.
 const Plots = (() => {
+  const scheme = window.matchMedia("(prefers-color-scheme: dark)");
+  scheme.addEventListener("change", () => location.reload());
   const COLOUR = {
-    black: "#7f7f7f", orange: "#e69f00", sky: "#56b4e9", green: "#009e73", yellow: "#c9b400",
-    blue: "#0072b2", vermilion: "#d55e00", purple: "#cc79a7", grey: "#999999", pale: "rgba(140,140,140,0.28)",
+    orange: "#e69f00", sky: "#56b4e9", green: "#009e73", yellow: "#c9b400",
+    blue: scheme.matches ? "#3b9ae1" : "#0072b2", vermilion: "#d55e00", purple: "#cc79a7", grey: "#999999", pale: "rgba(140,140,140,0.28)",
   };
   const STATE = {
     P0: [COLOUR.blue, "circle", ""], P1: [COLOUR.vermilion, "x", "x"], P2: [COLOUR.orange, "diamond", "/"],
@@ -49,7 +51,8 @@ const Plots = (() => {
 
   const pattern = (color, shape) => ({ shape, size: 6, solidity: 0.3, bgcolor: color, fgcolor: "#ffffff" });
 
-  const config = { responsive: true, displaylogo: false, scrollZoom: false,
+  // The library offers to upload a drawing to its maker; a report never leaves the place where it lies.
+  const config = { responsive: true, displaylogo: false, scrollZoom: false, showSendToCloud: false, plotlyServerURL: "",
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
 
   function draw(id, traces, shape) {

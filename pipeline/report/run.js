@@ -97,7 +97,7 @@
     const known = traces.filter(Boolean);
     if (!known.length) { empty(id, "Nothing is known to draw here."); return; }
     draw(id, known, layout(height, {
-      xaxis: timeAxis(), yaxis: axis(title), shapes: [...hazardShapes(now), ...levels.map((y) => level(y))],
+      margin: { l: 125, r: 20, t: 12, b: 40 }, xaxis: timeAxis(), yaxis: axis(title, { automargin: false }), shapes: [...hazardShapes(now), ...levels.map((y) => level(y))],
       showlegend: known.length > 1, ...extra,
     }));
     listen(id);
@@ -129,7 +129,7 @@
     const names = bands.map((band) => band.name);
     timePlot(now, name, "", [...traces.values()], 70 + 26 * bands.length, [], {
       barmode: "overlay", showlegend: true, bargap: 0.1,
-      yaxis: axis("", { type: "category", categoryorder: "array", categoryarray: names, fixedrange: true,
+      yaxis: axis("", { automargin: false, type: "category", categoryorder: "array", categoryarray: names, fixedrange: true,
         range: [-0.5, names.length - 0.5] }),
     });
   }
@@ -161,7 +161,7 @@
   function ratioPlot(now, name, traces) {
     const sizes = traces.filter(Boolean).map((trace) => trace.y.reduce((most, y) => Math.max(most, Math.abs(y ?? 0)), 0));
     const reach = Math.min(RATIO_REACH, Math.max(1.3, 1.1 * Math.max(0, ...sizes)));
-    const yaxis = axis("value / threshold", { range: [-reach, reach] });
+    const yaxis = axis("value / threshold", { automargin: false, range: [-reach, reach] });
     timePlot(now, name, "", traces, 230, [-1, 1], { yaxis });
   }
 
@@ -219,7 +219,7 @@
       const rows = [...plan.codes.keys()].filter((row) => plan.codes[row] === code);
       return { type: "scatter", mode: "markers", name: `GNSS, ${name}`, x: rows.map((row) => plan.x[row]),
         y: rows.map((row) => plan.y[row]), customdata: rows.map((row) => clock(plan.t[row] + t0)),
-        marker: { color, symbol, size: rows.map((row) => (inView(plan.t[row] + t0) ? 6 : 3)) },
+        marker: { color, symbol, line: { width: 0 }, size: rows.map((row) => (inView(plan.t[row] + t0) ? 6 : 3)) },
         hovertemplate: "%{customdata}<extra>%{fullData.name}</extra>" };
     }).filter((trace) => trace.x.length);
   }
