@@ -98,9 +98,26 @@ def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle,
     matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy() & np.isfinite(path_m)
     sign = polarity(track, t_s, np.where(matched, path_m, np.nan), config.matching.orientation_distance_m)
     track = track.oriented(sign)
-    arrays = EpochArrays(t_s, path_m, _floats(epochs["sigma_along_m"]), matched, stamp_jitter_s(t_s))
+    along_m = unrolled(epochs, matched)
+    arrays = EpochArrays(t_s, along_m, _floats(epochs["sigma_along_m"]), matched, stamp_jitter_s(t_s))
     learned = _learn(arrays, track, vehicle, config)
-    return epochs.with_columns(_columns(arrays, track, learned, config))
+    return epochs.with_columns(
+        *_columns(arrays, track, learned, config), pl.Series("along_m", along_m, nan_to_null=True)
+    )
+
+
+def unrolled(epochs: pl.DataFrame, matched: Mask) -> Array:
+    """Path position with the way taken out that a curve adds to a position beside the track [m]; NaN elsewhere.
+
+    A point y left of a track that turns left by its curvature k moves dx / (1 - k y) along it while the train moves
+    dx, whether y is an error of the position or of the survey. Both are known, so this is no noise of the monitor.
+    """
+    along = np.full(matched.size, np.nan)
+    rows = np.flatnonzero(matched)
+    path_m = _floats(epochs["path_m"])[rows]
+    beside = np.nan_to_num(_floats(epochs["curvature_per_m"])[rows] * _floats(epochs["cross_track_m"])[rows])
+    along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
+    return along
 
 
 def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometer: pl.DataFrame, config: Configuration) -> pl.Series:
@@ -178,6 +195,7 @@ def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configurat
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
     return epochs.with_columns(
+        along_m=nothing,
         odometer_m=nothing,
         odometer_step_m=nothing,
         odometer_reason=pl.lit(NO_ODOMETER),
@@ -402,9 +420,9 @@ def along_series(
         border=np.zeros(rows.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(distance - steps.distance_m) / dt,
-        **along_errors(arrays.sigma_m[rows] ** 2, arrays.jitter_s * steps.distance_m / dt, dt, shares, taus_s),
+        **along_errors(arrays.sigma_m[rows], arrays.jitter_s * steps.distance_m / dt, dt, shares, taus_s),
         white_m2=track.white_rate_m2_per_s * dt,
         border_m2=zero,
-        scale_mps=learned.scale_sigma[rows] * steps.distance_m / dt,
+        steady_mps=learned.scale_sigma[rows] * steps.distance_m / dt,
         latency_mps=learned.latency_sigma_s[rows] * steps.speed_mps / dt,
     )

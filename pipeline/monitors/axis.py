@@ -7,7 +7,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.monitors.recursion import Array, AxisState, ewma_weight, linear_recurrence, variance_of_ewma
+from pipeline.monitors.recursion import (
+    Array,
+    AxisState,
+    ewma_weight,
+    increment_variance,
+    linear_recurrence,
+    variance_of_ewma,
+)
 
 Mask = npt.NDArray[np.bool_]
 
@@ -18,9 +25,10 @@ class AxisSeries:
 
     `epoch`: index of the row among all epochs. `fresh`: no increment leads here (start, long gap, lost distance).
     `rate_mps`: increment of GNSS minus odometer or track over `dt_s`. `border`: the increment crosses into another
-    net element, whose survey offset is another (`border_m2`, its variance). `variance_m2` (m, sources) and
-    `decorrelation` (m, sources): R_j and 1 - phi_j. `white_m2`: odometer noise of the increment. `scale_mps`,
-    `latency_mps`: what one sigma of scale and of latency makes of the rate, signed.
+    net element, whose survey offset is another (`border_m2`, its variance). `sigma_m`, `sigma_before_m` and
+    `decorrelation` (m, sources): sqrt R_j here and at the row before, and 1 - phi_j. `white_m2`: odometer noise of
+    the increment. `steady_mps`, `latency_mps`: what one sigma of an error that stays (odometer scale; the position
+    error that a curve turns into this axis) and of the latency makes of the rate, signed.
     """
 
     epoch: npt.NDArray[np.int64]
@@ -28,11 +36,12 @@ class AxisSeries:
     border: Mask
     dt_s: Array
     rate_mps: Array
-    variance_m2: Array
+    sigma_m: Array
+    sigma_before_m: Array
     decorrelation: Array
     white_m2: Array
     border_m2: Array
-    scale_mps: Array
+    steady_mps: Array
     latency_mps: Array
 
     def between(self, low: int, high: int) -> AxisSeries:
@@ -48,15 +57,21 @@ class AxisResult:
     sigma: Array
 
 
-def along_errors(variance_m2: Array, jitter_m: Array, dt_s: Array, shares: Array, taus_s: Array) -> dict[str, Array]:
-    """R_j and 1 - phi_j of the along-track axis: the Gauss-Markov errors, and stamps that scatter.
+def with_memory(sigma_m: Array, decorrelation: Array) -> dict[str, Array]:
+    """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j."""
+    before = np.concatenate([sigma_m[:1], sigma_m[:-1]])
+    return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
+
+
+def along_errors(sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, taus_s: Array) -> dict[str, Array]:
+    """Error fields of the along-track axis: the Gauss-Markov errors, and stamps that scatter.
 
     `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
     """
-    return {
-        "variance_m2": np.column_stack([np.outer(variance_m2, shares), jitter_m**2]),
-        "decorrelation": np.column_stack([-np.expm1(-dt_s[:, None] / taus_s), np.ones(dt_s.size)]),
-    }
+    return with_memory(
+        np.column_stack([np.outer(sigma_m, np.sqrt(shares)), jitter_m]),
+        np.column_stack([-np.expm1(-dt_s[:, None] / taus_s), np.ones(dt_s.size)]),
+    )
 
 
 def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisResult, AxisState]:
@@ -66,25 +81,25 @@ def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisR
     keep = (1.0 - weight) * moving[:, None]
     gain = weight / series.dt_s[:, None]
     variance, covariance = variance_of_ewma(
-        keep, gain, series.variance_m2, series.decorrelation, series.white_m2, state
+        keep, gain, series.sigma_m, series.sigma_before_m, series.decorrelation, series.white_m2, state
     )
     # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
     # survey's sigma, judges it; inside the EWMAs it would ring for long.
     smooth_rate = np.where(series.border, 0.0, series.rate_mps)
     ewma = linear_recurrence(keep, weight * smooth_rate[:, None], state.ewma)
-    scale = linear_recurrence(keep, weight * series.scale_mps[:, None], state.scale_response)
+    steady = linear_recurrence(keep, weight * series.steady_mps[:, None], state.steady_response)
     latency = linear_recurrence(keep, weight * series.latency_mps[:, None], state.latency_response)
     raw_variance = _raw_variance(series)
-    sigma = np.sqrt(np.column_stack([raw_variance, variance + scale**2 + latency**2]))
+    sigma = np.sqrt(np.column_stack([raw_variance, variance + steady**2 + latency**2]))
     result = AxisResult(np.column_stack([series.rate_mps, ewma]), sigma)
     if series.epoch.size == 0:
         return result, state
-    return result, AxisState(ewma[-1], variance[-1], covariance, scale[-1], latency[-1])
+    return result, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
 
 
 def _raw_variance(series: AxisSeries) -> Array:
     """Variance of the raw rate (DIAG eq. 4-7 with correlated GNSS errors) [m^2/s^2]."""
-    gnss = 2.0 * (series.variance_m2 * series.decorrelation).sum(axis=1)
+    gnss = increment_variance(series.sigma_m, series.sigma_before_m, series.decorrelation)
     border = np.where(series.border, series.border_m2, 0.0)
     noise: Array = (gnss + series.white_m2 + border) / series.dt_s**2
-    return noise + series.scale_mps**2 + series.latency_mps**2
+    return noise + series.steady_mps**2 + series.latency_mps**2

@@ -38,7 +38,7 @@ class _AxisBank:
         self._carry = self._zero()
 
     def _zero(self) -> AxisState:
-        return AxisState.at_restart(self._alphas.size, self._series.variance_m2.shape[1])
+        return AxisState.at_restart(self._alphas.size, self._series.sigma_m.shape[1])
 
     def advance(self, epoch: int) -> int:
         """Evaluate up to this epoch at least; returns the last epoch that is evaluated now."""
@@ -53,7 +53,7 @@ class _AxisBank:
 
     def _store(self, part: AxisSeries, value: Array, threshold: Array) -> None:
         evaluated = ~part.fresh[:, None] & self._enabled[None, :]
-        failing = np.abs(value) > threshold
+        failing = ~(np.abs(value) <= threshold)  # what cannot be compared is no pass
         self.state[part.epoch] = np.where(evaluated, np.where(failing, _FAIL, _PASS), _NOT_EVALUATED)
         self.value[part.epoch] = np.where(evaluated, value, np.nan)
         self.threshold[part.epoch] = np.where(evaluated, threshold, np.nan)

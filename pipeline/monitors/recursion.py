@@ -50,7 +50,7 @@ class AxisState:
     ewma: Array
     variance: Array
     covariance: Array
-    scale_response: Array
+    steady_response: Array
     latency_response: Array
 
     @classmethod
@@ -62,7 +62,8 @@ class AxisState:
 def variance_of_ewma(
     keep: Array,
     gain: Array,
-    variance_m2: Array,
+    sigma_m: Array,
+    sigma_before_m: Array,
     decorrelation: Array,
     white_m2: Array,
     state: AxisState,
@@ -70,18 +71,33 @@ def variance_of_ewma(
     """Variance of the EWMAs of a rate [m^2/s^2], epoch by epoch, from a restart or a carried state.
 
     `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
-    `variance_m2` (n, sources): R_j; `decorrelation` (n, sources): 1 - phi_j, given as such because it is
-    tiny at 10 Hz; `white_m2` (n,): variance of white noise on the increment. Returns the variance
-    (n, alphas) and the last covariances c_j (alphas, sources). Recursion of DOMAIN section 3, in which
-    (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R + R (1-phi^2) = R (1-phi).
+    `sigma_m`, `sigma_before_m` (n, sources): sqrt R_j at the row and at the row before it; `decorrelation`
+    (n, sources): 1 - phi_j, given as such because it is tiny at 10 Hz; `white_m2` (n,): variance of white noise on
+    the increment. Returns the variance (n, alphas) and the last covariances c_j (alphas, sources).
+
+    Each source is e_k = sigma_k n_k with a unit Gauss-Markov process n, and c_j = cov(u, n):
+
+        v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi s_k - s_p) + (alpha g)^2 white
+        c <- b phi c + alpha g (s_k - phi s_p)
+
+    For constant R this is the recursion of DOMAIN section 3; where R changes by the step (a fix that is lost to
+    dead reckoning), that one may fall below zero.
     """
-    n, sources = variance_m2.shape
-    step = variance_m2 * decorrelation
-    drive = (gain[:, :, None] * step[:, None, :]).reshape(n, -1)
-    decay = (keep[:, :, None] * (1.0 - decorrelation)[:, None, :]).reshape(n, -1)
-    covariance = linear_recurrence(decay, drive, state.covariance.reshape(-1)).reshape(n, -1, sources)
+    n, sources = sigma_m.shape
+    drive = gain[:, :, None] * (sigma_m - (1.0 - decorrelation) * sigma_before_m)[:, None, :]
+    decay = keep[:, :, None] * (1.0 - decorrelation)[:, None, :]
+    flat = (n, gain.shape[1] * sources)
+    covariance = linear_recurrence(decay.reshape(flat), drive.reshape(flat), state.covariance.reshape(-1))
+    covariance = covariance.reshape(n, -1, sources)
     before = np.concatenate([state.covariance[None], covariance[:-1]])
-    coupling = np.einsum("kas,ks->ka", before, decorrelation)
-    fresh = gain**2 * (2.0 * step.sum(axis=1) + white_m2)[:, None] - 2.0 * gain * keep * coupling
+    coupling = np.einsum("kas,ks->ka", before, (1.0 - decorrelation) * sigma_m - sigma_before_m)
+    increment = increment_variance(sigma_m, sigma_before_m, decorrelation) + white_m2
+    fresh = gain**2 * increment[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
-    return variance, covariance[-1] if n else state.covariance
+    return np.maximum(variance, 0.0), covariance[-1] if n else state.covariance
+
+
+def increment_variance(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> Array:
+    """Variance of the increments of all sources together [m^2]; shape (n,)."""
+    summed: Array = ((sigma_m - sigma_before_m) ** 2 + 2.0 * decorrelation * sigma_m * sigma_before_m).sum(axis=1)
+    return summed

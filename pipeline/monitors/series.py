@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.monitors.axis import AxisSeries, Mask, along_errors
+from pipeline.monitors.axis import AxisSeries, Mask, along_errors, with_memory
 from pipeline.monitors.recursion import Array
 from pipeline.odometer_filter import error_model
 from schemas.config import Configuration
@@ -81,9 +81,9 @@ class _Builder:
         values: Array = self._epochs[name].to_numpy().astype(np.float64)[rows]
         return values
 
-    def _variance(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
-        """Position variance of the axis [m^2]; `calibrate` may have fitted sigma = a + b sigma_receiver."""
-        return (self._intercept_m + self._slope * self._column(name, rows)) ** 2
+    def _sigma(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
+        """Position sigma of the axis [m]; `calibrate` may have fitted sigma = a + b sigma_receiver."""
+        return self._intercept_m + self._slope * self._column(name, rows)
 
     def along(self, reasons: pl.Series) -> AxisSeries:
         rows = np.flatnonzero(reasons.is_null().to_numpy())
@@ -101,11 +101,11 @@ class _Builder:
             fresh=fresh,
             border=np.zeros(rows.size, dtype=np.bool_),
             dt_s=dt,
-            rate_mps=(_steps(self._column("path_m", rows)) - odometer) / dt,
-            **along_errors(self._variance("sigma_along_m", rows), jitter, dt, self._shares, self._taus_s),
+            rate_mps=(_steps(self._column("along_m", rows)) - odometer) / dt,
+            **along_errors(self._sigma("sigma_along_m", rows), jitter, dt, self._shares, self._taus_s),
             white_m2=white,
             border_m2=np.zeros(rows.size),
-            scale_mps=self._column("scale_sigma", rows) * odometer / dt,
+            steady_mps=self._column("scale_sigma", rows) * odometer / dt,
             latency_mps=self._column("latency_sigma_s", rows) * speed / dt,
         )
 
@@ -117,7 +117,7 @@ class _Builder:
         dt, fresh = self._time_steps(rows)
         border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
         survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
-        shares = np.outer(self._variance(sigma, rows), self._shares)
+        shares = np.outer(self._sigma(sigma, rows), np.sqrt(self._shares))
         chord, chord_decorrelation = self._chord_error(rows, dt)
         zero = np.zeros(rows.size)
         return AxisSeries(
@@ -126,21 +126,28 @@ class _Builder:
             border=border,
             dt_s=dt,
             rate_mps=_steps(self._column(position, rows)) / dt,
-            variance_m2=np.column_stack([shares, chord]),
-            decorrelation=np.column_stack([-np.expm1(-dt[:, None] / self._taus_s), chord_decorrelation]),
+            **with_memory(
+                np.column_stack([shares, chord]),
+                np.column_stack([-np.expm1(-dt[:, None] / self._taus_s), chord_decorrelation]),
+            ),
             white_m2=zero,
             border_m2=2.0 * survey**2,
-            scale_mps=zero,
+            steady_mps=self._turned_mps(rows) if position == "cross_track_m" else zero,
             latency_mps=zero,
         )
 
+    def _turned_mps(self, rows: npt.NDArray[np.int64]) -> Array:
+        """What one sigma of the error along the track makes across it while a curve turns the axes [m/s]."""
+        turning = self._column("curvature_per_m", rows) * self._column("speed_mps", rows)
+        return np.nan_to_num(turning) * self._sigma("sigma_along_m", rows)
+
     def _chord_error(self, rows: npt.NDArray[np.int64], dt: Array) -> tuple[Array, Array]:
-        """Variance of the polyline's chord error [m^2] and its decorrelation over the way of each step."""
+        """The polyline's chord error [m] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
         curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))
         length = np.sqrt(8.0 * error / np.maximum(curvature, _STRAIGHT_PER_M))  # chord of an arc with this sagitta
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
-        return error**2, -np.expm1(-way / np.maximum(length, 1.0))
+        return error, -np.expm1(-way / np.maximum(length, 1.0))
 
     def _time_steps(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Mask]:
         """Time since the row before [s] (1 s stands in where there is none) and rows that nothing leads to."""
@@ -163,4 +170,4 @@ def _changes(values: npt.NDArray[np.generic]) -> Mask:
 def _empty(sources: int) -> AxisSeries:
     none, many = np.zeros(0), np.zeros((0, sources))
     no, index = np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.int64)
-    return AxisSeries(index, no, no, none, none, many, many, none, none, none, none)
+    return AxisSeries(index, no, no, none, none, many, many, many, none, none, none, none)

@@ -32,10 +32,12 @@ def by_hand(alpha, dt_s, sigma2_m2, odometer_sigma_mps):
 
 def exact(dt_s, sigma2_m2, odometer_sigma_mps=0.05):
     weight = ewma_weight(ALPHAS, dt_s)
+    sigma_m = np.sqrt(np.outer(sigma2_m2, SHARES))
     variance, _ = variance_of_ewma(
         1.0 - weight,
         weight / dt_s[:, None],
-        np.outer(sigma2_m2, SHARES),
+        sigma_m,
+        np.concatenate([sigma_m[:1], sigma_m[:-1]]),
         -np.expm1(-dt_s[:, None] / TAUS_S),
         odometer_sigma_mps**2 * dt_s,
         AxisState.at_restart(3, 4),
@@ -44,13 +46,50 @@ def exact(dt_s, sigma2_m2, odometer_sigma_mps=0.05):
 
 
 @pytest.mark.parametrize("period_s", [0.1, 1.0])
-def test_variance_follows_the_recursion_through_gaps_and_changing_accuracy(period_s):
-    rng = np.random.default_rng(3)
+@pytest.mark.parametrize("sigma2", [0.5, 4.0])
+def test_variance_follows_the_recursion_through_gaps(period_s, sigma2):
     dt_s = np.full(700, period_s)
     dt_s[200], dt_s[450] = 40.0, 7.3
-    sigma2_m2 = rng.uniform(0.5, 4.0, dt_s.size)
+    sigma2_m2 = np.full(dt_s.size, sigma2)
     expected = np.column_stack([by_hand(alpha, dt_s, sigma2_m2, 0.05) for alpha in ALPHAS])
     np.testing.assert_allclose(exact(dt_s, sigma2_m2), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("period_s", [0.1, 1.0])
+def test_a_slowly_changing_accuracy_follows_the_printed_recursion_closely(period_s):
+    t_s = np.arange(600.0 / period_s) * period_s
+    sigma2_m2 = 1.0 + 0.5 * np.sin(t_s / 200.0)
+    dt_s = np.full(t_s.size, period_s)
+    expected = np.column_stack([by_hand(alpha, dt_s, sigma2_m2, 0.05) for alpha in ALPHAS])
+    np.testing.assert_allclose(np.sqrt(exact(dt_s, sigma2_m2)), np.sqrt(expected), rtol=0.1)
+
+
+def test_variance_stays_true_where_the_accuracy_jumps():
+    """Sigma between 0.1 and 5 m every 20 s, against 4,000 sampled paths: within 15 %, and never negative."""
+    rng = np.random.default_rng(5)
+    paths, n = 4_000, 121
+    sigma_m = np.where((np.arange(n) // 20) % 2 == 0, 0.1, 5.0)
+    error = np.zeros((paths, n))
+    for share, tau in zip(SHARES, TAUS_S, strict=True):
+        phi = np.exp(-1.0 / tau)
+        noise = rng.standard_normal((paths, n)) * np.sqrt(1 - phi**2)
+        noise[:, 0] = rng.standard_normal(paths)
+        error += np.sqrt(share) * sigma_m * lfilter([1.0], [1.0, -phi], noise, axis=1)
+    rate = np.diff(error, axis=1)
+    sampled = np.column_stack([lfilter([a], [1.0, a - 1.0], rate, axis=1).var(axis=0) for a in ALPHAS])
+    weight = ewma_weight(ALPHAS, np.ones(n - 1))
+    sources = np.outer(sigma_m, np.sqrt(SHARES))
+    found, _ = variance_of_ewma(
+        1.0 - weight,
+        weight,
+        sources[1:],
+        sources[:-1],
+        np.broadcast_to(-np.expm1(-1.0 / TAUS_S), (n - 1, 4)),
+        np.zeros(n - 1),
+        AxisState.at_restart(3, 4),
+    )
+    assert (found > 0).all()
+    np.testing.assert_allclose(found, sampled, rtol=0.15)
 
 
 @pytest.mark.parametrize("period_s", [0.1, 1.0])
