@@ -68,23 +68,30 @@ def single_line(length_m: float = 100_000.0) -> Site:
     return Site(Track.validate(element("line", *centre_line(length_m, 5.0)), cast=True), Links.create_empty())
 
 
-def network(elements: int = 2000, length_m: float = 100_000.0) -> Site:
-    """Two tracks with crossovers every fifth piece, and sidings beside the rest."""
-    x, y = centre_line(length_m, 5.0)
-    pieces = elements // 4
-    cuts = np.linspace(0, len(x) - 1, pieces + 1).astype(int)
+def network() -> Site:
+    """2000 elements: a double track of 100 km in pieces of 400 m with a crossover or a siding in every
+    fifth, and seven other lines of its region.
+    """
+    x, y = centre_line(100_000.0, 5.0)
     frames: list[pl.DataFrame] = []
     links: list[tuple[str, int, str, int, str]] = []
+    cuts = np.linspace(0, len(x) - 1, 251).astype(int)
     for k, (begin, end) in enumerate(zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)):
         part = slice(begin, end + 1)
         frames += [element(f"a{k}", x[part], y[part]), element(f"b{k}", x[part], y[part] + 4.5)]
-        across = 4.5 * np.linspace(0.0, 1.0, end + 1 - begin)
-        frames.append(element(f"x{k}", x[part], y[part] + across))
-        frames.append(element(f"s{k}", x[part], y[part] - across))
-        if k:
-            links += [(f"{t}{k - 1}", 1, f"{t}{k}", 0, "both") for t in "ab"]
-            links += [(f"a{k - 1}", 1, f"x{k}", 0, "both"), (f"a{k - 1}", 1, f"s{k}", 0, "both")]
-            links.append((f"x{k - 1}", 1, f"b{k}", 0, "both"))
+        links += [(f"{t}{k - 1}", 1, f"{t}{k}", 0, "both") for t in "ab"] if k else []
+        if k % 5 == 2:
+            across = 4.5 * np.linspace(0.0, 1.0, end + 1 - begin)
+            frames.append(element(f"x{k}", x[part], y[part] + across))
+            frames.append(element(f"s{k}", x[part], y[part] - 2 * across))
+            links += [(f"a{k - 1}", 1, f"{t}{k}", 0, "both") for t in "xs"]
+            links.append((f"x{k}", 1, f"b{k + 1}", 0, "both"))
+    x, y = x[::4], y[::4]
+    others = [(line, k) for line in range(7) for k in range(200)]
+    for line, k in others:
+        part = slice(25 * k, 25 * k + 26)
+        frames.append(element(f"o{line}_{k}", x[part], y[part] + 3000.0 * (line + 1)))
+        links += [(f"o{line}_{k - 1}", 1, f"o{line}_{k}", 0, "both")] if k else []
     relations = pl.DataFrame(links, schema=list(Links.columns()), orient="row")
     return Site(Track.validate(pl.concat(frames), cast=True), Links.validate(relations, cast=True))
 
@@ -178,7 +185,9 @@ def speeds(with_shapely: bool) -> None:
     big = network()
     run, distance = journey(big)
     yardstick = kd_tree_s(big, run)
-    print(f"network of 2000 elements, {big.track.height} vertices; KD-tree {yardstick * 1e3:.1f} ms")
+    print(
+        f"network of {big.track['netelement_id'].n_unique()} elements, {big.track.height} vertices; KD-tree {yardstick * 1e3:.1f} ms"
+    )
     say("the whole stage on the network", best_of(3, whole(big)), yardstick, 20.0)
 
 

@@ -70,10 +70,10 @@ def end_places(track: Track) -> Floats:
     return places.surface.reshape(-1, 2, 3)
 
 
-def gap_m(one: Floats, other: Floats) -> float:
-    """Length of a gap between two ends that counts as track [m]: 0 where it is only survey noise."""
-    gap = float(np.linalg.norm(one - other))
-    return gap if gap > GAP_COUNTS_M else 0.0
+def gaps_m(one: Floats, other: Floats) -> Floats:
+    """Lengths of gaps between ends that count as track [m]: 0 where it is only survey noise."""
+    gap = np.linalg.norm(one - other, axis=-1)
+    return np.where(gap > GAP_COUNTS_M, gap, 0.0)
 
 
 _NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")

@@ -85,7 +85,7 @@ def _trellis(
 def _all_candidates(fixes: Fixes, steps: Steps, network: Network, config: MatchingConfig) -> Candidates:
     """Candidates within reach, and for steps that are not close to a track those in a wider circle."""
     segments = segments_of(network.track)
-    close_m = config.reach_m + _CLOSE_M
+    close_m = _CLOSE_M + config.reach_m
     found = _candidates(fixes, steps.epoch, network, segments, close_m)
     close = np.zeros(len(steps), dtype=bool)
     close[found.step[found.distance_m <= _CLOSE_M]] = True

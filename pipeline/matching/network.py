@@ -13,9 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 import polars as pl
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.geodesy import Bools
-from pipeline.track import Track, end_places, gap_m
+from pipeline.track import Track, end_places, gaps_m
 from schemas.enums import Navigability
 
 
@@ -111,17 +113,19 @@ BARRED_DETOUR_M = 10_000.0
 def network_of(track: Track, links: pl.DataFrame) -> Network:
     """The network of a site; gaps between linked ends count as track."""
     successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
+    usable_links = links.filter(pl.col("navigability") != Navigability.NONE.value)
+    one = np.array([track.index[name] for name in usable_links["netelement_a"].to_list()], dtype=np.int64)
+    other = np.array([track.index[name] for name in usable_links["netelement_b"].to_list()], dtype=np.int64)
+    position_a = usable_links["position_a"].to_numpy().astype(np.int64)
+    position_b = usable_links["position_b"].to_numpy().astype(np.int64)
     ends = end_places(track)
-    for a, position_a, b, position_b, navigability in links.iter_rows():
-        if navigability == Navigability.NONE.value:
-            continue
-        one, other = track.index[a], track.index[b]
-        gap = gap_m(ends[one, int(position_a)], ends[other, int(position_b)])
-        there = navigability in (Navigability.AB.value, Navigability.BOTH.value)
-        back = navigability in (Navigability.BA.value, Navigability.BOTH.value)
-        leaving, entering = 2 * one + (1 - int(position_a)), 2 * other + int(position_b)
-        _add(successors[leaving], Edge(entering, gap, there, back))
-        _add(successors[entering ^ 1], Edge(leaving ^ 1, gap, back, there))
+    gap = gaps_m(ends[one, position_a], ends[other, position_b]).tolist()
+    leaving, entering = (2 * one + 1 - position_a).tolist(), (2 * other + position_b).tolist()
+    for row, way in enumerate(usable_links["navigability"].cast(pl.String).to_list()):
+        there = way in (Navigability.AB.value, Navigability.BOTH.value)
+        back = way in (Navigability.BA.value, Navigability.BOTH.value)
+        _add(successors[leaving[row]], Edge(entering[row], gap[row], there, back))
+        _add(successors[entering[row] ^ 1], Edge(leaving[row] ^ 1, gap[row], back, there))
     usable, orientable = _one_sheet(successors)
     return Network(track, successors, usable, orientable)
 
@@ -137,29 +141,14 @@ def _add(edges: list[Edge], edge: Edge) -> None:
 
 def _one_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
     """Of each connected part one orientation; both where a loop lets trains come back turned round."""
-    neighbours: list[list[int]] = [[] for _ in successors]
-    for one, edges in enumerate(successors):
-        for edge in edges:
-            neighbours[one].append(edge.to)
-            neighbours[edge.to].append(one)
-    usable, orientable, seen = [False] * len(successors), True, [False] * len(successors)
-    for start in range(0, len(successors), 2):
-        if seen[start]:
-            continue
-        part = _part(start, neighbours)
-        turned = start ^ 1 in part
-        orientable &= not turned
-        for oriented in part:
-            seen[oriented] = seen[oriented ^ 1] = True
-            usable[oriented] = True
-    return usable, orientable
-
-
-def _part(start: int, neighbours: list[list[int]]) -> set[int]:
-    part, queue = {start}, [start]
-    while queue:
-        for other in neighbours[queue.pop()]:
-            if other not in part:
-                part.add(other)
-                queue.append(other)
-    return part
+    count = len(successors)
+    here = np.repeat(np.arange(count), [len(edges) for edges in successors])
+    there = np.array([edge.to for edges in successors for edge in edges], dtype=np.int64)
+    graph = coo_array((np.ones(len(here)), (here, there)), shape=(count, count))
+    _, part = connected_components(graph, directed=False)
+    turned = part.reshape(-1, 2)[:, ::-1].ravel()
+    # Of a part and its mirror image the one that holds the first element in the sense of its measure.
+    first = np.full(int(part.max()) + 1, count)
+    np.minimum.at(first, part[::2], np.arange(0, count, 2))
+    usable = first[part] <= first[turned]
+    return usable.tolist(), bool((part != turned).all())

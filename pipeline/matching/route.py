@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.matching.leg import Visit
 from pipeline.matching.network import Edge, Network
-from pipeline.track import Track, end_places, gap_m
+from pipeline.track import Track, end_places, gaps_m
 
 # `Site.route` names directions as the site reader writes them: from an element's start to its end, or back.
 _FORWARD = "AB"
@@ -28,7 +28,7 @@ def network_along(track: Track, visits: list[Visit]) -> Network:
     ends = end_places(doubled)
     for number in range(len(visits) - 1):
         here, there = visits[number].forward, visits[number + 1].forward
-        gap = gap_m(ends[number, int(here)], ends[number + 1, int(not there)])
+        gap = float(gaps_m(ends[[number], [int(here)]], ends[[number + 1], [int(not there)]])[0])
         leaving, entering = 2 * number + (not here), 2 * (number + 1) + (not there)
         successors[leaving].append(Edge(entering, gap, True, True))
         successors[entering ^ 1].append(Edge(leaving ^ 1, gap, True, True))
