@@ -185,9 +185,8 @@ def speeds(with_shapely: bool) -> None:
     big = network()
     run, distance = journey(big)
     yardstick = kd_tree_s(big, run)
-    print(
-        f"network of {big.track['netelement_id'].n_unique()} elements, {big.track.height} vertices; KD-tree {yardstick * 1e3:.1f} ms"
-    )
+    count = big.track["netelement_id"].n_unique()
+    print(f"network of {count} elements, {big.track.height} vertices; KD-tree {yardstick * 1e3:.1f} ms")
     say("the whole stage on the network", best_of(3, whole(big)), yardstick, 20.0)
 
 
