@@ -1,0 +1,193 @@
+"""How fast MCAP logs become frames, against reading and decompressing alone and against the `mcap` package.
+
+    python -m benchmarks.ingest [--hours 1] [--repeats 5] [--long] [--out bench-out/ingest]
+
+All figures are ratios of medians within one run, the measurements taken in turn so that a slow minute of
+the machine slows all of them. `--long` adds ten hours of log: the same ratios, and the memory that reading
+takes. The stock decoders take seconds per log and are measured once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import pyarrow as pa
+
+from benchmarks.ingest_logs import CASES, Case, run_of, write_case
+from benchmarks.results import Figure, stopwatch
+from pipeline.ingest import read_run
+from schemas.config import IngestConfig
+from schemas.run import RunLog
+
+# Largest ratio to reading and decompressing, smallest to `mcap` with its decoder package.
+TARGETS: dict[Case, tuple[float, float]] = {
+    "cdr Odometry": (2.6, 70.0),
+    "cdr TwistStamped": (2.6, 50.0),
+    "protobuf": (4.0, 14.0),
+    "json": (9.0, 5.0),
+}
+_CRC_NS_PER_BYTE = 0.25
+_LONG_HOURS = 10.0
+_LONG_TOLERANCE = 1.25
+_MEMORY_FACTOR = 3.0
+_CHUNK = 0x06
+_HEAD = struct.Struct("<BQ")
+
+
+def read_and_decompress(path: Path) -> int:
+    """The bound: the file's bytes and what its zstd chunks hold; returns the uncompressed size."""
+    content = memoryview(path.read_bytes())
+    at, total = 8, 0
+    while at < len(content) - 8:
+        opcode, length = _HEAD.unpack_from(content, at)
+        if opcode == _CHUNK:
+            body = content[at + 9 : at + 9 + length]
+            size = struct.unpack_from("<Q", body, 16)[0]
+            records = 32 + struct.unpack_from("<I", body, 28)[0] + 8
+            total += len(pa.decompress(body[records:], size, codec="zstd"))
+        at += 9 + length
+    return total
+
+
+def stock_columns(path: Path) -> dict[str, list[Any]]:
+    """What one would write with `mcap` and its decoders: the fields of every message in lists."""
+    import orjson
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
+    from mcap_ros2.decoder import DecoderFactory as Ros2Factory
+
+    columns: dict[str, list[Any]] = {"/gnss": [], "/odometer": []}
+    reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[ProtobufFactory(), Ros2Factory()])
+    if path.name.startswith("json"):
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            columns[channel.topic].append(_fields(channel.topic, orjson.loads(message.data).get))
+        return columns
+    for _, channel, _, decoded in reader.iter_decoded_messages(log_time_order=False):
+        columns[channel.topic].append(_fields(channel.topic, lambda name, of=decoded: _attribute(of, name)))
+    return columns
+
+
+def _fields(topic: str, get: Callable[[str], Any]) -> tuple[Any, ...]:
+    if topic == "/gnss":
+        position = get("latitude_deg") or get("latitude"), get("longitude_deg") or get("longitude")
+        return (*position, get("position_covariance"), get("t") or get("timestamp") or get("header"))
+    return get("speed_mps"), get("twist"), get("t") or get("header")
+
+
+def _attribute(message: Any, name: str) -> Any:
+    return getattr(message, name, None)
+
+
+def measure(folder: Path, hours: float = 1.0, repeats: int = 5, long: bool = False) -> list[Figure]:
+    """Figures of all encodings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    run = run_of(hours)
+    figures = [figure for case in CASES for figure in _case(run, case, folder, repeats)]
+    return figures + (_long(folder, repeats, figures) if long else [])
+
+
+def _case(run: RunLog, case: Case, folder: Path, repeats: int) -> list[Figure]:
+    plain = write_case(run, case, folder, chunk_crc=False)
+    checked = write_case(run, case, folder, chunk_crc=True)
+    bound, ours, with_crc = _in_turn(
+        repeats,
+        lambda: read_and_decompress(plain),
+        lambda: read_run(plain, IngestConfig()),
+        lambda: read_run(checked, IngestConfig()),
+    )
+    with stopwatch() as stock:
+        stock_columns(plain)
+    size = read_and_decompress(plain)
+    crc_ns = (median(with_crc) - median(ours)) * 1e9 / size
+    most, least = TARGETS[case]
+    plain.unlink()
+    checked.unlink()
+    return [
+        Figure(f"{case}: read and decompress", median(bound) * 1e3, "ms"),
+        Figure(f"{case}: log to frames", median(ours) * 1e3, "ms"),
+        Figure(f"{case}: against read and decompress", median(ours) / median(bound), "times", most),
+        Figure(f"{case}: against mcap and its decoder", stock.seconds / median(ours), "times", least, "above"),
+        Figure(f"{case}: chunk checksums", crc_ns, "ns/byte", _CRC_NS_PER_BYTE),
+        Figure(f"{case}: noise of the bound, (max - min) / median", (max(bound) - min(bound)) / median(bound), "1"),
+    ]
+
+
+def _in_turn(repeats: int, *works: Callable[[], object]) -> list[list[float]]:
+    """Seconds of each work, measured one after the other so that noise hits all alike."""
+    taken: list[list[float]] = [[] for _ in works]
+    for _ in range(repeats):
+        for seconds, work in zip(taken, works, strict=True):
+            with stopwatch() as watch:
+                work()
+            seconds.append(watch.seconds)
+    return taken
+
+
+def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
+    run = run_of(_LONG_HOURS)
+    figures = []
+    for case in CASES:
+        path = write_case(run, case, folder, chunk_crc=False)
+        name = f"{case}: against read and decompress"
+        before = next(figure.value for figure in short if figure.name == name)
+        bound, ours = _in_turn(
+            repeats, lambda path=path: read_and_decompress(path), lambda path=path: read_run(path, IngestConfig())
+        )
+        ratio = median(ours) / median(bound)
+        figures += [
+            Figure(f"{case}, ten hours: ratio against that of one hour", ratio / before, "times", _LONG_TOLERANCE),
+            Figure(f"{case}, ten hours: memory over size of frames", memory_factor(path), "times", _MEMORY_FACTOR),
+        ]
+        path.unlink()
+    return figures
+
+
+_MEMORY_SCRIPT = """
+import resource, sys
+from pathlib import Path
+from pipeline.ingest import read_run
+from schemas.config import IngestConfig
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+read_run(Path(sys.argv[1]), IngestConfig())
+before = peak()
+run = read_run(Path(sys.argv[2]), IngestConfig())
+print((peak() - before) / sum(frame.estimated_size() for frame in (run.gnss, run.odometer)))
+"""
+
+
+def memory_factor(path: Path) -> float:
+    """Growth of a fresh process over the size of the frames that it reads, after a short log warmed it."""
+    small = write_case(run_of(0.001), "json", path.parent, chunk_crc=False)
+    script = [sys.executable, "-c", _MEMORY_SCRIPT, str(small), str(path)]
+    done = subprocess.run(script, check=True, capture_output=True, text=True)
+    return float(done.stdout)
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="benchmarks.ingest", description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--long", action="store_true", help="also ten hours of log")
+    parser.add_argument("--out", type=Path, default=Path("bench-out/ingest"))
+    given = parser.parse_args()
+    figures = measure(given.out, given.hours, given.repeats, given.long)
+    for figure in figures:
+        target = "" if figure.target is None else f"{figure.better} {figure.target:g}: {figure.met}"
+        print(f"{figure.name:60s} {figure.value:10.3f} {figure.unit:8s} {target}")
+    rows = [{"name": f.name, "value": f.value, "unit": f.unit, "target": f.target, "met": f.met} for f in figures]
+    (given.out / "ingest.json").write_text(json.dumps(rows, indent=2) + "\n")
+    return 0 if all(figure.met is not False for figure in figures) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
