@@ -129,6 +129,8 @@ class MonitorConfig(Settings):
     user_tau_s: Positive = 100.0
     odometer_sigma_mps: Positive = 0.05
     doppler_sigma_mps: Positive = 0.1
+    survey_wander_m: NonNegative = 0.3
+    survey_wander_length_m: Positive = 100.0
     sigma_intercept_m: NonNegative = 0.0
     sigma_slope: Positive = 1.0
     channel_reference: str | None = None

@@ -74,6 +74,7 @@ class _Builder:
         self._t_s = t_s
         self._gap_reset_s = config.align.gap_reset_s
         self._survey_default_m = config.matching.survey_sigma_default_m
+        self._wander_m, self._wander_length_m = config.monitors.survey_wander_m, config.monitors.survey_wander_length_m
         self._shares, self._taus_s = error_model(config.monitors)
         self._intercept_m, self._slope = config.monitors.sigma_intercept_m, config.monitors.sigma_slope
 
@@ -113,12 +114,13 @@ class _Builder:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""
         rows = np.flatnonzero(reasons.is_null().to_numpy())
         if rows.size == 0:
-            return _empty(self._shares.size + 1)
+            return _empty(self._shares.size + 2)
         dt, fresh = self._time_steps(rows)
         border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
         survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
         shares = np.outer(self._sigma(sigma, rows), np.sqrt(self._shares))
-        chord, chord_decorrelation = self._chord_error(rows, dt)
+        chord, chord_decorrelation = self._chord_error(rows)
+        wander, wander_decorrelation = self._wander(rows)
         zero = np.zeros(rows.size)
         return AxisSeries(
             epoch=rows,
@@ -127,8 +129,8 @@ class _Builder:
             dt_s=dt,
             rate_mps=_steps(self._column(position, rows)) / dt,
             **with_memory(
-                np.column_stack([shares, chord]),
-                np.column_stack([-np.expm1(-dt[:, None] / self._taus_s), chord_decorrelation]),
+                np.column_stack([shares, chord, wander]),
+                np.column_stack([-np.expm1(-dt[:, None] / self._taus_s), chord_decorrelation, wander_decorrelation]),
             ),
             white_m2=zero,
             border_m2=2.0 * survey**2,
@@ -141,7 +143,13 @@ class _Builder:
         turning = self._column("curvature_per_m", rows) * self._column("speed_mps", rows)
         return np.nan_to_num(turning) * self._sigma("sigma_along_m", rows)
 
-    def _chord_error(self, rows: npt.NDArray[np.int64], dt: Array) -> tuple[Array, Array]:
+    def _wander(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+        """How a 2-D survey of no stated accuracy wanders along its elements [m], and its decorrelation."""
+        unstated = np.isnan(self._column("survey_sigma_m", rows)) & np.isnan(self._column("vertical_m", rows))
+        way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
+        return np.where(unstated, self._wander_m, 0.0), -np.expm1(-way / self._wander_length_m)
+
+    def _chord_error(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Array]:
         """The polyline's chord error [m] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
         curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))

@@ -46,12 +46,25 @@ def test_rates_by_hand_at_one_hertz():
 
 def test_raw_threshold_by_hand_at_one_hertz():
     """k_T sqrt(sum 2 R_j (1 - phi_j) + 0.05^2) with sigma 1 m."""
-    result = table(bank_of(*steady(3)))
+    result = table(bank_of(*steady(3, survey_sigma_m=[0.1] * 3)))
     phi = np.exp(-1.0 / np.array([360.0, 1800.0, 3600.0, 100.0]))
     expected = 5.3267 * np.sqrt((2 * np.array([0.083, 0.014, 0.15, 0.752]) * (1 - phi)).sum() + 0.05**2)
     assert result["along_raw_threshold"][1] == pytest.approx(expected, rel=1e-4)
     across = 5.3267 * np.sqrt((2 * np.array([0.083, 0.014, 0.15, 0.752]) * (1 - phi)).sum())
     assert result["cross_raw_threshold"][1] == pytest.approx(across, rel=1e-4)
+
+
+def test_a_flat_survey_of_no_stated_accuracy_may_wander():
+    """0.3 m, decorrelated over 20 m of way as exp(-20/100), on top of the receiver's variance."""
+    stated = table(bank_of(*steady(3, survey_sigma_m=[0.1] * 3)))["cross_raw_threshold"][1] / FACTOR
+    unstated = table(bank_of(*steady(3)))["cross_raw_threshold"][1] / FACTOR
+    assert unstated**2 - stated**2 == pytest.approx(2 * 0.3**2 * (1 - np.exp(-0.2)), rel=1e-9)
+
+
+def test_a_curve_turns_the_error_along_the_track_across_it():
+    straight = table(bank_of(*steady(3)))["cross_raw_threshold"][2] / FACTOR
+    curved = table(bank_of(*steady(3, curvature_per_m=[1e-3] * 3)))["cross_raw_threshold"][2] / FACTOR
+    assert curved**2 - straight**2 == pytest.approx((1e-3 * 20.0) ** 2, rel=1e-6)
 
 
 def test_uncertain_scale_and_latency_widen_the_raw_threshold():
