@@ -120,10 +120,10 @@ def demo(out: OutFolder = Path("demo-out"), seed: int | None = None, quiet: Quie
     from pipeline.present import show_table
 
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
-    _write_demo(out, result)
+    page = _write_demo(out / "tables", result)
     if not quiet:
         show_table(result.checks, "What was injected, expected and found")
-        print(f"\nTrial and tables are in {out}.")
+        print(f"\nThe trial is in {out}, its tables in {out / 'tables'}, the report is {page}.")
     raise typer.Exit(OK if result.agrees else DEFECT)
 
 
@@ -159,19 +159,23 @@ def safety(config: ConfigFile = None, as_json: Json = False) -> None:
 
 @app.command()
 def inspect(
-    path: Annotated[str, typer.Argument(help="A site, or a result of `balise replay`.")], as_json: Json = False
+    path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
+    config: ConfigFile = None,
+    as_json: Json = False,
 ) -> None:
-    """What a site or a result holds, and what is remarkable in it."""
+    """What a log, a site or a result holds, and what is remarkable in it."""
     from pipeline.inspection import inspect_path
     from pipeline.present import show_table
 
-    tables = inspect_path(path)
+    settings, _ = _settings(config, None)
+    tables = inspect_path(path, settings.ingest)
     if as_json:
         _print_json(tables)
-        return
-    for name, table in tables.items():
-        show_table(table, name)
-        print()
+    else:
+        for name, table in tables.items():
+            show_table(table, name)
+            print()
+    raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
 @app.command()
@@ -279,6 +283,19 @@ def sql(
         _print_json(answer)
     else:
         show_table(answer)
+
+
+@app.command()
+def report(
+    out: Annotated[Path, typer.Argument(help="A result of `balise replay`.")],
+    site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
+) -> None:
+    """Write HTML pages, for the campaign and each run, that open offline."""
+    from pipeline.ingest.site import read_site
+    from pipeline.report import write_report
+
+    pages = write_report(out, None if site is None else read_site(site))
+    print(f"{len(pages)} files; begin with {pages[0]}")
 
 
 @app.command()
@@ -392,15 +409,21 @@ def _summary_rows(summary: Summary) -> Any:
     return pl.DataFrame(rows, schema=dict(zip(names, kinds, strict=True)), orient="row")
 
 
-def _write_demo(out: Path, result: Any) -> None:
-    """The tables of the demo, as a campaign would leave them."""
-    from pipeline.store import write_run
+def _write_demo(out: Path, result: Any) -> Path:
+    """The demo's tables as a campaign would leave them, and the report; returns the report's first page."""
+    from pipeline.campaign.finish import write_campaign
+    from pipeline.report import write_report
+    from pipeline.store import write_config, write_run
+    from schemas.config import Configuration
     from schemas.version import SOFTWARE
 
     for tables in result.tables:
         row = tables.runs.row(0, named=True)
         digests = {name: row[name] for name in ("config_digest", "input_digest")}
-        write_run(tables, out / "tables", {"software": SOFTWARE, **digests})
+        write_run(tables, out, {"software": SOFTWARE, "site_digest": result.site.digest, **digests})
+    write_config(out, Configuration())
+    write_campaign(out, Configuration())
+    return write_report(out, result.site)[0]
 
 
 if __name__ == "__main__":

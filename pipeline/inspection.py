@@ -1,18 +1,22 @@
-"""What `balise inspect` says of a site or a result."""
+"""What `balise inspect` says of a log, a site or a result."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
+from datetime import UTC, datetime
 
 import polars as pl
 
 from pipeline import storage, store
 from pipeline.ingest import files
+from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
 from pipeline.matching.describe import describe_site
+from schemas.config import IngestConfig
 from schemas.errors import UsageError
-from schemas.run import Finding
+from schemas.run import STREAMS, Finding
 
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
@@ -22,34 +26,76 @@ _RUN_COLUMNS = (
 )
 
 
-def inspect_path(path: Address) -> dict[str, pl.DataFrame]:
+def inspect_path(path: Address, config: IngestConfig | None = None) -> dict[str, pl.DataFrame]:
     """Tables by title, for whatever stands at the path."""
     if not files.exists(path):
         raise UsageError("does not exist", place=storage.redacted(str(path)))
-    if files.is_dir(path):
-        names = set(files.list_dir(path))
-        if names & _SITE_FILES:
-            return inspect_site(path)
-        if "runs" in names and store.run_ids(path):
-            return inspect_result(path)
+    names = set(files.list_dir(path)) if files.is_dir(path) else set()
+    if names & _SITE_FILES:
+        return inspect_site(path)
+    if "runs" in names and store.run_ids(path):
+        return inspect_result(path)
+    if files.name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
+        return inspect_log(path, config or IngestConfig())
     raise UsageError(
-        "is neither a site nor a result",
+        "is neither a log, a site nor a result",
         place=storage.redacted(str(path)),
-        expected="a folder with track.parquet (site) or with runs/ (result)",
+        expected="RUN.mcap, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
     )
+
+
+def inspect_log(path: Address, config: IngestConfig) -> dict[str, pl.DataFrame]:
+    """Streams, topics, what is mapped to what, and what keeps the log from being replayed."""
+    found = describe_log(path, config)
+    figures = {
+        "kind": found.kind,
+        "size_bytes": found.size_bytes,
+        "left_over": found.left_over,
+        "damage": found.notes.damage,
+        "chunks_without_crc": found.notes.chunks_without_crc,
+    }
+    tables = {"Log": _figures(figures)}
+    tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in found.streams])
+    if found.topics:
+        tables["Topics"] = pl.DataFrame([_topic_row(topic) for topic in found.topics])
+    if found.problems:
+        tables["Problems"] = pl.DataFrame({"problem": found.problems})
+    if found.starting_config:
+        tables["Configuration to begin with"] = pl.DataFrame({"toml": found.starting_config.splitlines()})
+    return tables
+
+
+def _stream_row(stream: StreamSummary) -> dict[str, object]:
+    row = {item.name: getattr(stream, item.name) for item in fields(stream)}
+    for name in ("t_start", "t_end"):
+        row[name] = _instant(row.pop(f"{name}_ns"))
+    return {**row, "fix_mix": _value(stream.fix_mix), "columns": " ".join(stream.columns)}
+
+
+def _topic_row(topic: TopicSummary) -> dict[str, object]:
+    row = {item.name: getattr(topic, item.name) for item in fields(topic) if item.name != "fields"}
+    mapping = ", ".join(f"{column} = {source}" for column, source in topic.mapping.items())
+    return {**row, "stream": topic.stream or "left over", "mapping": mapping}
+
+
+def _instant(t_ns: int | None) -> datetime | None:
+    return None if t_ns is None else datetime.fromtimestamp(t_ns / 1e9, UTC)
 
 
 def inspect_site(path: Address) -> dict[str, pl.DataFrame]:
     """Figures and findings of a site."""
     description = describe_site(read_site(path))
-    names = [item.name for item in fields(description) if item.name != "findings"]
-    figures = pl.DataFrame({"figure": names, "value": [_value(getattr(description, name)) for name in names]})
-    return {"Site": figures, "Findings": _findings(description.findings)}
+    figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
+    return {"Site": _figures(figures), "Findings": _findings(description.findings)}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:
     """The runs of a result in their main figures."""
     return {"Runs": store.read_table(path, "runs").select(_RUN_COLUMNS).collect()}
+
+
+def _figures(figures: Mapping[str, object]) -> pl.DataFrame:
+    return pl.DataFrame({"figure": list(figures), "value": [_value(value) for value in figures.values()]})
 
 
 def _findings(findings: tuple[Finding, ...]) -> pl.DataFrame:
@@ -64,9 +110,9 @@ def _value(value: object) -> str:
             return "-"
         case float():
             return f"{value:.6g}"
-        case dict():
+        case Mapping():
             return ", ".join(f"{count} {name}" for name, count in value.items()) or "none"
         case tuple():
-            return ", ".join(map(_value, value))
+            return ", ".join(map(_value, value)) or "none"
         case _:
             return str(value)

@@ -147,6 +147,27 @@ def test_inspect(balise: Balise, small_trial: SmallTrial, result: Path) -> None:
     assert [row["run_id"] for row in runs["Runs"]] == ["run0", "run1"]
 
 
+def test_inspect_logs(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    log = json.loads(balise("inspect", small_trial.paths[0], "--json").out)
+    assert {row["stream"]: row["rate_hz"] for row in log["Streams"]} == {"gnss": 10.0, "odometer": 25.0}
+    (tmp_path / "bad.mcap").write_bytes(b"no log")
+    bad = balise("inspect", tmp_path / "bad.mcap")
+    assert bad.status == 1
+    assert "does not start as MCAP does" in bad.out
+
+
+def test_report(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    balise("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path, "--quiet")
+    said = balise("report", tmp_path, "--site", small_trial.site)
+    assert said.status == 0
+    assert (tmp_path / "report/index.html").exists()
+    assert (tmp_path / "report/runs/run0.html").exists()
+
+
+def test_experiments_are_listed(balise: Balise) -> None:
+    assert "diagnostics" in balise("experiment", "list").out.split()
+
+
 def test_sql(balise: Balise, result: Path) -> None:
     said = balise("sql", result, "select run_id, count(*) as n from passages group by run_id order by run_id", "--json")
     assert [row["run_id"] for row in json.loads(said.out)] == ["run0", "run1"]
