@@ -1,0 +1,124 @@
+"""A run with its results as MCAP for Foxglove, Lichtblick and Rerun."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from itertools import accumulate
+from pathlib import Path
+from typing import Literal
+
+import polars as pl
+
+from pipeline.export.events import alarm_entries, hazard_entries, passage_entries
+from pipeline.export.gis import balises_geojson, track_geojson
+from pipeline.export.messages import geojson_topic, log_topic, rows_topic
+from pipeline.export.positions import as_gnss, positions_of
+from pipeline.ingest import payloads
+from pipeline.ingest.mcap_writer import Topic
+from pipeline.ingest.proto_schemas import LOCATION_FIX, descriptor_set
+from pipeline.ingest.ros2_text import DEFINITIONS
+from schemas.errors import OutputError
+from schemas.run import RunLog, RunTables, Site
+from schemas.tables import MONITORS
+
+PositionMessage = Literal["foxglove", "ros"]
+
+_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
+_FRAME = "wgs84"
+_LDS = (
+    "t", "netelement_id", "measure_m", "path_m", "odometer_m", "speed_mps", "cross_track_m", "vertical_m", "on_track",
+    "path_probability", "confidence_m", "error_along_m", "error_cross_m", "error_up_m", "alarm", "lds_mode",
+    "lds_state", "tvb", "lrvb_id", "distance_from_lrvb_m", "doubt_over_m", "doubt_under_m", "exposure_s",
+)  # fmt: skip
+
+
+def run_topics(
+    tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
+) -> tuple[list[Topic], list[str]]:
+    """All topics of a run, and what could not be written for want of the site or the log."""
+    topics: list[Topic] = []
+    missing = [] if site is not None else ["matched and true positions, track and balises (no site given)"]
+    missing += [] if log is not None else ["raw positions (no log given)"]
+    solutions = tables.epochs["solution"].unique(maintain_order=True).to_list()
+    if site is not None and tables.epochs.height:
+        t0_ns = int(tables.epochs["t"].to_physical().min())  # type: ignore[arg-type]
+        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site)))
+        topics += [geojson_topic("/site/balises", t0_ns, balises_geojson(site))] if site.balises is not None else []
+    for solution in solutions:
+        topics += _solution_topics(solution, tables, site, log, positions)
+    return topics, missing
+
+
+def write_topics(topics: list[Topic], path: Path, profile: str) -> None:
+    """Write topics merged by time; the same topics give the same bytes."""
+    from mcap.writer import CompressionType, Writer
+
+    try:
+        with path.open("wb") as stream:
+            writer = Writer(stream, compression=CompressionType.ZSTD)
+            writer.start(profile=profile, library="balise")
+            channels = [
+                writer.register_channel(
+                    topic.topic,
+                    topic.encoding,
+                    writer.register_schema(topic.schema_name, topic.schema_encoding, topic.schema),
+                )
+                for topic in topics
+            ]
+            for t_ns, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
+                data = next(topics[number].messages)
+                writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
+            writer.finish()  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
+
+
+def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
+    for row, t_ns in enumerate(accumulate(topic.times_ns, max)):
+        yield t_ns, number, row
+
+
+def _solution_topics(
+    solution: str, tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
+) -> list[Topic]:
+    epochs, hazards, alarms, passages = (
+        frame.filter(pl.col("solution") == solution)
+        for frame in (tables.epochs, tables.hazards, tables.alarms, tables.passages)
+    )
+    topics: list[Topic] = []
+    if log is not None:
+        raw = log.gnss.filter(pl.col("solution") == solution)
+        topics.append(_position_topic(f"/{solution}/raw", raw, positions))
+    if site is not None:
+        places = positions_of(epochs, site)
+        for name in ("gnss", "matched", "truth"):
+            topics.append(_position_topic(f"/{solution}/{name}", as_gnss(getattr(places, name)), positions))
+    return [
+        *topics,
+        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS)),
+        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs)),
+        log_topic(f"/{solution}/hazards", hazard_entries(hazards)),
+        log_topic(f"/{solution}/alarms", alarm_entries(alarms)),
+        log_topic(f"/{solution}/passages", passage_entries(passages)),
+    ]
+
+
+def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
+    """Values, thresholds and states, and the ratio that viewers draw: beyond ±1 the monitor fails."""
+    columns: list[pl.Expr] = [pl.col("t")]
+    for name in MONITORS:
+        value, threshold = pl.col(f"{name}_value"), pl.col(f"{name}_threshold")
+        ratio = pl.when(threshold > 0.0).then(value / threshold).alias(f"{name}_ratio")
+        columns += [value, threshold, ratio, pl.col(f"{name}_state").cast(pl.String)]
+    return epochs.select(columns)
+
+
+def _position_topic(topic: str, frame: pl.DataFrame, positions: PositionMessage) -> Topic:
+    known = frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
+    times = known["t"].to_physical().to_list()
+    if positions == "ros":
+        messages = payloads.navsatfix_payloads(known, _FRAME)
+        return Topic(topic, "cdr", _NAVSATFIX, "ros2msg", DEFINITIONS[_NAVSATFIX].encode(), times, messages)
+    messages = payloads.location_fix_payloads(known, _FRAME)
+    return Topic(topic, "protobuf", LOCATION_FIX, "protobuf", descriptor_set(LOCATION_FIX), times, messages)

@@ -1,0 +1,139 @@
+"""Flat protobuf messages built at run time: rows of a frame, and those of Foxglove's that are needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any
+
+import polars as pl
+
+from pipeline.ingest.mcap_writer import Topic
+
+_SECOND_NS = 1_000_000_000
+# descriptor.proto: FieldDescriptorProto.Type and Label
+_DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM, _OPTIONAL = 1, 3, 7, 8, 9, 11, 14, 1
+_TYPES: Mapping[str, int] = {"double": _DOUBLE, "int64": _INT64, "fixed32": _FIXED32, "bool": _BOOL, "string": _STRING}
+
+Fields = tuple[tuple[str, str], ...]
+
+LOG: Fields = (
+    ("timestamp", "time"), ("level", "level"), ("message", "string"), ("name", "string"), ("file", "string"),
+    ("line", "fixed32"),
+)  # fmt: skip
+"""foxglove.Log: fields in the order of their numbers."""
+
+GEOJSON: Fields = (("geojson", "string"),)
+"""foxglove.GeoJSON."""
+
+INFO, WARNING, ERROR = 2, 3, 4
+_LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+
+
+def rows_topic(topic: str, name: str, frame: pl.DataFrame) -> Topic:
+    """One message per row, time in the first column; a null is not set."""
+    fields = tuple((column, _kind(dtype)) for column, dtype in frame.schema.items())
+    times = frame.to_series(0).to_physical().to_list()
+    return Topic(topic, "protobuf", name, "protobuf", descriptor(name, fields), times, _rows(name, fields, frame))
+
+
+def log_topic(topic: str, entries: list[tuple[int, int, str, str]]) -> Topic:
+    """foxglove.Log from time [ns], level, name and message, put in order of time."""
+    ordered = sorted(entries)
+    messages = (
+        _message("foxglove.Log", LOG, {"timestamp": t_ns, "level": level, "name": name, "message": text, "line": 0})
+        for t_ns, level, name, text in ordered
+    )
+    schema = descriptor("foxglove.Log", LOG)
+    return Topic(topic, "protobuf", "foxglove.Log", "protobuf", schema, [entry[0] for entry in ordered], messages)
+
+
+def geojson_topic(topic: str, t_ns: int, text: str) -> Topic:
+    """foxglove.GeoJSON, once."""
+    message = _message("foxglove.GeoJSON", GEOJSON, {"geojson": text})
+    schema = descriptor("foxglove.GeoJSON", GEOJSON)
+    return Topic(topic, "protobuf", "foxglove.GeoJSON", "protobuf", schema, [t_ns], iter([message]))
+
+
+@cache
+def descriptor(name: str, fields: Fields) -> bytes:
+    """The serialised FileDescriptorSet of a message, with the time stamp it may hold."""
+    from google.protobuf import timestamp_pb2
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+
+    stamp = FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    file = FileDescriptorProto(
+        name=name.replace(".", "/") + ".proto",
+        package=name.rpartition(".")[0],
+        syntax="proto3",
+        dependency=[stamp.name],
+    )
+    message = file.message_type.add(name=name.rpartition(".")[2])
+    for number, (field, kind) in enumerate(fields, start=1):
+        _add_field(message, name, number, field, kind)
+    return bytes(FileDescriptorSet(file=[stamp, file]).SerializeToString(deterministic=True))
+
+
+@cache
+def message_class(name: str, fields: Fields) -> Any:
+    """The class of a message, in a pool of its own."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    pool = DescriptorPool()
+    for file in FileDescriptorSet.FromString(descriptor(name, fields)).file:
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(name))
+
+
+def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> None:
+    if kind == "time":
+        stamp = ".google.protobuf.Timestamp"
+        message.field.add(name=field, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=stamp)
+    elif kind == "level":
+        levels = message.enum_type.add(name="Level")
+        for value, level in enumerate(_LEVELS):
+            levels.value.add(name=level, number=value)
+        message.field.add(name=field, number=number, type=_ENUM, label=_OPTIONAL, type_name=f".{name}.Level")
+    elif name.startswith("foxglove."):
+        message.field.add(name=field, number=number, type=_TYPES[kind], label=_OPTIONAL)
+    else:
+        # With presence: absent means not known, which a plain proto3 field would show as zero.
+        message.oneof_decl.add(name=f"_{field}")
+        index = len(message.oneof_decl) - 1
+        message.field.add(
+            name=field, number=number, type=_TYPES[kind], label=_OPTIONAL, proto3_optional=True, oneof_index=index
+        )
+
+
+def _kind(dtype: pl.DataType) -> str:
+    if isinstance(dtype, pl.Datetime):
+        return "time"
+    if dtype == pl.Boolean:
+        return "bool"
+    if dtype.is_integer():
+        return "int64"
+    return "double" if dtype.is_float() else "string"
+
+
+def _rows(name: str, fields: Fields, frame: pl.DataFrame) -> Iterator[bytes]:
+    plain = frame.with_columns(pl.col(field).to_physical() for field, kind in fields if kind == "time")
+    for row in plain.iter_rows(named=True):
+        yield _message(name, fields, row)
+
+
+def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
+    message = message_class(name, fields)()
+    for field, kind in fields:
+        value = values.get(field)
+        if value is None:
+            continue
+        if kind == "time":
+            stamp = getattr(message, field)
+            stamp.SetInParent()
+            stamp.seconds, stamp.nanos = divmod(value, _SECOND_NS)
+        else:
+            setattr(message, field, value)
+    return bytes(message.SerializeToString(deterministic=True))

@@ -1,0 +1,85 @@
+"""One run of a result as a file that other programs read; the suffix decides which."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.export.gis import run_geojson, run_gpx
+from pipeline.export.layout import layout_json
+from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
+from pipeline.store import metadata_of, read_table, run_ids, table_address
+from schemas.errors import OutputError, UsageError
+from schemas.run import RunLog, RunTables, Site
+from schemas.tables import TABLES
+
+SUFFIXES = (".mcap", ".geojson", ".gpx")
+
+
+def export_run(
+    out: Path,
+    run_id: str,
+    to: Path,
+    site: Site | None = None,
+    log: RunLog | None = None,
+    positions: PositionMessage = "foxglove",
+) -> tuple[list[Path], list[str]]:
+    """Write a run of the result `out`; returns the files, and what they lack for want of site or log.
+
+    `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards,
+    alarms and passages; beside it goes `NAME.layout.json` for Foxglove. `.geojson` and `.gpx` hold matched
+    positions and hazards and need the site. `positions` chooses foxglove.LocationFix or ROS 2 NavSatFix.
+    """
+    if to.suffix.lower() not in SUFFIXES:
+        raise UsageError("cannot be told by its suffix", place=str(to), expected=" or ".join(SUFFIXES))
+    tables = read_run_tables(out, run_id)
+    _check(out, tables, site, log)
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if to.suffix.lower() == ".mcap":
+        return _write_mcap(tables, to, site, log, positions)
+    if site is None:
+        raise UsageError(
+            "positions on the ground need the site", place=str(to), remedy="Name it with --site, as in the replay."
+        )
+    make = run_geojson if to.suffix.lower() == ".geojson" else run_gpx
+    return [_write_text(to, make(tables, site))], []
+
+
+def read_run_tables(out: Path, run_id: str) -> RunTables:
+    """The five tables of one complete run."""
+    known = run_ids(out)
+    if run_id not in known:
+        shown = ", ".join(known[:10]) or "no complete run"
+        raise UsageError("has no such run", place=str(out), found=run_id, expected=shown)
+    frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
+    return RunTables(run_id, **frames)
+
+
+def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:
+    """Site and log have to be those of the replay, as far as the result tells."""
+    metadata = metadata_of(Path(str(table_address(out, "runs", tables.run_id))))
+    given = {"site_digest": site.digest if site else "", "log_digest": log.input_digest if log else ""}
+    for name, digest in given.items():
+        known = metadata.get(name, "")
+        if digest and known and digest != known:
+            what = name.removesuffix("_digest")
+            raise UsageError(f"was replayed with another {what}", place=tables.run_id, found=digest, expected=known)
+    if tables.epochs.is_empty():
+        raise UsageError("has no epoch to export", place=tables.run_id, found=str(tables.runs["error"].first()))
+
+
+def _write_mcap(
+    tables: RunTables, to: Path, site: Site | None, log: RunLog | None, positions: PositionMessage
+) -> tuple[list[Path], list[str]]:
+    topics, missing = run_topics(tables, site, log, positions)
+    write_topics(topics, to, "ros2" if positions == "ros" else "")
+    layout = to.with_suffix(".layout.json")
+    first = str(tables.epochs["solution"][0])
+    return [to, _write_text(layout, layout_json(first, site is not None))], missing
+
+
+def _write_text(path: Path, text: str) -> Path:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
+    return path
