@@ -17,7 +17,7 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
 from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
-from schemas.config import Configuration, Vehicle, digest_of
+from schemas.config import Configuration, LdsConfig, Vehicle, digest_of
 from schemas.conform import conform
 from schemas.enums import Evidence
 from schemas.run import RunLog, RunTables, Site
@@ -76,7 +76,9 @@ def _match(context: _Context, solution: str) -> Match:
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Solution:
     run, config, vehicle, found = context.run, context.config, context.vehicle, matches[solution]
     balises = found.path.balises(context.site.balises)
-    aligned = align(found.epochs, run.odometer, context.vehicle, config).with_columns(_confidence(context, solution))
+    fixes = run.gnss.filter(pl.col("solution") == solution)
+    matched = found.epochs.with_columns(fixes["hpl_m"])
+    aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
     telegrams = _with_odometer(run, aligned, config)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
@@ -97,7 +99,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         counts=context.counts.solutions[solution],
         ingest=run.notes,
         ambiguous_stretches=found.ambiguous.height,
-        notes=_notes(found, lds),
+        notes=_notes(run, found, lds),
     )
     return _Solution(epochs, result, summarise(results, config, provenance(context.run, context.site, vehicle, config)))
 
@@ -120,9 +122,15 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
     return Alignment(*(aligned[name][-1] for name in names))
 
 
-def _notes(found: Match, lds: LdsResult) -> tuple[str, ...]:
+def _notes(run: RunLog, found: Match, lds: LdsResult) -> tuple[str, ...]:
     """What the reader of the `runs` row should know beside its figures."""
     notes = []
+    if run.faults is not None and run.faults.height:
+        notes.append("faults were injected: " + ", ".join(sorted(set(run.faults["kind"].to_list()))))
+    if run.odometer is not None and _end_ns(run.gnss) > _end_ns(run.odometer) + 1_000_000_000:
+        notes.append("the odometer ends before the GNSS")
+    if run.odometer is not None and _end_ns(run.odometer) > _end_ns(run.gnss) + 1_000_000_000:
+        notes.append("the GNSS ends before the odometer")
     if found.ambiguous.height:
         clock = "%H:%M:%S"
         stretches = [
@@ -138,13 +146,14 @@ def _notes(found: Match, lds: LdsResult) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _confidence(context: _Context, solution: str) -> pl.Series | pl.Expr:
+def _end_ns(stream: pl.DataFrame) -> int:
+    return int(stream["t"].dt.timestamp("ns")[-1])
+
+
+def _confidence(lds: LdsConfig) -> pl.Expr:
     """Half-width of the confidence interval along the track: K sigma, or the receiver's HPL (DOMAIN section 4)."""
-    lds = context.config.lds
-    if lds.ci_source == "sigma":
-        return (lds.ci_factor * pl.col("sigma_along_m")).alias("confidence_m")
-    fixes = context.run.gnss.filter(pl.col("solution") == solution)
-    return fixes["hpl_m"].alias("confidence_m")
+    half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
+    return half_width.alias("confidence_m")
 
 
 def _single_monitors(

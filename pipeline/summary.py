@@ -88,6 +88,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | _exposure(results.epochs)
         | _state_shares(results.epochs, clock)
         | stanford_counts(results.epochs, config.lds.ci_limit_m)
+        | _stanford_of_receiver(results.epochs, config.lds.ci_limit_m)
         | _provenance(provenance)
     )
     return _frame(row)
@@ -96,12 +97,16 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
     """The `runs` row of a run that could not be replayed: counts are zero, the rest is not known."""
     zeros: Row = {name: 0 for name, column in Runs.columns().items() if column.dtype == pl.Int64}
-    row = zeros | {
-        "solution": solution,
-        "status": RunStatus.FAILED,
-        "error": error,
-        "false_alarms": None,
-    }
+    row = (
+        zeros
+        | {
+            "solution": solution,
+            "status": RunStatus.FAILED,
+            "error": error,
+            "false_alarms": None,
+        }
+        | {name: None for name in Runs.columns() if name.startswith("stanford_hpl_")}
+    )
     return _frame(row | _provenance(provenance))
 
 
@@ -351,6 +356,12 @@ def stanford_counts(epochs: pl.DataFrame, limit_m: float, bound: str = "confiden
         "stanford_hazardous": int(np.sum(offered & (error > limit_m))),
         "stanford_unavailable": int(np.sum(~offered)),
     }
+
+
+def _stanford_of_receiver(epochs: pl.DataFrame, limit_m: float) -> Row:
+    """The same counts with the receiver's protection level as bound; not known where it gives none."""
+    counts = stanford_counts(epochs, limit_m, "hpl_m") if epochs["hpl_m"].count() else {}
+    return {f"stanford_hpl_{name.removeprefix('stanford_')}": value for name, value in counts.items()}
 
 
 def _provenance(provenance: Provenance) -> Row:

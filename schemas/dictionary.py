@@ -8,6 +8,7 @@ import dataframely as dy
 import polars as pl
 from pydantic import BaseModel
 
+from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, Vehicle
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -34,6 +35,7 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
         "Input streams": {str(name): schema for name, schema in STREAM_SCHEMAS.items()},
         "Site": SITE_SCHEMAS,
         "Output tables": TABLES,
+        "Campaign tables": CAMPAIGN_TABLES,
     }
 
 

@@ -171,6 +171,7 @@ class _EpochsAfterMonitors(dy.Schema):
     gate_probability = real("1", "causal probability of the path, used for detection", min=0, max=1)
     odometer_scale = real("1", "scale in use at this epoch (true over odometer distance)")
     latency_s = real("s", "GNSS latency in use at this epoch")
+    hpl_m = real("m", "horizontal protection level of the receiver", min=0)
 
 
 def _monitor_columns(monitor: str) -> dict[str, dy.Column]:
@@ -266,6 +267,10 @@ class Runs(dy.Schema):
     input_digest = text("SHA-256 of log and site")
     software = text("name and version of the program")
     contract = text("version of this contract")
+    stanford_hpl_nominal = count("as stanford_nominal, with the receiver's HPL; null without one", nullable=True)
+    stanford_hpl_misleading = count("as stanford_misleading, with the receiver's HPL", nullable=True)
+    stanford_hpl_hazardous = count("as stanford_hazardous, with the receiver's HPL", nullable=True)
+    stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
     notes = text("what reading and matching found out about the run", nullable=True)
 

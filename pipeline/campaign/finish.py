@@ -9,18 +9,21 @@ import polars as pl
 from pipeline import storage, store
 from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_runs, with_speed
 from pipeline.ingest.files import Address, join
+from pipeline.safety.measured import detection_by_level, measured_figures
 from schemas.config import Configuration, digest_of
 from schemas.tables import CONTRACT_VERSION
 from schemas.version import SOFTWARE
 
 
 def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFrame]:
-    """Derive `runs`, `balises` and `accuracy` of `OUT/campaign/` from all complete runs of the result."""
+    """Derive `runs`, `balises`, `accuracy`, `figures` and `detection` of `OUT/campaign/` from all complete runs of the result."""
     runs, hazards, passages = (store.read_table(out, name).collect() for name in ("runs", "hazards", "passages"))
     tables = {
         "runs": campaign_runs(runs, hazards, config.safety),
         "balises": campaign_balises(passages, config),
         "accuracy": campaign_accuracy(_with_speeds(out, passages), config),
+        "figures": measured_figures(runs, hazards, config.safety),
+        "detection": detection_by_level(hazards, config.safety),
     }
     metadata = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config)}
     for name, table in tables.items():
