@@ -16,7 +16,7 @@ from schemas.version import SOFTWARE
 
 
 def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFrame]:
-    """Derive `runs`, `balises`, `accuracy`, `figures` and `detection` of `OUT/campaign/` from all complete runs of the result."""
+    """Derive the tables of `OUT/campaign/` from all complete runs of the result."""
     runs, hazards, passages = (store.read_table(out, name).collect() for name in ("runs", "hazards", "passages"))
     tables = {
         "runs": campaign_runs(runs, hazards, config.safety),
