@@ -45,7 +45,8 @@ def read_site(path: Path | str) -> Site:
     key-value metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON
     in its `crs` member. In a projected system `longitude_deg` holds the easting and `latitude_deg` the
     northing, or the columns are named `x_m` and `y_m`. Heights are taken as they are (ellipsoidal).
-    `measure_m` empty for a whole element: its geometric length.
+    `measure_m` empty for a whole element: its geometric length. A route's `direction` is AB, growing or
+    forward (from the element's start to its end), or BA, falling or reverse.
 
     Raises `SiteError` with all breaches at once; what is merely remarkable is in `Site.findings`.
     """

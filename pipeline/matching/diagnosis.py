@@ -26,6 +26,8 @@ def off_the_network(fixes: Fixes, track: Track, config: MatchingConfig) -> Input
         remedy = "Latitude and longitude are swapped, in the log or in the site: exchange them."
     elif nearest_m[row] > 10_000.0:
         remedy = "Check that it is this site, and that track file and log name their coordinate system rightly."
+    elif nearest_m[row] < 500.0:
+        remedy = "A national grid or datum taken for WGS 84 shifts by as much: check the EPSG codes of both."
     else:
         remedy = "Check that the site covers this run; matching.reach_m says how far off a track may be."
     return InputError(

@@ -130,6 +130,21 @@ def test_findings_name_what_is_odd(tmp_path: Path) -> None:
     assert site.links.height == 4
 
 
+def test_chords_that_leave_their_curve_are_said(tmp_path: Path) -> None:
+    """A curve of 300 m radius in chords of 60 m: 60²/(8·300) = 1.5 m."""
+    angle = np.arange(0.0, 1.2, 0.2)
+    frame = pl.DataFrame(
+        {
+            "netelement_id": ["arc"] * len(angle),
+            "latitude_deg": 50.0 + np.degrees(300.0 * (1 - np.cos(angle)) / 6_372_956.0),
+            "longitude_deg": 4.0 + np.degrees(300.0 * np.sin(angle) / (6_390_702.0 * np.cos(np.radians(50.0)))),
+        }
+    )
+    (finding,) = read_site(builders.write(tmp_path, track=frame)).findings
+    assert finding.message == "vertices up to 60 m apart: its chords leave the curve by up to 1.50 m"
+    assert finding.severity == "note"
+
+
 def test_declared_length_against_geometry(tmp_path: Path) -> None:
     declared = builders.track().with_columns(
         measure_m=pl.when(pl.col("netelement_id") == "b").then(
