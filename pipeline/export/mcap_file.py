@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.export.events import alarm_entries, hazard_entries, passage_entries
 from pipeline.export.gis import balises_geojson, track_geojson
-from pipeline.export.messages import geojson_topic, log_topic, rows_topic
+from pipeline.export.messages import Encoding, geojson_topic, log_topic, rows_topic
 from pipeline.export.positions import as_gnss, positions_of
 from pipeline.ingest import payloads
 from pipeline.ingest.mcap_writer import Topic
@@ -40,13 +40,16 @@ def run_topics(
     topics: list[Topic] = []
     missing = [] if site is not None else ["matched and true positions, track and balises (no site given)"]
     missing += [] if log is not None else ["raw positions (no log given)"]
+    # Readers of ROS 2 bags refuse a bag that holds anything else.
+    encoding: Encoding = "cdr" if positions == "ros" else "protobuf"
     solutions = tables.epochs["solution"].unique(maintain_order=True).to_list()
     if site is not None and tables.epochs.height:
         t0_ns = int(tables.epochs["t"].to_physical().min())  # type: ignore[arg-type]
-        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site)))
-        topics += [geojson_topic("/site/balises", t0_ns, balises_geojson(site))] if site.balises is not None else []
+        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site), encoding))
+        topics.append(geojson_topic("/site/balises", t0_ns, balises_geojson(site), encoding))
     for solution in solutions:
-        topics += _solution_topics(solution, tables, site, log, positions)
+        topics += _position_topics(solution, tables, site, log, positions)
+        topics += _result_topics(solution, tables, encoding)
     return topics, missing
 
 
@@ -79,28 +82,31 @@ def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
         yield t_ns, number, row
 
 
-def _solution_topics(
+def _position_topics(
     solution: str, tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
 ) -> list[Topic]:
-    epochs, hazards, alarms, passages = (
-        frame.filter(pl.col("solution") == solution)
-        for frame in (tables.epochs, tables.hazards, tables.alarms, tables.passages)
-    )
-    topics: list[Topic] = []
+    topics = []
     if log is not None:
         raw = log.gnss.filter(pl.col("solution") == solution)
         topics.append(_position_topic(f"/{solution}/raw", raw, positions))
     if site is not None:
-        places = positions_of(epochs, site)
+        places = positions_of(tables.epochs.filter(pl.col("solution") == solution), site)
         for name in ("gnss", "matched", "truth"):
             topics.append(_position_topic(f"/{solution}/{name}", as_gnss(getattr(places, name)), positions))
+    return topics
+
+
+def _result_topics(solution: str, tables: RunTables, encoding: Encoding) -> list[Topic]:
+    epochs, hazards, alarms, passages = (
+        frame.filter(pl.col("solution") == solution)
+        for frame in (tables.epochs, tables.hazards, tables.alarms, tables.passages)
+    )
     return [
-        *topics,
-        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS)),
-        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs)),
-        log_topic(f"/{solution}/hazards", hazard_entries(hazards)),
-        log_topic(f"/{solution}/alarms", alarm_entries(alarms)),
-        log_topic(f"/{solution}/passages", passage_entries(passages)),
+        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS), encoding),
+        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs), encoding),
+        log_topic(f"/{solution}/hazards", hazard_entries(hazards), encoding),
+        log_topic(f"/{solution}/alarms", alarm_entries(alarms), encoding),
+        log_topic(f"/{solution}/passages", passage_entries(passages), encoding),
     ]
 
 

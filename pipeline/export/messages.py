@@ -1,13 +1,14 @@
-"""Flat protobuf messages built at run time: rows of a frame, and those of Foxglove's that are needed."""
+"""Flat messages, protobuf or ROS 2, built at run time: rows of a frame, and those of Foxglove's that are needed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import polars as pl
 
+from pipeline.export.cdr import Fields, cdr_messages, definition
 from pipeline.ingest.mcap_writer import Topic
 
 _SECOND_NS = 1_000_000_000
@@ -15,7 +16,7 @@ _SECOND_NS = 1_000_000_000
 _DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM, _OPTIONAL = 1, 3, 7, 8, 9, 11, 14, 1
 _TYPES: Mapping[str, int] = {"double": _DOUBLE, "int64": _INT64, "fixed32": _FIXED32, "bool": _BOOL, "string": _STRING}
 
-Fields = tuple[tuple[str, str], ...]
+Encoding = Literal["protobuf", "cdr"]
 
 LOG: Fields = (
     ("timestamp", "time"), ("level", "level"), ("message", "string"), ("name", "string"), ("file", "string"),
@@ -30,29 +31,40 @@ INFO, WARNING, ERROR = 2, 3, 4
 _LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
 
-def rows_topic(topic: str, name: str, frame: pl.DataFrame) -> Topic:
+def rows_topic(topic: str, name: str, frame: pl.DataFrame, encoding: Encoding) -> Topic:
     """One message per row, time in the first column; a null is not set."""
     fields = tuple((column, _kind(dtype)) for column, dtype in frame.schema.items())
     times = frame.to_series(0).to_physical().to_list()
-    return Topic(topic, "protobuf", name, "protobuf", descriptor(name, fields), times, _rows(name, fields, frame))
+    plain = frame.with_columns(pl.col(field).to_physical() for field, kind in fields if kind == "time")
+    return _topic(topic, name, fields, times, plain.iter_rows(named=True), encoding)
 
 
-def log_topic(topic: str, entries: list[tuple[int, int, str, str]]) -> Topic:
+def log_topic(topic: str, entries: list[tuple[int, int, str, str]], encoding: Encoding) -> Topic:
     """foxglove.Log from time [ns], level, name and message, put in order of time."""
     ordered = sorted(entries)
-    messages = (
-        _message("foxglove.Log", LOG, {"timestamp": t_ns, "level": level, "name": name, "message": text, "line": 0})
+    rows = (
+        {"timestamp": t_ns, "level": level, "message": text, "name": name, "file": "", "line": 0}
         for t_ns, level, name, text in ordered
     )
-    schema = descriptor("foxglove.Log", LOG)
-    return Topic(topic, "protobuf", "foxglove.Log", "protobuf", schema, [entry[0] for entry in ordered], messages)
+    return _topic(topic, "foxglove.Log", LOG, [entry[0] for entry in ordered], rows, encoding)
 
 
-def geojson_topic(topic: str, t_ns: int, text: str) -> Topic:
+def geojson_topic(topic: str, t_ns: int, text: str, encoding: Encoding) -> Topic:
     """foxglove.GeoJSON, once."""
-    message = _message("foxglove.GeoJSON", GEOJSON, {"geojson": text})
-    schema = descriptor("foxglove.GeoJSON", GEOJSON)
-    return Topic(topic, "protobuf", "foxglove.GeoJSON", "protobuf", schema, [t_ns], iter([message]))
+    return _topic(topic, "foxglove.GeoJSON", GEOJSON, [t_ns], iter([{"geojson": text}]), encoding)
+
+
+def _topic(
+    topic: str, name: str, fields: Fields, times: list[int], rows: Iterator[Mapping[str, Any]], encoding: Encoding
+) -> Topic:
+    if encoding == "cdr":
+        package, _, message = name.rpartition(".")
+        schema = definition(fields).encode()
+        return Topic(
+            topic, "cdr", f"{package}_msgs/msg/{message}", "ros2msg", schema, times, cdr_messages(fields, rows)
+        )
+    messages = (_message(name, fields, row) for row in rows)
+    return Topic(topic, "protobuf", name, "protobuf", descriptor(name, fields), times, messages)
 
 
 @cache
@@ -116,12 +128,6 @@ def _kind(dtype: pl.DataType) -> str:
     if dtype.is_integer():
         return "int64"
     return "double" if dtype.is_float() else "string"
-
-
-def _rows(name: str, fields: Fields, frame: pl.DataFrame) -> Iterator[bytes]:
-    plain = frame.with_columns(pl.col(field).to_physical() for field, kind in fields if kind == "time")
-    for row in plain.iter_rows(named=True):
-        yield _message(name, fields, row)
 
 
 def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
