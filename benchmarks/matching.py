@@ -7,13 +7,13 @@ that they mean the same on every machine.
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
+from benchmarks.results import Figure, best_of
 from pipeline.geodesy import points_of
 from pipeline.matching import match
 from pipeline.matching.leg import Visit, leg_of, nearest_on_leg, path_at
@@ -25,16 +25,6 @@ from schemas.run import Site
 EPOCHS = 36_000
 ORIGIN_DEG = (50.0, 14.0)
 METRES_PER_DEGREE = (111_229.0, 71_695.0)
-
-
-def best_of(times: int, work: Callable[[], object]) -> float:
-    """Least of several timings [s]."""
-    taken = []
-    for _ in range(times):
-        begin = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - begin)
-    return min(taken)
 
 
 def degrees(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,13 +145,8 @@ def shapely_s(site: Site, fixes: pl.DataFrame, count: int = 500) -> float | None
     return best_of(1, lambda: shapely.line_locate_point(line, points)) * EPOCHS / len(points)
 
 
-def say(what: str, seconds: float, yardstick: float, target: float) -> None:
-    ratio = seconds / yardstick
-    verdict = "met" if ratio < target else "MISSED"
-    print(f"{what:<58} {seconds * 1e3:8.1f} ms {ratio:7.2f} x KD-tree (target < {target:g}) {verdict}")
-
-
-def speeds(with_shapely: bool) -> None:
+def speeds(with_shapely: bool) -> list[Figure]:
+    """Projection, the whole stage on a line, and on a network, as multiples of the KD-tree's time."""
     site = single_line()
     fixes, odometer = journey(site)
     track = track_of(site.track)
@@ -171,48 +156,57 @@ def speeds(with_shapely: bool) -> None:
     def project() -> np.ndarray:
         return path_at(leg, nearest_on_leg(points_of(latitude, longitude), leg))
 
-    def whole(place: Site) -> Callable[[], object]:
-        return lambda: match(run, distance, place, Vehicle(), MatchingConfig(), FixSigma())
-
-    yardstick = kd_tree_s(site, fixes)
-    print(f"{EPOCHS} epochs on 100 km, vertices 5 m apart; KD-tree {yardstick * 1e3:.1f} ms")
-    projected = best_of(5, project)
-    say("projection on the line", projected, yardstick, 4.0)
-    run, distance = fixes, odometer
-    say("the whole stage: path, posterior, all columns", best_of(3, whole(site)), yardstick, 12.0)
+    yardstick, projected = kd_tree_s(site, fixes), best_of(5, project)
+    figures = [
+        Figure("KD-tree, nearest vertex of 36,000 epochs on 100 km", yardstick, "s"),
+        Figure("projection on the line", projected / yardstick, "x KD-tree", 4.0),
+        Figure("whole stage on the line", whole_s(site, fixes, odometer) / yardstick, "x KD-tree", 12.0),
+    ]
     if with_shapely and (by_shapely := shapely_s(site, fixes)) is not None:
-        print(f"shapely line_locate_point {by_shapely:.1f} s: {by_shapely / projected:.0f} times the projection")
+        name = "shapely line_locate_point over projection"
+        figures.append(Figure(name, by_shapely / projected, "times", 100.0, "above"))
     big = network()
-    run, distance = journey(big)
-    yardstick = kd_tree_s(big, run)
-    count = big.track["netelement_id"].n_unique()
-    print(f"network of {count} elements, {big.track.height} vertices; KD-tree {yardstick * 1e3:.1f} ms")
-    say("the whole stage on the network", best_of(3, whole(big)), yardstick, 20.0)
+    fixes, odometer = journey(big)
+    yardstick, taken = kd_tree_s(big, fixes), whole_s(big, fixes, odometer)
+    return [*figures, Figure("whole stage on a network of 2000 elements", taken / yardstick, "x KD-tree", 20.0)]
 
 
-def calibration(seeds: int) -> None:
+def whole_s(site: Site, fixes: pl.DataFrame, odometer: pl.DataFrame) -> float:
+    """Path, posterior, projection and all columns."""
+    return best_of(3, lambda: match(fixes, odometer, site, Vehicle(), MatchingConfig(), FixSigma()))
+
+
+def calibration(seeds: int) -> list[Figure]:
     """Parallel tracks 4 m apart with a crossover, Gauss-Markov errors of 100 s."""
     from tests.matching.ladder import journey as trip_of
     from tests.matching.ladder import ladder, matched_lateral_m
 
-    site = ladder()
+    site, figures = ladder(), []
     for sigma_m in (1.0, 2.0):
         claims, rights, wrong = [], [], 0
         for seed in range(seeds):
             trip = trip_of(seed, sigma_m)
             epochs = match(trip.fixes, trip.odometer, site, Vehicle(), MatchingConfig(), FixSigma()).epochs
-            right = np.abs(matched_lateral_m(epochs) - trip.lateral_m) < 1.0
-            claim = epochs["path_probability"].to_numpy()
-            wrong += bool(((claim > 0.99) & ~right).mean() > 0.01)
-            claims.append(claim)
-            rights.append(right)
+            rights.append(np.abs(matched_lateral_m(epochs) - trip.lateral_m) < 1.0)
+            claims.append(epochs["path_probability"].to_numpy())
+            wrong += bool(((claims[-1] > 0.99) & ~rights[-1]).mean() > 0.01)
         claim, right = np.concatenate(claims), np.concatenate(rights)
-        print(f"{seeds} seeds at {sigma_m} m: {wrong} claim a wrong track above 0.99 for over 1 % of epochs;")
-        print(f"  mean claim {claim.mean():.3f}, right {right.mean():.3f}")
-        for low, high in ((0.5, 0.7), (0.7, 0.85), (0.85, 0.95), (0.95, 0.99), (0.99, 1.01)):
+        noise = f"at {sigma_m:g} m noise"
+        target = 0.0 if sigma_m == 1.0 else None
+        figures.append(Figure(f"seeds sure of a wrong track {noise}, of {seeds}", float(wrong), "", target))
+        figures.append(Figure(f"mean claim {noise}", float(claim.mean()), ""))
+        figures.append(Figure(f"share right {noise}", float(right.mean()), ""))
+        for low, high in ((0.5, 0.7), (0.7, 0.85), (0.85, 0.95), (0.95, 0.99)):
             inside = (claim >= low) & (claim < high)
             if inside.any():
-                print(f"  claimed {claim[inside].mean():.3f}: right {right[inside].mean():.3f} ({inside.sum()} epochs)")
+                name = f"right where {claim[inside].mean():.3f} is claimed {noise}"
+                figures.append(Figure(name, float(right[inside].mean()), f"of {inside.sum()} epochs"))
+    return figures
+
+
+def measure(out: Path) -> list[Figure]:
+    """All figures; nothing is written."""
+    return [*speeds(with_shapely=True), *calibration(200)]
 
 
 def main() -> None:
@@ -220,8 +214,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--no-shapely", action="store_true")
     options = parser.parse_args()
-    speeds(not options.no_shapely)
-    calibration(options.seeds)
+    for figure in [*speeds(not options.no_shapely), *calibration(options.seeds)]:
+        limit = f" (target {figure.better} {figure.target:g})" if figure.target is not None else ""
+        verdict = {True: " met", False: " MISSED", None: ""}[figure.met]
+        print(f"{figure.name:<58} {figure.value:9.3f} {figure.unit}{limit}{verdict}")
 
 
 if __name__ == "__main__":
