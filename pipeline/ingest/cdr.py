@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.template import Field, Fixed, Flag, Template, Text, UnfitError, check_type, template_of
+from pipeline.ingest.layout import Field, Fixed, Flag, Text, UnfitError, check_type
+from pipeline.ingest.template import Template, template_of
 
 _MOST_ELEMENTS = 4096
 _HEADER_SIZE = 4  # encapsulation: representation, options

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -13,6 +12,7 @@ from pipeline.ingest import files
 from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.byte_window import ByteWindow
+from pipeline.ingest.digest import BackgroundDigest
 from pipeline.ingest.generic import UndecodableError, decoder_for, undecodable
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
@@ -60,10 +60,11 @@ def sample_of(messages: Messages, channel: Channel) -> Sample:
 
 def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
     """All streams of a log, read strictly from front to back in pieces."""
-    digest = hashlib.sha256()
     streams = McapStreams(config)
-    walk = walk_log(path, config, streams, digest.update)
-    frames, slow_messages, left_over = _frames(path, config, walk, streams)
+    with BackgroundDigest() as digest:
+        walk = walk_log(path, config, streams, digest.update)
+        frames, slow_messages, left_over = _frames(path, config, walk, streams)
+        input_digest = digest.hexdigest()
     return RunLog(
         run_id=files.stem_of(path),
         notes=IngestNotes(
@@ -73,7 +74,7 @@ def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
             chunks_without_crc=walk.chunks_without_crc,
             skipped_topics=left_over,
         ),
-        input_digest=digest.hexdigest(),
+        input_digest=input_digest,
         **frames,
     )
 

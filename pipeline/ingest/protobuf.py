@@ -8,18 +8,8 @@ from typing import Any
 import polars as pl
 
 from pipeline.ingest.generic import parse_path
-from pipeline.ingest.template import (
-    Constant,
-    Field,
-    Fixed,
-    Flag,
-    Template,
-    Text,
-    UnfitError,
-    Varint,
-    check_type,
-    template_of,
-)
+from pipeline.ingest.layout import Constant, Field, Fixed, Flag, Text, UnfitError, Varint, check_type
+from pipeline.ingest.template import Template, template_of
 
 # Wire types (protobuf encoding guide).
 _VARINT, _I64, _LEN, _I32 = 0, 1, 2, 5

@@ -9,11 +9,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.generic import decode_columns
+from pipeline.ingest.layout import Repeated, Rows, UnfitError, Values, joined_rows
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
-from pipeline.ingest.template import Part, Rows, Template, TemplateDecoder, UnfitError, Values, joined_rows
+from pipeline.ingest.template import Part, Template, TemplateDecoder
 from schemas.errors import InputError
 
 ORDINAL = "(ordinal)"  # place of a message in the file
@@ -60,6 +61,8 @@ class SourceReader:
         self._template: Template | None = None
         self._waiting: list[Rows] = []
         self._waiting_rows = 0
+        self._last_ordinal = -1
+        self._in_order = True
 
     def add(self, messages: Messages) -> None:
         """Decode these messages."""
@@ -88,6 +91,8 @@ class SourceReader:
 
     def _note(self, messages: Messages) -> None:
         self._columns[ORDINAL].append(messages.ordinal)
+        self._in_order &= bool(messages.ordinal[0] >= self._last_ordinal)
+        self._last_ordinal = int(messages.ordinal[-1])
         for name in self._times:
             self._columns[name].append(messages.times("log_time" if name == LOG_TIME else "publish_time"))
 
@@ -109,7 +114,7 @@ class SourceReader:
         """One row per message in order of the file; what was collected is given up."""
         self._take_fields()
         ordinals = np.concatenate([np.zeros(0, np.int64), *self._columns[ORDINAL]])
-        order = None if (np.diff(ordinals) >= 0).all() else np.argsort(ordinals, kind="stable")
+        order = None if self._in_order else np.argsort(ordinals, kind="stable")
         types: dict[str, pl.DataType] = {name: pl.Int64() for name in (ORDINAL, *self._times)}
         types |= self.source.types
         series = []
@@ -124,6 +129,8 @@ _KINDS = {pl.Float64: np.float64, pl.Int64: np.int64, pl.Boolean: np.bool_}
 
 def _typed(values: Values, dtype: pl.DataType) -> Values:
     """In the type asked for, on its own memory."""
+    if isinstance(values, Repeated):
+        return values
     if isinstance(values, pl.Series):
         return values.cast(dtype)
     if values.dtype == np.uint64 and len(values) and values.max() >= 2**63 and dtype == pl.Int64():
@@ -138,4 +145,9 @@ def _joined(name: str, parts: list[Values], dtype: pl.DataType) -> pl.Series:
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if len(arrays) == len(parts):
         return pl.Series(name, np.concatenate(arrays))
-    return pl.concat([pl.Series(name, part, dtype=dtype) for part in parts], rechunk=True)
+    repeated = [part for part in parts if isinstance(part, Repeated)]
+    if len(repeated) == len(parts) and len({part.value for part in repeated}) == 1:
+        whole = Repeated(repeated[0].value, sum(part.count for part in repeated), dtype)
+        return whole.series().alias(name)
+    series = [part.series() if isinstance(part, Repeated) else pl.Series(part) for part in parts]
+    return pl.concat([part.cast(dtype).alias(name) for part in series], rechunk=True)
