@@ -299,6 +299,30 @@ def report(
 
 
 @app.command()
+def export(
+    out: Annotated[Path, typer.Argument(help="A result of `balise replay`.")],
+    run: Annotated[str, typer.Argument(help="Id of the run.")],
+    to: Annotated[Path, typer.Option("--to", help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    site: Annotated[str | None, typer.Option("--site", help="Site, for positions on the ground.")] = None,
+    log: Annotated[str | None, typer.Option("--log", help="The recorded run, for its raw positions.")] = None,
+    ros: Annotated[bool, typer.Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
+    config: ConfigFile = None,
+) -> None:
+    """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
+    from pipeline.export import export_run
+    from pipeline.ingest.run import read_run
+    from pipeline.ingest.site import read_site
+
+    settings, _ = _settings(config, None)
+    ground = None if site is None else read_site(site)
+    recorded = None if log is None else read_run(log, settings.ingest)
+    files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
+    print("Wrote " + " and ".join(str(path) for path in files))
+    for text in missing:
+        print(f"Without {text}")
+
+
+@app.command()
 def diff(
     out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     out_b: Annotated[str, typer.Argument(help="Another one.")],
