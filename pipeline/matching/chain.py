@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import polars as pl
 
+from pipeline.geodesy import Points
 from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
+from pipeline.matching.segments import Feet, no_feet
 from pipeline.matching.steps import travelled
 from pipeline.track import Track
 from schemas.config import MatchingConfig
@@ -21,20 +25,42 @@ def path_on_chain(
     fixes: Fixes, odometer: pl.DataFrame | None, track: Track, leg: Leg, config: MatchingConfig
 ) -> tuple[TravelledPath, Assignment]:
     """The part of a chain that the run covers, oriented as the run began; nothing is in doubt on it."""
-    feet = nearest_on_leg(fixes.points.take(np.flatnonzero(fixes.valid)), leg)
+    known = np.flatnonzero(fixes.valid)
+    feet = nearest_on_leg(fixes.points.take(known), leg)
     near = feet.distance_m <= config.reach_m
     if not near.any():
         raise off_the_network(fixes, track, config)
     position = np.full(len(fixes), np.nan)
-    position[fixes.valid] = np.where(near, path_at(leg, feet), np.nan)
-    used = np.unique(leg.visit[feet.segment[near]])
-    part = list(leg.visits[int(used[0]) : int(used[-1]) + 1])
-    way = travelled(fixes, odometer)
-    if not grows_with(position, np.arange(len(fixes)), way, config.orientation_distance_m):
-        part = [Visit(visit.element, not visit.forward) for visit in reversed(part)]
-    ones = np.ones(len(fixes))
-    path = TravelledPath(track, (leg_of(track, part),))
-    return path, Assignment(np.zeros(len(fixes), dtype=np.int64), None, ones, ones)
+    position[known] = np.where(near, path_at(leg, feet), np.nan)
+    used = leg.visit[feet.segment[near]]
+    part = slice(int(used.min()), int(used.max()) + 1)
+    forward = grows_with(position, np.arange(len(fixes)), travelled(fixes, odometer), config.orientation_distance_m)
+    covered = leg_of(track, leg.visits[part] if forward else turned(leg.visits[part]))
+    feet = _carried_over(fixes.points.take(known), feet, leg, covered, part, forward)
+    everywhere = no_feet(len(fixes))
+    everywhere.put(known, feet)
+    ones, zeros = np.ones(len(fixes)), np.zeros(len(fixes), dtype=np.int64)
+    return TravelledPath(track, (covered,)), Assignment(zeros, None, ones, ones, everywhere)
+
+
+def turned(visits: Sequence[Visit]) -> list[Visit]:
+    """The same elements run the other way round."""
+    return [Visit(visit.element, not visit.forward) for visit in reversed(visits)]
+
+
+def _carried_over(points: Points, feet: Feet, leg: Leg, covered: Leg, part: slice, forward: bool) -> Feet:
+    """Feet on a whole chain as feet on its covered part; those at that part's ends are sought anew."""
+    segment = feet.segment - int(np.searchsorted(leg.visit, part.start))
+    last = len(covered.line) - 1
+    new = Feet(
+        np.clip(segment if forward else last - segment, 0, last),
+        feet.fraction if forward else 1.0 - feet.fraction,
+        feet.offset_m if forward else -feet.offset_m,
+        feet.distance_m.copy(),
+    )
+    again = np.flatnonzero((segment <= 0) | (segment >= last))
+    new.put(again, nearest_on_leg(points.take(again), covered))
+    return new
 
 
 def whole_chain(track: Track, links: pl.DataFrame) -> list[Visit] | None:

@@ -14,6 +14,7 @@ from pipeline.geodesy import Floats, Ints
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.leg import segments_at
 from pipeline.matching.path import TravelledPath
+from pipeline.matching.segments import Feet
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
 
@@ -22,13 +23,14 @@ from schemas.enums import SigmaSource
 class Assignment:
     """What the search found per epoch: leg, a hint at the passage [m], and how sure it is.
 
-    Probabilities are NaN where the epoch was not judged.
+    `feet`, where the search already has them, are the epochs' nearest places on the one leg.
     """
 
     leg: Ints
     near_path_m: Floats | None
     path_probability: Floats
     gate_probability: Floats
+    feet: Feet | None = None
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def epoch_frame(
     `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
     track too (`on_track` false), and goes on straight beyond the ends of the path.
     """
-    feet = path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
+    feet = found.feet or path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
     places = path.places(found.leg, feet, fixes.height_m)
     path_m = places.path_m - vehicle.gnss_antenna_ahead_m
     element, measure_m = path.locate_index(found.leg, path_m)
