@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+from datasets.experiment.bank import write_bank
 from datasets.experiment.diagnostics import write_experiment
+from datasets.experiment.false_alarms import write_thresholds
 from datasets.experiment.findings import write_findings
 from datasets.experiment.ranges import write_ranges
+from datasets.experiment.rare_tables import write_rare
 
 
 class Experiment(Protocol):
@@ -20,4 +23,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "diagnostics": write_experiment,
     "findings": write_findings,
     "pseudorange": write_ranges,
+    "thresholds": write_thresholds,
+    "rare": write_rare,
+    "bank": write_bank,
 }

@@ -99,6 +99,17 @@ class LinearBank:
             earlier = A.T @ earlier
         return result
 
+    def covariances_by_lag(self, epochs: int) -> Array:
+        """Covariance of monitor j at epoch k + lag with monitor i at k, lags -(n-1) .. n-1; (lags, i, j)."""
+        size = self.slope.size
+        result = np.empty((2 * epochs - 1, size, size))
+        later = self.covariance[:, self.sources :].copy()
+        for lag in range(epochs):
+            result[epochs - 1 + lag] = later[self.sources :].T
+            result[epochs - 1 - lag] = later[self.sources :]
+            later = self.advance @ later
+        return result
+
     def start(self, runs: int, rng: np.random.Generator) -> Array:
         """Stationary states, shape (states, runs)."""
         values, vectors = np.linalg.eigh(self.covariance)

@@ -62,13 +62,19 @@ def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
     geometry = plan.geometry
     rows = line_of_sight_rows(geometry.azimuth_deg, geometry.elevation_deg)
     axes = geometry.axes(heading_deg)
-    held = rows @ axes[1:].T
+    held = held_rows(plan, heading_deg)
     covariance = np.diag(geometry.range_variance_m2.sum(axis=1)) + plan.survey_m**2 * held @ held.T
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     free = whiten @ np.column_stack([rows @ axes[0], clock_columns(geometry.svs)])
     basis, _ = np.linalg.qr(free, mode="complete")
     kept = basis[:, free.shape[1] :].T
     return Statistic(kept @ whiten, float(chdtri(kept.shape[0], plan.false_alarm_probability)))
+
+
+def held_rows(plan: RangePlan, heading_deg: float) -> Array:
+    """Range change per metre of survey error across and in height, shape (satellites, 2)."""
+    rows = line_of_sight_rows(plan.geometry.azimuth_deg, plan.geometry.elevation_deg)
+    return np.asarray(rows @ plan.geometry.axes(heading_deg)[1:].T)
 
 
 @dataclass(frozen=True)
@@ -101,9 +107,8 @@ def range_passages(plan: RangePlan, repetitions: int, rng: np.random.Generator) 
     geometry, rates = plan.geometry, np.array(plan.rates_mps)
     statistics = [statistic(plan, heading) for heading in plan.headings_deg]
     along = np.stack([geometry.axes(heading)[0] @ geometry.gain for heading in plan.headings_deg])
-    rows = line_of_sight_rows(geometry.azimuth_deg, geometry.elevation_deg)
     survey = rng.standard_normal((2, repetitions)) * plan.survey_m
-    offsets = [rows @ geometry.axes(heading)[1:].T @ survey for heading in plan.headings_deg]
+    offsets = [held_rows(plan, heading) @ survey for heading in plan.headings_deg]
     errors = _RangeErrors(plan, repetitions, rng)
     detected = np.full((len(statistics), rates.size, repetitions), float(_UNDETECTED))
     failed_first = np.zeros(detected.shape, dtype=np.bool_)

@@ -173,11 +173,11 @@ def _false_alarm_block(work: _Work) -> tuple[float, float]:
     target *= rng.choice([-1.0, 1.0], work.runs)
     expected_count = work.epochs * monitors * 2.0 * np.exp(log_tail)
     estimates = np.empty(work.runs)
-    tables = [bank.covariance_with(which, work.epochs, 2 * work.epochs - 1) for which in range(monitors)]
+    by_lag = bank.covariances_by_lag(work.epochs)
     for run in range(work.runs):
         at, which = int(epoch[run]), int(monitor[run])
-        # Stationary: the covariance depends on the lag alone, and the table has lag zero in its middle.
-        together = tables[which][work.epochs - at : 2 * work.epochs - at]
+        # Stationary: the covariance depends on the lag alone, and lag zero is in the middle.
+        together = by_lag[work.epochs - at : 2 * work.epochs - at, which]
         lacking = target[run] - paths[at - 1, which, run]
         path = paths[:, :, run] + together * (lacking / bank.sigma[which] ** 2)
         # The forced one counts, whatever rounding does to it.

@@ -1,11 +1,11 @@
-"""Exact standard deviations of EWMA monitors at a constant rate, from the recursion of the replay's own bank."""
+"""Exact standard deviations of EWMA monitors at a constant rate and sigma (DOMAIN section 3)."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.monitors.recursion import AxisState, ewma_weight, variance_of_ewma
+from pipeline.monitors.recursion import linear_recurrence
 
 Array = npt.NDArray[np.float64]
 
@@ -25,19 +25,23 @@ def bank_sigmas(
     increments over 1 s, growing with the root of the step; `position_white_m`: white noise on position,
     which is a Gauss-Markov error with no memory. Alpha 1 is the raw monitor.
     """
-    dt_s = np.full(epochs, 1.0 / rate_hz)
-    weight = ewma_weight(alphas, dt_s)
     variance = np.append(variances_m2, position_white_m**2)
-    decorrelation = np.append(-np.expm1(-1.0 / (rate_hz * taus_s)), 1.0)
-    result, _ = variance_of_ewma(
-        1.0 - weight,
-        weight / dt_s[:, None],
-        np.broadcast_to(variance, (epochs, variance.size)),
-        np.broadcast_to(decorrelation, (epochs, variance.size)),
-        np.full(epochs, white_m**2 / rate_hz),
-        AxisState.at_restart(alphas.size, variance.size),
-    )
-    return np.sqrt(result)
+    loss = np.append(-np.expm1(-1.0 / (rate_hz * taus_s)), 1.0)
+    keep = (1.0 - alphas) ** (1.0 / rate_hz)
+    gain = (1.0 - keep) * rate_hz
+    decay = np.outer(keep, 1.0 - loss).ravel()
+    drive = np.outer(gain, variance * loss).ravel()
+    shape = (epochs, alphas.size, variance.size)
+    covariance = linear_recurrence(
+        np.broadcast_to(decay, (epochs, decay.size)),
+        np.broadcast_to(drive, (epochs, drive.size)),
+        np.zeros(decay.size),
+    ).reshape(shape)
+    before = np.concatenate([np.zeros((1, *shape[1:])), covariance[:-1]])
+    increment = 2.0 * float(variance @ loss) + white_m**2 / rate_hz
+    fresh = gain**2 * increment - 2.0 * gain * keep * (before @ loss)
+    kept = np.broadcast_to(keep**2, fresh.shape)
+    return np.asarray(np.sqrt(linear_recurrence(kept, fresh, np.zeros(alphas.size))))
 
 
 def limit_sigmas(

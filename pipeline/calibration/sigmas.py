@@ -97,10 +97,15 @@ def _fit_with_errors(monitor: str, pieces: list[Array]) -> SigmaFit:
     )
 
 
+def overall_ratio(ratios: Array) -> float:
+    """Measured over predicted sigma, from values over predicted sigmas."""
+    return float(np.sqrt(np.mean(np.square(ratios))))
+
+
 def _fit(samples: Array) -> Array:
     """Overall ratio, intercept [m] and slope from rows (sigma, ratio): weighted least squares over bins of sigma."""
     sigma, squares = samples[:, 0], samples[:, 1] ** 2
-    overall = float(np.sqrt(squares.mean()))
+    overall = overall_ratio(samples[:, 1])
     if sigma.std() < _LEAST_SPREAD * sigma.mean():
         return np.array([overall, 0.0, overall])
     edges = np.unique(np.quantile(sigma, np.linspace(0.0, 1.0, _BINS + 1)))

@@ -1,0 +1,168 @@
+"""Thresholds three ways.
+
+- `exact`: k_T times the sigma of the error model, transient included (the replay's bank).
+- `regression`: sigma of each monitor as a line over sigma_x of the position along the track, fitted over skies and
+  headings (DIAG: "modeled with standard deviation of the along-track GNSS position by a linear regression method").
+- `calibrated`: the model's sigma times the ratio measured on some hours of fault-free runs, as `balise calibrate` does.
+
+A monitor is Gaussian, so a threshold too small by a few percent shows in the tail many times over: the false-alarm
+probability that a way really gives at a sky is 2 Q(k_T T_way / T_exact).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from scipy.special import ndtr
+
+from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, geometries_of_day
+from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
+from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Reading, bank_forms
+from datasets.experiment.sigmas import limit_sigmas
+from datasets.experiment.workers import generator
+from pipeline.align import threshold_factor
+from pipeline.calibration.sigmas import overall_ratio
+
+Array = npt.NDArray[np.float64]
+
+EXTRAPOLATED = 1e-7
+_PER_PLACE = 20
+_CALIBRATION_RUNS = 20
+_CALIBRATION_S = 3_600
+_AXES = ("along", "cross", "up")
+
+
+@dataclass(frozen=True)
+class SkyMonitor:
+    """Exact long-term sigmas of one axis of a sky and heading, by alpha, beside sigma_x."""
+
+    constellation: str
+    heading_deg: float
+    axis: str
+    sigma_x_m: float
+    sigma_mps: Array
+
+
+def sky_monitors(reading: Reading, per_place: int) -> list[SkyMonitor]:
+    """All skies of the day, headings and axes."""
+    alphas = np.array(BANKS[reading])
+    monitors = []
+    for constellation in CONSTELLATIONS:
+        for geometry in geometries_of_day(constellation, per_place):
+            covariances = geometry.source_covariances_m2
+            for heading in HEADINGS_DEG:
+                axes = geometry.axes(heading)
+                variances = np.einsum("ai,jik,ak->aj", axes, covariances, axes)
+                sigma_x = float(np.sqrt(variances[0].sum()))
+                for axis, name in enumerate(_AXES):
+                    white, position = _white_noise(reading, axis)
+                    sigma = limit_sigmas(alphas, variances[axis], TAUS_S, white, position)
+                    monitors.append(SkyMonitor(constellation, heading, name, sigma_x, sigma))
+    return monitors
+
+
+def _white_noise(reading: Reading, axis: int) -> tuple[float, float]:
+    """White noise on increments and on position of an axis [m]."""
+    if axis > 0:
+        return 0.0, 1.0
+    return (0.05, 0.0) if reading == "increments" else (0.0, 0.05)
+
+
+@dataclass(frozen=True)
+class Line:
+    """sigma_monitor = intercept + slope sigma_x."""
+
+    intercept_mps: float
+    slope_per_s: float
+
+    def sigma_mps(self, sigma_x_m: Array) -> Array:
+        return self.intercept_mps + self.slope_per_s * sigma_x_m
+
+
+def regression_lines(monitors: list[SkyMonitor]) -> dict[tuple[str, int], Line]:
+    """One line per axis and alpha, least squares over all skies and headings (DIAG eq. 17 and below)."""
+    lines = {}
+    for axis in _AXES:
+        chosen = [one for one in monitors if one.axis == axis]
+        sigma_x = np.array([one.sigma_x_m for one in chosen])
+        sigmas = np.array([one.sigma_mps for one in chosen])
+        for index in range(sigmas.shape[1]):
+            slope, intercept = np.polyfit(sigma_x, sigmas[:, index], 1)
+            lines[axis, index] = Line(float(intercept), float(slope))
+    return lines
+
+
+def regression_table(per_place: int = _PER_PLACE) -> pl.DataFrame:
+    """How the regressed sigma compares with the exact one over skies, and what that does to false alarms at 1e-7."""
+    factor = threshold_factor(EXTRAPOLATED)
+    rows = []
+    for reading in READINGS:
+        monitors = sky_monitors(reading, per_place)
+        lines = regression_lines(monitors)
+        for (axis, index), line in lines.items():
+            chosen = [one for one in monitors if one.axis == axis]
+            exact = np.array([one.sigma_mps[index] for one in chosen])
+            ratio = line.sigma_mps(np.array([one.sigma_x_m for one in chosen])) / exact
+            real = two_sided(factor * np.maximum(ratio, 0.0))
+            rows.append(
+                {
+                    "reading": reading,
+                    "axis": axis,
+                    "alpha": BANKS[reading][index],
+                    "intercept_mps": line.intercept_mps,
+                    "slope_per_s": line.slope_per_s,
+                    "skies": len(chosen),
+                    "ratio_least": float(ratio.min()),
+                    "ratio_median": float(np.median(ratio)),
+                    "ratio_greatest": float(ratio.max()),
+                    "false_alarm_median": float(np.median(real)),
+                    "false_alarm_worst": float(real.max()),
+                }
+            )
+    return pl.DataFrame(rows)
+
+
+def two_sided(factor: Array) -> Array:
+    """Probability that a Gaussian is beyond +- factor sigmas."""
+    return np.asarray(2.0 * ndtr(-factor))
+
+
+def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> Array:
+    """Measured over modelled sigma of each monitor on fault-free runs of an hour."""
+    long = replace(plan, span_s=_CALIBRATION_S, onset_s=_CALIBRATION_S)
+    forms = bank_forms(long)
+    factor = threshold_factor(long.false_alarm_probability)
+    paths = NoisePaths(long, runs, generator(seed, 51))
+    blocks = [
+        np.matmul(forms.rows * paths.weights, paths.advance(BLOCK_EPOCHS))
+        for _ in range(_CALIBRATION_S // BLOCK_EPOCHS)
+    ]
+    values = np.concatenate(blocks)
+    ratios = factor * values / forms.threshold[: len(values), :, None]
+    return np.array([overall_ratio(ratios[:, form]) for form in range(values.shape[1])])
+
+
+def regressed_ratios(plan: Plan) -> Array:
+    """Regressed over exact long-term sigma of each monitor of the plan, from the lines over all skies."""
+    forms = bank_forms(plan)
+    axes = plan.geometry.axes(0.0)
+    variances = np.einsum("ai,jik,ak->aj", axes, plan.geometry.source_covariances_m2, axes)
+    sigma_x = np.sqrt(variances[:1].sum(axis=1))
+    ratios = []
+    lines = {reading: regression_lines(sky_monitors(reading, _PER_PLACE)) for reading in READINGS}
+    for name, alpha in zip(forms.names, plan.alphas[forms.alpha], strict=True):
+        axis = _AXES.index(name.split("_", 1)[0])
+        reading: Reading = next((r for r in READINGS if f"along_{r}" in name), _reading_with(float(alpha)))
+        white, position = _white_noise(reading, axis)
+        exact = limit_sigmas(np.array([alpha]), variances[axis], TAUS_S, white, position)
+        line = lines[reading][_AXES[axis], BANKS[reading].index(float(alpha))]
+        ratios.append(float((line.sigma_mps(sigma_x) / exact)[0]))
+    return np.array(ratios)
+
+
+def _reading_with(alpha: float) -> Reading:
+    """A reading whose bank has this weight: across and up, sigmas do not depend on the odometer."""
+    return next(reading for reading in READINGS if alpha in BANKS[reading])
