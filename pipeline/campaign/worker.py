@@ -20,7 +20,6 @@ from pipeline import storage, store
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
 from pipeline.ingest.site import read_site
-from pipeline.replay import replay
 from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
@@ -164,6 +163,9 @@ def _earlier(job: RunJob) -> RunOutcome:
 
 
 def _replayed(job: RunJob, path: Path, site: Site) -> RunTables:
+    # Imported here because it takes most of a second, and the parent of a campaign never needs it.
+    from pipeline.replay import replay
+
     run = read_run(path, job.config.ingest)
     return replay(run, site, job.vehicle, job.config)
 

@@ -60,7 +60,7 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
 
 def test_sudden_death_of_the_parent(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
     chance = random.Random(7)
-    for trial in range(3):
+    for trial in range(2):
         process = start(command(small_trial, tmp_path, "--jobs", "2", "--force"))
         time.sleep(chance.uniform(0.5, 4.0))
         process.kill()
