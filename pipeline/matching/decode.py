@@ -65,13 +65,15 @@ def decode(trellis: Trellis, best: Ints) -> Decoded:
     leg = np.zeros(len(best), dtype=np.int64)
     number = np.zeros(len(best), dtype=np.int64)
     at = 0
-    loops = {one for one in set(oriented.tolist()) if trellis.network.linked(one, one)}
-    for step in range(1, len(best)):
+    loops = [one for one in set(oriented.tolist()) if trellis.network.linked(one, one)]
+    moving = (oriented[1:] != oriented[:-1]) | np.isin(oriented[1:], loops)
+    before = 0
+    for step in (np.flatnonzero(moving) + 1).tolist():
+        leg[before:step], number[before:step], before = len(chains) - 1, at, step
         one, other = int(oriented[step - 1]), int(oriented[step])
-        if one != other or one in loops:
-            move = _move(trellis, step, one, float(place[step - 1]), other, float(place[step]))
-            at = _follow(chains, at, move, other)
-        leg[step], number[step] = len(chains) - 1, at
+        move = _move(trellis, step, one, float(place[step - 1]), other, float(place[step]))
+        at = _follow(chains, at, move, other)
+    leg[before:], number[before:] = len(chains) - 1, at
     return Decoded(tuple(chains), leg, number, place)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
+from scipy.spatial import cKDTree
 
 from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, segments_of
@@ -17,8 +18,9 @@ from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.search import search
-from pipeline.matching.steps import Steps, resumed, steps_of, travelled
+from pipeline.matching.steps import Steps, Travelled, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
+from pipeline.track import end_places
 from schemas.config import MatchingConfig
 
 # An element past whose end a position lies by more is no candidate, unless the track ends there.
@@ -28,6 +30,9 @@ _BEYOND_SIGMAS = 4.0
 _FAR = 3.0
 # A position this close to a track lies near it whatever else is around [m].
 _CLOSE_M = 10.0
+# Further than this from any link [m], one step in so many is enough.
+_CLEAR_M = 100.0
+_THINNING = 4
 
 
 def find_path(
@@ -64,7 +69,7 @@ def _trellis(
     by its movement which way the train turned.
     """
     way = travelled(fixes, odometer)
-    steps = steps_of(fixes, fixes.valid, way, config)
+    steps = _thinned(fixes, steps_of(fixes, fixes.valid, way, config), network, way, config)
     wide = _all_candidates(fixes, steps, network, config)
     nearest = np.full(len(steps), np.inf)
     np.minimum.at(nearest, wide.step, wide.distance_m)
@@ -80,6 +85,19 @@ def _trellis(
     like = likelihood_of(fixes, steps, candidates, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, like, config)
+
+
+def _thinned(fixes: Fixes, steps: Steps, network: Network, way: Travelled, config: MatchingConfig) -> Steps:
+    """Fewer steps where no link is near, since nothing can be decided there that a later step does not show."""
+    ends = end_places(network.track)[network.linked_ends()]
+    if len(ends) == 0 or len(steps) == 0:
+        return steps
+    apart, _ = cKDTree(ends).query(fixes.points.surface[steps.epoch], distance_upper_bound=_CLEAR_M)
+    moved = np.cumsum(np.nan_to_num(steps.chord_m)) / (_THINNING * config.step_distance_m)
+    kept = np.isfinite(apart) | (np.nan_to_num(steps.elapsed_s) >= 0.5 * config.step_time_s)
+    kept[1:] |= np.diff(np.floor(moved)) > 0
+    kept[[0, -1]] = True
+    return resumed(fixes, steps.epoch[kept], way)
 
 
 def _all_candidates(fixes: Fixes, steps: Steps, network: Network, config: MatchingConfig) -> Candidates:

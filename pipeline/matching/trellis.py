@@ -17,7 +17,7 @@ from schemas.config import MatchingConfig
 # Log-probability of a move that the network does not know: only where nothing else is possible.
 BREAK = -200.0
 # Steps longer than this are judged move by move, since more than one element may lie within them.
-_LONG_STEP_M = 30.0
+_LONG_STEP_M = 60.0
 _SEARCH_MARGIN_M = 100.0
 
 
