@@ -1,0 +1,111 @@
+"""A folder in which the commands of the documentation run as they are written: `RUN`, `SITE`, `OUT` exist there."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from datasets.scenario import Scenario, load_scenario
+from datasets.trial import build_run, build_site, write_run_log, write_site
+from pipeline.campaign import make_plan, run_campaign
+from schemas.config import Configuration, to_toml
+from schemas.tables import BANK_MONITORS
+from tests.docs.blocks import ROOT
+
+BLIND = ("windows_only_early", "windows_only_late")
+LINK_MONITORS = ("link_order", "link_distance", "along_doppler")
+RUNS = ("drift_early", "jump_two", "outage_and_slip")
+
+
+@pytest.fixture(scope="session")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small site, three runs on it, their result, a receiver log. Not to be changed: see `workplace`."""
+    folder = tmp_path_factory.mktemp("docs")
+    scenario = load_scenario(ROOT / "tests/golden/golden.toml")
+    write_site(build_site(scenario), folder / "SITE")
+    for name in RUNS:
+        run = build_run(scenario, _spec(scenario, name))
+        write_run_log(run.with_streams(faults=None), folder / "runs")
+    shutil.copytree(folder / "runs" / "jump_two", folder / "RUN")
+    assert scenario.vehicle is not None
+    (folder / "vehicle.toml").write_text(to_toml(scenario.vehicle))
+    runs = [str(folder / "runs" / name) for name in RUNS]
+    run_campaign(make_plan(runs, str(folder / "SITE"), str(folder / "OUT")), jobs=1)
+    shutil.copytree(folder / "OUT", folder / "OUT_A")
+    shutil.copytree(folder / "OUT", folder / "OUT_B")
+    _receiver_log(folder / "runs" / "outage_and_slip", folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a result `OUT` in which everything went wrong that one may ask for."""
+    folder = tmp_path_factory.mktemp("asked")
+    scenario = load_scenario(ROOT / "tests/golden/golden.toml")
+    write_site(build_site(scenario), folder / "SITE")
+    for name in (*RUNS, *BLIND, "jump_without_odometer", "two_solutions"):
+        write_run_log(build_run(scenario, _spec(scenario, name)), folder / "runs")
+    (folder / "runs" / "broken").mkdir()
+    (folder / "runs" / "broken" / "gnss.parquet").write_bytes(b"cut off")
+    bank_off = Configuration.model_validate({"monitors": {"disabled": [*BANK_MONITORS, *LINK_MONITORS]}})
+    for runs, config in ((BLIND, bank_off), (("*",), Configuration())):
+        addresses = [str(folder / "runs" / run) for run in runs]
+        run_campaign(make_plan(addresses, str(folder / "SITE"), str(folder / "OUT"), config), jobs=1)
+        for run in BLIND:
+            shutil.rmtree(folder / "runs" / run, ignore_errors=True)
+    return folder
+
+
+@pytest.fixture
+def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the folder to work in; it is the working directory."""
+    folder = tmp_path / "work"
+    shutil.copytree(workspace, folder)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def _spec(scenario: Scenario, name: str):
+    return next(run for run in scenario.runs if run.id == name)
+
+
+def _receiver_log(run: Path, folder: Path) -> None:
+    """`morning.ubx` and `odometer.csv`, as a receiver and a data logger would have left the run."""
+    gnss = pl.read_parquet(run / "gnss.parquet").drop_nulls("latitude_deg")
+    (folder / "morning.ubx").write_bytes(b"".join(_nav_pvt(row) for row in gnss.iter_rows(named=True)))
+    odometer = pl.read_parquet(run / "odometer.parquet")
+    odometer.select(
+        time=pl.col("t").dt.strftime("%Y-%m-%dT%H:%M:%S%.6fZ"), km=pl.col("distance_m") / 1000
+    ).write_csv(folder / "odometer.csv")
+
+
+def _nav_pvt(row: dict) -> bytes:
+    from pyubx2 import GET, UBXMessage
+
+    t = row["t"]
+    message = UBXMessage(
+        *("NAV", "NAV-PVT", GET),
+        year=t.year,
+        month=t.month,
+        day=t.day,
+        hour=t.hour,
+        min=t.minute,
+        second=t.second,
+        iTOW=((t.isoweekday() % 7) * 86_400 + t.hour * 3600 + t.minute * 60 + t.second + 18) * 1000,
+        validDate=1,
+        validTime=1,
+        fullyResolved=1,
+        fixType=3,
+        gnssFixOk=1,
+        diffSoln=1,
+        numSV=11,
+        lat=row["latitude_deg"],
+        lon=row["longitude_deg"],
+        height=round(row["height_m"] * 1000),
+        hAcc=1000,
+        vAcc=1500,
+    )
+    return message.serialize()

@@ -1,0 +1,83 @@
+"""The queries of the analyst's page: SQL and polars give the same rows, and so does DuckDB."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pipeline.query import run_sql
+from tests.docs.blocks import ROOT, Block, blocks
+
+PAGE = blocks(ROOT / "docs" / "analyst.md")
+PREAMBLE = next(block.text for block in PAGE if block.language == "python")
+PAIRS = [
+    (sql, python)
+    for sql, python in zip(PAGE, PAGE[1:], strict=False)
+    if (sql.language, python.language) == ("sql", "python")
+]
+
+
+def test_there_are_twenty_and_the_verdict() -> None:
+    assert len(PAIRS) == 21
+    assert len([block for block in PAGE if block.language == "sql"]) == 21
+    assert len({sql.heading for sql, _ in PAIRS}) == 21
+
+
+@pytest.mark.parametrize(("sql", "python"), PAIRS, ids=lambda block: block.heading[:40])
+def test_sql_and_polars_agree(sql: Block, python: Block, asked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(asked)
+    names: dict[str, Any] = {}
+    exec(PREAMBLE + python.text, names)
+    answer, told = names["answer"].collect(), run_sql("OUT", sql.text)
+    assert answer.columns == told.columns
+    assert_same_rows(answer, told)
+
+
+@pytest.mark.parametrize("sql", [sql for sql, _ in PAIRS], ids=lambda block: block.heading[:40])
+def test_duckdb_gives_the_same(sql: Block, asked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="DuckDB is not installed")
+    monkeypatch.chdir(asked)
+    view = next(block.text for block in PAGE if block.text.startswith("CREATE VIEW"))
+    with duckdb.connect() as connection:
+        for name in ("hazards", "passages", "alarms", "epochs", "runs"):
+            connection.execute(view.replace("hazards", name))
+        connection.execute("CREATE VIEW campaign_runs AS SELECT * FROM 'OUT/campaign/runs.parquet'")
+        found = pl.from_arrow(connection.sql(sql.text).to_arrow_table())
+    told = run_sql("OUT", sql.text)
+    assert told.columns == found.columns
+    assert_same_rows(found, told)
+
+
+def test_hardly_a_query_is_empty(asked: Path) -> None:
+    empty = {sql.heading.split(".")[0] for sql, _ in PAIRS if run_sql(asked / "OUT", sql.text).is_empty()}
+    assert empty == set()
+
+
+def assert_same_rows(one: pl.DataFrame, other: pl.DataFrame) -> None:
+    assert_same_values(one.rows(), other.rows())
+
+
+def assert_same_values(one: list[tuple[Any, ...]], other: list[tuple[Any, ...]]) -> None:
+    assert len(one) == len(other)
+    for left, right in zip(sorted(one, key=in_order), sorted(other, key=in_order), strict=True):
+        for a, b in zip(left, right, strict=True):
+            assert same(a, b), (left, right)
+
+
+def in_order(row: tuple[Any, ...]) -> str:
+    return repr([round(value, 6) if isinstance(value, float) else plain(value) for value in row])
+
+
+def plain(value: Any) -> Any:
+    # DuckDB gives times in the zone of the machine.
+    return value.timestamp() if hasattr(value, "timestamp") else value
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, float) or isinstance(b, float):
+        return a is not None and b is not None and math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9)
+    return bool(plain(a) == plain(b))
