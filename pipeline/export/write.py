@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from pipeline.export.gis import run_geojson, run_gpx
@@ -56,15 +57,21 @@ def read_run_tables(out: Path, run_id: str) -> RunTables:
 
 def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:
     """Site and log have to be those of the replay, as far as the result tells."""
-    metadata = metadata_of(Path(str(table_address(out, "runs", tables.run_id))))
-    given = {"site_digest": site.digest if site else "", "log_digest": log.input_digest if log else ""}
-    for name, digest in given.items():
-        known = metadata.get(name, "")
-        if digest and known and digest != known:
-            what = name.removesuffix("_digest")
-            raise UsageError(f"was replayed with another {what}", place=tables.run_id, found=digest, expected=known)
+    known = metadata_of(Path(str(table_address(out, "runs", tables.run_id)))).get("site_digest", "")
+    if site is not None and site.digest and known and site.digest != known:
+        raise UsageError("was replayed on another site", place=tables.run_id, found=site.digest, expected=known)
+    digest = site.digest if site is not None else known
+    if log is not None and log.input_digest and digest:
+        found, expected = input_digest(log, digest), str(tables.runs["input_digest"].first())
+        if found != expected:
+            raise UsageError("was replayed from another log", place=tables.run_id, found=found, expected=expected)
     if tables.epochs.is_empty():
         raise UsageError("has no epoch to export", place=tables.run_id, found=str(tables.runs["error"].first()))
+
+
+def input_digest(log: RunLog, site_digest: str) -> str:
+    """What the `runs` table calls the input digest: that of log and site."""
+    return hashlib.sha256(f"{log.input_digest}:{site_digest}".encode()).hexdigest()
 
 
 def _write_mcap(

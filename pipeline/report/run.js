@@ -345,13 +345,14 @@
   function zoomTo(id) {
     const now = prepare(state.solution);
     const hazard = now.raw.hazards.find((one) => one.id === id);
-    if (!hazard) return;
+    if (!hazard) return false;
     state.hazard = id;
     const moments = ["t_onset", "t_hazard", "t_failure", "t_detected", "t_negated"].map((key) => hazard[key]).filter((t) => t !== null);
     const begin = Math.min(...moments);
     const end = Math.max(...moments);
     const margin = Math.max(10_000, 0.25 * (end - begin));
     show(begin - margin, end + margin);
+    return true;
   }
 
   function choose(name) {
@@ -368,9 +369,11 @@
   function follow() {
     const wanted = new URLSearchParams(location.hash.slice(1));
     const name = wanted.get("s") ?? state.solution ?? Object.keys(data.solutions)[0];
-    if (name !== state.solution) { choose(name); showAll(); }
-    if (wanted.has("h")) {
-      zoomTo(Number(wanted.get("h")));
+    const other = name !== state.solution;
+    if (other) choose(name);
+    const known = wanted.has("h") && zoomTo(Number(wanted.get("h")));
+    if (other && !known) showAll();
+    if (known) {
       document.getElementById(`drawings-s${state.index}`).scrollIntoView();
     }
   }
