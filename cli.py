@@ -124,7 +124,7 @@ def demo(out: OutFolder = Path("demo-out"), seed: int | None = None, quiet: Quie
     if not quiet:
         show_table(result.checks, "What was injected, expected and found")
         print(f"\nThe trial is in {out}, its tables in {out / 'tables'}, the report is {page}.")
-    raise typer.Exit(OK if result.agrees else DEFECT)
+    raise typer.Exit(OK if result.agrees else RUNS_NOT_OK)
 
 
 @app.command()

@@ -81,11 +81,11 @@ def with_previous(plan: Plan) -> Plan:
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in plan.jobs))
 
 
-def digests(job: RunJob, log_digest: str) -> dict[str, str]:
+def digests(job: RunJob, files_digest: str) -> dict[str, str]:
     """What decides a run's tables; equal digests mean equal tables, so that the run is skipped."""
     return {
         "config_digest": digest_of(job.config, job.vehicle),
-        "log_digest": log_digest,
+        "files_digest": files_digest,
         "site_digest": job.site_digest,
         "software": SOFTWARE,
         "software_digest": job.software_digest,

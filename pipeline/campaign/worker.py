@@ -23,7 +23,7 @@ from pipeline.ingest.site import read_site
 from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
-from schemas.run import RunTables, Site
+from schemas.run import RunLog, RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES, Runs
 from schemas.version import SOFTWARE
 
@@ -60,23 +60,25 @@ def replay_one(job: RunJob) -> RunOutcome:
     be written, a changed site and an interruption leave this function as an exception.
     """
     begun = time.monotonic()
-    log_digest = ""
+    files_digest = ""
     try:
         _same_software(job)
         site = _site(job.site, job.site_digest)
         with storage.local_copy(job.address) as path, _told_of(job, path):
-            before, log_digest = _identity(path)
-            if _is_done(job, log_digest):
+            before, files_digest = _identity(path)
+            if _is_done(job, files_digest):
                 return _earlier(job)
-            tables = _replayed(job, path, site)
+            run = read_run(path, job.config.ingest)
+            tables = _replayed(job, run, site)
             if storage.signature(path) != before:
                 raise _ChangedError(f"{path}: changed while it was read. Replay it again when it is complete.")
     except (OutputError, SiteError, UsageError):
         raise
     except Exception as error:
-        failure = _failure(error, lasting=bool(log_digest))
-        return fail_run(job, failure.error, log_digest, failure, time.monotonic() - begun)
-    store.write_run(tables, job.out, _metadata(job, log_digest, _worst(tables.runs)))
+        failure = _failure(error, lasting=bool(files_digest))
+        return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
+    metadata = _metadata(job, files_digest, _worst(tables.runs)) | {"log_digest": run.input_digest}
+    store.write_run(tables, job.out, metadata)
     return _outcome(job, tables.runs, sum(entry[1] for entry in before), time.monotonic() - begun)
 
 
@@ -92,13 +94,13 @@ def replay_within(job: RunJob, limit_s: float) -> RunOutcome:
 
 
 def fail_run(
-    job: RunJob, error: str, log_digest: str = "", failure: _Failure | None = None, seconds: float = 0.0
+    job: RunJob, error: str, files_digest: str = "", failure: _Failure | None = None, seconds: float = 0.0
 ) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
     Without `failure` (a worker was lost, a run took too long) the next campaign tries the run again.
     """
-    metadata = _metadata(job, log_digest, RunStatus.FAILED)
+    metadata = _metadata(job, files_digest, RunStatus.FAILED)
     if failure is None or not failure.lasting:
         metadata["redo"] = "yes"
     store.write_run(_failed_tables(job, error), job.out, metadata)
@@ -149,10 +151,10 @@ def _told_of(job: RunJob, path: Path) -> Iterator[None]:
         raise
 
 
-def _is_done(job: RunJob, log_digest: str) -> bool:
+def _is_done(job: RunJob, files_digest: str) -> bool:
     if job.previous is None or job.previous.get("redo") == "yes":
         return False
-    return all(job.previous.get(key) == value for key, value in digests(job, log_digest).items())
+    return all(job.previous.get(key) == value for key, value in digests(job, files_digest).items())
 
 
 def _earlier(job: RunJob) -> RunOutcome:
@@ -162,11 +164,10 @@ def _earlier(job: RunJob) -> RunOutcome:
     return RunOutcome(**{**outcome.__dict__, "skipped": True})
 
 
-def _replayed(job: RunJob, path: Path, site: Site) -> RunTables:
+def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
     # Imported here because it takes most of a second, and the parent of a campaign never needs it.
     from pipeline.replay import replay
 
-    run = read_run(path, job.config.ingest)
     return replay(run, site, job.vehicle, job.config)
 
 
@@ -184,8 +185,8 @@ def _failure(error: Exception, lasting: bool) -> _Failure:
     return _Failure(text, text, lasting=False, trace=trace)
 
 
-def _metadata(job: RunJob, log_digest: str, status: RunStatus) -> dict[str, str]:
-    return {**digests(job, log_digest), "status": status.value}
+def _metadata(job: RunJob, files_digest: str, status: RunStatus) -> dict[str, str]:
+    return {**digests(job, files_digest), "status": status.value}
 
 
 def _worst(runs: pl.DataFrame) -> RunStatus:

@@ -164,6 +164,16 @@ def test_report(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None
     assert (tmp_path / "report/runs/run0.html").exists()
 
 
+def test_export(balise: Balise, small_trial: SmallTrial, result: Path, tmp_path: Path) -> None:
+    log = ("--log", small_trial.paths[0], "--site", small_trial.site)
+    said = balise("export", result, "run0", "--to", tmp_path / "run0.mcap", *log)
+    assert said.status == 0, said.err
+    assert (tmp_path / "run0.mcap").read_bytes().startswith(b"\x89MCAP0\r\n")
+    other = balise("export", result, "run0", "--to", tmp_path / "x.mcap", "--log", small_trial.paths[1])
+    assert (other.status, "another log" in other.err) == (2, True)
+    assert balise("export", result, "none", "--to", tmp_path / "x.mcap").status == 2
+
+
 def test_experiments_are_listed(balise: Balise) -> None:
     assert "diagnostics" in balise("experiment", "list").out.split()
 
