@@ -160,8 +160,7 @@ class Watch:
     def responses(self, begin: int, end: int) -> Array:
         """To a ramp of 1 m/s, shape (epochs, forms): 1 - (1 - alpha)^k of an EWMA, k s of the position."""
         elapsed = np.arange(begin + 1, end + 1)[:, None] - self._plan.onset_s
-        keep = 1.0 - self._plan.alphas[self._banks.alpha]
-        smooth = 1.0 - keep ** np.maximum(elapsed, 0)
+        smooth = (1.0 - (1.0 - self._plan.alphas) ** np.maximum(elapsed, 0))[:, self._banks.alpha]
         drift = np.broadcast_to(elapsed, (end - begin, self._slope.size - self._monitors))
         return np.asarray(np.maximum(np.hstack([smooth, drift]) * self._slope, _TINY))
 
