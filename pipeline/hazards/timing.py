@@ -14,9 +14,9 @@ from pipeline.hazards.jumps import Jump
 from pipeline.hazards.series import Series
 from schemas.config import HazardConfig
 
-# Faults that do not displace the position along the track.
-_OTHER_KINDS = ("slip", "slide", "scale", "outage")
-_OTHER_TARGETS = ("odometer", "cross", "up")
+# Faults that do not displace the position along the track; trials name them in words of their own.
+_OTHER_KINDS = "(?i)slip|slid|scale|outage|gap|odo|wheel"
+_OTHER_TARGETS = "(?i)odo|wheel|^cross|^up$"
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,21 @@ def _drift_onset(draft: Draft, failure: int | None, series: Series) -> int:
 
 
 def _step_of_shift(draft: Draft, series: Series, jumps: list[Jump], config: HazardConfig) -> Jump | None:
-    """The jump between VBs that a shift stayed after, if that is what brought the error beyond noise."""
+    """The jump between VBs that a shift stayed after, if that is what brought the error beyond noise.
+
+    An error that is a little beyond 3 sigma before it (a late clock, a bad minute) is no drift that the jump
+    ended: below max(5 m, 3 sigma) the position counts as healthy.
+    """
     failure = _sustained_failure(draft.floor + 1, draft.end, series, config)
     onset = _drift_onset(draft, failure, series)
-    return next((jump for jump in jumps if jump.first <= onset <= jump.last), None)
+    until = draft.first_epoch if failure is None else min(failure, draft.first_epoch)
+    begins = [jump for jump in jumps if jump.last >= onset and jump.first <= max(until, onset)]
+    return next((jump for jump in begins if jump.first <= onset or _made_the_error(jump, series, config)), None)
+
+
+def _made_the_error(jump: Jump, series: Series, config: HazardConfig) -> bool:
+    healthy = max(config.false_alarm_margin_m, float(series.quiet_m[jump.first - 1]))
+    return abs(jump.error_before_m) <= healthy and abs(jump.error_after_m) > config.failure_limit_m
 
 
 def _onset_ns(
@@ -136,7 +147,7 @@ def _named_onset(faults: pl.DataFrame | None, by_error_ns: int, latest_ns: int) 
     """
     if faults is None or faults.height == 0:
         return None
-    on_position = ~pl.col("kind").is_in(_OTHER_KINDS) & ~pl.col("target").is_in(_OTHER_TARGETS)
+    on_position = ~pl.col("kind").str.contains(_OTHER_KINDS) & ~pl.col("target").str.contains(_OTHER_TARGETS)
     starts = pl.col("t_start").dt.timestamp("ns")
     ends = pl.col("t_end").dt.timestamp("ns").fill_null(np.iinfo(np.int64).max)
     on = faults.filter(on_position & (starts <= latest_ns) & (ends >= by_error_ns))

@@ -94,6 +94,25 @@ def test_named_fault_gives_the_onset():
     assert row["rate_mps"] == pytest.approx(0.5)
 
 
+def test_faults_on_the_odometer_in_other_words_name_no_onset():
+    faults = ((10.0, 80.0, "ramp", "along"), (12.0, 80.0, "wheel_slip", "odometry"), (13.0, 80.0, "GNSS gap", "gnss"))
+    assert seconds(only(DRIFT.but(faults=faults))["t_onset"]) == 10.0
+
+
+def test_step_after_an_error_a_little_beyond_noise_is_the_onset():
+    # 3.5 m is beyond 3 sigma (3.00015 m) for a second before the step of 45 m: noise, not a drift up to it.
+    row = only(Journey(steps=((30.0, 31.0, 3.5), (31.0, 500.0, 45.0))))
+    assert seconds(row["t_onset"]) == 31.0
+    assert row["rate_mps"] is None
+    assert seconds(row["t_failure"]) == 31.0
+
+
+def test_step_on_top_of_a_drift_leaves_the_drift_its_onset():
+    # 0.5 m/s from 10 s: 10.5 m at 31 s, then 30 m more.
+    row = only(Journey(steps=((31.0, 500.0, 30.0),), ramps=((10.0, 500.0, 0.5),)))
+    assert seconds(row["t_onset"]) == pytest.approx(16.1)
+
+
 def test_fault_that_was_over_names_no_onset():
     row = only(DRIFT.but(faults=((2.0, 6.0, "bias", "along"),)))
     assert seconds(row["t_onset"]) == pytest.approx(16.1)
