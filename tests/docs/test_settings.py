@@ -1,0 +1,136 @@
+"""The references of configuration, vehicle, scenario and fault files name every key with its default, and no other."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from datasets.expectation import ExpectedHazard, ExpectedRun
+from datasets.faults import FaultSpec, PlacedFault
+from datasets.motion import MotionSpec, PhaseSpec
+from datasets.range_errors import RangeErrorSpec
+from datasets.scenario import (
+    BaliseSpec,
+    ElementSpec,
+    GnssSpec,
+    LineSpec,
+    OdometerSpec,
+    ParallelSpec,
+    ReferenceSpec,
+    RunSpec,
+    Scenario,
+    SectionSpec,
+    SkySpec,
+    SurveySpec,
+)
+from schemas.config import StreamMapping
+from schemas.dictionary import settings_frame
+from tests.docs.blocks import ROOT
+
+Rows = dict[str, str]
+CONFIGURATION = ROOT / "docs" / "configuration.md"
+SCENARIOS = ROOT / "docs" / "scenarios.md"
+DEFAULTS_IN_WORDS = {"start": "2025-03-03T06:00:00Z", "solutions": "primary: gps", "target": "by kind"}
+# Keys that nothing reads yet.
+IDLE = ("link_tolerance_m", "acceleration_window_s")
+
+
+def tables(page: Path) -> list[Rows]:
+    """Every table `key | default | meaning` of a page: key to default."""
+    found: list[Rows] = []
+    for line in page.read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 3 and "default" in cells[1] and cells[0].startswith("key"):
+            found.append({})
+        elif found and line.startswith("| `") and len(cells) == 3:
+            assert cells[0].strip("`") not in found[-1]
+            found[-1][cells[0].strip("`")] = cells[1]
+    return found
+
+
+def defaults(model: type[BaseModel], without: type[BaseModel] | None = None) -> Rows:
+    known = without.model_fields if without else {}
+    return {name: _default(name, item) for name, item in model.model_fields.items() if name not in known}
+
+
+def _default(name: str, field: Any) -> str:
+    if name in DEFAULTS_IN_WORDS:
+        return DEFAULTS_IN_WORDS[name]
+    if field.default is PydanticUndefined and field.default_factory is None:
+        return "required"
+    match field.get_default(call_default_factory=True):
+        case None:
+            return "not set"
+        case BaseModel():
+            return "all defaults"
+        case "" | () | {}:
+            return "none"
+        case bool() as flag:
+            return str(flag).lower()
+        case value:
+            return str(value)
+
+
+MODELS = (
+    *(Scenario, LineSpec, SectionSpec, ElementSpec, ParallelSpec, BaliseSpec, SurveySpec),
+    *(RunSpec, MotionSpec, PhaseSpec, GnssSpec, SkySpec, RangeErrorSpec, OdometerSpec, ReferenceSpec, FaultSpec),
+)
+
+
+def test_scenario_keys_and_defaults() -> None:
+    expected = [defaults(model) for model in MODELS]
+    expected += [defaults(PlacedFault, FaultSpec), defaults(ExpectedRun), defaults(ExpectedHazard)]
+    written = tables(SCENARIOS)
+    assert len(written) == len(expected)
+    for one, other in zip(written, expected, strict=True):
+        assert one == other
+
+
+def test_fault_kinds() -> None:
+    from datasets.faults import _NEEDS, FaultKind, _usual_target_of
+
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (\w+) \| [^|]+ \|$", SCENARIOS.read_text(), re.MULTILINE)
+    kinds = {kind.value: (f"`{_NEEDS[kind]}`" if _NEEDS[kind] else "none", _usual_target_of(kind)) for kind in FaultKind}
+    assert {kind: (needs, target) for kind, needs, target in rows} == kinds
+
+
+def test_configuration_keys_and_defaults() -> None:
+    rows = {(file, key): default for file, key, default in settings_frame().iter_rows()}
+    *sections, mapping, vehicle = tables(CONFIGURATION)
+    written = {("configuration", key): default for section in sections for key, default in section.items()}
+    written |= {("vehicle", key): default for key, default in vehicle.items()}
+    assert written == {key: "none" if value == "()" else value for key, value in rows.items()}
+    assert mapping == {**defaults(StreamMapping), "time": "auto"}
+
+
+# Read by the name of the stream, of the fix and of the service level.
+BY_NAME = ("ingest.", "fix_sigma.", "safety.service_levels.")
+KEYS = [
+    key.rsplit(".", 1)[1]
+    for file, key, _ in settings_frame().iter_rows()
+    if file == "configuration" and not key.startswith(BY_NAME)
+]
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        pytest.param(key, marks=pytest.mark.xfail(strict=True, reason="nothing reads this key yet"))
+        if key in IDLE
+        else key
+        for key in KEYS
+    ],
+)
+def test_a_key_that_is_described_is_read(key: str, sources: str) -> None:
+    assert re.search(rf"\.{key}\b", sources)
+
+
+@pytest.fixture(scope="module")
+def sources() -> str:
+    files = [*(ROOT / "pipeline").rglob("*.py"), ROOT / "schemas" / "config.py"]
+    return "\n".join(path.read_text(encoding="utf-8") for path in sorted(files))
