@@ -15,6 +15,7 @@ Mask = npt.NDArray[np.bool_]
 _NS = 1e-9
 _GAP_IN_PERIODS = 2.5
 _SPEED_WINDOW_S = 1.0
+_POLARITY_STARTS = 40
 
 
 @dataclass(frozen=True)
@@ -107,14 +108,26 @@ def polarity(track: OdometerTrack, t_s: Array, path_m: Array, distance_m: float)
     """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
 
     `path_m` grows in the direction of that same movement (DOMAIN section 2), so GNSS decides once, over these
-    metres only. A run that never moves so far is judged by its largest movement.
+    metres only: starts every metre have a vote each, so that a leap of the
+    position in between does not turn the odometer round. A run that never moves so far is judged by its largest
+    movement.
     """
     usable = np.flatnonzero(np.isfinite(path_m) & track.known_at(t_s))
     if usable.size < 2:
         return 1
-    odometer = track.distance_at(t_s[usable])
+    odometer, path = track.distance_at(t_s[usable]), path_m[usable]
+    way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
+    window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
+    # Starts a fixed way apart: a long stand before the departure has one vote, not thousands.
+    starts = np.unique(np.searchsorted(way, np.linspace(0.0, 2.0 * distance_m, _POLARITY_STARTS)))
+    starts = starts[starts < min(window, way.size)]
+    votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
+    return -1 if sum(votes) < 0 else 1
+
+
+def _side(odometer: Array, path: Array, distance_m: float) -> int:
+    """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0) over these metres."""
     moved = odometer - odometer[0]
     far = np.flatnonzero(np.abs(moved) >= distance_m)
     end = int(far[0]) if far.size else int(np.argmax(np.abs(moved)))
-    by_gnss = path_m[usable[end]] - path_m[usable[0]]
-    return -1 if moved[end] * by_gnss < 0 else 1
+    return int(np.sign(moved[end] * (path[end] - path[0])))

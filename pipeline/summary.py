@@ -231,7 +231,7 @@ def _positions(epochs: pl.DataFrame, clock: _Clock, config: Configuration) -> Ro
         "availability": availability(clock.t_ns, _flags(epochs, pl.col("tvb")), moving, clock.limit_s),
         "outages": len(lost),
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
-        "cross_bias_m": epochs["cross_track_m"].median(),
+        "cross_bias_m": epochs.filter("on_track")["cross_track_m"].median(),
         "mtbf_h": mtbf_h,
         "continuity_15s": math.exp(-CONTINUITY_S / 3600.0 / mtbf_h) if mtbf_h else None,
     }

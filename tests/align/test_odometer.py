@@ -57,3 +57,10 @@ def test_polarity_comes_from_the_first_twenty_metres(reads, expected):
 def test_speed_is_the_mean_over_the_second_before():
     track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 30.0]), 1.0, 0.05)
     np.testing.assert_allclose(track.speed_at(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 20.0, 15.0])
+
+
+def test_a_leap_in_the_first_metres_does_not_turn_the_odometer_round():
+    t = np.arange(0.0, 10.0, 0.1)
+    track = odometer_track(odometer_of(t, distance_m=5.0 * t), 1.0, 0.05)
+    path = 5.0 * t - np.where((t > 3.9) & (t < 4.2), 300.0, 0.0)
+    assert polarity(track, t, path, 20.0) == 1
