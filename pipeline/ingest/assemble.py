@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.ingest.breaches import Breach
 from pipeline.ingest.conform import conform
-from pipeline.ingest.plan import Source
+from pipeline.ingest.plan import Source, missing_field
 from pipeline.ingest.reader import ORDINAL
 from schemas.errors import InputError
 from schemas.run import STREAMS, Stream
@@ -35,6 +35,12 @@ def stream_frames(decoded: Sequence[Decoded], breaches: list[Breach]) -> dict[st
 
 def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
+    breaches += [
+        missing_field(part.source.channel, [], column, [path])
+        for part in parts
+        for column, path in part.source.doubtful.items()
+        if part.frame[path].null_count() == part.frame.height
+    ]
     supplements = [part for part in parts if part.source.recipe.supplement]
     rows = [_rows(part, supplements) for part in parts if not part.source.recipe.supplement]
     joined = pl.concat(rows, how="diagonal_relaxed")

@@ -48,7 +48,7 @@ def _refuse_literal(literal: str) -> Value:
 
 
 def _protobuf_decoder(channel: Channel) -> Decode:
-    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+    from google.protobuf.message import DecodeError
     from mcap_protobuf.decoder import DecoderFactory
 
     decode = _made(lambda: DecoderFactory().decoder_for("protobuf", channel.mcap_schema()), channel)

@@ -59,7 +59,8 @@ class _Builder:
         self._next = 0
 
     def _split(self, text: str) -> list[re.Match[str]]:
-        tokens, at = [], 0
+        tokens: list[re.Match[str]] = []
+        at = 0
         while at < len(text):
             match = _TOKEN.match(text, at)
             if match is None or len(tokens) > _MOST_TOKENS:

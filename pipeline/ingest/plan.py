@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import dataframely as dy
 import polars as pl
@@ -20,6 +20,7 @@ from schemas.errors import ConfigError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
+_POSITION = ("latitude_deg", "longitude_deg")
 _USUAL_STAMPS = ("header.stamp", "timestamp", "stamp")
 
 
@@ -33,7 +34,10 @@ class Sample:
 
 @dataclass(frozen=True)
 class Source:
-    """One channel that feeds a stream: fields to decode, columns and times over them."""
+    """One channel that feeds a stream: fields to decode, columns and times over them.
+
+    `doubtful` are fields that the first message lacks and some message must have, by column.
+    """
 
     channel: Channel
     recipe: Recipe
@@ -43,6 +47,7 @@ class Source:
     solution: str | None = None
     breaches: tuple[Breach, ...] = ()
     mapped: bool = False
+    doubtful: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def dropped(self) -> bool:
@@ -135,20 +140,25 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
     closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
     columns: dict[str, pl.Expr] = {}
     breaches: list[Breach] = []
+    doubtful: dict[str, str] = {}
     for name, expression in recipe.columns.items():
         absent = [path for path in recipe.fields_of(name) if not _is_there(sample, recipe, path)]
         wanted = mapping is not None and name in mapping.fields
         if not absent or (not closed and contract[name].nullable):
             columns[name] = expression
+            if absent and (wanted or (name in _POSITION and not recipe.own)):
+                doubtful[name] = absent[0]
         elif wanted or not (contract[name].nullable or name == "solution"):
-            breaches.append(_missing_field(sample, name, absent))
+            breaches.append(missing_field(sample.channel, sample.fields, name, absent))
     times = _times(sample, recipe, mapping, breaches)
     paths = dict.fromkeys([*recipe.key, *(path for name in columns for path in recipe.fields_of(name))])
     types = {path: recipe.type_of(path) for path in paths}
     for time in times.values():
         types |= time.types
     solution = mapping.solution if mapping else None
-    return Source(sample.channel, recipe, columns, times, types, solution, tuple(breaches), mapping is not None)
+    return Source(
+        sample.channel, recipe, columns, times, types, solution, tuple(breaches), mapping is not None, doubtful
+    )
 
 
 def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
@@ -160,11 +170,11 @@ def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
     )
 
 
-def _missing_field(sample: Sample, column: str, absent: Sequence[str]) -> Breach:
+def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> Breach:
     return Breach(
-        sample.channel.place,
+        channel.place,
         f"has no field {', '.join(absent)} for column {column}",
-        found=", ".join(list(sample.fields)[:40]),
+        found=", ".join(list(fields)[:40]) or None,
         remedy="Map the column by `fields` in [ingest] of the configuration.",
     )
 
@@ -195,7 +205,7 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
         if parts:
             return time_source(parts, sample.fields, mapping)
     if named:
-        breaches.append(_missing_field(sample, "t", [named]))
+        breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
     return log_time
 
 

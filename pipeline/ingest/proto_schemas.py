@@ -28,8 +28,8 @@ _TYPES: dict[type[dy.Column], int] = {
 @cache
 def descriptor_set(name: str) -> bytes:
     """The serialised FileDescriptorSet of a message, with what it depends on."""
-    from google.protobuf import timestamp_pb2  # type: ignore[import-untyped]
-    from google.protobuf.descriptor_pb2 import (  # type: ignore[import-untyped]
+    from google.protobuf import timestamp_pb2
+    from google.protobuf.descriptor_pb2 import (
         FileDescriptorProto,
         FileDescriptorSet,
     )
@@ -54,8 +54,8 @@ def descriptor_set(name: str) -> bytes:
 def message_class(name: str) -> Any:
     """The class of a message, in a pool of its own."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool  # type: ignore[import-untyped]
-    from google.protobuf.message_factory import GetMessageClass  # type: ignore[import-untyped]
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
 
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(descriptor_set(name)).file:

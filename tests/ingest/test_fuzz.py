@@ -1,0 +1,67 @@
+"""A short run of the fuzz benchmark, and a log whose bulk is not ours."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+
+from benchmarks.fuzz_ingest import MUTATIONS, fuzz
+from tests.ingest import samples
+
+
+def test_random_damage_never_gives_wrong_data():
+    report = fuzz(600, seed=20_240_501)
+    assert report.failures == []
+    assert {name.split(":")[0] for name in report.mutations} == set(MUTATIONS)
+    assert report.outcomes["partial"] > 20
+    assert report.outcomes["error"] > 200
+
+
+def test_judge_sees_wrong_data(tmp_path, monkeypatch):
+    """The fuzz run can fail: a reader that swaps two rows is caught."""
+    import benchmarks.fuzz_ingest as bench
+
+    path = samples.save(tmp_path, samples.log_bytes())
+    expected = bench.read_run(path, bench.IngestConfig())
+    assert bench.judge(path, expected) == ("whole", "")
+    swapped = expected.with_streams(gnss=expected.gnss.reverse())
+    monkeypatch.setattr(bench, "read_run", lambda *_: swapped)
+    assert bench.judge(path, expected)[0] == "WRONG"
+
+
+_SCRIPT = """
+import resource, sys
+from pathlib import Path
+from pipeline.ingest import read_run
+from schemas.config import IngestConfig
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+read_run(Path(sys.argv[1]), IngestConfig())
+before = peak()
+assert read_run(Path(sys.argv[2]), IngestConfig()).gnss.height == 3
+print(peak() - before)
+"""
+
+
+def test_memory_does_not_grow_with_what_is_not_read(tmp_path):
+    """160 MB of camera pictures and an attachment pass by in pieces."""
+    from tests.ingest.samples import channel, definitions, message, position, record, schema, text, whole
+
+    picture = message(bytes(500_000), channel_id=2)
+    attachment_body = (
+        struct.pack("<QQ", 0, 0) + text("a") + text("b") + struct.pack("<Q", 80_000_000) + bytes(80_000_004)
+    )
+    bulk = schema(2, "sensor_msgs/msg/Image") + channel(2, 2, "/camera", "cdr")
+    content = whole(
+        definitions(),
+        bulk,
+        message(position(0)),
+        picture * 160,
+        record(0x09, attachment_body),
+        message(position(1)),
+        message(position(2)),
+    )
+    small = samples.save(tmp_path, whole(definitions(), samples.some_messages()), "small.mcap")
+    large = samples.save(tmp_path, content, "large.mcap")
+    done = subprocess.run([sys.executable, "-c", _SCRIPT, small, large], check=True, capture_output=True, text=True)
+    assert float(done.stdout) < 60
