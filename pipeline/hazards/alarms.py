@@ -23,11 +23,19 @@ def alarms_table(
     fails: Fails, judged: list[Judged], solution: str, witnesses: Witnesses, config: HazardConfig
 ) -> pl.DataFrame:
     """One row per alarm episode in order of time."""
-    rows = [
-        {"solution": solution, "alarm_id": number, **_row(span, judged, witnesses, config)}
-        for number, span in enumerate(fails.alarms)
-    ]
+    rows: list[dict[str, Any]] = []
+    for number, span in enumerate(fails.alarms):
+        row = {"solution": solution, "alarm_id": number, **_row(span, judged, witnesses, config)}
+        if row["verdict"] == Verdict.FALSE.value and number and _rings_on(fails, number):
+            row["suspect"] = rows[-1]["suspect"]
+        rows.append(row)
     return pl.DataFrame(rows, schema=schema_of(Alarms))
+
+
+def _rings_on(fails: Fails, number: int) -> bool:
+    """The position never came back since the alarm before: its fault still rings in the bank (DOMAIN section 4)."""
+    between = slice(fails.alarms[number - 1].last, fails.alarms[number].first + 1)
+    return bool(fails.negated[between].all())
 
 
 def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: HazardConfig) -> dict[str, Any]:

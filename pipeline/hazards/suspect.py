@@ -12,6 +12,8 @@ from schemas.enums import Evidence, Suspect, Verdict
 
 # How far back an alarm's cause may lie: a raw monitor answers at once, the slowest EWMA after minutes.
 _LOOKBACKS_S = (1.0, 30.0, 300.0)
+# What an alarm is about shows when it comes; a long one sees other things too.
+_COMING_S = 30.0
 _ACROSS = ("cross_", "up_")
 
 
@@ -71,6 +73,10 @@ def witnesses_of(
 def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, ...], verdict: Verdict) -> Suspect:
     """Who caused the alarm over epochs `first..last`, in the order in which the evidence speaks."""
     if verdict is Verdict.TRUE:
+        # The position was wrong at some other time; whoever left the truth when the alarm came made it.
+        came = min(int(np.searchsorted(w.t_ns, w.t_ns[first] + round(_COMING_S * NS_PER_S))), last)
+        if by_reference_within_noise(w, first, came) and odometer_left_truth(w, first, came):
+            return Suspect.ODOMETER
         return suspect_of_error(w, first, last, monitors)
     vote = doppler_vote(w, first, last)
     if odometer_left_truth(w, first, last) or vote is Suspect.ODOMETER:
@@ -79,8 +85,11 @@ def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, .
         return Suspect.GNSS
     if w.doubtful_track[first : last + 1].any():
         return Suspect.TRACK
-    if _beyond(w.error_cross_m, w.noise_cross_m, first, last) or _beyond(w.error_up_m, w.noise_up_m, first, last):
-        return Suspect.GNSS
+    cross = "cross_", w.error_cross_m, w.noise_cross_m
+    up = "up_", w.error_up_m, w.noise_up_m
+    for axis, error, noise in (cross, up):
+        if any(name.startswith(axis) for name in monitors) and _beyond(error, noise, first, last):
+            return Suspect.GNSS
     across = all(name.startswith(_ACROSS) for name in monitors)
     if across and w.by_reference[first : last + 1].all():
         # The reference clears the position and no along-track monitor failed: what is left is the map.
@@ -104,6 +113,14 @@ def suspect_of_error(w: Witnesses, first: int, last: int, monitors: tuple[str, .
     if w.doubtful_track[part].any():
         return Suspect.TRACK
     return Suspect.GNSS if any(name.startswith(_ACROSS) for name in monitors) else Suspect.UNKNOWN
+
+
+def by_reference_within_noise(w: Witnesses, first: int, last: int) -> bool:
+    """The reference has the position within 3 sigma along the track all through the epochs `first..last`."""
+    part = slice(first, last + 1)
+    known = np.isfinite(w.error_m[part]) & w.by_reference[part]
+    within: Bools = np.abs(w.error_m[part][known]) < w.noise_m[part][known]
+    return bool(known.any() and within.all())
 
 
 def odometer_left_truth(w: Witnesses, first: int, last: int) -> bool:

@@ -105,3 +105,28 @@ def test_truth_that_is_missing_for_longer_than_a_second_leaves_the_verdict_open(
         truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
         result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
         assert result.alarms["verdict"].to_list() == [verdict]
+
+
+def test_slip_long_after_an_error_of_the_position_is_the_odometers_fault():
+    # 6 m from 20 s to 30 s make the verdict true; at 100 s the position is sound and the odometer is not.
+    journey = Journey(duration_s=400.0, steps=((20.0, 30.0, 6.0),), balises_m=(100.0,), slip=(100.0, 105.0, 6.0))
+    (row,) = alarms(journey.but(fails={"along_raw": ((100.2, 105.0),)}))
+    assert (row["verdict"], row["suspect"]) == ("true", "odometer")
+
+
+def test_bank_that_rings_on_while_negated_keeps_its_suspect():
+    fails = {"along_raw": ((50.2, 55.0),), "along_ewma_0p001": ((395.0, 400.0),)}
+    journey = Journey(duration_s=450.0, slip=(50.0, 55.0, 6.0), fails=fails)
+    standing, returned = (alarms(journey.but(negated=(span,))) for span in ((50.2, 450.0), (50.2, 100.0)))
+    assert [row["suspect"] for row in standing] == ["odometer", "odometer"]
+    assert returned[1]["suspect"] == "unknown"
+
+
+def test_error_across_says_nothing_of_an_alarm_along():
+    epochs_wrong_across = Journey(fails={"along_raw": ((50.0, 51.0),)})
+    frame = epochs_wrong_across.epochs().with_columns(
+        cross_track_m=pl.when(pl.Series(epochs_wrong_across.within(((50.0, 51.0),)))).then(4.0).otherwise(0.0)
+    )
+    arguments = (truth_of(epochs_wrong_across), epochs_wrong_across.passages(), epochs_wrong_across.balises(), None)
+    result = classify("primary", frame, *arguments, locate, Configuration())
+    assert result.alarms["suspect"].to_list() == ["unknown"]

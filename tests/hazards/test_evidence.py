@@ -169,3 +169,15 @@ def test_smoothed_truth_stays_within_its_own_sigma():
     error = truth["truth_path_m"].to_numpy() - journey.truth_m()
     assert np.abs(error).max() < 1.0
     assert np.all(np.abs(error) < 3.0 * truth["truth_sigma_m"].to_numpy())
+
+
+def test_errors_are_judged_with_the_latency_that_is_known_in_the_end():
+    # Positions are 0.1 s old throughout; the estimate in use was 0 for the first minute (20 m/s: 2 m).
+    journey = Journey()
+    late = np.where(journey.t_s() < 60.0, 0.0, 0.1)
+    epochs = journey.epochs().with_columns(path_m=pl.Series(journey.truth_m() - 2.0), latency_s=pl.Series(late))
+    config = Configuration()
+    truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config.hazards, config.lds)
+    error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
+    assert error.abs().max() == pytest.approx(0.0, abs=1e-6)
+    assert error.len() > 1000
