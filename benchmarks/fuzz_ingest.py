@@ -170,7 +170,7 @@ def judge(path: Path, expected: RunLog) -> tuple[str, str]:
         return "WRONG", f"{type(error).__name__}: {error}"
     partial = log.notes.partial_until_ns is not None
     for name in ("gnss", "odometer"):
-        found, whole = log.stream(name), expected.stream(name)  # type: ignore[arg-type]
+        found, whole = log.stream(name), expected.stream(name)
         if whole is None:
             raise ValueError("a subject lacks a stream")
         if found is None and partial:

@@ -16,6 +16,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -72,7 +73,7 @@ def stock_columns(path: Path) -> dict[str, list[Any]]:
             columns[channel.topic].append(_fields(channel.topic, orjson.loads(message.data).get))
         return columns
     for _, channel, _, decoded in reader.iter_decoded_messages(log_time_order=False):
-        columns[channel.topic].append(_fields(channel.topic, lambda name, of=decoded: _attribute(of, name)))
+        columns[channel.topic].append(_fields(channel.topic, partial(_attribute, decoded)))
     return columns
 
 
@@ -139,9 +140,7 @@ def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
         path = write_case(run, case, folder, chunk_crc=False)
         name = f"{case}: against read and decompress"
         before = next(figure.value for figure in short if figure.name == name)
-        bound, ours = _in_turn(
-            repeats, lambda path=path: read_and_decompress(path), lambda path=path: read_run(path, IngestConfig())
-        )
+        bound, ours = _in_turn(repeats, partial(read_and_decompress, path), partial(read_run, path, IngestConfig()))
         ratio = median(ours) / median(bound)
         figures += [
             Figure(f"{case}, ten hours: ratio against that of one hour", ratio / before, "times", _LONG_TOLERANCE),
