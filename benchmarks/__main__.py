@@ -12,7 +12,7 @@ import polars as pl
 from benchmarks.results import Figure
 from pipeline.present import show_table, to_json
 
-MODULES = ("end_to_end", "campaign", "interruptions")
+MODULES = ("end_to_end", "ingest", "matching", "campaign", "interruptions", "experiment")
 
 
 def main() -> int:
@@ -21,6 +21,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(MODULES))
     parser.add_argument("--out", type=Path, default=Path("bench-out"), help="where trials and figures go")
     given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
     missed = 0
     for name in given.names or MODULES:
         figures: list[Figure] = importlib.import_module(f"benchmarks.{name}").measure(given.out / name)
