@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 
-from datasets.scenario import Scenario, load_scenario
+from datasets.scenario import RunSpec, Scenario, load_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import make_plan, run_campaign
 from schemas.config import Configuration, to_toml
@@ -24,19 +25,20 @@ RUNS = ("drift_early", "jump_two", "outage_and_slip")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small site, three runs on it, their result, a receiver log. Not to be changed: see `workplace`."""
     folder = tmp_path_factory.mktemp("docs")
-    scenario = load_scenario(ROOT / "tests/golden/golden.toml")
+    scenario = _with_a_clean_run(load_scenario(ROOT / "tests/golden/golden.toml"))
     write_site(build_site(scenario), folder / "SITE")
     for name in RUNS:
         run = build_run(scenario, _spec(scenario, name))
         write_run_log(run.with_streams(faults=None), folder / "runs")
     shutil.copytree(folder / "runs" / "jump_two", folder / "RUN")
+    write_run_log(build_run(scenario, _spec(scenario, "evening")), folder / "runs")
     assert scenario.vehicle is not None
     (folder / "vehicle.toml").write_text(to_toml(scenario.vehicle))
     runs = [str(folder / "runs" / name) for name in RUNS]
     run_campaign(make_plan(runs, str(folder / "SITE"), str(folder / "OUT")), jobs=1)
     shutil.copytree(folder / "OUT", folder / "OUT_A")
     shutil.copytree(folder / "OUT", folder / "OUT_B")
-    _receiver_log(folder / "runs" / "outage_and_slip", folder)
+    _receiver_log(folder / "runs" / "evening", folder)
     return folder
 
 
@@ -68,7 +70,12 @@ def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     return folder
 
 
-def _spec(scenario: Scenario, name: str):
+def _with_a_clean_run(scenario: Scenario) -> Scenario:
+    clean = _spec(scenario, "jump_two").model_copy(update={"id": "evening", "faults": ()})
+    return scenario.model_copy(update={"runs": (*scenario.runs, clean)})
+
+
+def _spec(scenario: Scenario, name: str) -> RunSpec:
     return next(run for run in scenario.runs if run.id == name)
 
 
@@ -77,12 +84,12 @@ def _receiver_log(run: Path, folder: Path) -> None:
     gnss = pl.read_parquet(run / "gnss.parquet").drop_nulls("latitude_deg")
     (folder / "morning.ubx").write_bytes(b"".join(_nav_pvt(row) for row in gnss.iter_rows(named=True)))
     odometer = pl.read_parquet(run / "odometer.parquet")
-    odometer.select(
-        time=pl.col("t").dt.strftime("%Y-%m-%dT%H:%M:%S%.6fZ"), km=pl.col("distance_m") / 1000
-    ).write_csv(folder / "odometer.csv")
+    odometer.select(time=pl.col("t").dt.strftime("%Y-%m-%dT%H:%M:%S%.6fZ"), km=pl.col("distance_m") / 1000).write_csv(
+        folder / "odometer.csv"
+    )
 
 
-def _nav_pvt(row: dict) -> bytes:
+def _nav_pvt(row: dict[str, Any]) -> bytes:
     from pyubx2 import GET, UBXMessage
 
     t = row["t"]

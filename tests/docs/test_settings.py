@@ -95,7 +95,9 @@ def test_fault_kinds() -> None:
     from datasets.faults import _NEEDS, FaultKind, _usual_target_of
 
     rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (\w+) \| [^|]+ \|$", SCENARIOS.read_text(), re.MULTILINE)
-    kinds = {kind.value: (f"`{_NEEDS[kind]}`" if _NEEDS[kind] else "none", _usual_target_of(kind)) for kind in FaultKind}
+    kinds = {
+        kind.value: (f"`{_NEEDS[kind]}`" if _NEEDS[kind] else "none", _usual_target_of(kind)) for kind in FaultKind
+    }
     assert {kind: (needs, target) for kind, needs, target in rows} == kinds
 
 
