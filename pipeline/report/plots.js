@@ -67,5 +67,15 @@ const Plots = (() => {
     place.replaceChildren(note);
   }
 
+  // On paper a drawing has the width of the page (A4 across), whatever the window's.
+  const PAPER_PX = 960;
+  const drawn = () => document.querySelectorAll(".js-plotly-plot");
+  window.addEventListener("beforeprint", () => {
+    for (const place of drawn()) Plotly.relayout(place, { autosize: false, width: Math.min(PAPER_PX, place.clientWidth || PAPER_PX) });
+  });
+  window.addEventListener("afterprint", () => {
+    for (const place of drawn()) Plotly.relayout(place, { autosize: true, width: null });
+  });
+
   return { COLOUR, STATE, PASSAGE, LINES, axis, config, data, draw, empty, layout, pattern, unpack };
 })();

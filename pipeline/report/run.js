@@ -2,7 +2,9 @@
 // The page of a run: every drawing over time shows the same stretch of it.
 (() => {
   const { COLOUR, STATE, PASSAGE, LINES, axis, data, draw, empty, layout, unpack } = Plots;
-  const POINTS = 1600;
+  const POINTS = 1200;
+  const PIECES = 400;
+  const PLAN_POINTS = 2000;
   const LEAST_MS = 500;
   const RATIO_REACH = 5;
   const state = { solution: null, index: 0, lo: 0, hi: 0, hazard: null, drawing: false };
@@ -73,6 +75,7 @@
     const shapes = [];
     for (const hazard of now.raw.hazards) {
       const begin = hazard.t_onset ?? hazard.t_hazard;
+      if (begin > state.hi || (hazard.t_end ?? Infinity) < state.lo) continue;
       shapes.push({ type: "rect", xref: "x", yref: "paper", x0: begin, x1: hazard.t_end ?? now.raw.time.t1_ms, y0: 0,
         y1: 1, line: { width: 0 }, fillcolor: COLOUR.orange, opacity: hazard.id === state.hazard ? 0.22 : 0.1,
         layer: "below" });
@@ -103,17 +106,45 @@
     listen(id);
   }
 
+  // The visible pieces of a band as [start, end, code]; where they are too many the worst in a bin stands for it.
+  function visiblePieces(band, t0) {
+    const lo = state.lo - t0;
+    const hi = state.hi - t0;
+    const first = Math.max(0, below(band.starts, lo) - 1);
+    const last = Math.min(band.starts.length, below(band.starts, hi) + 1);
+    const end = (piece) => (piece + 1 < band.starts.length ? band.starts[piece + 1] : band.end_ms);
+    const pieces = [];
+    const put = (from, to, code) => {
+      const before = pieces[pieces.length - 1];
+      if (before && before[2] === code && before[1] >= from) before[1] = to; else pieces.push([from, to, code]);
+    };
+    if (last - first <= PIECES) {
+      for (let piece = first; piece < last; piece += 1) put(band.starts[piece], end(piece), band.codes[piece]);
+      return pieces;
+    }
+    const from = Math.max(lo, band.starts[first]);
+    const step = (Math.min(hi, end(last - 1)) - from) / PIECES;
+    let piece = first;
+    for (let bin = 0; bin < PIECES; bin += 1) {
+      const limit = from + (bin + 1) * step;
+      let worst = band.codes[piece];
+      while (piece + 1 < last && band.starts[piece + 1] < limit) {
+        piece += 1;
+        worst = Math.max(worst, band.codes[piece]);
+      }
+      put(limit - step, limit, worst);
+    }
+    return pieces;
+  }
+
   function bandPlot(now, name, group) {
     const id = `plot-s${state.index}-${name}`;
     const bands = now.bands.filter((band) => band.group === group).reverse();
     const traces = new Map();
     for (const band of bands) {
-      const first = Math.max(0, below(band.starts, state.lo - now.t0) - 1);
-      const last = Math.min(band.starts.length, below(band.starts, state.hi - now.t0) + 1);
-      for (let piece = first; piece < last; piece += 1) {
-        const label = band.states[band.codes[piece]];
-        if (band.codes[piece] === 0) continue;
-        const end = piece + 1 < band.starts.length ? band.starts[piece + 1] : band.end_ms;
+      for (const [from, to, code] of visiblePieces(band, now.t0)) {
+        if (code === 0) continue;
+        const label = band.states[code];
         if (!traces.has(label)) {
           const [color, , pattern] = STATE[label];
           traces.set(label, { type: "bar", orientation: "h", name: label.replace("_", " "), base: [], x: [], y: [],
@@ -121,8 +152,8 @@
             width: 0.8, hovertemplate: `%{y}: ${label.replace("_", " ")}<extra></extra>` });
         }
         const trace = traces.get(label);
-        trace.base.push(band.starts[piece] + now.t0);
-        trace.x.push(end - band.starts[piece]);
+        trace.base.push(from + now.t0);
+        trace.x.push(to - from);
         trace.y.push(band.name);
       }
     }
@@ -213,13 +244,21 @@
     return plan.windows.length ? [trace] : [];
   }
 
+  // Positions of the stretch in view, and where the state changes in any case.
+  function shownRows(plan, t0) {
+    const within = [...plan.codes.keys()].filter((row) => inView(plan.t[row] + t0));
+    const stride = Math.ceil(within.length / PLAN_POINTS);
+    return within.filter((row, at) => at % stride === 0 || plan.codes[row] !== plan.codes[row - 1]);
+  }
+
   function gnssTraces(plan, t0) {
+    const shown = shownRows(plan, t0);
     return plan.states.map((name, code) => {
       const [color, symbol] = STATE[name];
-      const rows = [...plan.codes.keys()].filter((row) => plan.codes[row] === code);
+      const rows = shown.filter((row) => plan.codes[row] === code);
       return { type: "scatter", mode: "markers", name: `GNSS, ${name}`, x: rows.map((row) => plan.x[row]),
         y: rows.map((row) => plan.y[row]), customdata: rows.map((row) => clock(plan.t[row] + t0)),
-        marker: { color, symbol, line: { width: 0 }, size: rows.map((row) => (inView(plan.t[row] + t0) ? 6 : 3)) },
+        marker: { color, symbol, line: { width: 0 }, size: 5 },
         hovertemplate: "%{customdata}<extra>%{fullData.name}</extra>" };
     }).filter((trace) => trace.x.length);
   }

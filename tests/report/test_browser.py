@@ -229,8 +229,14 @@ def test_readable_in_both_schemes(browser: Chrome, out: Path, scheme: str) -> No
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
-def test_prints(browser: Chrome, out: Path) -> None:
+def test_prints_no_wider_than_the_paper(browser: Chrome, out: Path) -> None:
     visit(browser, address(out, "runs/jump_two.html"))
-    printed = browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": False, "landscape": True})
+    widest = "return Math.max(...[...document.querySelectorAll('.main-svg')].map(s => s.width.baseVal.value))"
+    before = browser.execute_script(widest)
+    browser.execute_script("window.dispatchEvent(new Event('beforeprint'))")
+    assert browser.execute_script(widest) <= 960 < before
+    browser.execute_script("window.dispatchEvent(new Event('afterprint'))")
+    assert browser.execute_script(widest) == pytest.approx(before, abs=30)
+    printed = browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})
     assert len(printed["data"]) > 100_000
     assert errors(browser) == []

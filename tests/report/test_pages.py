@@ -1,0 +1,248 @@
+"""What the pages say, without a browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from cli import app
+from pipeline.report import page_name, write_report
+from pipeline.store import write_run
+from schemas.errors import UsageError
+from schemas.run import RunTables, Site
+from schemas.tables import MONITORS
+from tests.report.conftest import FAILED, REASON, RUNS
+
+
+def text_of(out: Path, page: str) -> str:
+    return (out / "report" / page).read_text(encoding="utf-8")
+
+
+def data_of(out: Path, page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text_of(out, page), re.DOTALL)
+    assert found is not None
+    data: dict[str, Any] = json.loads(found[1])
+    return data
+
+
+def unpacked(packed: dict[str, str]) -> np.ndarray[Any, Any]:
+    return np.frombuffer(base64.b64decode(packed["data"]), dtype=f"<{packed['kind']}")
+
+
+class _Tags(HTMLParser):
+    """Whether elements are closed in order, and which ids and addresses there are."""
+
+    _VOID = frozenset(("meta", "link", "br", "input", "img"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        named = dict(attrs)
+        if named.get("id"):
+            self.ids.append(str(named["id"]))
+        self.addresses += [str(named[key]) for key in ("href", "src") if named.get(key)]
+        if tag not in self._VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize("page", ["index.html", *(f"runs/{page_name(run)}" for run in (*RUNS, FAILED))])
+def test_markup_is_whole_and_names_nothing_outside(out: Path, page: str) -> None:
+    parser = _Tags()
+    parser.feed(text_of(out, page))
+    assert parser.open == []
+    assert len(parser.ids) == len(set(parser.ids))
+    outside = [one for one in parser.addresses if re.match(r"[a-z]+:|//|/", one) and one != "data:,"]
+    assert outside == []
+    assert "<b>odd" not in text_of(out, page)
+
+
+def test_every_epoch_of_a_short_run_is_there(out: Path, replayed: dict[str, RunTables]) -> None:
+    time = data_of(out, "runs/jump_two.html")["solutions"]["primary"]["time"]
+    epochs = replayed["jump_two"].epochs
+    series = time["series"]["error_along_m"]
+    np.testing.assert_array_equal(unpacked(series["y"]), epochs["error_along_m"].to_numpy().astype("<f4"))
+    t_ms = epochs["t"].dt.timestamp("ms").to_numpy()
+    np.testing.assert_array_equal(unpacked(series["x"]), t_ms - t_ms[0])
+
+
+def test_ratios_cross_one_exactly_where_monitors_fail(out: Path, replayed: dict[str, RunTables]) -> None:
+    time = data_of(out, "runs/jump_two.html")["solutions"]["primary"]["time"]
+    epochs = replayed["jump_two"].epochs
+    judged = 0
+    for monitor in MONITORS:
+        if f"ratio_{monitor}" not in time["series"]:
+            assert (epochs[f"{monitor}_state"] == "not_evaluated").all()
+            continue
+        beyond = np.abs(unpacked(time["series"][f"ratio_{monitor}"]["y"])) > 1.0
+        fails = (epochs[f"{monitor}_state"] == "fail").to_numpy()
+        np.testing.assert_array_equal(beyond, fails, err_msg=monitor)
+        judged += int(fails.sum())
+    assert judged > 10
+
+
+def test_bands_say_what_the_epochs_say(out: Path, replayed: dict[str, RunTables]) -> None:
+    data = data_of(out, "runs/jump_one_no_odometer.html")["solutions"]["primary"]["time"]
+    epochs = replayed["jump_one_no_odometer"].epochs
+    t_ms = epochs["t"].dt.timestamp("ms").to_numpy()
+    for band in data["bands"]:
+        starts, codes = unpacked(band["starts"]), unpacked(band["codes"])
+        drawn = [band["states"][code] for code in codes[np.searchsorted(starts, t_ms - t_ms[0], side="right") - 1]]
+        if band["group"] == "monitors":
+            assert drawn == epochs[f"{band['name']}_state"].to_list()
+    along = next(band for band in data["bands"] if band["name"] == "along_raw")
+    assert set(unpacked(along["codes"])) == {along["states"].index("not_evaluated")}
+
+
+def test_an_outage_is_a_gap(out: Path, replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    tables = replayed["jump_two"]
+    start = tables.epochs["t"][0]
+    cut = tables.epochs.filter(
+        ~pl.col("t").is_between(start + pl.duration(seconds=20), start + pl.duration(seconds=30))
+    )
+    write_run(RunTables("gap", tables.hazards, tables.passages, tables.alarms, cut, tables.runs), tmp_path, {})
+    write_report(tmp_path)
+    time = data_of(tmp_path, "runs/gap.html")["solutions"]["primary"]["time"]
+    x, y = (unpacked(time["series"]["speed_mps"][key]) for key in "xy")
+    assert len(x) == cut.height + 1
+    broken = x[np.isnan(y) & (x > 10_000)]
+    assert len(broken) == 1
+    assert 20_000 < broken[0] < 30_000
+    mode = next(band for band in time["bands"] if band["name"] == "LDS mode")
+    codes, starts = unpacked(mode["codes"]), unpacked(mode["starts"])
+    assert codes[np.searchsorted(starts, 25_000, side="right") - 1] == 0
+
+
+def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
+    """Three faults in five rows for `primary`, one of them missed; Clopper-Pearson of 1 in 3 is 0.8 % to 90.6 %."""
+    text = text_of(out, "index.html")
+    section = text[text.index('id="s1"') : text.index("table-levels-s1")]
+    assert "3 in 5 rows" in section
+    assert "1 of 3 with a failure" in section
+    assert "33.3% (95 %: 0.8% to 90.6%)" in section
+
+
+def test_allowed_times_of_every_level_are_drawn(out: Path) -> None:
+    levels = dict(data_of(out, "index.html")["levels"])
+    assert levels == pytest.approx({"npa": 24.12, "lpv200": 0.5025, "egnos_observed": 1.675, "horizontal_sis": 100.5})
+
+
+def test_undetected_hazards_do_not_count_as_detected(out: Path, replayed: dict[str, RunTables]) -> None:
+    own = data_of(out, "index.html")["solutions"]["primary"]
+    hazards = pl.concat([tables.hazards for tables in replayed.values()])
+    assert own["hazards"] == hazards.height == 5
+    assert len(own["time_to_detect_s"]) == hazards["detected"].sum() == 3
+    assert len(own["hazardous_s"]) < own["failures"]
+
+
+def test_location_errors_are_all_counted(out: Path, replayed: dict[str, RunTables]) -> None:
+    own = data_of(out, "index.html")["solutions"]["primary"]
+    known = sum(tables.passages["location_error_m"].is_not_null().sum() for tables in replayed.values())
+    assert sum(count for _, _, count in own["location"]) == known
+
+
+def test_availability_map_counts_moving_epochs(out: Path, replayed: dict[str, RunTables]) -> None:
+    pieces = data_of(out, "index.html")["solutions"]["primary"]["map"]["pieces"]
+    moving = pl.concat([tables.epochs for tables in replayed.values()]).filter(
+        (pl.col("speed_mps").abs() > 0.3) & pl.col("netelement_id").is_not_null()
+    )
+    assert sum(piece["epochs"] for piece in pieces) == moving.height
+    assert sum(piece["epochs"] * piece["share"] for piece in pieces) == pytest.approx(moving["tvb"].sum(), rel=1e-3)
+    assert all(len(piece["x"]) >= 2 for piece in pieces)
+
+
+def test_failed_runs_come_first_with_their_reason(out: Path) -> None:
+    text = text_of(out, "index.html")
+    table = text[text.index('id="table-runs"') :]
+    first = table[table.index("<tbody>") : table.index("</tr>", table.index("<tbody>"))]
+    assert "broken &amp; &lt;b&gt;odd" in first
+    assert REASON in first
+
+
+def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    tables = replayed["jump_two"]
+    blind = RunTables(
+        "blind",
+        tables.hazards.clear(),
+        tables.passages.with_columns(location_error_m=pl.lit(None, pl.Float64)),
+        tables.alarms,
+        tables.epochs.with_columns(error_along_m=pl.lit(None, pl.Float64)),
+        tables.runs.with_columns(
+            evidence=pl.lit(None, tables.runs.schema["evidence"]), false_alarm_rate_per_h=pl.lit(None, pl.Float64)
+        ),
+    )
+    write_run(blind, tmp_path, {})
+    write_report(tmp_path)
+    run, index = text_of(tmp_path, "runs/blind.html"), text_of(tmp_path, "index.html")
+    assert "there was nothing to judge the positions by" in run
+    assert "no run with a truth that judges every alarm" in index
+    assert "rate not known" in index
+
+
+def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
+    files = sorted(path for path in (out / "report").rglob("*") if path.is_file())
+    before = {path: path.read_bytes() for path in files}
+    (out / "report" / "runs" / "gone.html").write_text("left over")
+    written = write_report(out, site)
+    assert written[0] == out / "report" / "index.html"
+    assert sorted(written) == files
+    assert {path: path.read_bytes() for path in files} == before
+    assert not (out / "report" / "runs" / "gone.html").exists()
+
+
+def test_ten_hours_at_ten_hertz_stay_small(replayed: dict[str, RunTables], site: Site, tmp_path: Path) -> None:
+    one = replayed["jump_two"]
+    copies = -(-360_000 // one.epochs.height)
+
+    def repeated(frame: pl.DataFrame) -> pl.DataFrame:
+        times = [name for name, dtype in frame.schema.items() if isinstance(dtype, pl.Datetime)]
+        parts = [frame.with_columns(pl.col(times) + pl.duration(milliseconds=411_100 * copy)) for copy in range(copies)]
+        return pl.concat(parts)
+
+    frames = {name: repeated(getattr(one, name)) for name in ("hazards", "passages", "alarms")}
+    hazards = frames["hazards"].with_columns(hazard_id=pl.int_range(pl.len()))
+    alarms = frames["alarms"].with_columns(alarm_id=pl.int_range(pl.len()))
+    epochs = repeated(one.epochs).head(360_000)
+    write_run(RunTables("long", hazards, frames["passages"], alarms, epochs, one.runs), tmp_path, {})
+    total = sum(path.stat().st_size for path in write_report(tmp_path, site))
+    assert total < 15_000_000
+    time = data_of(tmp_path, "runs/long.html")["solutions"]["primary"]["time"]
+    largest = np.nanmax(unpacked(time["series"]["error_along_m"]["y"]))
+    assert largest == np.float32(epochs["error_along_m"].max())
+
+
+def test_a_folder_without_result_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no complete run"):
+        write_report(tmp_path)
+
+
+def test_another_site_is_refused(replayed: dict[str, RunTables], site: Site, tmp_path: Path) -> None:
+    write_run(replayed["jump_two"], tmp_path, {"site_digest": "one"})
+    other = Site(site.track, site.links, site.balises, digest="two")
+    with pytest.raises(UsageError, match="another site"):
+        write_report(tmp_path, other)
+
+
+def test_command(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    write_run(replayed["jump_two"], tmp_path, {})
+    answer = CliRunner().invoke(app, ["report", str(tmp_path)])
+    assert answer.exit_code == 0, answer.output
+    assert "index.html" in answer.output
+    plan = data_of(tmp_path, "runs/jump_two.html")["solutions"]["primary"]["plan"]
+    assert plan["geographic"] is False
+    assert len(unpacked(plan["x"])) == replayed["jump_two"].epochs["path_m"].is_not_null().sum()
