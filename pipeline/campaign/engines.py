@@ -46,6 +46,9 @@ class Engine(Protocol):
 
     def submit(self, job: RunJob) -> Result: ...
 
+    def has_begun(self, result: Result) -> bool:
+        """Whether the run is under way; a worker that is still starting does not use up the time limit."""
+
     def kill(self, result: Result) -> None:
         """End the run at once; its future then holds a `BrokenExecutor`."""
 
@@ -72,6 +75,9 @@ class SerialEngine:
         except Exception as error:
             result.set_exception(error)
         return result
+
+    def has_begun(self, result: Result) -> bool:
+        return True
 
     def kill(self, result: Result) -> None:
         return None
@@ -104,6 +110,9 @@ class LocalEngine:
         self._busy[result] = slot
         return result
 
+    def has_begun(self, result: Result) -> bool:
+        return self._busy[result].is_ready
+
     def kill(self, result: Result) -> None:
         self._busy[result].kill()
 
@@ -133,6 +142,11 @@ class _Slot:
             # It died while it was idle: that costs no run.
             self.kill()
             return self._started().submit(replay_one, job)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the process has started and answered."""
+        return self._pid is not None and self._pid.done()
 
     def kill(self) -> None:
         if self._executor is None or self._pid is None:
@@ -219,6 +233,9 @@ class DaskEngine:
     def submit(self, job: RunJob) -> Result:
         result: Result = self._executor.submit(replay_within, job, self._limit_s)
         return result
+
+    def has_begun(self, result: Result) -> bool:
+        return True
 
     def kill(self, result: Result) -> None:
         """The worker ends itself at the limit (`replay_within`)."""

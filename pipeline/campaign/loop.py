@@ -206,6 +206,8 @@ def _collect(state: _State, engine: Engine, result: Result, limit_s: float) -> R
 def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
     now = time.monotonic()
     for result, item in state.under_way.items():
+        if not engine.has_begun(result):
+            item.since_s = now
         if now - item.since_s > limit_s and not item.overdue:
             item.overdue = not engine.retries_itself
             engine.kill(result)
