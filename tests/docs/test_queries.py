@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,7 @@ from tests.docs.blocks import ROOT, Block, blocks
 PAGE = blocks(ROOT / "docs" / "analyst.md")
 PREAMBLE = next(block.text for block in PAGE if block.language == "python")
 PAIRS = [
-    (sql, python)
-    for sql, python in zip(PAGE, PAGE[1:], strict=False)
-    if (sql.language, python.language) == ("sql", "python")
+    (sql, python) for sql, python in itertools.pairwise(PAGE) if (sql.language, python.language) == ("sql", "python")
 ]
 
 
