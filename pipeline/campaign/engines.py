@@ -15,10 +15,11 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
+from types import FrameType
 from typing import Any, Protocol
 
 from pipeline.campaign.plan import RunJob
-from pipeline.campaign.worker import RunOutcome, replay_one, replay_within
+from pipeline.campaign.worker import RunOutcome, fail_run, overdue, replay_one, replay_within
 from schemas.errors import UsageError
 
 Result = Future[RunOutcome]
@@ -65,13 +66,19 @@ class SerialEngine:
     in_process = True
     retries_itself = True
 
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+
     def capacity(self) -> int:
         return 1
 
     def submit(self, job: RunJob) -> Result:
         result: Result = Future()
         try:
-            result.set_result(replay_one(job))
+            with _alarm(self._limit_s):
+                result.set_result(replay_one(job))
+        except _Overdue:
+            result.set_result(fail_run(job, overdue(self._limit_s)))
         except Exception as error:
             result.set_exception(error)
         return result
@@ -87,6 +94,29 @@ class SerialEngine:
 
     def close(self) -> None:
         return None
+
+
+class _Overdue(BaseException):
+    """Not an `Exception`, so that nothing on the way takes it for a failure of its own."""
+
+
+@contextlib.contextmanager
+def _alarm(limit_s: float) -> Iterator[None]:
+    """Raise `_Overdue` after a time; only the main thread can be told."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(signum: int, frame: FrameType | None) -> None:
+        raise _Overdue
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 class LocalEngine:
@@ -293,6 +323,6 @@ def engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> E
     """The engine that suits: a cluster if one is named, else this machine."""
     if scheduler is not None:
         return DaskEngine(scheduler, limit_s)
-    if jobs == 1 and runs == 1:
-        return SerialEngine()
+    if runs == 1:
+        return SerialEngine(limit_s)
     return LocalEngine(min(jobs, runs))

@@ -18,7 +18,7 @@ from pipeline.campaign.engines import Engine, Result, engine_for
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.plan import Plan, RunJob, with_previous
-from pipeline.campaign.worker import RunOutcome, fail_run
+from pipeline.campaign.worker import RunOutcome, fail_run, overdue
 from pipeline.ingest.files import is_url
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
@@ -141,9 +141,10 @@ def _watched(plan: Plan, engine: Engine, limit_s: float, watches: Sequence[Watch
             _loop(state, engine, limit_s, watches)
         except Interrupted as interrupted:
             stopped = interrupted
-    summary = Summary(len(plan.jobs), tuple(_in_order(state.outcomes)), time.monotonic() - begun)
-    for watch in watches:
-        watch.end(summary)
+        finally:
+            summary = Summary(len(plan.jobs), tuple(_in_order(state.outcomes)), time.monotonic() - begun)
+            for watch in watches:
+                watch.end(summary)
     if stopped is not None:
         raise Interrupted(stopped.signum, summary)
     return summary
@@ -188,7 +189,7 @@ def _collect(state: _State, engine: Engine, result: Result, limit_s: float) -> R
     if error is None:
         return result.result()
     if item.overdue:
-        return fail_run(item.job, f"took longer than the time limit of {limit_s:g} s")
+        return fail_run(item.job, overdue(limit_s))
     if isinstance(error, CancelledError):
         raise UsageError("the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped.")
     if not engine.is_lost_worker(error):

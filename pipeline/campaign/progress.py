@@ -168,4 +168,4 @@ def watches(quiet: bool) -> list[Watch]:
     """What shows a campaign on this terminal or pipe."""
     if quiet:
         return [LogWatch()]
-    return [LogWatch(), BarWatch() if sys.stderr.isatty() else LineWatch()]
+    return [BarWatch() if sys.stderr.isatty() else LineWatch(), LogWatch()]

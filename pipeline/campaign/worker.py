@@ -109,6 +109,11 @@ def fail_run(
     return RunOutcome(job.run_id, RunStatus.FAILED, shown, defect=trace is not None, trace=trace, seconds=seconds)
 
 
+def overdue(limit_s: float) -> str:
+    """The reason of a run that was given up."""
+    return f"took longer than the time limit of {limit_s:g} s"
+
+
 class _ChangedError(InputError):
     """The log was written to while it was read: trying again may succeed."""
 

@@ -227,6 +227,14 @@ def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path) -> Non
     assert [summary[f"run{number}"].status for number in range(4)] == [RunStatus.OK] * 4
 
 
+def test_single_run_is_given_up_too(tmp_path: Path, small_trial: SmallTrial) -> None:
+    os.mkfifo(tmp_path / "hanging.mcap")
+    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap"])
+    outcome = by_run(run_campaign(plan, time_limit_s=0.5))["hanging"]
+    assert (outcome.status, outcome.defect) == (RunStatus.FAILED, False)
+    assert "time limit of 0.5 s" in (outcome.error or "")
+
+
 def test_output_held_by_another_campaign(small_trial: SmallTrial, tmp_path: Path) -> None:
     from pipeline.campaign.lock import locked
 
