@@ -39,15 +39,35 @@ def availability_pieces(epochs: pl.LazyFrame, deadband_mps: float) -> pl.DataFra
     )
 
 
-def availability_map(pieces: pl.DataFrame, site: Site | None) -> Json:
-    """Pieces of one solution as lines: in plan with a site, else one row per net element along its measure."""
-    elements = sorted(set(pieces["netelement_id"].to_list()))
+def availability_map(pieces: pl.DataFrame, hazards: pl.DataFrame, site: Site | None) -> Json:
+    """Pieces of one solution as lines, and where its hazards were.
+
+    In plan with a site, else one row per net element along its measure.
+    """
+    placed = hazards.filter(pl.col("netelement_id").is_not_null() & pl.col("measure_m").is_not_null())
+    elements = sorted({*pieces["netelement_id"].to_list(), *placed["netelement_id"].to_list()})
     return {
         "geographic": site is not None,
         "elements": elements,
         "track": _track_lines(site) if site is not None else [],
         "pieces": [_piece(row, elements, site) for row in pieces.iter_rows(named=True)],
+        "hazards": _hazards(placed, elements, site),
     }
+
+
+def _hazards(hazards: pl.DataFrame, elements: list[str], site: Site | None) -> list[Json]:
+    """Place and name of each hazard."""
+    measure_m = hazards["measure_m"].to_numpy()
+    if site is None:
+        x, y = measure_m, np.array([float(elements.index(name)) for name in hazards["netelement_id"]])
+    else:
+        x, y = plane_m(ground_of(site.track, hazards["netelement_id"], measure_m), _origin(site))
+    names = hazards.select("run_id", "hazard_id", pl.col("hazard").cast(pl.String)).iter_rows()
+    return [
+        [round(float(east), 1), round(float(north), 1), f"{run} {number}: {kind}"]
+        for east, north, (run, number, kind) in zip(x, y, names, strict=True)
+        if np.isfinite(east) and np.isfinite(north)
+    ]
 
 
 def _piece(row: dict[str, object], elements: list[str], site: Site | None) -> Json:

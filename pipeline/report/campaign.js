@@ -8,8 +8,11 @@
   ];
   const LEAST_S = 0.05;
 
+  // What nobody could have seen was not found either.
+  const noHazard = (own) => `No hazard was found; ${own.runs_with_truth} of ${own.runs} runs had a truth to find one by.`;
+
   function classesPlot(id, own) {
-    if (!own.hazards) { empty(id, "No hazard was found."); return; }
+    if (!own.hazards) { empty(id, noHazard(own)); return; }
     const traces = OUTCOMES.map(([name, color, pattern], index) => ({
       type: "bar", name, x: own.classes.map((row) => row[0]), y: own.classes.map((row) => row[1 + index]),
       marker: { color, pattern: Plots.pattern(color, pattern) },
@@ -34,7 +37,7 @@
       shareCurve(own.time_to_detect_s, own.hazards, "detected, T_D", LINES[0]),
       shareCurve(own.hazardous_s, own.failures, "negated, hazardous time", LINES[5]),
     ].filter(Boolean);
-    if (!traces.length) { empty(id, own.hazards ? `None of ${own.hazards} hazards was detected.` : "No hazard was found."); return; }
+    if (!traces.length) { empty(id, own.hazards ? `None of ${own.hazards} hazards was detected.` : noHazard(own)); return; }
     const shapes = data.levels.map(([, allowed]) => ({ type: "line", x0: allowed, x1: allowed, yref: "paper", y0: 0, y1: 1,
       line: { color: COLOUR.grey, dash: "dash", width: 1.2 } }));
     const annotations = data.levels.map(([name, allowed], index) => ({ x: Math.log10(allowed), yref: "paper",
@@ -85,6 +88,10 @@
       }
       return trace;
     }).filter((trace) => trace.x.length);
+    const hazards = { type: "scatter", mode: "markers", name: "hazard", x: map.hazards.map((one) => one[0]),
+      y: map.hazards.map((one) => one[1]), text: map.hazards.map((one) => one[2]), hovertemplate: "%{text}<extra></extra>",
+      marker: { symbol: "x", size: 11, color: COLOUR.purple, line: { width: 1, color: "#000000" } } };
+    if (map.hazards.length) groups.push(hazards);
     const axes = map.geographic
       ? { xaxis: axis("east [m]"), yaxis: axis("north [m]", { scaleanchor: "x", scaleratio: 1 }) }
       : { xaxis: axis("measure on the net element [m]"),

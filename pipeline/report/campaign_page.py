@@ -52,7 +52,7 @@ _PLOTS = (
     ("detection", "Time to detect", "Share of all hazards detected, and of all failures negated, by then; vertical "
      "lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never detected."),
     ("location", "Location error at VBs", "Positive: offered early. Offers by what became of them."),
-    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place."),
+    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; hazards at the train's."),
 )  # fmt: skip
 
 
@@ -100,11 +100,11 @@ def _runs_table(campaign: Campaign) -> str:
     rows = []
     for row in runs.iter_rows(named=True):
         name = Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"]))
-        status = Cell(str(row["status"]), float(row["order"]), badge(str(row["status"])))
+        status = Cell(str(row["status"]), str(row["order"]), badge(str(row["status"])))
         reason = cell("; ".join(text for text in (row["error"], row["notes"]) if text) or None)
         figures = [cell(None if row["status"] == "failed" else row[key]) for key, _ in _RUN_COLUMNS]
         rows.append([name, status, reason, cell(row["solution"] or None), *figures])
-    titles = ["run", "status", "reason", "solution", *(title for _, title in _RUN_COLUMNS)]
+    titles = ["run", "status", "reason or notes", "solution", *(title for _, title in _RUN_COLUMNS)]
     return table("table-runs", "Runs, failed ones first", titles, rows)
 
 
@@ -166,15 +166,17 @@ def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
 
 
 def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
-    hazards, passages = _only(campaign.hazards, name), _only(campaign.passages, name)
+    runs, hazards, passages = (_only(frame, name) for frame in (campaign.runs, campaign.hazards, campaign.passages))
     return {
         "classes": [[kind.value, *_outcomes(hazards.filter(pl.col("hazard") == kind))] for kind in Hazard],
+        "runs": runs.height,
+        "runs_with_truth": runs["evidence"].is_not_null().sum(),
         "hazards": hazards.height,
         "failures": hazards["t_failure"].is_not_null().sum(),
         "time_to_detect_s": _sorted(hazards.filter(pl.col("detected"))["time_to_detect_s"]),
         "hazardous_s": _sorted(hazards.filter(pl.col("t_negated").is_not_null())["hazardous_s"]),
         "location": _location(passages),
-        "map": availability_map(_only(campaign.pieces, name), made.site),
+        "map": availability_map(_only(campaign.pieces, name), hazards, made.site),
     }
 
 

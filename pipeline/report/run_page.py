@@ -25,86 +25,13 @@ from pipeline.report.markup import (
 )
 from pipeline.report.packing import Json, script_json
 from pipeline.report.plan_view import plan_data
+from pipeline.report.run_columns import ALARM_COLUMNS, FIGURES, HAZARD_COLUMNS, PASSAGE_COLUMNS, PLOTS
 from pipeline.report.series import moments_of, reasons, time_data
 from pipeline.report.stanford import stanford_data
 from schemas.config import Configuration
 from schemas.run import RunTables, Site
 
 Row = Mapping[str, Any]
-
-_FIGURES = (
-    ("duration_s", "duration", "s"),
-    ("distance_m", "distance", "m"),
-    ("epochs", "epochs", ""),
-    ("gnss_rate_hz", "GNSS rate", "Hz"),
-    ("evidence", "truth taken from", ""),
-    ("availability", "availability of the TVB while moving", ""),
-    ("outages", "outages", ""),
-    ("longest_outage_s", "longest outage", "s"),
-    ("along_error_p95_m", "error along, 95 %", "m"),
-    ("along_error_max_m", "error along, largest", "m"),
-    ("cross_error_p95_m", "error across, 95 %", "m"),
-    ("up_error_p95_m", "error of height, 95 %", "m"),
-    ("balises_on_path", "VBs passed", ""),
-    ("balises_accepted", "accepted", ""),
-    ("balises_rejected", "rejected", ""),
-    ("balises_missed", "missed", ""),
-    ("balises_not_available", "not available", ""),
-    ("unsafe_accepted", "accepted beyond the failure limit", ""),
-    ("location_error_p95_m", "location error, 95 %", "m"),
-    ("missed_detections", "missed detections", ""),
-    ("time_to_detect_max_s", "longest time to detect", "s"),
-    ("hazardous_max_s", "longest hazardous time", "s"),
-    ("alarms", "alarms", ""),
-    ("false_alarms", "of these false", ""),
-    ("exposure_max_s", "longest exposure", "s"),
-    ("exposure_p99_s", "exposure, 99 %", "s"),
-    ("mtbf_h", "time between outages", "h"),
-    ("latency_s", "GNSS latency", "s"),
-    ("odometer_scale", "odometer scale", ""),
-    ("ambiguous_stretches", "ambiguous stretches", ""),
-    ("duplicates", "duplicated epochs", ""),
-    ("out_of_order", "epochs out of order", ""),
-)
-_HAZARD_COLUMNS = (
-    ("failure_mode", "ETCS failure"), ("timing", "offered"), ("size_m", "size [m]"), ("rate_mps", "rate [m/s]"),
-    ("t_onset", "onset"), ("t_failure", "failure"), ("t_detected", "detected"), ("monitor", "by"),
-    ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
-    ("budget_s", "budget [s]"), ("within_budget", "within budget"), ("balise_ids", "VBs hit"),
-    ("accepted_ids", "accepted all the same"), ("suspect", "suspect"), ("evidence", "evidence"),
-    ("speed_mps", "speed [m/s]"), ("caused_by", "follows from"),
-)  # fmt: skip
-_PASSAGE_COLUMNS = (
-    ("kind", "kind"), ("direction", "direction"), ("t_offered", "offered"), ("t_true", "passed"),
-    ("location_error_m", "location error [m]"), ("window_open_m", "window opens [m]"),
-    ("odometer_distance_m", "odometer [m]"), ("window_close_m", "window closes [m]"),
-    ("confidence_m", "confidence [m]"), ("linking_error", "linking error"), ("reaction", "reaction"),
-    ("failure_mode", "ETCS failure"), ("cause", "cause"), ("suspect_after_the_fact", "suspect after the fact"),
-    ("hazard_id", "hazard"),
-)  # fmt: skip
-_ALARM_COLUMNS = (
-    ("t_start", "from"), ("t_end", "to"), ("monitors", "monitors in order of failing"),
-    ("peak_ratio", "peak ratio"), ("verdict", "verdict"), ("suspect", "suspect"), ("hazard_id", "hazard"),
-)  # fmt: skip
-_PLOTS = (
-    ("plan", "Plan", "GNSS positions coloured by the state of the LDS; balises by what became of them; "
-     "thick lines are expectation windows."),
-    ("bands", "LDS mode, state, TVB and alarm", "Where nothing is drawn there was no epoch."),
-    ("speed", "Speed", ""),
-    ("along", "Error along the track", "Positive ahead of the train; the confidence interval is dashed. "
-     "Without truth: GNSS minus odometer."),
-    ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
-    ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
-     "in odometer distance; markers are the offers."),
-    ("exposure", "Exposure", "Time since the last linked TVB or accepted VB."),
-    ("monitors-along", "Monitors along the track", "Value over threshold: beyond ±1 the monitor fails."),
-    ("monitors-cross", "Monitors across the track", "Value over threshold."),
-    ("monitors-up", "Monitors of height", "Value over threshold."),
-    ("monitors-other", "Other monitors", "Value over threshold."),
-    ("states", "State of every monitor", "Not evaluated is not the same as passed."),
-    ("stanford", "Stanford diagram", "Epochs of known error: error along the track against the confidence claimed. "
-     "Below the diagonal the claim was wrong."),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -229,13 +156,13 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
 
 
 def _drawings(key: str) -> str:
-    figures = (figure(f"{key}-{plot}", title, note) for plot, title, note in _PLOTS)
+    figures = (figure(f"{key}-{plot}", title, note) for plot, title, note in PLOTS)
     return section(f"drawings-{key}", "Drawings", *figures)
 
 
 def _figures(row: Row) -> str:
     values = []
-    for key, title, unit in _FIGURES:
+    for key, title, unit in FIGURES:
         value = row[key]
         text = number(value, 4) if isinstance(value, int | float) else str(value or UNKNOWN)
         values.append((title, f"{text} {unit}".strip() if value is not None else "not known"))
@@ -259,8 +186,8 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
         title = f"{row['hazard_id']} {row['hazard']}"
         anchor = link(hazard_hash(row["solution"], row["hazard_id"]), title, data_hazard=str(row["hazard_id"]))
         first = Cell(title, float(row["hazard_id"]), anchor, "" if row["detected"] else "bad")
-        rows.append([first, *(cell(row[key]) for key, _ in _HAZARD_COLUMNS)])
-    titles = ["hazard", *(title for _, title in _HAZARD_COLUMNS)]
+        rows.append([first, *(cell(row[key]) for key, _ in HAZARD_COLUMNS)])
+    titles = ["hazard", *(title for _, title in HAZARD_COLUMNS)]
     return table(f"table-hazards-{key}", "Hazards; a link zooms every drawing to its hazard", titles, rows)
 
 
@@ -269,17 +196,17 @@ def _passages(key: str, passages: pl.DataFrame) -> str:
         [
             cell(row["balise_id"]),
             Cell(str(row["status"]), str(row["status"]), tone="" if row["status"] == "accepted" else "bad"),
-            *(cell(row[key], 4) for key, _ in _PASSAGE_COLUMNS),
+            *(cell(row[key], 4) for key, _ in PASSAGE_COLUMNS),
         ]
         for row in passages.iter_rows(named=True)
     ]
-    titles = ["balise", "status", *(title for _, title in _PASSAGE_COLUMNS)]
+    titles = ["balise", "status", *(title for _, title in PASSAGE_COLUMNS)]
     return table(f"table-passages-{key}", "Passages of balises", titles, rows)
 
 
 def _alarms(key: str, alarms: pl.DataFrame) -> str:
-    rows = [[cell(row[key]) for key, _ in _ALARM_COLUMNS] for row in alarms.iter_rows(named=True)]
-    return table(f"table-alarms-{key}", "Alarm episodes", [title for _, title in _ALARM_COLUMNS], rows)
+    rows = [[cell(row[key]) for key, _ in ALARM_COLUMNS] for row in alarms.iter_rows(named=True)]
+    return table(f"table-alarms-{key}", "Alarm episodes", [title for _, title in ALARM_COLUMNS], rows)
 
 
 def _reasons(key: str, epochs: pl.DataFrame) -> str:
