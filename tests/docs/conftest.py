@@ -122,7 +122,10 @@ def _nav_pvt(row: dict[str, Any]) -> bytes:
         lat=row["latitude_deg"],
         lon=row["longitude_deg"],
         height=round(row["height_m"] * 1000),
-        hAcc=1000,
+        velN=round(row["vel_n_mps"] * 1000),
+        velE=round(row["vel_e_mps"] * 1000),
+        velD=round(-row["vel_u_mps"] * 1000),
+        hAcc=1414,
         vAcc=1500,
     )
     return message.serialize()
