@@ -197,8 +197,9 @@ def _between(data: Bytes, named: Sequence[tuple[Ints, Ints]], offset: int, on_re
 
     Records that follow each other without gap: sorted, each end but the last is the next start.
     """
-    starts = np.sort(np.concatenate([start for start, _ in named]))
-    ends = np.sort(np.concatenate([end for _, end in named]))
+    # Stable, for it merges what is sorted already, as each channel is.
+    starts = np.sort(np.concatenate([start for start, _ in named]), kind="stable")
+    ends = np.sort(np.concatenate([end for _, end in named]), kind="stable")
     gaps = [(0, int(starts[0])), (int(ends[-1]), len(data))]
     if not np.array_equal(starts[1:], ends[:-1]):
         if (starts[1:] < ends[:-1]).any():

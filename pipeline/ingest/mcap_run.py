@@ -145,7 +145,7 @@ def _frames(
 
 
 def _no_gnss(path: files.Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:
-    if walk.cut_at is not None and not walk.message_counts:
+    if walk.cut_at is not None and not walk.met.message_counts:
         return Breach(
             str(path),
             f"is cut off at byte {walk.cut_at}, before any complete message",

@@ -7,8 +7,6 @@ checksums, statistics) is then held against what was met.
 
 from __future__ import annotations
 
-import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -19,6 +17,7 @@ from pipeline.ingest.byte_window import ByteWindow
 from pipeline.ingest.mcap_block import Block, block_of, chunk_messages, decompressed
 from pipeline.ingest.mcap_model import Channel, Schema
 from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, DamageError, Op
+from pipeline.ingest.mcap_summary import Met, Summary
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
 _RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
@@ -40,7 +39,7 @@ class McapWalk:
 
     def __init__(self, window: ByteWindow, file: str, chunk_limit: int) -> None:
         self.channels: dict[int, Channel] = {}
-        self.message_counts: Counter[int] = Counter()
+        self.met = Met()
         self.data_crc = (0, 0)
         self.chunks_without_crc = 0
         self.cut_at: int | None = None
@@ -51,14 +50,8 @@ class McapWalk:
         self._schemas: dict[int, Schema] = {}
         self._definitions: dict[int, records.ChannelRecord] = {}
         self._pending: Pending | None = None
-        self._met: list[ChunkSummary] = []
-        self._indexed: list[ChunkSummary] = []
-        self._attachments = 0
-        self._metadata = 0
         self._ordinal = 0
-        self._span_ns: tuple[int, int] | None = None
-        self._crc = 0
-        self._summary_start: int | None = None
+        self._summary: Summary | None = None
 
     def blocks(self) -> Iterator[Block]:
         """All messages in order of the file. Stops at a cut, with `cut_at` set; raises `DamageError`."""
@@ -70,7 +63,7 @@ class McapWalk:
             opcode, length = head
             if opcode != Op.MESSAGE_INDEX and self._pending:
                 yield self._finished_chunk()
-            if opcode == Op.MESSAGE and self._summary_start is None:
+            if opcode == Op.MESSAGE and self._summary is None:
                 block, position = self._loose_messages(position)
                 yield block
             else:
@@ -138,8 +131,8 @@ class McapWalk:
     def _record(self, opcode: int, length: int, position: int) -> int | None:
         """Meet one record; the position of the next, none after the closing magic."""
         following = position + HEAD_SIZE + length
-        if self._summary_start is not None:
-            return self._summary_record(opcode, length, position)
+        if self._summary is not None:
+            return self._summary_record(opcode, length, position, self._summary)
         if opcode == Op.ATTACHMENT:
             self._attachment(length, position)
             return following
@@ -199,15 +192,15 @@ class McapWalk:
     def _attachment(self, length: int, position: int) -> None:
         head = self._window.at(position + HEAD_SIZE, min(length, _ATTACHMENT_HEAD))
         records.parse_attachment_lengths(head, length, position)
-        self._attachments += 1
+        self.met.attachments += 1
 
     def _metadata_record(self, body: memoryview, position: int) -> None:
-        self._metadata += 1
+        self.met.metadata += 1
 
     def _data_end(self, body: memoryview, position: int) -> None:
         cursor = records.Cursor(body, position, "DataEnd")
         self.data_crc = (cursor.u32(), position)
-        self._summary_start = position + HEAD_SIZE + len(body)
+        self._summary = Summary(position + HEAD_SIZE + len(body), self.met)
 
     def _finished_chunk(self) -> Block:
         pending, self._pending = self._pending, None
@@ -217,7 +210,7 @@ class McapWalk:
         self.chunks_without_crc += chunk.crc == 0
         met = chunk_messages(data, pending.indexes, chunk.offset, self._ordinal, self._chunk_record)
         block = self._counted(met, chunk.offset, len(data))
-        self._met.append(
+        self.met.chunks.append(
             ChunkSummary(
                 chunk.start_ns, chunk.end_ns, chunk.offset, pending.length, chunk.compression,
                 len(chunk.records), chunk.size,
@@ -240,78 +233,24 @@ class McapWalk:
         for channel_id, messages in block.items():
             if channel_id not in self.channels:
                 raise DamageError(offset, f"a message belongs to the unknown channel {channel_id}")
-            self.message_counts[channel_id] += len(messages)
+            self.met.message_counts[channel_id] += len(messages)
             times = messages.heads["log_time"]
-            low, high = int(times.min()), int(times.max())
-            old = self._span_ns or (low, high)
-            self._span_ns = (min(old[0], low), max(old[1], high))
+            self.met.add_times(int(times.min()), int(times.max()))
         self._ordinal += size
         return block
 
-    def _summary_record(self, opcode: int, length: int, position: int) -> int | None:
+    def _summary_record(self, opcode: int, length: int, position: int, summary: Summary) -> int | None:
         if opcode in _DATA_OPS:
             raise DamageError(position, f"a {Op(opcode).name} record stands after the end of the data")
         self._check_size("summary", length, position)
         whole = self._window.at(position, HEAD_SIZE + length)
-        body = whole[HEAD_SIZE:]
         if opcode == Op.FOOTER:
-            self._footer(whole, position)
+            self.cut_at = summary.finish(whole, position, self._window)
             return None
-        self._crc = zlib.crc32(whole, self._crc)
         if opcode in (Op.SCHEMA, Op.CHANNEL):
-            _HANDLERS[opcode](self, body, position)
-        elif opcode == Op.CHUNK_INDEX:
-            self._indexed.append(records.parse_chunk_index(body, position))
-        elif opcode == Op.STATISTICS:
-            self._check_statistics(records.parse_statistics(body, position), position)
+            _HANDLERS[opcode](self, whole[HEAD_SIZE:], position)
+        summary.add(opcode, whole, position)
         return position + HEAD_SIZE + length
-
-    def _check_statistics(self, told: records.Statistics, position: int) -> None:
-        counts = {channel: count for channel, count in told.by_channel.items() if count}
-        pairs = [
-            ("messages", told.messages, self.message_counts.total()),
-            ("chunks", told.chunks, len(self._met)),
-            ("attachments", told.attachments, self._attachments),
-            ("metadata records", told.metadata, self._metadata),
-            ("messages per channel", counts or dict(self.message_counts), dict(self.message_counts)),
-        ]
-        if self._span_ns:
-            pairs.append(("times", (told.start_ns, told.end_ns), self._span_ns))
-        for name, expected, met in pairs:
-            if expected != met:
-                raise DamageError(position, f"the statistics speak of {expected} {name}, the file holds {met}")
-
-    def _footer(self, whole: memoryview, position: int) -> None:
-        cursor = records.Cursor(whole[HEAD_SIZE:], position, "Footer")
-        summary_start, _, crc = cursor.u64(), cursor.u64(), cursor.u32()
-        cursor.finish()
-        met = self._summary_start if position != self._summary_start else 0
-        if summary_start != met:
-            raise DamageError(position, f"the footer places the summary at {summary_start}, it is at {met}")
-        if crc and zlib.crc32(whole[:-4], self._crc) != crc:
-            raise DamageError(position, "the checksum of the summary does not match")
-        end = position + len(whole)
-        closing = (
-            bytes(self._window.at(end, min(len(MAGIC), self._window.size - end))) if end < self._window.size else b""
-        )
-        if closing != MAGIC:
-            if not MAGIC.startswith(closing):
-                raise DamageError(end, "the closing magic is wrong")
-            self.cut_at = end
-        elif end + len(MAGIC) != self._window.size:
-            raise DamageError(end + len(MAGIC), "the file goes on after its end: trailing data, or two files in one")
-        self._check_chunk_index(position)
-
-    def _check_chunk_index(self, position: int) -> None:
-        """A chunk index lists every chunk once, or there is none."""
-        if not self._indexed:
-            return
-        if sorted(chunk.offset for chunk in self._indexed) != [chunk.offset for chunk in self._met]:
-            raise DamageError(
-                position, f"the chunk index names {len(self._indexed)} chunks, not the {len(self._met)} there are"
-            )
-        if sorted(self._indexed, key=lambda chunk: chunk.offset) != self._met:
-            raise DamageError(position, "the chunk index disagrees with the chunks")
 
 
 _HANDLERS: dict[int, Callable[[McapWalk, memoryview, int], None]] = {

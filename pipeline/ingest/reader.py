@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from pipeline.ingest.generic import decode_columns
@@ -119,8 +120,7 @@ class SourceReader:
         types |= self.source.types
         series = []
         for name, dtype in types.items():
-            column = _joined(name, self._columns.pop(name), dtype)
-            series.append(column if order is None else column.gather(order))
+            series.append(_joined(name, self._columns.pop(name), dtype, order))
         return pl.DataFrame(series)
 
 
@@ -138,16 +138,18 @@ def _typed(values: Values, dtype: pl.DataType) -> Values:
     return np.ascontiguousarray(values.astype(_KINDS[type(dtype)]))
 
 
-def _joined(name: str, parts: list[Values], dtype: pl.DataType) -> pl.Series:
-    """One column of what the parts hold."""
+def _joined(name: str, parts: list[Values], dtype: pl.DataType, order: npt.NDArray[np.int64] | None) -> pl.Series:
+    """One column of what the parts hold, put in order."""
     if not parts:
         return pl.Series(name, [], dtype=dtype)
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if len(arrays) == len(parts):
-        return pl.Series(name, np.concatenate(arrays))
+        joined = np.concatenate(arrays)
+        return pl.Series(name, joined if order is None else joined[order])
     repeated = [part for part in parts if isinstance(part, Repeated)]
     if len(repeated) == len(parts) and len({part.value for part in repeated}) == 1:
         whole = Repeated(repeated[0].value, sum(part.count for part in repeated), dtype)
         return whole.series().alias(name)
     series = [part.series() if isinstance(part, Repeated) else pl.Series(part) for part in parts]
-    return pl.concat([part.cast(dtype).alias(name) for part in series], rechunk=True)
+    column = pl.concat([part.cast(dtype).alias(name) for part in series], rechunk=True)
+    return column if order is None else column.gather(order)

@@ -11,11 +11,11 @@ from tests.ingest import samples
 
 
 def test_random_damage_never_gives_wrong_data():
-    report = fuzz(600, seed=20_240_501)
+    report = fuzz(400, seed=20_240_501)
     assert report.failures == []
     assert {name.split(":")[0] for name in report.mutations} == set(MUTATIONS)
-    assert report.outcomes["partial"] > 20
-    assert report.outcomes["error"] > 200
+    assert report.outcomes["partial"] > 15
+    assert report.outcomes["error"] > 150
 
 
 def test_judge_sees_wrong_data(tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from schemas.config import IngestConfig
 from tests.ingest import oracle, samples
 
 SETTINGS = settings(
-    max_examples=40, deadline=None, derandomize=True,
+    max_examples=25, deadline=None, derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )  # fmt: skip
 

@@ -1,0 +1,98 @@
+"""What a log says about itself at its end, held against what the walk met."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from dataclasses import dataclass, field
+
+from pipeline.ingest import mcap_records as records
+from pipeline.ingest.byte_window import ByteWindow
+from pipeline.ingest.mcap_records import HEAD_SIZE, MAGIC, ChunkSummary, DamageError, Op
+
+
+@dataclass
+class Met:
+    """What the walk counted on its way."""
+
+    message_counts: Counter[int] = field(default_factory=Counter)
+    chunks: list[ChunkSummary] = field(default_factory=list)
+    attachments: int = 0
+    metadata: int = 0
+    span_ns: tuple[int, int] | None = None
+
+    def add_times(self, low_ns: int, high_ns: int) -> None:
+        old = self.span_ns or (low_ns, high_ns)
+        self.span_ns = (min(old[0], low_ns), max(old[1], high_ns))
+
+
+class Summary:
+    """The summary section, record by record; raises where it contradicts what was met."""
+
+    def __init__(self, start: int, met: Met) -> None:
+        self._start = start
+        self._met = met
+        self._crc = 0
+        self._indexed: list[ChunkSummary] = []
+
+    def add(self, opcode: int, whole: memoryview, position: int) -> None:
+        """A record before the footer."""
+        self._crc = zlib.crc32(whole, self._crc)
+        if opcode == Op.CHUNK_INDEX:
+            self._indexed.append(records.parse_chunk_index(whole[HEAD_SIZE:], position))
+        elif opcode == Op.STATISTICS:
+            self._check_statistics(records.parse_statistics(whole[HEAD_SIZE:], position), position)
+
+    def _check_statistics(self, told: records.Statistics, position: int) -> None:
+        met = self._met
+        per_channel = {channel: count for channel, count in told.by_channel.items() if count}
+        pairs = [
+            ("messages", told.messages, met.message_counts.total()),
+            ("chunks", told.chunks, len(met.chunks)),
+            ("attachments", told.attachments, met.attachments),
+            ("metadata records", told.metadata, met.metadata),
+            ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
+        ]
+        if met.span_ns:
+            pairs.append(("times", (told.start_ns, told.end_ns), met.span_ns))
+        for name, expected, found in pairs:
+            if expected != found:
+                raise DamageError(position, f"the statistics speak of {expected} {name}, the file holds {found}")
+
+    def finish(self, footer: memoryview, position: int, window: ByteWindow) -> int | None:
+        """The footer and the end of the file; the offset of a cut through the closing magic, if there is one."""
+        cursor = records.Cursor(footer[HEAD_SIZE:], position, "Footer")
+        start, _, crc = cursor.u64(), cursor.u64(), cursor.u32()
+        cursor.finish()
+        met = self._start if position != self._start else 0
+        if start != met:
+            raise DamageError(position, f"the footer places the summary at {start}, it is at {met}")
+        if crc and zlib.crc32(footer[:-4], self._crc) != crc:
+            raise DamageError(position, "the checksum of the summary does not match")
+        cut_at = _check_end(position + len(footer), window)
+        self._check_chunk_index(position)
+        return cut_at
+
+    def _check_chunk_index(self, position: int) -> None:
+        """A chunk index lists every chunk once, or there is none."""
+        if not self._indexed:
+            return
+        chunks = self._met.chunks
+        if sorted(chunk.offset for chunk in self._indexed) != [chunk.offset for chunk in chunks]:
+            told = f"the chunk index names {len(self._indexed)} chunks, not the {len(chunks)} there are"
+            raise DamageError(position, told)
+        if sorted(self._indexed, key=lambda chunk: chunk.offset) != chunks:
+            raise DamageError(position, "the chunk index disagrees with the chunks")
+
+
+def _check_end(end: int, window: ByteWindow) -> int | None:
+    """The closing magic and nothing after it; the offset of a cut through it."""
+    left = min(len(MAGIC), window.size - end)
+    closing = bytes(window.at(end, left)) if left else b""
+    if not MAGIC.startswith(closing):
+        raise DamageError(end, "the closing magic is wrong")
+    if closing != MAGIC:
+        return end
+    if end + len(MAGIC) != window.size:
+        raise DamageError(end + len(MAGIC), "the file goes on after its end: trailing data, or two files in one")
+    return None
