@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.align import align, odometer_at, threshold_factor
+from pipeline.align import align, threshold_factor
 from pipeline.clean import CleanCounts, clean
+from pipeline.evidence_notes import evidence_notes, return_notes
 from pipeline.hazards import HazardResult, classify, establish_truth
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
@@ -17,6 +18,7 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
 from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
+from pipeline.telegrams import place_reads
 from schemas.config import Configuration, LdsConfig, Vehicle, digest_of
 from schemas.conform import conform
 from schemas.enums import Evidence
@@ -80,11 +82,11 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     matched = found.epochs.with_columns(fixes["hpl_m"])
     aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
-    telegrams = _with_odometer(run, aligned, config)
+    telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
     reference = _reference_on_path(context, found.path)
-    reads = _reads_on_path(run.balise_reads, balises)
+    reads = None if telegrams is None else telegrams.drop_nulls("path_m")
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
     result = classify(solution, monitored, truth, lds.passages, balises, run.faults, found.path.locate, config)
     epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
@@ -99,7 +101,11 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         counts=context.counts.solutions[solution],
         ingest=run.notes,
         ambiguous_stretches=found.ambiguous.height,
-        notes=_notes(run, found, lds),
+        notes=(
+            *_notes(run, found, lds),
+            *evidence_notes(aligned, truth),
+            *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
+        ),
     )
     return _Solution(epochs, result, summarise(results, config, provenance(context.run, context.site, vehicle, config)))
 
@@ -170,13 +176,6 @@ def _single_monitors(
     }
 
 
-def _with_odometer(run: RunLog, aligned: pl.DataFrame, config: Configuration) -> pl.DataFrame | None:
-    """Balise reads with the odometer's distance, which windows need where GNSS has a gap."""
-    if run.balise_reads is None or run.odometer is None:
-        return run.balise_reads
-    return run.balise_reads.with_columns(odometer_at(run.balise_reads["t"], aligned, run.odometer, config))
-
-
 def _reference_on_path(context: _Context, path: TravelledPath) -> pl.DataFrame | None:
     """The reference stream as path positions of the balise antenna, as the epochs are."""
     reference = context.run.reference
@@ -190,12 +189,6 @@ def _reference_on_path(context: _Context, path: TravelledPath) -> pl.DataFrame |
         pl.Series("vertical_m", places.vertical_m - context.vehicle.antenna_height_m, nan_to_null=True),
         "sigma_m",
     )
-
-
-def _reads_on_path(reads: pl.DataFrame | None, balises: pl.DataFrame) -> pl.DataFrame | None:
-    if reads is None:
-        return None
-    return reads.join(balises.select("balise_id", "path_m"), on="balise_id", how="inner", maintain_order="left")
 
 
 def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:

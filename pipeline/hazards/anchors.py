@@ -33,13 +33,15 @@ class Carried:
     """Position by the nearest anchor and the odometer [m]; NaN where no anchor reaches.
 
     `confidence_m` is the odometer's half-width (SUBSET-041 5.3.1.1), `mismatch_m` by how much two
-    anchors contradict the odometer between them beyond that.
+    anchors contradict the odometer between them beyond that. `backward`: before the first anchor, so that
+    nothing but the odometer itself speaks for the way in between.
     """
 
     path_m: Floats
     sigma_m: Floats
     confidence_m: Floats
     mismatch_m: Floats
+    backward: Bools
 
 
 def carry(anchors: Anchors, travel: Travel, at_ns: Ints, lds: LdsConfig, *, both_ways: bool) -> Carried:
@@ -52,7 +54,7 @@ def carry(anchors: Anchors, travel: Travel, at_ns: Ints, lds: LdsConfig, *, both
     before = np.searchsorted(reader.at_ns, at_ns, side="right") - 1
     forward = reader.reach(before, travel, lds)
     if not both_ways:
-        return Carried(*forward, np.zeros(at_ns.size))
+        return Carried(*forward, np.zeros(at_ns.size), np.zeros(at_ns.size, dtype=np.bool_))
     backward = reader.reach(before + 1, travel, lds)
     return _between(forward, backward, reader, before, travel)
 
@@ -119,6 +121,7 @@ def _between(
         sigma_m=smaller(forward[1], backward[1]),
         confidence_m=smaller(forward[2], backward[2]),
         mismatch_m=np.where(difference > allowed, difference, 0.0),
+        backward=behind & ~ahead,
     )
 
 

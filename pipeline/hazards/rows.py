@@ -124,10 +124,12 @@ def _verdict(timing: Timing, budget_s: float) -> dict[str, Any]:
 def _size(item: Judged, series: Series) -> dict[str, Any]:
     """Largest error with its sign, and its slope from onset to failure.
 
-    A jump back leaves no error: its size is the step itself.
+    A jump back leaves no error: its size is the step itself. The offers count too: where the odometer since the
+    LRVB is the evidence, the error starts anew at the VB that was offered wrong and accepted.
     """
     draft, timing = item.draft, item.timing
-    errors = series.error_m[timing.onset_epoch : max(draft.end, draft.first_epoch + 1)]
+    lasting = series.error_m[timing.onset_epoch : max(draft.end, draft.first_epoch + 1)]
+    errors = np.concatenate((lasting, [hit.error_m for hit in draft.hits]))
     size = float(errors[int(np.argmax(np.abs(errors)))])
     if draft.caused_by is not None and draft.jump is not None:
         size = draft.jump.step_m

@@ -121,10 +121,14 @@ def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
 
 
 def _balise_rung(carried: Carried, config: HazardConfig) -> Rung:
-    """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard."""
+    """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard.
+
+    Reckoned back from the first read, its whole confidence: a slip on the way would look like an error of GNSS.
+    """
     nothing = np.full(carried.path_m.size, np.nan)
     sigma = np.hypot(config.balise_read_sigma_m, carried.sigma_m)
-    bound = np.maximum(np.minimum(3.0 * sigma, carried.confidence_m), carried.mismatch_m)
+    smallest = np.where(carried.backward, carried.confidence_m, np.minimum(3.0 * sigma, carried.confidence_m))
+    bound = np.maximum(smallest, carried.mismatch_m)
     return Rung(Evidence.BALISE, carried.path_m, sigma, bound, nothing, nothing)
 
 

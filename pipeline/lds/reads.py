@@ -25,7 +25,8 @@ class Read:
 def reads_of(frame: pl.DataFrame | None, balises: list[Balise], journey: Journey) -> tuple[list[Read], pl.DataFrame]:
     """Telegrams in order of time, and those of balises that are not on the path.
 
-    A balise on several legs is read on the leg that the train is on.
+    A balise with several places on the path is read at the given `leg` and `path_m`, else on the leg that the
+    train is on.
     """
     if frame is None:
         return [], pl.DataFrame(schema={"t": pl.Datetime("ns", "UTC"), "balise_id": pl.String})
@@ -39,7 +40,11 @@ def _read(row: dict[str, object], balises: list[Balise], journey: Journey) -> Re
     t_ns, name = int(str(row["t_ns"])), row["balise_id"]
     epoch = min(int(np.searchsorted(journey.t_ns, t_ns)), journey.t_ns.size - 1)
     named = [balise for balise in balises if balise.balise_id == name]
-    balise = next((here for here in named if here.leg == journey.leg[epoch]), named[0])
+    leg, path_m = row.get("leg"), row.get("path_m")
+    if leg is None or path_m is None:
+        balise = next((here for here in named if here.leg == journey.leg[epoch]), named[0])
+    else:
+        balise = next(here for here in named if (here.leg, here.path_m) == (leg, path_m))
     given = row.get("odometer_m")
     odometer_m = float(str(given)) if given is not None else _odometer_at(journey, t_ns, epoch)
     since_m = journey.odometer_m[epoch] - (np.nan if odometer_m is None else odometer_m)

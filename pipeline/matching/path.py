@@ -130,15 +130,16 @@ class TravelledPath:
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with their path position, in order of leg and path position.
 
-        A place that two legs share is given once, on the first; an element passed twice gives its balises
-        twice. A balise off its element is on no path (the site's findings name it).
+        A place that two legs share is given on each of them, for a train may pass it on each; an element passed
+        twice on one leg gives its balises twice. A balise off its element is on no path (the site's findings
+        name it).
         """
-        rows: dict[tuple[str, float], tuple[object, ...]] = {}
+        rows: dict[tuple[int, str, float], tuple[object, ...]] = {}
         if balises is not None:
             groups = balises.partition_by("netelement_id", as_dict=True, maintain_order=True)
             for number, leg in enumerate(self.legs):
                 for row in _balises_on(self.track, number, leg, groups):
-                    rows.setdefault((str(row[1]), round(float(str(row[5])), 3)), row)
+                    rows.setdefault((number, str(row[1]), round(float(str(row[5])), 3)), row)
         frame = pl.DataFrame(list(rows.values()), schema=BALISE_COLUMNS, orient="row")
         return frame.sort("leg", "path_m", "balise_id")
 

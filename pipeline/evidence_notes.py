@@ -1,0 +1,78 @@
+"""What the evidence of a run cannot see, said in words beside its figures."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from schemas.enums import Evidence
+
+_BALISE = (
+    "evidence balise: reads carried on by the odometer; a slip or slide between two reads, or after the last, "
+    "looks like an error of the position unless Doppler velocity sides with it"
+)
+_ODOMETER = (
+    "evidence odometer: errors within 5 m + 5 % of the way since the last accepted balise are not seen (here up to "
+    "{bound_m:.0f} m), nor is what a balise accepted in the wrong place hides"
+)
+_SMOOTHED = "evidence odometer, smoothed from the position itself: slow errors that raise no alarm are not seen"
+_NOTHING = "no evidence for {share:.0%} of the positions: their errors are not known"
+_DRIFT = "a slow drift of the position and a change of the odometer's scale look alike"
+_NO_DOPPLER = "without GNSS velocity nothing tells a fault of the position from one of the odometer"
+
+
+def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame) -> tuple[str, ...]:
+    """Notes on what stands behind the errors of one solution; none where the reference covers all positions.
+
+    `epochs`: matched and aligned; `truth`: from `establish_truth`, row by row.
+    """
+    positioned = (epochs["fix_valid"] & epochs["path_m"].is_not_null()).fill_null(False)
+    seen = truth.filter(positioned)
+    if seen.is_empty():
+        return ()
+    kinds = seen["evidence"].cast(pl.String)
+    notes = []
+    without = kinds.null_count() / seen.height
+    if without > 0.01:
+        notes.append(_NOTHING.format(share=without))
+    weak = seen.filter(kinds.is_in([Evidence.BALISE.value, Evidence.ODOMETER.value]).fill_null(False))
+    if weak.height <= 0.01 * seen.height:
+        return tuple(notes)
+    notes += _weak_evidence(weak)
+    notes.append(_DRIFT)
+    if not epochs["velocity_along_mps"].is_not_null().any():
+        notes.append(_NO_DOPPLER)
+    return tuple(notes)
+
+
+def _weak_evidence(weak: pl.DataFrame) -> list[str]:
+    by_odometer = weak.filter(pl.col("evidence") == Evidence.ODOMETER.value)
+    plain = by_odometer.filter(~pl.col("truth_smoothed"))
+    notes = [_BALISE] if (weak["evidence"] == Evidence.BALISE.value).any() else []
+    if plain.height:
+        bound_m = plain.select(pl.col("truth_bound_m").max()).item()
+        notes.append(_ODOMETER.format(bound_m=bound_m or 0.0))
+    if by_odometer["truth_smoothed"].any():
+        notes.append(_SMOOTHED)
+    return notes
+
+
+def return_notes(epochs: pl.DataFrame, hazards: pl.DataFrame, failure_limit_m: float) -> tuple[str, ...]:
+    """Hazards that were detected, but during which the position came back into use beyond the limit.
+
+    Their T_D and hazardous time count to the first detection (DOMAIN section 5); this says that it was not the end.
+    `epochs`: with `negated` and `error_along_m`.
+    """
+    notes = []
+    for row in hazards.filter(pl.col("detected") & pl.col("caused_by").is_null()).iter_rows(named=True):
+        again = epochs.filter(
+            pl.col("t").is_between(row["t_detected"], row["t_end"], closed="right")
+            & ~pl.col("negated")
+            & (pl.col("error_along_m").abs() > failure_limit_m)
+        )
+        if again.height:
+            largest_m = again.select(pl.col("error_along_m").abs().max()).item()
+            notes.append(
+                f"hazard {row['hazard_id']}: after its detection the position was taken up again while it lasted, "
+                f"{again.height} epochs beyond {failure_limit_m:.0f} m, up to {largest_m:.0f} m"
+            )
+    return tuple(notes)
