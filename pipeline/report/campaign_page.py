@@ -52,7 +52,7 @@ _PLOTS = (
     ("detection", "Time to detect", "Share of all hazards detected, and of all failures negated, by then; vertical "
      "lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never detected."),
     ("location", "Location error at VBs", "Positive: offered early. Offers by what became of them."),
-    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; hazards at the train's."),
+    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; crosses are hazards."),
 )  # fmt: skip
 
 
