@@ -60,7 +60,7 @@ PLOTS = (
     ("plan", "Plan", "GNSS positions coloured by the state of the LDS; balises by what became of them; "
      "thick lines are expectation windows."),
     ("bands", "LDS mode, state, TVB and alarm", "Where nothing is drawn there was no epoch. Hazards are shaded; "
-     "of the chosen one the dotted line is the onset, the solid one the detection, the dashed one the position failure."),
+     "of the chosen one the dotted line is the onset, the solid one the detection, the dashed one the failure."),
     ("speed", "Speed", ""),
     ("along", "Error along the track", "Positive ahead of the train; the confidence interval is dashed. "
      "Without truth: GNSS minus odometer."),
