@@ -91,7 +91,6 @@ class MatchingConfig(Settings):
     heading_sigma_deg: Positive = 10.0
     heading_min_speed_mps: Positive = 2.0
     transition_scale_m: Positive = 5.0
-    link_tolerance_m: Positive = 2.0
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
     noise_tau_s: Positive = 100.0
@@ -111,7 +110,6 @@ class AlignConfig(Settings):
     scale_prior_sigma: Positive = 0.01
     latency_prior_sigma_s: Positive = 0.2
     filter_period_s: Positive = 1.0
-    acceleration_window_s: Positive = 1.0
 
 
 class MonitorConfig(Settings):

@@ -37,7 +37,7 @@ CONFIGURATION = ROOT / "docs" / "configuration.md"
 SCENARIOS = ROOT / "docs" / "scenarios.md"
 DEFAULTS_IN_WORDS = {"start": "2025-03-03T06:00:00Z", "solutions": "primary: gps", "target": "by kind"}
 # Keys that nothing reads yet.
-IDLE = ("link_tolerance_m", "acceleration_window_s")
+IDLE: tuple[str, ...] = ()
 
 
 def tables(page: Path) -> list[Rows]:
