@@ -21,9 +21,10 @@ from pipeline.odometer_filter import SPEED_SPAN_S
 
 Array = npt.NDArray[np.float64]
 
-# Points of one dense covariance, and the least time between them: user errors last 100 s, accelerations a few seconds.
+# Points of one dense covariance, and the time between them: user errors last 100 s, accelerations a few seconds, so a
+# long run loses little at 2 s; a short one is used to the full.
 _BLOCK_POINTS = 900
-_LEAST_STEP_S = 2.0
+_STEP_S = (0.1, 2.0)
 _LEAST_POINTS = 20
 # Keeps the covariance well conditioned where epochs repeat.
 _WHITE_SHARE = 0.001
@@ -92,10 +93,11 @@ def _blocks(seen: Observations, track: OdometerTrack) -> list[Observations]:
 
 
 def _thinned(t_s: Array) -> npt.NDArray[np.int64]:
-    """Indices at least `_LEAST_STEP_S` apart."""
+    """Indices a step apart that suits the length of the run."""
     if t_s.size == 0:
         return np.zeros(0, dtype=np.int64)
-    slot = np.floor((t_s - t_s[0]) / _LEAST_STEP_S + 1e-6).astype(np.int64)
+    step_s = np.clip((t_s[-1] - t_s[0]) / (_BLOCK_POINTS - 1), *_STEP_S)
+    slot = np.floor((t_s - t_s[0]) / step_s + 1e-6).astype(np.int64)
     return np.flatnonzero(np.diff(slot, prepend=-1))
 
 

@@ -1,12 +1,14 @@
 """Regression of monitor sigmas, and the whole of `calibrate` on synthetic fault-free runs."""
 
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
 from datasets.demo import demo_scenario
+from datasets.samples import comma2k19_run
 from datasets.trial import build_run, build_site
 from pipeline.calibrate import calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
@@ -94,3 +96,16 @@ def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]
     logs, site = fault_free
     with pytest.raises(InputError, match="no run gives"):
         calibrate([logs[0].with_streams(odometer=None)], site)
+
+
+def test_a_recorded_minute_gives_its_known_scale_and_latency() -> None:
+    """comma2k19: wheels read 0.85 % short and fixes lag by some 85 ms, by least squares against the pose."""
+    segment = Path(__file__).parents[3] / "shared" / "data" / "comma2k19" / "segment"
+    if not segment.is_dir():
+        pytest.skip("the shared recordings are not beside the repository")
+    run, site = comma2k19_run(segment)
+    vehicle = calibrate([run], site).vehicle
+    assert vehicle.odometer_scale == pytest.approx(1.0085, abs=3 * (vehicle.odometer_scale_sigma or 0))
+    assert vehicle.gnss_latency_s == pytest.approx(0.085, abs=3 * (vehicle.gnss_latency_sigma_s or 0))
+    assert 0 < (vehicle.odometer_scale_sigma or 0) < 0.003
+    assert 0 < (vehicle.gnss_latency_sigma_s or 0) < 0.1
