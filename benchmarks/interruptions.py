@@ -52,10 +52,15 @@ def _kill(campaign: subprocess.Popen[bytes], worker: bool, chance: random.Random
     """The parent, or one of its children, without warning."""
     listed = Path(f"/proc/{campaign.pid}/task/{campaign.pid}/children")
     try:
-        children = [int(pid) for pid in listed.read_text().split()]
+        children = [int(pid) for pid in listed.read_text().split() if _is_worker(pid)]
         os.kill(chance.choice(children) if worker and children else campaign.pid, signal.SIGKILL)
     except (FileNotFoundError, ProcessLookupError):
         return
+
+
+def _is_worker(pid: str) -> bool:
+    """Python's tracker of semaphores is a child too, but none that does the work."""
+    return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 def _interrupt_s(logs: Path, site: Path, out: Path, chance: random.Random) -> float:
