@@ -315,7 +315,7 @@ def _connect(scheduler: str) -> Any:
 def _hush() -> None:
     """Dask logs tracebacks of lost connections; the campaign says in one message what was lost."""
     for name in list(logging.root.manager.loggerDict):
-        if name == "distributed" or name.startswith("distributed."):
+        if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
