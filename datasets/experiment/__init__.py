@@ -11,12 +11,23 @@ from datasets.experiment.false_alarms import write_thresholds
 from datasets.experiment.findings import write_findings
 from datasets.experiment.ranges import write_ranges
 from datasets.experiment.rare_tables import write_rare
+from schemas.config import Configuration
 
 
 class Experiment(Protocol):
-    """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given."""
+    """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 
-    def __call__(self, out: Path, repetitions: int | None = None, seed: int = 1, jobs: int = 1) -> list[Path]: ...
+    `config` is the bank to judge, for `rare` and `bank`; the published experiments refuse one.
+    """
+
+    def __call__(
+        self,
+        out: Path,
+        repetitions: int | None = None,
+        seed: int = 1,
+        jobs: int = 1,
+        config: Configuration | None = None,
+    ) -> list[Path]: ...
 
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -8,7 +8,7 @@ is disturbed for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ import polars as pl
 from datasets.experiment.diagnostics import SEED
 from datasets.experiment.geometry import Geometry, default_geometry
 from datasets.experiment.linear_bank import AXES, BankSpec, LinearBank, linear_bank
+from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import write_tables
 from datasets.experiment.workers import generator, mapped
@@ -31,6 +32,8 @@ _FAILURE_LIMIT_M = 20.0
 _LONGEST_S = 6_000.0
 _ALARM_RUNS = 200
 _HEADING_DEG = 30.0
+# Noise of a matched position against the surveyed track beyond the survey's constant error [m].
+_MAP_M = 0.1
 # A train that is stopped by its own diagnosis more often than this is not operated.
 _MOST_ALARMS_PER_H = 0.01
 
@@ -78,7 +81,7 @@ def candidates() -> list[BankSpec]:
         (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001),
     )
     return [
-        BankSpec(alphas=alphas, sensors=sensors, false_alarm_probability=probability, rate_hz=rate_hz, map_m=0.1)
+        BankSpec(alphas=alphas, sensors=sensors, false_alarm_probability=probability, rate_hz=rate_hz, map_m=_MAP_M)
         for alphas in weights
         for sensors in ("odometer", "odometer_and_track")
         for probability, rate_hz in ((1e-7, 1.0), (1e-8, 1.0), (1e-7, 10.0), (1e-8, 10.0))
@@ -248,9 +251,21 @@ def _reason(row: dict[str, object]) -> str:
     return text
 
 
-def write_bank(out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1) -> list[Path]:
-    """`comparison.parquet` by bank and fault, `ranking.parquet` with the recommendation first."""
+def write_bank(
+    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
+) -> list[Path]:
+    """`comparison.parquet` by bank and fault, `ranking.parquet` with the recommendation first.
+
+    A configured bank enters the comparison beside the candidates.
+    """
     count = repetitions or REPETITIONS
-    comparison = compare_banks(repetitions=count, seed=seed, jobs=jobs)
+    specs = candidates()
+    if config is not None:
+        specs += [
+            replace(BankSpec.of(config.monitors, sensors, rate_hz), map_m=_MAP_M)
+            for sensors in SENSORS
+            for rate_hz in (1.0, 10.0)
+        ]
+    comparison = compare_banks(list(dict.fromkeys(specs)), repetitions=count, seed=seed, jobs=jobs)
     tables = {"comparison": comparison, "ranking": rank_banks(comparison)}
     return write_tables(out, tables, {"experiment": "bank", "repetitions": count, "seed": seed})

@@ -19,8 +19,10 @@ from datasets.experiment.bounds import Expected, expected
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, Geometry, default_geometry
 from datasets.experiment.passage import NEVER, Passages, first_passages, joined
 from datasets.experiment.plan import Plan, bank_forms, failure_forms
+from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks, mapped
 from pipeline.statistics import clopper_pearson
+from schemas.config import Configuration
 
 Ints = npt.NDArray[np.int64]
 
@@ -204,12 +206,17 @@ def geometry_table(geometry: Geometry) -> pl.DataFrame:
 
 
 def write_experiment(
-    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, figures: bool = True
+    out: Path,
+    repetitions: int | None = None,
+    seed: int = SEED,
+    jobs: int = 1,
+    config: Configuration | None = None,
+    figures: bool = True,
 ) -> list[Path]:
     """Tables and pictures of the experiment into a folder; returns what was written."""
     from datasets.experiment.figures import draw_figures, require_matplotlib
-    from datasets.experiment.tables import write_tables
 
+    refuse_configuration("diagnostics", config)
     if figures:
         require_matplotlib()
     frames = run_diagnostics(repetitions or REPETITIONS, seed, jobs)

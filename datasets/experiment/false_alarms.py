@@ -17,7 +17,7 @@ from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
 from datasets.experiment.plan import Plan, Sensors, bank_forms
 from datasets.experiment.ranges import RangePlan, held_rows, statistic
 from datasets.experiment.rare import false_alarm_probability
-from datasets.experiment.tables import write_tables
+from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.thresholds import (
     EXTRAPOLATED,
     calibrated_ratios,
@@ -28,7 +28,7 @@ from datasets.experiment.thresholds import (
 from datasets.experiment.workers import generator, in_blocks, mapped
 from pipeline.align import threshold_factor
 from pipeline.statistics import clopper_pearson, poisson_rate
-from schemas.config import LdsConfig
+from schemas.config import Configuration, LdsConfig
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.int64]
@@ -236,8 +236,11 @@ def _per_hour(value: float | None, low: float | None, high: float | None) -> dic
     }
 
 
-def write_thresholds(out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1) -> list[Path]:
+def write_thresholds(
+    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
+) -> list[Path]:
     """`regression.parquet`, `verification.parquet`, `alarms_per_hour.parquet`."""
+    refuse_configuration("thresholds", config)
     count = repetitions or REPETITIONS
     tables = {
         "regression": regression_table(),

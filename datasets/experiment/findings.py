@@ -16,9 +16,10 @@ from datasets.experiment.diagnostics import SEED, detection_times
 from datasets.experiment.geometry import CONSTELLATIONS, PLACES, Geometry, epochs_of_day, geometry_at
 from datasets.experiment.passage import first_passages
 from datasets.experiment.plan import Plan, bank_forms, failure_forms
-from datasets.experiment.tables import write_tables
+from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks, mapped
 from pipeline.statistics import clopper_pearson
+from schemas.config import Configuration
 
 EPOCHS_PER_PLACE = 40
 REPETITIONS = 500
@@ -188,9 +189,15 @@ def _track_steadies(detection: pl.DataFrame) -> pl.DataFrame:
 
 
 def write_findings(
-    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, per_place: int = EPOCHS_PER_PLACE
+    out: Path,
+    repetitions: int | None = None,
+    seed: int = SEED,
+    jobs: int = 1,
+    config: Configuration | None = None,
+    per_place: int = EPOCHS_PER_PLACE,
 ) -> list[Path]:
     """`findings.parquet` (per sky) and `shares.parquet`."""
+    refuse_configuration("findings", config)
     by_geometry = findings_by_geometry(per_place, repetitions or REPETITIONS, seed, jobs)
     settings = {
         "experiment": "findings",

@@ -18,6 +18,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
 from datasets.experiment.plan import BANKS, Reading, Sensors
 from pipeline.align import threshold_factor
+from schemas.config import MonitorConfig
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +39,17 @@ class BankSpec:
     rate_hz: float = 1.0
     odometer_m: float = 0.05
     map_m: float = 1.0
+
+    @classmethod
+    def of(cls, config: MonitorConfig, sensors: Sensors, rate_hz: float = 1.0) -> BankSpec:
+        """The bank of a replay's configuration; recorded odometers are noisy on increments."""
+        return cls(
+            alphas=(1.0, *config.ewma_alphas),
+            sensors=sensors,
+            false_alarm_probability=config.false_alarm_probability,
+            rate_hz=rate_hz,
+            odometer_m=config.odometer_sigma_mps,
+        )
 
     @property
     def weights(self) -> tuple[float, ...]:

@@ -19,10 +19,11 @@ from datasets.experiment.bounds import expected
 from datasets.experiment.diagnostics import SEED
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, default_geometry
 from datasets.experiment.plan import HEADINGS_DEG
-from datasets.experiment.tables import write_tables
+from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks, mapped
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
 from pipeline.statistics import clopper_pearson
+from schemas.config import Configuration
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -211,8 +212,11 @@ def _row(
     }
 
 
-def write_ranges(out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1) -> list[Path]:
+def write_ranges(
+    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
+) -> list[Path]:
     """`pseudorange.parquet`."""
+    refuse_configuration("pseudorange", config)
     table = run_ranges(repetitions or REPETITIONS, seed, jobs)
     settings = {"experiment": "pseudorange", "repetitions": repetitions or REPETITIONS, "seed": seed}
     return write_tables(out, {"pseudorange": table}, settings)

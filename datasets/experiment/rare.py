@@ -25,7 +25,8 @@ from datasets.experiment.workers import generator, in_blocks, mapped
 
 Array = npt.NDArray[np.float64]
 
-_RUNS_PER_BLOCK = 500
+# Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
+_RUNS_PER_BLOCK = 250
 _LARGEST_BLOCK = 8_000_000
 _MOST_CONSTRAINTS = 120
 # The shifted path stays this many sigmas inside the thresholds: with many constraints at once more runs survive.

@@ -20,6 +20,7 @@ from datasets.experiment.rare import (
 )
 from datasets.experiment.tables import write_tables
 from pipeline.statistics import clopper_pearson
+from schemas.config import Configuration
 
 RUNS = 20_000
 PLAIN_RUNS = 400_000
@@ -31,13 +32,20 @@ _LONGEST_S = 10_000
 _CLOSE_ENOUGH = 0.02
 
 
-def banks() -> Iterator[tuple[Constellation, BankSpec, LinearBank]]:
-    """Both constellations, readings and sensor sets, heading 0, 1 Hz."""
+def banks(config: Configuration | None) -> Iterator[tuple[Constellation, BankSpec, LinearBank]]:
+    """Both constellations and sensor sets, heading 0, 1 Hz: the configured bank, or those of both readings."""
+    specs = [
+        spec
+        for sensors in SENSORS
+        for spec in (
+            [BankSpec.of(config.monitors, sensors)]
+            if config is not None
+            else [BankSpec(reading=reading, sensors=sensors) for reading in READINGS]
+        )
+    ]
     for constellation in CONSTELLATIONS:
-        for reading in READINGS:
-            for sensors in SENSORS:
-                spec = BankSpec(reading=reading, sensors=sensors)
-                yield constellation, spec, linear_bank(default_geometry(constellation), 0.0, spec)
+        for spec in specs:
+            yield constellation, spec, linear_bank(default_geometry(constellation), 0.0, spec)
 
 
 def failure_epoch(bank: LinearBank, rate_mps: float) -> int:
@@ -67,10 +75,12 @@ def epochs_until(bank: LinearBank, rate_mps: float, target: float, seed: int, jo
     return high
 
 
-def missed_table(runs: int = RUNS, seed: int = SEED, jobs: int = 1) -> pl.DataFrame:
+def missed_table(
+    runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
+) -> pl.DataFrame:
     """Pmd at the mean failure, and the time that makes it as rare as each target, with the error of the estimate."""
     rows = []
-    for constellation, spec, bank in banks():
+    for constellation, spec, bank in banks(config):
         for rate in _RATES_MPS:
             at_failure = failure_epoch(bank, rate)
             rows.append(_missed_row(constellation, spec, bank, rate, at_failure, "failure", runs, seed, jobs))
@@ -96,6 +106,7 @@ def _missed_row(
     return {
         "constellation": constellation,
         "reading": spec.reading,
+        "alphas": ", ".join(f"{alpha:g}" for alpha in spec.weights),
         "sensors": spec.sensors,
         "rate_mps": rate,
         "chosen_for": reason,
@@ -150,11 +161,13 @@ def _agreement(event: str, sensors: str, epochs: int, clever: Probability, plain
     }
 
 
-def write_rare(out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1) -> list[Path]:
+def write_rare(
+    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
+) -> list[Path]:
     """`missed.parquet`, `agreement.parquet`; `repetitions` are the runs of importance sampling."""
     runs = repetitions or RUNS
     tables = {
-        "missed": missed_table(runs, seed, jobs),
+        "missed": missed_table(runs, seed, jobs, config),
         "agreement": agreement_table(runs, 20 * runs, seed, jobs),
     }
     return write_tables(out, tables, {"experiment": "rare", "repetitions": runs, "seed": seed})

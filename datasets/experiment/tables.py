@@ -8,7 +8,19 @@ from pathlib import Path
 
 import polars as pl
 
-from schemas.errors import OutputError
+from schemas.config import Configuration
+from schemas.errors import OutputError, UsageError
+
+
+def refuse_configuration(experiment: str, config: Configuration | None) -> None:
+    """A published experiment has the paper's settings; silently ignoring others would mislead."""
+    if config is not None:
+        raise UsageError(
+            "takes no configuration",
+            place=f"experiment {experiment}",
+            expected="the published settings",
+            remedy="`rare` and `bank` judge the bank of a configuration.",
+        )
 
 
 def write_tables(out: Path, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, object]) -> list[Path]:

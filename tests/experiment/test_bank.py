@@ -1,13 +1,18 @@
 """The design aid: responses, failures and ranking worked by hand, and a comparison small enough to run."""
 
+from pathlib import Path
+
 import numpy as np
 import polars as pl
 import pytest
 
+from datasets.experiment import EXPERIMENTS
 from datasets.experiment.bank import Fault, compare_banks, failure_s, fault_response, rank_banks
 from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
-from datasets.experiment.rare_tables import epochs_until, failure_epoch
+from datasets.experiment.rare_tables import banks, epochs_until, failure_epoch
+from schemas.config import Configuration, MonitorConfig
+from schemas.errors import UsageError
 
 GPS = default_geometry("gps")
 
@@ -64,3 +69,17 @@ def test_time_until_a_miss_is_rare_enough() -> None:
     assert later is not None
     assert earlier < later < failure_epoch(bank, 1.0)
     assert failure_epoch(bank, 1.0) == pytest.approx(20.0 / abs(float(bank.along_error[0])), abs=1.0)
+
+
+def test_a_configured_bank_is_judged(tmp_path: Path) -> None:
+    """The replay's configuration as a bank; published experiments refuse one instead of ignoring it."""
+    config = Configuration(
+        monitors=MonitorConfig(ewma_alphas=(0.2, 0.05, 0.005), odometer_sigma_mps=0.1, false_alarm_probability=1e-6)
+    )
+    spec = BankSpec.of(config.monitors, "odometer_and_track", 10.0)
+    assert spec.weights == (1.0, 0.2, 0.05, 0.005)
+    assert (spec.odometer_m, spec.false_alarm_probability, spec.rate_hz) == (0.1, 1e-6, 10.0)
+    assert all(chosen.weights == spec.weights for _, chosen, _ in banks(config))
+    for name in ("diagnostics", "findings", "pseudorange", "thresholds"):
+        with pytest.raises(UsageError, match="takes no configuration"):
+            EXPERIMENTS[name](tmp_path, 1, 1, 1, config)
