@@ -221,9 +221,9 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
 def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "hanging.mcap")
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths])
-    summary = by_run(run_campaign(plan, jobs=2, time_limit_s=8.0))
+    summary = by_run(run_campaign(plan, jobs=2, time_limit_s=5.0))
     assert summary["hanging"].status is RunStatus.FAILED
-    assert "time limit of 8 s" in (summary["hanging"].error or "")
+    assert "time limit of 5 s" in (summary["hanging"].error or "")
     assert [summary[f"run{number}"].status for number in range(4)] == [RunStatus.OK] * 4
 
 

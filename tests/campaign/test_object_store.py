@@ -13,7 +13,7 @@ from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_ba
 from werkzeug.serving import BaseWSGIServer, make_server
 
 from pipeline import storage, store
-from pipeline.campaign import make_plan, run_campaign
+from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
@@ -118,6 +118,13 @@ def test_store_that_is_not_there(bucket: str, small_trial: SmallTrial) -> None:
     assert SECRET not in str(caught.value)
 
 
+@pytest.fixture
+def _quick_beat(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lock, "_BEAT_S", 0.4)
+    monkeypatch.setattr(lock, "_SILENCE_S", 2.0)
+
+
+@pytest.mark.usefixtures("_quick_beat")
 def test_one_campaign_at_a_time(bucket: str) -> None:
     out = f"{bucket}/held"
     with locked(out), pytest.raises(OutputError, match="another campaign is writing here"), locked(out):
@@ -126,6 +133,7 @@ def test_one_campaign_at_a_time(bucket: str) -> None:
         pass
 
 
+@pytest.mark.usefixtures("_quick_beat")
 def test_lock_of_a_dead_campaign_is_taken_over(bucket: str) -> None:
     storage.write_bytes(f"{bucket}/dead/.lock", b"somebody 7")
     with locked(f"{bucket}/dead"):
