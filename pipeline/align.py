@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pipeline.monitors.axis import AxisSeries, along_errors, run_axis
 from pipeline.monitors.recursion import Array, AxisState
@@ -32,7 +32,7 @@ _REGULAR_PERIODS = 3
 
 def threshold_factor(false_alarm_probability: float) -> float:
     """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
-    return float(norm.isf(false_alarm_probability / 2.0))
+    return float(-ndtri(false_alarm_probability / 2.0))
 
 
 @dataclass(frozen=True)

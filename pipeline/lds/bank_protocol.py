@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from schemas.config import Configuration
 
@@ -57,7 +57,7 @@ class LdsLimits:
         return cls(
             ambiguity_probability=configuration.matching.ambiguity_probability,
             failure_limit_m=configuration.hazards.failure_limit_m,
-            threshold_factor=float(norm.isf(configuration.monitors.false_alarm_probability / 2)),
+            threshold_factor=float(-ndtri(configuration.monitors.false_alarm_probability / 2)),
             odometer_sigma_mps=configuration.monitors.odometer_sigma_mps,
             disabled=configuration.monitors.disabled,
         )
