@@ -33,7 +33,7 @@ class CleanCounts:
 
 
 def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
-    """The run with every stream in order and each stamp once (the first recorded one stays).
+    """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
     Raises `InputError` where a solution or the odometer has no two different times: nothing can be replayed.
     """
@@ -55,6 +55,7 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
 
 
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
+    frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     late = _out_of_order(frame, [key for key in keys if key == "solution"])
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
     unique = ordered.unique(subset=keys, keep="first", maintain_order=True)

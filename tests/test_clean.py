@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 
 from pipeline.clean import StreamCounts, clean
 from schemas.errors import InputError
@@ -44,3 +45,9 @@ def test_the_callers_frames_are_untouched():
 def test_one_time_only_cannot_be_replayed(times):
     with pytest.raises(InputError, match="only one time"):
         clean(RunLog("r", gnss(times)))
+
+
+def test_times_of_another_unit_are_the_same_instants():
+    run = RunLog("r", gnss([1_000_000, 2_000_000, 3_000_000]))
+    coarse = run.with_streams(gnss=run.gnss.with_columns(pl.col("t").cast(pl.Datetime("us", "UTC"))))
+    assert_frame_equal(clean(coarse)[0].gnss, clean(run)[0].gnss)

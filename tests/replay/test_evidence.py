@@ -1,0 +1,104 @@
+"""The same faults with a reference, with physical balises alone, and with nothing but the odometer."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from pipeline.replay import replay
+from tests.replay.journeys import VEHICLE, journey
+
+JUMP = {"kind": "step", "size_m": 850.0, "start_s": 150.0, "duration_s": 6.0}
+OFFSET = {"kind": "step", "size_m": 50.0, "start_s": 140.0, "duration_s": 60.0}
+# 2 m/s from just after VB3 (accepted 3400 m) on: 60 m at VB4, 900 m beyond, where the odometer knows 50 m.
+EARLY = {"kind": "ramp", "rate_mps": 2.5, "at_m": 3450.0, "duration_s": 30.0}
+SLIP = {"kind": "slip", "rate_mps": 20.0, "start_s": 150.0, "duration_s": 2.0}
+FAULTS = {"jump": JUMP, "offset": OFFSET, "early": EARLY}
+
+
+def kinds_of(run):
+    """The run with each kind of evidence."""
+    return {
+        "reference": run,
+        "balise": run.with_streams(reference=None),
+        "odometer": run.with_streams(reference=None, balise_reads=None),
+    }
+
+
+def rows(tables):
+    return [
+        (row["hazard"], row["balise_ids"], row["caused_by"], row["timing"])
+        for row in tables.hazards.iter_rows(named=True)
+    ]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_balise_reads_find_what_the_reference_finds(name):
+    run, site = journey(FAULTS[name])
+    found = {kind: replay(logs, site, VEHICLE) for kind, logs in kinds_of(run).items()}
+    assert rows(found["reference"])
+    assert rows(found["balise"]) == rows(found["reference"])
+    for kind, tables in found.items():
+        assert tables.runs["evidence"].to_list() == [kind]
+        assert tables.hazards["evidence"].to_list() == [kind] * tables.hazards.height
+
+
+def test_odometer_alone_finds_what_exceeds_its_confidence():
+    run, site = journey(JUMP)
+    logs = kinds_of(run)
+    assert rows(replay(logs["odometer"], site, VEHICLE)) == rows(replay(run, site, VEHICLE))
+    ramp, _ = journey(EARLY)
+    seen = rows(replay(kinds_of(ramp)["odometer"], site, VEHICLE))
+    assert [row[0] for row in seen] == ["VB_SHIFT"]
+
+
+def test_odometer_alone_does_not_see_an_offset_within_its_confidence_and_says_so():
+    # 30 m, 900 m beyond the last accepted balise, where 5 m + 5 % are 50 m.
+    run, site = journey({**OFFSET, "size_m": 30.0})
+    logs = kinds_of(run)
+    assert len(rows(replay(run, site, VEHICLE))) == 1
+    blind = replay(logs["odometer"], site, VEHICLE)
+    assert rows(blind) == []
+    notes = blind.runs["notes"].item()
+    assert "errors within 5 m + 5 %" in notes
+    assert "look alike" in notes
+    assert replay(logs["reference"], site, VEHICLE).runs["notes"].item() is None
+
+
+@pytest.mark.parametrize("kind", ["reference", "balise", "odometer"])
+def test_slip_is_no_hazard_with_any_evidence(kind):
+    run, site = journey(SLIP)
+    tables = replay(kinds_of(run)[kind], site, VEHICLE)
+    assert rows(tables) == []
+    assert tables.alarms["suspect"].unique().to_list() == ["odometer"]
+
+
+def test_without_doppler_the_notes_say_that_nothing_tells_the_two_apart():
+    run, site = journey(OFFSET, gnss={"velocity": False})
+    tables = replay(kinds_of(run)["balise"], site, VEHICLE)
+    assert tables.hazards["suspect"].to_list() == ["unknown"]
+    assert "without GNSS velocity" in tables.runs["notes"].item()
+    assert "between two reads" in tables.runs["notes"].item()
+
+
+def test_physical_balises_are_judged_beside_the_virtual_ones():
+    run, site = journey()
+    passages = replay(run, site, VEHICLE).passages
+    assert passages.group_by("kind", "status").len().sort("kind").rows() == [
+        ("virtual", "accepted", 8),
+        ("physical", "accepted", 8),
+    ]
+    physical = passages.filter(pl.col("kind") == "physical")
+    assert physical["location_error_m"].abs().max() < 0.5
+
+
+def test_physical_balise_brings_a_position_back():
+    # A persisting 50 m offset never re-links; after the slip of 40 m only the next balise group can tell.
+    run, site = journey(SLIP)
+    by_read = replay(run, site, VEHICLE).passages
+    blind = replay(run.with_streams(balise_reads=None), site, VEHICLE).passages
+    accepted = [
+        frame.filter((pl.col("kind") == "virtual") & (pl.col("status") == "accepted")).height
+        for frame in (by_read, blind)
+    ]
+    assert accepted[0] > accepted[1]

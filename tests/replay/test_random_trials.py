@@ -1,0 +1,32 @@
+"""Random faults through the whole replay; the same trials as `python -m benchmarks.random_trials`, fewer of them."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from datasets.random_trials import KINDS, deviations, random_trial
+from pipeline.replay import replay
+
+SEEDS = range(27)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_tables_say_what_was_injected(seed):
+    trial = random_trial(seed)
+    assert deviations(trial, replay(trial.run, trial.site, trial.vehicle)) == []
+
+
+def test_a_row_too_few_or_of_another_class_is_a_deviation():
+    trial = next(trial for trial in map(random_trial, SEEDS) if trial.kind == "offset" and trial.rows)
+    tables = replay(trial.run, trial.site, trial.vehicle)
+    without = tables.__class__(**{**vars(tables), "hazards": tables.hazards.clear()})
+    assert any("0 rows, expected 1" in wrong for wrong in deviations(trial, without))
+    other = tables.hazards.with_columns(hazard=pl.lit("VB_JUMP_1A").cast(tables.hazards["hazard"].dtype))
+    renamed = tables.__class__(**{**vars(tables), "hazards": other})
+    assert any("expected VB_SHIFT" in wrong for wrong in deviations(trial, renamed))
+
+
+def test_every_kind_of_fault_is_among_the_trials():
+    assert {random_trial(seed).kind for seed in SEEDS} == set(KINDS)
+    assert {row.hazard for seed in SEEDS for row in random_trial(seed).rows} >= {"VB_JUMP_1B", "VB_SHIFT"}
