@@ -8,13 +8,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
+import multiprocessing.process
 import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from concurrent.futures import TimeoutError as FutureTimeout
 from types import FrameType
 from typing import Any, Protocol
 
@@ -159,7 +159,8 @@ class _Slot:
 
     def __init__(self) -> None:
         self._executor: ProcessPoolExecutor | None = None
-        self._pid: Future[int] | None = None
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._answer: Future[int] | None = None
         self._runs = 0
 
     def submit(self, job: RunJob) -> Result:
@@ -176,35 +177,27 @@ class _Slot:
     @property
     def is_ready(self) -> bool:
         """Whether the process has started and answered."""
-        return self._pid is not None and self._pid.done()
+        return self._answer is not None and self._answer.done()
 
     def kill(self) -> None:
-        if self._executor is None or self._pid is None:
+        """End the process, also one that is still starting."""
+        if self._executor is None or self._process is None:
             return
-        with contextlib.suppress(ProcessLookupError, BrokenExecutor, FutureTimeout):
-            os.kill(self._pid.result(timeout=5.0), signal.SIGKILL)
+        self._process.kill()
         self._executor.shutdown(wait=True, cancel_futures=True)
-        self._executor, self._pid, self._runs = None, None, 0
+        self._executor, self._process, self._answer, self._runs = None, None, None, 0
 
     def _started(self) -> ProcessPoolExecutor:
-        if self._executor is not None and self._pid is not None and _is_broken(self._pid, self._executor):
+        if self._process is not None and not self._process.is_alive():
             self.kill()
         if self._executor is None:
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker)
+            before = set(multiprocessing.active_children())
             with _as_workers_start():
-                self._pid = self._executor.submit(os.getpid)
+                self._answer = self._executor.submit(os.getpid)
+            (self._process,) = set(multiprocessing.active_children()) - before
         return self._executor
-
-
-def _is_broken(pid: Future[int], executor: ProcessPoolExecutor) -> bool:
-    if pid.done() and pid.exception() is not None:
-        return True
-    try:
-        os.kill(pid.result(timeout=30.0), 0)
-    except (ProcessLookupError, FutureTimeout):
-        return True
-    return False
 
 
 @contextlib.contextmanager
