@@ -159,7 +159,7 @@ def _check_values(series: pl.Series, column: dy.Column, where: str, breaches: li
     if not column.nullable and series.null_count():
         rows = rows_text(series.is_null())
         breaches.append(Breach(where, "is not complete", found=f"null in {rows}", expected="a value in every row"))
-    if isinstance(column, dy.Float64) and not _all_finite(series):
+    if isinstance(column, dy.Float64) and not all_finite(series):
         strange = ~series.is_finite().fill_null(True)
         value = series.filter(strange)[0]
         breaches.append(
@@ -175,7 +175,8 @@ def _check_values(series: pl.Series, column: dy.Column, where: str, breaches: li
         _check_range(series, column, where, breaches)
 
 
-def _all_finite(series: pl.Series) -> bool:
+def all_finite(series: pl.Series) -> bool:
+    """Whether no value is NaN or infinite (nulls are fine)."""
     total = series.sum()  # NaN and infinity survive a sum, so one pass says that all is well
     return total is None or math.isfinite(total) or bool(series.is_finite().all())
 

@@ -36,11 +36,19 @@ def decoder_for(channel: Channel) -> Decode:
 
 
 def parse_json(payload: bytes) -> Value:
-    """One JSON document; literals that are not JSON (NaN, Infinity) are refused."""
+    """One JSON document; literals that are not JSON (NaN, Infinity) and doubled names are refused."""
     try:
-        return json.loads(payload, parse_constant=_refuse_literal)
+        return json.loads(payload, parse_constant=_refuse_literal, object_pairs_hook=_object)
     except (ValueError, RecursionError) as error:
         raise UndecodableError(f"not JSON: {error}") from None
+
+
+def _object(pairs: list[tuple[str, Value]]) -> dict[str, Value]:
+    """An object; of two values under one name, nobody can say which is meant."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a name stands twice in one object")
+    return found
 
 
 def _refuse_literal(literal: str) -> Value:

@@ -16,9 +16,12 @@ import polars as pl
 _INTEGER = r"-?(?:0|[1-9][0-9]*)"
 _NUMBER = _INTEGER + r"(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?"
 _TEXT = r'[^"\\\x00-\x1f]*'
-_ANY = rf'(?:{_NUMBER}|"{_TEXT}"|true|false|null)'
+_ESCAPE = r'\\(?:["\\/bfnrt]|u[0-9a-fA-F]{4})'
+_ESCAPED_TEXT = rf"{_TEXT}(?:{_ESCAPE}{_TEXT})*"
+_ANY = rf'(?:{_NUMBER}|"{_ESCAPED_TEXT}"|true|false|null)'
 _TOKEN = re.compile(
-    rf'(?P<space>[ \t\r\n]+)|(?P<mark>[{{}}\[\],:])|"(?P<text>{_TEXT})"|(?P<other>{_NUMBER}|true|false|null)'
+    rf'(?P<space>[ \t\r\n]+)|(?P<mark>[{{}}\[\],:])|"(?P<text>{_TEXT})"'
+    rf'|(?P<other>{_NUMBER}|true|false|null|"{_ESCAPED_TEXT}")'
 )
 _MOST_TOKENS = 2000
 

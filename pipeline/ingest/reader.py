@@ -32,7 +32,7 @@ def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder | 
     """The columnar decoder, or none where the encoding or schema has none."""
     try:
         if channel.encoding == "json":
-            from pipeline.ingest.ndjson import JsonDecoder
+            from pipeline.ingest.json_columns import JsonDecoder
 
             return JsonDecoder(types)
         if channel.encoding == "cdr" and channel.schema and channel.schema.encoding == "ros2msg":
@@ -130,7 +130,8 @@ _KINDS = {pl.Float64: np.float64, pl.Int64: np.int64, pl.Boolean: np.bool_}
 def _typed(values: Values, dtype: pl.DataType) -> Values:
     """In the type asked for, on its own memory."""
     if isinstance(values, Repeated):
-        return values
+        whole = values.value is not None and type(dtype) in _KINDS
+        return np.full(values.count, values.value, _KINDS[type(dtype)]) if whole else values
     if isinstance(values, pl.Series):
         return values.cast(dtype)
     if values.dtype == np.uint64 and len(values) and values.max() >= 2**63 and dtype == pl.Int64():

@@ -16,6 +16,7 @@ from pipeline.ingest.mcap_block import Bytes, Ints, Messages, stretches_of
 
 _MOST_TEMPLATES = 256  # layouts of one channel; beyond, messages are decoded one by one
 _MOST_PER_LENGTH = 16
+_MOST_ASIDE = 8  # messages without layout that may come before one that has a layout
 
 
 @dataclass(frozen=True)
@@ -99,15 +100,22 @@ class TemplateDecoder:
     def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]:
         """Messages whose layout is known, and those that no layout fits."""
         parts: list[Part] = []
-        left = [rest for length, group in _by_length(messages) if len(rest := self._decode_group(length, group, parts))]
+        left: list[Messages] = []
+        for length, group in _by_length(messages):
+            rest = self._decode_group(length, group, parts, left)
+            left += [rest] if len(rest) else []
         return parts, left
 
-    def _decode_group(self, length: int, messages: Messages, parts: list[Part]) -> Messages:
+    def _decode_group(self, length: int, messages: Messages, parts: list[Part], aside: list[Messages]) -> Messages:
         known = self._templates.setdefault(length, [])
         tried = 0
         while len(messages):
             if tried == len(known) and not self._learn(messages.payload(0), known):
-                break
+                if len(aside) >= _MOST_ASIDE:
+                    break
+                aside.append(messages.chosen(np.arange(1)))
+                messages = messages.chosen(np.arange(1, len(messages)))
+                continue
             template = known[tried]
             tried += 1
             rows = template.rows(messages.data, messages.start)

@@ -1,60 +1,46 @@
-"""Columnar decoding of JSON messages: a block's payloads joined to lines and parsed at once."""
+"""Columnar decoding of JSON messages by their patterns."""
 
 from __future__ import annotations
 
-import io
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from pipeline.ingest.generic import parse_path
+from pipeline.ingest.conform import all_finite
 from pipeline.ingest.json_layout import JsonLayout, NoPatternError, layout_of
 from pipeline.ingest.layout import Repeated
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.template import Part
 
-_LINES = 20_000  # parsed at once
-_MOST_LAYOUTS = 8
+_MOST_LAYOUTS = 32
+_MOST_ASIDE = 8  # messages without pattern that may come before one that has a pattern
 
 
 class JsonDecoder:
-    """Decodes the messages of a channel: by pattern, else as lines; what both refuse is left over."""
+    """Decodes the messages of a channel that match the pattern of one seen before."""
 
     def __init__(self, types: Mapping[str, pl.DataType]) -> None:
         self._types = types
-        self._schema = _schema_of(types)
-        self._columns = [_expression(path) for path in types]
         self._layouts: list[JsonLayout] = []
         self._tried = 0
 
     def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]:
+        """Messages by pattern, learning new ones while there are few, and those that have none."""
         parts: list[Part] = []
         left: list[Messages] = []
-        for first in range(0, len(messages), _LINES):
-            rest = messages.chosen(np.arange(first, min(first + _LINES, len(messages))))
-            rest = self._by_pattern(rest, parts)
-            if not len(rest):
-                continue
-            values = self._parse(rest)
-            if values is None:
-                left.append(rest)
+        number = 0
+        while len(messages) and number < _MOST_LAYOUTS:
+            if number < len(self._layouts) or self._learn(messages.payload(0)):
+                messages = _matched(messages, self._layouts[number], self._types, parts)
+                number += 1
+            elif len(left) < _MOST_ASIDE:
+                left.append(messages.chosen(np.arange(1)))
+                messages = messages.chosen(np.arange(1, len(messages)))
             else:
-                parts.append(Part(rest, values=values))
-        return parts, left
-
-    def _by_pattern(self, messages: Messages, parts: list[Part]) -> Messages:
-        """Take the messages that match a known pattern, learning new ones while there are few."""
-        for number in range(_MOST_LAYOUTS):
-            if not len(messages):
                 break
-            if number == len(self._layouts) and not self._learn(messages.payload(0)):
-                break
-            messages = _matched(messages, self._layouts[number], self._types, parts)
-        return messages
+        return parts, [*left, messages] if len(messages) else left
 
     def _learn(self, payload: bytes) -> bool:
         self._tried += 1
@@ -65,19 +51,6 @@ class JsonDecoder:
         except NoPatternError:
             return False
         return True
-
-    def _parse(self, messages: Messages) -> Mapping[str, Any] | None:
-        content = messages.data.tobytes()  # slices of bytes are several times cheaper than those of a view
-        bounds = zip(messages.start.tolist(), (messages.start + messages.length).tolist(), strict=True)
-        lines = b"\n".join([content[start:end] for start, end in bounds])
-        if lines.count(b"\n") != len(messages) - 1:
-            return None
-        try:
-            frame = pl.read_ndjson(io.BytesIO(lines), schema=self._schema)
-            # A blank line vanishes without a word, so every line must have become a row.
-            return frame.select(self._columns).to_dict() if frame.height == len(messages) else None
-        except pl.exceptions.PolarsError:
-            return None
 
 
 def _matched(messages: Messages, layout: JsonLayout, types: Mapping[str, pl.DataType], parts: list[Part]) -> Messages:
@@ -129,35 +102,5 @@ def _cast(groups: pl.DataFrame, paths: Sequence[str], types: Mapping[str, pl.Dat
         values = groups.select(columns)
     except pl.exceptions.PolarsError:
         return None
-    finite = all(math.isfinite(column.sum()) for column in values if column.dtype == pl.Float64)
+    finite = all(all_finite(column) for column in values if column.dtype == pl.Float64)
     return values.to_dict() if finite else None
-
-
-def _schema_of(types: Mapping[str, pl.DataType]) -> dict[str, Any]:
-    tree: dict[str | int, Any] = {}
-    for path, dtype in types.items():
-        node = tree
-        *parents, last = parse_path(path)
-        for step in parents:
-            node = node.setdefault(step, {})
-        node[last] = dtype
-    return {str(name): _dtype(node) for name, node in tree.items()}
-
-
-def _dtype(node: Any) -> Any:
-    if not isinstance(node, dict):
-        return node
-    if all(isinstance(step, int) for step in node):
-        return pl.List(_dtype(next(iter(node.values()))))
-    return pl.Struct({str(name): _dtype(child) for name, child in node.items()})
-
-
-def _expression(path: str) -> pl.Expr:
-    first, *steps = parse_path(path)
-    expression = pl.col(str(first))
-    for step in steps:
-        if isinstance(step, int):
-            expression = expression.list.get(step, null_on_oob=True)
-        else:
-            expression = expression.struct.field(step)
-    return expression.alias(path)

@@ -1,0 +1,97 @@
+"""JSON by pattern against JSON message by message."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.ingest.generic import UndecodableError, decode_columns, parse_json
+from pipeline.ingest.json_columns import JsonDecoder
+from pipeline.ingest.layout import Repeated
+from pipeline.ingest.mcap_block import MESSAGE_HEAD, Messages
+from pipeline.ingest.mcap_model import Channel
+from schemas.errors import InputError
+
+CHANNEL = Channel(1, "/x", "json", None, "x.mcap")
+TYPES = {
+    "a": pl.Float64(), "t.sec": pl.Int64(), "name": pl.String(), "ok": pl.Boolean(), "c[1]": pl.Float64(),
+}  # fmt: skip
+
+texts = st.text(max_size=8)
+numbers = st.one_of(st.integers(-(2**70), 2**70), st.floats(allow_nan=False, allow_infinity=False), st.integers(-9, 9))
+scalars = st.one_of(numbers, st.none(), st.booleans(), texts)
+documents = st.fixed_dictionaries(
+    {},
+    optional={
+        "a": st.one_of(numbers, st.none(), scalars),
+        "t": st.one_of(st.fixed_dictionaries({"sec": st.integers(0, 2**40)}), scalars),
+        "name": st.one_of(texts, st.none()),
+        "ok": st.one_of(st.booleans(), st.none()),
+        "c": st.lists(numbers, max_size=3),
+        "other": scalars,
+        "more": st.dictionaries(texts, scalars, max_size=2),
+    },
+)
+styles = st.sampled_from([{}, {"separators": (",", ":")}, {"indent": 1}, {"ensure_ascii": False}])
+damage = st.one_of(
+    st.none(),
+    st.none(),
+    st.tuples(st.integers(0, 200), st.sampled_from([*'{}[]:,"0-.eE+ \\\n', "NaN", "null", "", "\t"])),
+)
+payloads = st.lists(st.tuples(documents, styles, damage), min_size=1, max_size=12)
+
+
+def messages_of(contents: list[bytes]) -> Messages:
+    lengths = np.array([len(content) for content in contents], dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(lengths[:-1])]).astype(np.int64)
+    data = np.frombuffer(b"".join(contents) + b" ", dtype=np.uint8)
+    return Messages(data, starts, lengths, starts, np.zeros(len(contents), MESSAGE_HEAD))
+
+
+def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
+    content = json.dumps(document, **style)
+    if harm is not None:
+        at = harm[0] % (len(content) + 1)
+        content = content[:at] + harm[1] + content[at + 1 :]
+    return content.encode("utf-8", "surrogatepass")
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(payloads)
+def test_what_a_pattern_takes_is_what_the_parser_says(drawn):
+    contents = [written(*one) for one in drawn]
+    parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
+    taken = [part.messages for part in parts]
+    assert sum(map(len, taken)) + sum(map(len, left)) == len(contents)
+    for part in parts:
+        expected, _ = decode_columns(CHANNEL, part.messages, TYPES)
+        for path, values in part.values.items():
+            series = values.series() if isinstance(values, Repeated) else values
+            assert series.to_list() == expected[path].to_list()
+
+
+def test_equal_messages_share_a_pattern():
+    contents = [json.dumps({"a": number / 7, "name": "x", "t": {"sec": number}}).encode() for number in range(50)]
+    parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
+    assert (len(parts), left) == (1, [])
+    assert parts[0].values["a"].to_list() == [number / 7 for number in range(50)]
+    assert parts[0].values["t.sec"].to_list() == list(range(50))
+
+
+@pytest.mark.parametrize(
+    "content", [b'{"a": NaN}', b'{"a": -Infinity}', b'{"a": 1, "a": 2}', b'{"a": 01}', b'{"a": 1}{}', b"[1", b"\xff"]
+)
+def test_what_is_no_json_is_refused(content):
+    with pytest.raises(UndecodableError):
+        parse_json(content)
+    with pytest.raises(InputError):
+        decode_columns(CHANNEL, messages_of([content]), TYPES)
+    parts, left = JsonDecoder(TYPES).decode(messages_of([b'{"a": 1.5}', content, b'{"a": 2.5}']))
+    is_text = content != b"\xff"
+    assert sum(len(part.messages) for part in parts) == (2 if is_text else 0)
+    assert sum(map(len, left)) == (1 if is_text else 3)
