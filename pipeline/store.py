@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from urllib.parse import quote, unquote
 
@@ -120,15 +120,30 @@ def metadata_of(source: Path | bytes) -> dict[str, str]:
 
 
 def sweep(out: Address) -> None:
-    """Remove what an interrupted run left: tables without a marker, and unfinished files."""
+    """Remove what interrupted runs left: tables without a marker, and unfinished files."""
     complete = {_partition(run) for run in run_ids(out)}
     for table in TABLES:
         for folder in storage.folders_in(join(out, table)):
             if folder.startswith("run_id=") and folder not in complete:
                 storage.remove_folder(join(join(out, table), folder))
     if not is_url(out):
-        for leftover in Path(out).glob("*/run_id=*/.*.tmp"):
-            leftover.unlink(missing_ok=True)
+        _remove_unfinished(Path(out).glob("*/run_id=*/.*.tmp"))
+
+
+def sweep_run(out: Path, run_id: str) -> None:
+    """`sweep` for one run of a local result, whose worker is known to have ended."""
+    complete = Path(table_address(out, _MARKER, run_id)).exists()
+    for table in TABLES:
+        folder = Path(table_address(out, table, run_id)).parent
+        if complete:
+            _remove_unfinished(folder.glob(".*.tmp"))
+        else:
+            storage.remove_folder(folder)
+
+
+def _remove_unfinished(files: Iterable[Path]) -> None:
+    for file in files:
+        file.unlink(missing_ok=True)
 
 
 def write_config(out: Address, settings: Settings) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
@@ -113,11 +114,13 @@ def run_campaign(
         store.sweep(plan.out)
         plan = plan if force else with_previous(plan)
         store.write_config(plan.out, plan.config)
+        state = _State(deque((job, 1) for job in plan.jobs))
         engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
         try:
-            summary = _watched(plan, engine, time_limit_s, watches)
+            summary = _watched(plan, state, engine, time_limit_s, watches)
         finally:
             engine.close()
+            _tidy(plan, state, scheduler)
         write_campaign(plan.out, plan.config)
         return summary
 
@@ -130,8 +133,14 @@ def _check_shared(plan: Plan, scheduler: str | None) -> None:
         raise UsageError("workers cannot write into this process's memory", place=plan.out)
 
 
-def _watched(plan: Plan, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> Summary:
-    state = _State(deque((job, 1) for job in plan.jobs))
+def _tidy(plan: Plan, state: _State, scheduler: str | None) -> None:
+    """Remove what ended workers left half done; those of a cluster may be at it still."""
+    if scheduler is None and not is_url(plan.out):
+        for item in state.under_way.values():
+            store.sweep_run(Path(plan.out), item.job.run_id)
+
+
+def _watched(plan: Plan, state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> Summary:
     begun = time.monotonic()
     for watch in watches:
         watch.begin(plan)

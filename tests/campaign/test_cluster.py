@@ -29,7 +29,7 @@ class Cluster:
         self.file = folder / "scheduler.json"
         common = ["--scheduler-file", str(self.file)]
         self.scheduler = _dask("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1", *common)
-        wait_for(self.file.exists)
+        wait_for(lambda: self.file.exists() and self.file.read_text().rstrip().endswith("}"))
         self.worker = self.start_worker()
 
     def start_worker(self) -> subprocess.Popen[bytes]:

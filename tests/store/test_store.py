@@ -97,6 +97,17 @@ def test_run_without_marker_does_not_count(tmp_path: Path) -> None:
     assert len(files_in(tmp_path)) == len(TABLES)
 
 
+def test_sweep_of_one_run_leaves_the_others(tmp_path: Path) -> None:
+    for run_id in ("a", "b", "c"):
+        store.write_run(tables_of(run_id), tmp_path, METADATA)
+    whole = {name: data for name, data in files_in(tmp_path).items() if "run_id=a" not in name}
+    (tmp_path / "runs/run_id=a/runs.parquet").unlink()
+    (tmp_path / "runs/run_id=b/.runs.parquet.12.tmp").touch()
+    for run_id in ("a", "b"):
+        store.sweep_run(tmp_path, run_id)
+    assert files_in(tmp_path) == whole
+
+
 @pytest.mark.parametrize("failing", range(5))
 def test_interrupted_write_leaves_no_half_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
     calls = 0
