@@ -151,15 +151,19 @@ def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
 
 
 _MEMORY_SCRIPT = """
-import resource, sys
+import re, sys
 from pathlib import Path
 from pipeline.ingest import read_run
 from schemas.config import IngestConfig
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+def status(name):
+    return 1024 * int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text()).group(1))
+
 read_run(Path(sys.argv[1]), IngestConfig())
-before = peak()
+Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from what is resident now
+before = status("VmRSS")
 run = read_run(Path(sys.argv[2]), IngestConfig())
-print((peak() - before) / sum(frame.estimated_size() for frame in (run.gnss, run.odometer)))
+print((status("VmHWM") - before) / sum(frame.estimated_size() for frame in (run.gnss, run.odometer)))
 """
 
 

@@ -23,17 +23,17 @@ class Decoded:
     frame: pl.DataFrame
 
 
-def stream_frames(decoded: Sequence[Decoded], breaches: list[Breach]) -> dict[str, pl.DataFrame]:
-    """One frame per stream that has a source, rows in order of the file."""
+def stream_frames(decoded: Sequence[Decoded], breaches: list[Breach], remarks: list[str]) -> dict[str, pl.DataFrame]:
+    """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out."""
     frames: dict[str, pl.DataFrame] = {}
     for stream in STREAMS:
         parts = [part for part in decoded if part.source.stream == stream]
         if parts:
-            frames[stream] = _stream(stream, parts, breaches)
+            frames[stream] = _stream(stream, parts, breaches, remarks)
     return frames
 
 
-def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) -> pl.DataFrame:
+def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], remarks: list[str]) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [
         missing_field(part.source.channel, [], column, [path])
@@ -42,7 +42,7 @@ def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach]) ->
         if part.frame[path].null_count() == part.frame.height
     ]
     supplements = [part for part in parts if part.source.recipe.supplement]
-    rows = [_rows(part, supplements) for part in parts if not part.source.recipe.supplement]
+    rows = [_rows(part, supplements, remarks) for part in parts if not part.source.recipe.supplement]
     joined = pl.concat(rows, how="diagonal_relaxed")
     frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
     return conform(frame.drop(ORDINAL), stream, place, breaches)
@@ -66,7 +66,7 @@ def _same_receiver(part: Decoded, other: Decoded) -> bool:
     return part.source.channel.topic.rpartition("/")[0] == other.source.channel.topic.rpartition("/")[0]
 
 
-def _rows(part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:
+def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> pl.DataFrame:
     source = part.source
     columns = part.frame.select(
         pl.col(ORDINAL), *(expression.alias(name) for name, expression in source.columns.items())
@@ -76,7 +76,12 @@ def _rows(part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:
     except pl.exceptions.PolarsError as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
-    return _supplemented(_named(columns.with_columns(times), source), part, supplements)
+    frame = _supplemented(_named(columns.with_columns(times), source), part, supplements)
+    if source.recipe.time is None or not frame["t"].null_count():
+        return frame
+    # The calendar of a receiver that does not know the time yet: there is no epoch to be placed anywhere.
+    remarks.append(f"{source.channel.topic}: {frame['t'].null_count()} messages without valid time")
+    return frame.drop_nulls("t")
 
 
 def _named(frame: pl.DataFrame, source: Source) -> pl.DataFrame:

@@ -71,7 +71,7 @@ def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
             partial_until_ns=_last_ns(frames["gnss"]) if walk.cut_at is not None else None,
             damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
             slow_path_messages=slow_messages,
-            chunks_without_crc=walk.chunks_without_crc,
+            chunks_without_crc=walk.without_crc,
             skipped_topics=left_over,
         ),
         input_digest=input_digest,
@@ -137,11 +137,12 @@ def _frames(
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[Breach] = []
-    frames = stream_frames(decoded, breaches)
+    remarks: list[str] = []
+    frames = stream_frames(decoded, breaches, remarks)
     if "gnss" not in frames:
         breaches.append(_no_gnss(path, walk, left_over))
     refuse(breaches)
-    return frames, slow_messages, left_over
+    return frames, slow_messages, (*left_over, *remarks)
 
 
 def _no_gnss(path: files.Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:

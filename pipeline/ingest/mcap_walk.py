@@ -41,7 +41,8 @@ class McapWalk:
         self.channels: dict[int, Channel] = {}
         self.met = Met()
         self.data_crc = (0, 0)
-        self.chunks_without_crc = 0
+        self._chunks_without_crc = 0
+        self._loose_blocks = 0
         self.cut_at: int | None = None
         self.unknown_records = 0
         self._window = window
@@ -72,6 +73,11 @@ class McapWalk:
             # The cut may have taken part of the chunk's indexes, so the chunk is walked instead.
             self._pending.indexes.clear()
             yield self._finished_chunk()
+
+    @property
+    def without_crc(self) -> int:
+        """Blocks of messages whose content no checksum covers."""
+        return 0 if self.data_crc[0] else self._chunks_without_crc + self._loose_blocks
 
     def _first_record(self) -> int | None:
         size = self._window.size
@@ -124,6 +130,7 @@ class McapWalk:
                 break
             starts.append(at)
             at = following
+        self._loose_blocks += 1
         data = np.frombuffer(view[:at], dtype=np.uint8)
         block = block_of(data, np.array(starts, dtype=np.int64), position, self._ordinal)
         return self._counted(block, position, at), position + at
@@ -207,7 +214,7 @@ class McapWalk:
         assert pending is not None  # callers checked
         chunk = pending.chunk
         data = decompressed(chunk, self._limit)
-        self.chunks_without_crc += chunk.crc == 0
+        self._chunks_without_crc += chunk.crc == 0
         met = chunk_messages(data, pending.indexes, chunk.offset, self._ordinal, self._chunk_record)
         block = self._counted(met, chunk.offset, len(data))
         self.met.chunks.append(

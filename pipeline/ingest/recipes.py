@@ -79,6 +79,7 @@ def recorded_type(column: dy.Column) -> pl.DataType:
 
 _COMMON: dict[str, tuple[Recipe, ...]] = {
     "foxglove.LocationFix": (_location_fix(),),
+    "foxglove_msgs/msg/LocationFix": (_location_fix(),),
     "sensor_msgs/msg/NavSatFix": (_navsatfix(),),
     "nav_msgs/msg/Odometry": (_twist("twist.twist.linear.x"),),
     "geometry_msgs/msg/TwistStamped": (_twist("twist.linear.x"),),

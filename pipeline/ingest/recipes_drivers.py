@@ -137,7 +137,7 @@ def _nav_pvt(h_acc: str, v_acc: str, velocity: tuple[str, str, str], satellites:
         stamps={},
         columns={"fix": fix} | _ublox_columns(h_acc, v_acc, velocity, satellites),
         types={fix_type: pl.Int64(), "flags": pl.Int64(), satellites: pl.Int64()},
-        time=CivilTime(("year", "month", "day", "hour", "min", "sec"), "nano"),
+        time=CivilTime(("year", "month", "day", "hour", "min", "sec"), "nano", "valid"),
     )
 
 

@@ -70,26 +70,29 @@ def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamM
 
 @dataclass(frozen=True)
 class CivilTime:
-    """A UTC calendar in six fields, and nanoseconds that may be negative."""
+    """A UTC calendar in six fields, nanoseconds that may be negative, and flags of which bits 0 and 1
+    say that date and time are valid.
+    """
 
     calendar: tuple[str, str, str, str, str, str]
     nanoseconds: str
+    valid: str
 
     @property
     def fields(self) -> tuple[str, ...]:
-        return (*self.calendar, self.nanoseconds)
+        return (*self.calendar, self.nanoseconds, self.valid)
 
     @property
     def types(self) -> Mapping[str, pl.DataType]:
         return {name: pl.Int64() for name in self.fields}
 
     def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
-        """Times in UTC; null where the calendar is not one yet (a receiver before its first fix)."""
+        """Times in UTC; null where the calendar is not valid yet (a receiver before its first fix)."""
         year, *others = (pl.col(field) for field in self.calendar)
         month, day, hour, minute, second = others
         # A leap second (60) is the first second of the next minute; datetime() knows none.
         whole = pl.datetime(year, month, day, hour, minute, time_unit="ns", time_zone="UTC")
-        known = (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (year >= 1980)
+        known = (pl.col(self.valid) & 3 == 3) & month.is_between(1, 12) & day.is_between(1, 31)
         at = whole.to_physical() + second * 1_000_000_000 + pl.col(self.nanoseconds)
         instant = pl.when(known).then(at).cast(pl.Datetime("ns", "UTC"))
         return frame.select(instant.alias(name)).to_series()

@@ -53,6 +53,7 @@ def test_hand_made_file_reads(tmp_path):
     assert log.gnss["latitude_deg"].to_list() == [50.0, 50.001, 50.002]
     assert log.gnss["t"].to_physical().to_list() == [(1_700_000_000 + n) * 10**9 for n in range(3)]
     assert log.notes.partial_until_ns is None
+    assert log.notes.chunks_without_crc == 1
 
 
 def test_chunk_and_loose_messages_mix(tmp_path):

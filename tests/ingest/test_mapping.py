@@ -263,9 +263,20 @@ def test_ublox_calendar(tmp_path):
         "int32 vel_n\nint32 vel_e\nint32 vel_d\n"
     )
     calendar = {"year": 2023, "month": 11, "day": 14, "hour": 22, "min": 13, "sec": 20, "nano": -1500}
-    message = calendar | {"fix_type": 3, "flags": 1 | 2 << 6, "num_sv": 5, "lat": 505_000_000, "lon": 45_000_000}
+    message = calendar | {
+        "valid": 7,
+        "fix_type": 3,
+        "flags": 1 | 2 << 6,
+        "num_sv": 5,
+        "lat": 505_000_000,
+        "lon": 45_000_000,
+    }
     path = ros_log(tmp_path, ("/navpvt", "ublox_msgs/msg/NavPVT", text, [message]))
     assert (row(path)["t"], row(path)["fix"]) == (1_700_000_000 * 10**9 - 1500, "rtk_fixed")
+    early = message | {"valid": 1, "year": 2016}
+    log = read_run(ros_log(tmp_path, ("/navpvt", "ublox_msgs/msg/NavPVT", text, [early, message])), IngestConfig())
+    assert log.gnss.height == 1
+    assert log.notes.skipped_topics == ("/navpvt: 1 messages without valid time",)
 
 
 def test_novatel_and_gpsfix(tmp_path):
