@@ -10,6 +10,7 @@ import numpy.typing as npt
 from pipeline.monitors.recursion import (
     Array,
     AxisState,
+    before_steps,
     ewma_weight,
     increment_variance,
     linear_recurrence,
@@ -26,7 +27,8 @@ class AxisSeries:
     `epoch`: index of the row among all epochs. `fresh`: no increment leads here (start, long gap, lost distance).
     `rate_mps`: increment of GNSS minus odometer or track over `dt_s`. `border`: the increment crosses into another
     net element, whose survey offset is another (`border_m2`, its variance). `sigma_m`, `sigma_before_m` and
-    `decorrelation` (m, sources): sqrt R_j here and at the row before, and 1 - phi_j. `white_m2`: odometer noise of
+    `decorrelation` (m, sources): sqrt R_j here and at the row before (see `before_steps`), and
+    1 - phi_j. `white_m2`: odometer noise of
     the increment. `steady_mps`, `latency_mps`: what one sigma of an error that stays (odometer scale; the position
     error that a curve turns into this axis) and of the latency makes of the rate, signed.
     """
@@ -59,7 +61,7 @@ class AxisResult:
 
 def with_memory(sigma_m: Array, decorrelation: Array) -> dict[str, Array]:
     """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j."""
-    before = np.concatenate([sigma_m[:1], sigma_m[:-1]])
+    before = before_steps(sigma_m, decorrelation)
     return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
 
 
@@ -69,7 +71,7 @@ def along_errors(sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, ta
     `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
     """
     return with_memory(
-        np.column_stack([np.outer(sigma_m, np.sqrt(shares)), jitter_m]),
+        np.column_stack([np.outer(sigma_m, np.sqrt(shares)), np.abs(jitter_m)]),
         np.column_stack([-np.expm1(-dt_s[:, None] / taus_s), np.ones(dt_s.size)]),
     )
 

@@ -13,6 +13,9 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+# Between two rows a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
+STEP_OF_SIGMA = 1.5
+
 
 def linear_recurrence(decay: Array, drive: Array, initial: Array) -> Array:
     """Solve `y[k] = decay[k] * y[k-1] + drive[k]` with `y[-1] = initial`, shapes (n, c), (n, c), (c,).
@@ -73,31 +76,47 @@ def variance_of_ewma(
     `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
     `sigma_m`, `sigma_before_m` (n, sources): sqrt R_j at the row and at the row before it; `decorrelation`
     (n, sources): 1 - phi_j, given as such because it is tiny at 10 Hz; `white_m2` (n,): variance of white noise on
-    the increment. Returns the variance (n, alphas) and the last covariances c_j (alphas, sources).
+    the increment. Returns the variance (n, alphas) and the last covariances c_j = cov(u, e_j) (alphas, sources).
 
-    Each source is e_k = sigma_k n_k with a unit Gauss-Markov process n, and c_j = cov(u, n):
+    The recursion of DOMAIN section 3, in which (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R +
+    R (1-phi^2) = R (1-phi). Where sigma changes by the step (s_p to s_k: a fix lost to dead reckoning), the error
+    goes with it as e = s n with n of unit variance, from there on (`sigma_before_m` as `before_steps` gives it; in
+    the printed form it is s_k itself); there, with r = s_k / s_p,
 
-        v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi s_k - s_p) + (alpha g)^2 white
-        c <- b phi c + alpha g (s_k - phi s_p)
-
-    For constant R this is the recursion of DOMAIN section 3; where R changes by the step (a fix that is lost to
-    dead reckoning), that one may fall below zero.
+        v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi r - 1) + (alpha g)^2 white
+        c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
     n, sources = sigma_m.shape
-    drive = gain[:, :, None] * (sigma_m - (1.0 - decorrelation) * sigma_before_m)[:, None, :]
-    decay = keep[:, :, None] * (1.0 - decorrelation)[:, None, :]
+    ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
+    carried = (1.0 - decorrelation) * ratio
+    own = sigma_m * (sigma_m - sigma_before_m + decorrelation * sigma_before_m)
     flat = (n, gain.shape[1] * sources)
-    covariance = linear_recurrence(decay.reshape(flat), drive.reshape(flat), state.covariance.reshape(-1))
-    covariance = covariance.reshape(n, -1, sources)
+    drive = (gain[:, :, None] * own[:, None, :]).reshape(flat)
+    decay = (keep[:, :, None] * carried[:, None, :]).reshape(flat)
+    covariance = linear_recurrence(decay, drive, state.covariance.reshape(-1)).reshape(n, -1, sources)
     before = np.concatenate([state.covariance[None], covariance[:-1]])
-    coupling = np.einsum("kas,ks->ka", before, (1.0 - decorrelation) * sigma_m - sigma_before_m)
+    coupling = np.einsum("kas,ks->ka", before, np.where(ratio == 1.0, -decorrelation, carried - 1.0))
     increment = increment_variance(sigma_m, sigma_before_m, decorrelation) + white_m2
     fresh = gain**2 * increment[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
-    return np.maximum(variance, 0.0), covariance[-1] if n else state.covariance
+    # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
+    new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
+    return np.maximum(variance, gain**2 * new_m2[:, None]), covariance[-1] if n else state.covariance
+
+
+def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
+    """The sigma before each row that the recursion counts with, per source; shapes (n, sources).
+
+    Until a source's sigma first changes by the step, R_j of the row stands for both ends of the increment, as
+    printed; from then on the row before has its own. Sources without memory (phi = 0) know no step.
+    """
+    before = np.concatenate([sigma_m[:1], sigma_m[:-1]])
+    low, high = np.minimum(sigma_m, before), np.maximum(sigma_m, before)
+    steps = (high > STEP_OF_SIGMA * low) & (decorrelation < 1.0)
+    return np.where(np.logical_or.accumulate(steps, axis=0), before, sigma_m)
 
 
 def increment_variance(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> Array:
-    """Variance of the increments of all sources together [m^2]; shape (n,)."""
+    """Variance of the increments of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
     summed: Array = ((sigma_m - sigma_before_m) ** 2 + 2.0 * decorrelation * sigma_m * sigma_before_m).sum(axis=1)
     return summed

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from pipeline.monitors.recursion import AxisState, ewma_weight, linear_recurrence, variance_of_ewma
+from pipeline.monitors.recursion import AxisState, before_steps, ewma_weight, linear_recurrence, variance_of_ewma
 
 SHARES = np.array([0.083, 0.014, 0.150, 0.752])
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
@@ -33,12 +33,13 @@ def by_hand(alpha, dt_s, sigma2_m2, odometer_sigma_mps):
 def exact(dt_s, sigma2_m2, odometer_sigma_mps=0.05):
     weight = ewma_weight(ALPHAS, dt_s)
     sigma_m = np.sqrt(np.outer(sigma2_m2, SHARES))
+    decorrelation = -np.expm1(-dt_s[:, None] / TAUS_S)
     variance, _ = variance_of_ewma(
         1.0 - weight,
         weight / dt_s[:, None],
         sigma_m,
-        np.concatenate([sigma_m[:1], sigma_m[:-1]]),
-        -np.expm1(-dt_s[:, None] / TAUS_S),
+        before_steps(sigma_m, decorrelation),
+        decorrelation,
         odometer_sigma_mps**2 * dt_s,
         AxisState.at_restart(3, 4),
     )
@@ -56,12 +57,24 @@ def test_variance_follows_the_recursion_through_gaps(period_s, sigma2):
 
 
 @pytest.mark.parametrize("period_s", [0.1, 1.0])
-def test_a_slowly_changing_accuracy_follows_the_printed_recursion_closely(period_s):
+@pytest.mark.parametrize("accuracy", ["slow", "restless"])
+def test_a_changing_accuracy_follows_the_printed_recursion(period_s, accuracy):
     t_s = np.arange(600.0 / period_s) * period_s
-    sigma2_m2 = 1.0 + 0.5 * np.sin(t_s / 200.0)
+    restless = np.random.default_rng(8).uniform(0.9, 1.6, t_s.size)
+    sigma2_m2 = restless if accuracy == "restless" else 1.0 + 0.5 * np.sin(t_s / 200.0)
     dt_s = np.full(t_s.size, period_s)
+    dt_s[t_s.size // 2] = 25.0
     expected = np.column_stack([by_hand(alpha, dt_s, sigma2_m2, 0.05) for alpha in ALPHAS])
-    np.testing.assert_allclose(np.sqrt(exact(dt_s, sigma2_m2)), np.sqrt(expected), rtol=0.1)
+    np.testing.assert_allclose(exact(dt_s, sigma2_m2), expected, rtol=1e-9)
+
+
+def test_an_accuracy_that_jumps_up_and_creeps_down_for_hours_keeps_its_variance_bounded():
+    sigma2_m2 = np.tile(np.geomspace(25.0, 0.25, 30), 400)
+    found = exact(np.ones(sigma2_m2.size), sigma2_m2)
+    first, last = found[3000:3030], found[-30:]
+    assert (found > 0).all()
+    np.testing.assert_allclose(last[:, :2], first[:, :2], rtol=1e-3)
+    assert (last[:, 2] < 2.0 * first[:, 2]).all()
 
 
 def test_variance_stays_true_where_the_accuracy_jumps():
