@@ -18,7 +18,7 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
 from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
-from pipeline.telegrams import place_reads
+from pipeline.telegrams import place_reads, places_near
 from schemas.config import Configuration, LdsConfig, Vehicle, digest_of
 from schemas.conform import conform
 from schemas.enums import Evidence
@@ -85,7 +85,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    reference = _reference_on_path(context, found.path)
+    reference = _reference_on_path(context, found.path, aligned)
     reads = None if telegrams is None else telegrams.drop_nulls("path_m")
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
     result = classify(solution, monitored, truth, lds.passages, balises, run.faults, found.path.locate, config)
@@ -176,12 +176,18 @@ def _single_monitors(
     }
 
 
-def _reference_on_path(context: _Context, path: TravelledPath) -> pl.DataFrame | None:
-    """The reference stream as path positions of the balise antenna, as the epochs are."""
+def _reference_on_path(context: _Context, path: TravelledPath, aligned: pl.DataFrame) -> pl.DataFrame | None:
+    """The reference stream as path positions of the balise antenna, as the epochs are.
+
+    Where the path comes back to a place, the epochs around say which passage of it is meant.
+    """
     reference = context.run.reference
     if reference is None:
         return None
-    places = path.project(reference["latitude_deg"], reference["longitude_deg"], reference["height_m"])
+    leg, near_path_m = places_near(reference["t"], aligned) or (None, None)
+    places = path.project(
+        reference["latitude_deg"], reference["longitude_deg"], reference["height_m"], leg, near_path_m
+    )
     return reference.select(
         "t",
         pl.Series("path_m", places.path_m - context.vehicle.gnss_antenna_ahead_m, nan_to_null=True),

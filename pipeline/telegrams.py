@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.align import odometer_at
+from pipeline.geodesy import Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
 
@@ -29,7 +30,8 @@ def place_reads(
         known = odometer_at(reads["t"], aligned, odometer, config)
     physical = balises.filter(pl.col("kind") == BaliseKind.PHYSICAL.value)
     places = physical.select("balise_id", "leg", "path_m").partition_by("balise_id", as_dict=True)
-    here = _positions(reads["t"], aligned)
+    near = places_near(reads["t"], aligned)
+    here = [(0, float("nan"))] * reads.height if near is None else list(zip(*(x.tolist() for x in near), strict=True))
     chosen = [
         _nearest(places.get((name,)), leg, path_m) for name, (leg, path_m) in zip(reads["balise_id"], here, strict=True)
     ]
@@ -39,16 +41,16 @@ def place_reads(
     )
 
 
-def _positions(times: pl.Series, aligned: pl.DataFrame) -> list[tuple[int, float]]:
-    """Leg and path position of the epoch next in time to each read; NaN in a run without a position."""
+def places_near(times: pl.Series, aligned: pl.DataFrame) -> tuple[Ints, Floats] | None:
+    """Leg and path position [m] of the epoch next in time to each instant; None in a run without a position."""
     placed = aligned.drop_nulls(["leg", "path_m"])
     if placed.is_empty():
-        return [(0, float("nan"))] * times.len()
+        return None
     stamps, at = placed["t"].dt.timestamp("ns").to_numpy(), times.dt.timestamp("ns").to_numpy()
     after = np.searchsorted(stamps, at).clip(0, stamps.size - 1)
     before = np.maximum(after - 1, 0)
     rows = np.where(np.abs(stamps[before] - at) <= np.abs(stamps[after] - at), before, after)
-    return list(zip(placed["leg"].gather(rows), placed["path_m"].gather(rows), strict=True))
+    return placed["leg"].to_numpy().astype(np.int64)[rows], placed["path_m"].to_numpy()[rows]
 
 
 def _nearest(places: pl.DataFrame | None, leg: int, path_m: float) -> tuple[int | None, float | None]:
