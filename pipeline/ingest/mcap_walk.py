@@ -14,12 +14,15 @@ import numpy as np
 
 from pipeline.ingest import mcap_records as records
 from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.mcap_block import Block, block_of, chunk_messages, decompressed
+from pipeline.ingest.decompress import Decompressor
+from pipeline.ingest.mcap_block import Block, block_of
+from pipeline.ingest.mcap_chunk import Index, Placed, messages_in
 from pipeline.ingest.mcap_model import Channel, Schema
 from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, DamageError, Op
 from pipeline.ingest.mcap_summary import Met, Summary
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
+_TOGETHER = 4 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
 _SLACK = 1024 * 1024  # what does not compress grows a little
 _ATTACHMENT_HEAD = 64 * 1024  # holds times, name and media type of an attachment
@@ -31,7 +34,14 @@ class Pending:
 
     chunk: ChunkRecord
     length: int
-    indexes: list[tuple[int, memoryview]] = field(default_factory=list)
+    indexes: list[Index] = field(default_factory=list)
+
+    def summary(self) -> ChunkSummary:
+        """What a chunk index must say of it."""
+        chunk = self.chunk
+        return ChunkSummary(
+            chunk.start_ns, chunk.end_ns, chunk.offset, self.length, chunk.compression, len(chunk.records), chunk.size
+        )
 
 
 class McapWalk:
@@ -50,7 +60,9 @@ class McapWalk:
         self._limit = chunk_limit
         self._schemas: dict[int, Schema] = {}
         self._definitions: dict[int, records.ChannelRecord] = {}
-        self._pending: Pending | None = None
+        self._pending: list[Pending] = []
+        self._unpacker = Decompressor()
+        self._memory = np.empty(0, dtype=np.uint8)
         self._ordinal = 0
         self._summary: Summary | None = None
 
@@ -62,17 +74,22 @@ class McapWalk:
             if head is None:
                 break
             opcode, length = head
-            if opcode != Op.MESSAGE_INDEX and self._pending:
-                yield self._finished_chunk()
+            if self._pending and not self._waits_for(opcode):
+                yield self._finished_chunks()
             if opcode == Op.MESSAGE and self._summary is None:
                 block, position = self._loose_messages(position)
                 yield block
             else:
                 position = self._record(opcode, length, position)
         if self._pending:
-            # The cut may have taken part of the chunk's indexes, so the chunk is walked instead.
-            self._pending.indexes.clear()
-            yield self._finished_chunk()
+            # The cut may have taken part of the last chunk's indexes, so that chunk is walked instead.
+            self._pending[-1].indexes.clear()
+            yield self._finished_chunks()
+
+    def _waits_for(self, opcode: int) -> bool:
+        """Whether the chunks met last wait: for their indexes, or for neighbours to be taken with them."""
+        size = sum(pending.chunk.size for pending in self._pending)
+        return opcode == Op.MESSAGE_INDEX or (opcode == Op.CHUNK and size < _TOGETHER)
 
     @property
     def without_crc(self) -> int:
@@ -132,7 +149,7 @@ class McapWalk:
             at = following
         self._loose_blocks += 1
         data = np.frombuffer(view[:at], dtype=np.uint8)
-        block = block_of(data, np.array(starts, dtype=np.int64), position, self._ordinal)
+        block = block_of(data, np.array(starts, dtype=np.int64), position.__add__, self._ordinal)
         return self._counted(block, position, at), position + at
 
     def _record(self, opcode: int, length: int, position: int) -> int | None:
@@ -189,12 +206,16 @@ class McapWalk:
             self.channels[record.id] = Channel(record.id, record.topic, record.encoding, schema, self._file)
 
     def _chunk(self, body: memoryview, position: int) -> None:
-        self._pending = Pending(records.parse_chunk(body, position), len(body) + HEAD_SIZE)
+        chunk = records.parse_chunk(body, position)
+        if chunk.size > self._limit:
+            told = f"a chunk declares {chunk.size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
+            raise DamageError(position, told)
+        self._pending.append(Pending(chunk, len(body) + HEAD_SIZE))
 
     def _message_index(self, body: memoryview, position: int) -> None:
-        if self._pending is None:
+        if not self._pending:
             raise DamageError(position, "a message index follows no chunk")
-        self._pending.indexes.append(records.parse_message_index(body, position))
+        self._pending[-1].indexes.append(records.parse_message_index(body, position))
 
     def _attachment(self, length: int, position: int) -> None:
         head = self._window.at(position + HEAD_SIZE, min(length, _ATTACHMENT_HEAD))
@@ -209,21 +230,22 @@ class McapWalk:
         self.data_crc = (cursor.u32(), position)
         self._summary = Summary(position + HEAD_SIZE + len(body), self.met)
 
-    def _finished_chunk(self) -> Block:
-        pending, self._pending = self._pending, None
-        assert pending is not None  # callers checked
-        chunk = pending.chunk
-        data = decompressed(chunk, self._limit)
-        self._chunks_without_crc += chunk.crc == 0
-        met = chunk_messages(data, pending.indexes, chunk.offset, self._ordinal, self._chunk_record)
-        block = self._counted(met, chunk.offset, len(data))
-        self.met.chunks.append(
-            ChunkSummary(
-                chunk.start_ns, chunk.end_ns, chunk.offset, pending.length, chunk.compression,
-                len(chunk.records), chunk.size,
-            )
-        )  # fmt: skip
-        return block
+    def _finished_chunks(self) -> Block:
+        """The messages of the chunks that waited, which are taken at once."""
+        pending, self._pending = self._pending, []
+        size = sum(waiting.chunk.size for waiting in pending)
+        if size > len(self._memory):
+            self._memory = np.empty(max(size, 2 * _TOGETHER), dtype=np.uint8)
+        data = self._memory[:size]
+        placed: list[Placed] = []
+        for waiting in pending:
+            chunk = waiting.chunk
+            placed.append(Placed(placed[-1].end if placed else 0, chunk.size, chunk.offset, waiting.indexes))
+            self._unpacker.unpack(chunk, memoryview(data.data)[placed[-1].base : placed[-1].end])
+            self._chunks_without_crc += chunk.crc == 0
+            self.met.chunks.append(waiting.summary())
+        found = messages_in(data, placed, self._ordinal, self._chunk_record)
+        return self._counted(found, placed[0].offset, size)
 
     def _chunk_record(self, opcode: int, body: memoryview, position: int) -> None:
         """A record inside a chunk that is no message."""

@@ -1,0 +1,182 @@
+"""Messages of neighbouring chunks, found by their message indexes and proved record by record."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.ingest.mcap_block import (
+    MESSAGE_HEAD,
+    MESSAGE_HEAD_SIZE,
+    Block,
+    Bytes,
+    Ints,
+    block_of,
+    gathered,
+    messages_of,
+)
+from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, DamageError, Op
+
+OnRecord = Callable[[int, memoryview, int], None]
+Index = tuple[int, memoryview]  # channel, pairs of log time and offset
+
+_MESSAGE = int(Op.MESSAGE)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A chunk's records at `base` of a block; `offset` is the chunk's place in the file."""
+
+    base: int
+    size: int
+    offset: int
+    indexes: Sequence[Index]
+
+    @property
+    def end(self) -> int:
+        return self.base + self.size
+
+    def filled(self) -> list[Index]:
+        """Indexes with entries (recovered logs have empty ones)."""
+        return [(channel, entries) for channel, entries in self.indexes if len(entries)]
+
+
+@dataclass(frozen=True)
+class Named:
+    """Records that indexes name."""
+
+    starts: Ints
+    ends: Ints
+    heads: npt.NDArray[Any]
+
+
+def messages_in(data: Bytes, chunks: Sequence[Placed], first_ordinal: int, on_record: OnRecord) -> Block:
+    """All messages of the chunks; other records go to `on_record`.
+
+    Taken from the message indexes where there are any, and proved: the records tile each chunk exactly.
+    What no index names is walked record by record.
+    """
+    named = {channel: _named(data, channel, parts) for channel, parts in _by_channel(chunks).items()}
+    others = _between(data, chunks, list(named.values()), on_record)
+
+    def locate(place: int) -> int:
+        return _chunk_at(chunks, place).offset
+
+    if len(others):
+        _check_unindexed(data, others, chunks)
+        starts = np.concatenate([others, *(part.starts for part in named.values())])
+        return block_of(data, np.sort(starts), locate, first_ordinal)
+    return {channel: messages_of(data, *_in_order(part), locate, first_ordinal) for channel, part in named.items()}
+
+
+def _chunk_at(chunks: Sequence[Placed], place: int) -> Placed:
+    return chunks[bisect_right([chunk.base for chunk in chunks], place) - 1]
+
+
+def _by_channel(chunks: Sequence[Placed]) -> dict[int, list[tuple[Placed, memoryview]]]:
+    found: dict[int, list[tuple[Placed, memoryview]]] = {}
+    for chunk in chunks:
+        for channel, entries in chunk.filled():
+            if chunk.size < MESSAGE_HEAD_SIZE:
+                raise DamageError(chunk.offset, "a message index points outside its chunk")
+            parts = found.setdefault(channel, [])
+            if parts and parts[-1][0] is chunk:
+                raise DamageError(chunk.offset, "a chunk has two message indexes for one channel")
+            parts.append((chunk, entries))
+    return found
+
+
+def _named(data: Bytes, channel: int, parts: Sequence[tuple[Placed, memoryview]]) -> Named:
+    """The records that the indexes of a channel name, held against what stands there."""
+    chunks = [chunk for chunk, _ in parts]
+    pairs = np.frombuffer(b"".join(entries for _, entries in parts), dtype="<u8").reshape(-1, 2)
+    part = np.repeat(np.arange(len(parts)), [len(entries) // 16 for _, entries in parts])
+    bases, sizes = np.array([(chunk.base, chunk.size) for chunk in chunks], dtype=np.int64).T[:, part]
+
+    def check(wrong: npt.NDArray[np.bool_], kind: str) -> None:
+        if wrong.any():
+            raise DamageError(chunks[part[wrong.argmax()]].offset, kind)
+
+    check(pairs[:, 1] > (sizes - MESSAGE_HEAD_SIZE).view(np.uint64), "a message index points outside its chunk")
+    starts = pairs[:, 1].view(np.int64) + bases
+    heads = gathered(data, starts, MESSAGE_HEAD)
+    agrees = (heads["opcode"] == _MESSAGE) & (heads["channel"] == channel)
+    check(~(agrees & (heads["log_time"] == pairs[:, 0].view(np.int64))), "a message index disagrees with its chunk")
+    check(heads["length"] > len(data), "a record runs past the end of its chunk")
+    ends = starts + heads["length"].astype(np.int64) + HEAD_SIZE
+    check(ends > bases + sizes, "a record runs past the end of its chunk")
+    return Named(starts, ends, heads)
+
+
+def _between(data: Bytes, chunks: Sequence[Placed], named: Sequence[Named], on_record: OnRecord) -> Ints:
+    """Messages that no index names; proves that all records together tile the chunks exactly.
+
+    Records that follow each other without gap: sorted, each end but the last is the next start.
+    """
+    # Stable, for it merges what is sorted already, as each channel is.
+    starts = np.sort(np.concatenate([*(part.starts for part in named), [len(data)]]), kind="stable")
+    ends = np.sort(np.concatenate([[0], *(part.ends for part in named)]), kind="stable")
+    if (starts < ends).any():
+        place = int(starts[(starts < ends).argmax()])
+        kind = "records of a chunk overlap, or its message index names one twice"
+        raise DamageError(_chunk_at(chunks, place).offset, kind)
+    found: list[int] = []
+    for gap in np.flatnonzero(starts > ends).tolist():
+        found += _walk_gap(data, chunks, int(ends[gap]), int(starts[gap]), on_record)
+    return np.array(found, dtype=np.int64)
+
+
+def _walk_gap(data: Bytes, chunks: Sequence[Placed], start: int, end: int, on_record: OnRecord) -> list[int]:
+    """Walk a gap, chunk by chunk: no record reaches into the next."""
+    found: list[int] = []
+    while start < end:
+        chunk = _chunk_at(chunks, start)
+        stop = min(end, chunk.end)
+        found += _walk(data, start, stop, chunk.offset, on_record)
+        start = stop
+    return found
+
+
+def _walk(data: Bytes, start: int, end: int, offset: int, on_record: OnRecord) -> list[int]:
+    """Record by record from `start` to exactly `end`; the offsets of messages."""
+    unpack, messages, view = HEAD.unpack_from, [], memoryview(data.data)
+    room = end - HEAD_SIZE
+    while start < end:
+        if start > room:
+            raise DamageError(offset, "a record is cut off by the end of its chunk")
+        opcode, length = unpack(view, start)
+        following = start + HEAD_SIZE + length
+        if following > end:
+            raise DamageError(offset, "a record runs past the end of its chunk")
+        if opcode == _MESSAGE:
+            messages.append(start)
+        else:
+            on_record(opcode, view[start + HEAD_SIZE : following], offset)
+        start = following
+    return messages
+
+
+def _check_unindexed(data: Bytes, starts: Ints, chunks: Sequence[Placed]) -> None:
+    """A channel's index is whole or absent: part of one would make a reader that trusts it lose messages."""
+    for chunk in chunks:
+        mine = starts[(starts >= chunk.base) & (starts < chunk.end)]
+        if not len(mine):
+            continue
+        if mine.max() > len(data) - MESSAGE_HEAD_SIZE:
+            raise DamageError(chunk.offset, "a message is shorter than its header")
+        indexed = [channel for channel, _ in chunk.filled()]
+        if np.isin(gathered(data, mine, MESSAGE_HEAD)["channel"], indexed).any():
+            raise DamageError(chunk.offset, "a message index lacks messages of its chunk")
+
+
+def _in_order(part: Named) -> tuple[Ints, npt.NDArray[Any]]:
+    """By place in the file (an index is sorted by log time)."""
+    if (part.starts[1:] > part.starts[:-1]).all():
+        return part.starts, part.heads
+    order = np.argsort(part.starts)
+    return part.starts[order], part.heads[order]
