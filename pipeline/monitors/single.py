@@ -16,6 +16,7 @@ from schemas.enums import MonitorState
 Array = npt.NDArray[np.float64]
 
 NO_VELOCITY = "no GNSS velocity"
+NO_VALUE = "nothing to compute it from"
 NO_RANGES = "no satellites stream"
 NO_OTHER_SOLUTION = "no other solution configured to compare with"
 NO_OTHER_EPOCH = "the other solution has no position at this epoch"
@@ -24,7 +25,10 @@ _STATES = pl.Enum([state.value for state in MonitorState])
 
 
 def judged(value: Array, threshold: Array, reasons: pl.Series) -> pl.DataFrame:
-    """States of a monitor: where a reason stands it is not evaluated, else |value| against the threshold."""
+    """States of a monitor: where a reason stands it is not evaluated, else |value| against the threshold.
+
+    What has no reason and yet no value or threshold is not evaluated either: absence is never health.
+    """
     frame = pl.DataFrame(
         {
             "value": pl.Series(value, nan_to_null=True),
@@ -32,6 +36,8 @@ def judged(value: Array, threshold: Array, reasons: pl.Series) -> pl.DataFrame:
             "reason": reasons.cast(pl.String),
         }
     )
+    unknown = pl.col("value").is_null() | pl.col("threshold").is_null()
+    frame = frame.with_columns(reason=pl.coalesce("reason", pl.when(unknown).then(pl.lit(NO_VALUE))))
     evaluated = pl.col("reason").is_null()
     state = (
         pl.when(~evaluated)

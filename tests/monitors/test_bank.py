@@ -9,7 +9,7 @@ import pytest
 from pipeline.align import NO_ODOMETER, align, threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
-from pipeline.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor
+from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged
 from schemas.config import Configuration, Vehicle
 from schemas.tables import BANK_MONITORS
 from tests.align.straight import Straight, epochs_of, odometer_of, run
@@ -195,3 +195,14 @@ def test_channels_are_compared_where_both_have_a_position():
     assert result["state"].to_list() == ["pass", "fail", "not_evaluated"]
     assert result["value"].to_list() == [0.0, -10.0, None]
     assert result["threshold"][0] == pytest.approx(FACTOR * np.sqrt(2.0))
+
+
+def test_a_single_monitor_without_value_or_threshold_is_no_pass():
+    nothing = np.nan
+    frame = judged(
+        np.array([1.0, 3.0, nothing, 1.0, 1.0]),
+        np.array([2.0, 2.0, 2.0, nothing, 2.0]),
+        pl.Series([None, None, None, None, "why"], dtype=pl.String),
+    )
+    assert frame["state"].to_list() == ["pass", "fail", "not_evaluated", "not_evaluated", "not_evaluated"]
+    assert frame["reason"].to_list() == [None, None, NO_VALUE, NO_VALUE, "why"]
