@@ -22,7 +22,7 @@ from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, Ch
 from pipeline.ingest.mcap_summary import Met, Summary
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
-_TOGETHER = 4 * 1024 * 1024  # chunks of up to so many bytes are taken at once
+_TOGETHER = 8 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
 _SLACK = 1024 * 1024  # what does not compress grows a little
 _ATTACHMENT_HEAD = 64 * 1024  # holds times, name and media type of an attachment
@@ -235,7 +235,7 @@ class McapWalk:
         pending, self._pending = self._pending, []
         size = sum(waiting.chunk.size for waiting in pending)
         if size > len(self._memory):
-            self._memory = np.empty(max(size, 2 * _TOGETHER), dtype=np.uint8)
+            self._memory = np.empty(max(size, _TOGETHER + _SLACK), dtype=np.uint8)
         data = self._memory[:size]
         placed: list[Placed] = []
         for waiting in pending:
