@@ -169,7 +169,9 @@ print((status("VmHWM") - before) / sum(frame.estimated_size() for frame in (run.
 
 def memory_factor(path: Path) -> float:
     """Growth of a fresh process over the size of the frames that it reads, after a short log warmed it."""
-    small = write_case(run_of(0.001), "json", path.parent, chunk_crc=False)
+    warm_up = path.parent / "warm-up"
+    warm_up.mkdir(exist_ok=True)
+    small = write_case(run_of(0.02), "json", warm_up, chunk_crc=False)
     script = [sys.executable, "-c", _MEMORY_SCRIPT, str(small), str(path)]
     done = subprocess.run(script, check=True, capture_output=True, text=True)
     return float(done.stdout)
