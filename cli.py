@@ -254,6 +254,7 @@ def experiment(
     repetitions: Annotated[int | None, typer.Option(min=1, help="Instead of the published number.")] = None,
     seed: int = 1,
     jobs: Annotated[int, typer.Option(min=0, help="Processes; 0 takes one per core.")] = 0,
+    config: Annotated[Path | None, typer.Option("--config", help="The bank to judge, for `rare` and `bank`.")] = None,
 ) -> None:
     """Run a published experiment again, at its own size."""
     from datasets.experiment import EXPERIMENTS
@@ -264,7 +265,8 @@ def experiment(
         return
     if name not in EXPERIMENTS:
         raise UsageError("is no experiment", place=name, expected=", ".join(EXPERIMENTS))
-    for path in EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1):
+    bank = None if config is None else _settings(config, None)[0]
+    for path in EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank):
         print(path)
 
 
