@@ -1,8 +1,8 @@
 """Alignment: the odometer at each GNSS epoch's time of validity, scale and latency known or learned causally.
 
-Adds to the matched epochs: `odometer_m, odometer_step_m, odometer_reason, odometer_stretch, speed_mps, direction,
-odometer_scale, scale_sigma, latency_s, latency_sigma_s, speed_step_mps`. Steps lead to an epoch from the
-usable epoch before it; a reason says why an epoch has no odometer.
+Adds to the matched epochs: `along_m, odometer_m, odometer_reason, odometer_stretch, speed_mps, direction,
+odometer_scale, scale_sigma, latency_s, latency_sigma_s, stamp_jitter_s, odometer_white_m2_per_s`. A reason says why
+an epoch has no odometer.
 """
 
 from __future__ import annotations
@@ -156,19 +156,15 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     steps = _steps(np.flatnonzero(known), arrays.t_s, track, learned)
     step = np.full(known.size, np.nan)
     step[known] = steps.distance_m
-    speed_step = np.full(known.size, np.nan)
-    speed_step[known] = steps.speed_mps
     speed = np.where(known, learned.scale * track.speed_at(at), np.nan)
     total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
-        pl.Series("odometer_step_m", step, nan_to_null=True),
         pl.Series("odometer_reason", reason.tolist(), dtype=pl.String),
         pl.Series("odometer_stretch", track.stretch_at(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, arrays.jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, track.white_rate_m2_per_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),
-        pl.Series("speed_step_mps", speed_step, nan_to_null=True),
         pl.Series("direction", _direction(speed, config.matching.deadband_mps)),
         pl.Series("odometer_scale", learned.scale),
         pl.Series("scale_sigma", learned.scale_sigma),
@@ -197,13 +193,11 @@ def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configurat
     return epochs.with_columns(
         along_m=nothing,
         odometer_m=nothing,
-        odometer_step_m=nothing,
         odometer_reason=pl.lit(NO_ODOMETER),
         odometer_stretch=pl.lit(0, pl.Int64),
         stamp_jitter_s=nothing,
         odometer_white_m2_per_s=nothing,
         speed_mps=pl.Series(speed, nan_to_null=True),
-        speed_step_mps=nothing,
         direction=_direction(speed, config.matching.deadband_mps),
         odometer_scale=nothing,
         scale_sigma=nothing,
