@@ -9,26 +9,30 @@ from collections.abc import Callable
 
 import polars as pl
 
-from pipeline.safety.episodes import independent_episodes
+from pipeline.hazards.independent import independent_episodes
 from pipeline.statistics import Estimate, clopper_pearson, poisson_rate
 from pipeline.summary import is_passage
-from schemas.campaign import CampaignAccuracy, CampaignBalises, ThrVerdict, campaign_runs_schema
+from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform
-from schemas.enums import BaliseKind, FailureMode, LinkingError, PassageStatus, RunStatus
+from schemas.enums import BaliseKind, FailureMode, LinkingError, PassageStatus, RunStatus, ThrVerdict
 
 SPEED_BAND_KMH = 40.0
-DEFAULT_LOCATION_ACCURACY_M = 12.0
-"""Q_LOCACC where the balise table names none (CONTRACT section 2)."""
 
 _RUN = ["run_id", "solution"]
 
 
 def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
     """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
-    joined = runs.join(_faults_per_run(hazards, safety), on=_RUN, how="left", maintain_order="left").with_columns(
-        pl.col("faults", "failures", "missed", *(f"within_{level}" for level in safety.service_levels)).fill_null(0),
-        hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
+    joined = (
+        runs.drop("failures")
+        .join(_faults_per_run(hazards, safety), on=_RUN, how="left", maintain_order="left")
+        .with_columns(
+            pl.col("faults", "failures", "missed", *(f"within_{level}" for level in safety.service_levels)).fill_null(
+                0
+            ),
+            hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
+        )
     )
     seen = pl.when(pl.col("evidence").is_not_null()).then(pl.col("hours")).otherwise(0.0)
     table = joined.with_columns(hours_seen=seen).pipe(
@@ -41,6 +45,35 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
     for level in safety.service_levels:
         table = table.with_columns(_verdict(level, safety.allowed_time_to_detect_s(level)))
     return conform(table.sort(_RUN), campaign_runs_schema(safety.service_levels))
+
+
+def campaign_levels(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
+    """One row per run, solution and service level: would the run have kept this level's allowed T_D (TVB eq. 7)?
+
+    The columns of `campaign_runs` for each level, one below the other.
+    """
+    wide = campaign_runs(runs, hazards, safety)
+    parts = [
+        wide.select(
+            *_RUN,
+            "evidence",
+            "failures",
+            service_level=pl.lit(level),
+            allowed_s=f"allowed_{level}_s",
+            within=f"within_{level}",
+            verdict=f"verdict_{level}",
+        )
+        for level in safety.service_levels
+    ]
+    longest = independent_episodes(hazards).filter("failed").group_by(_RUN)
+    known = longest.agg(
+        hazardous_max_s=pl.col("hazardous_s").max(), never_negated=pl.col("hazardous_s").null_count().cast(pl.Int64)
+    )
+    table = pl.concat(parts) if parts else CampaignLevels.create_empty().drop("hazardous_max_s", "never_negated")
+    joined = table.join(known, on=_RUN, how="left", maintain_order="left")
+    return conform(
+        joined.with_columns(pl.col("never_negated").fill_null(0)).sort(_RUN, maintain_order=True), CampaignLevels
+    )
 
 
 def _faults_per_run(hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
@@ -145,20 +178,10 @@ def _in_order(passages: pl.DataFrame) -> pl.DataFrame:
     return passages.sort("run_id", maintain_order=True)
 
 
-def with_speed(passages: pl.DataFrame, epochs: pl.DataFrame) -> pl.DataFrame:
-    """Passages of one run and solution with `speed_mps` of the epoch at or before the offer, null without one."""
-    speeds = epochs.select("t", pl.col("speed_mps").abs()).drop_nulls().sort("t")
-    offered = passages.with_row_index("row").sort("t_offered", nulls_last=True)
-    joined = offered.join_asof(speeds, left_on="t_offered", right_on="t", strategy="backward")
-    return joined.sort("row").drop("row", "t", strict=False)
-
-
-def campaign_accuracy(
-    passages: pl.DataFrame, config: Configuration, location_accuracy_m: float = DEFAULT_LOCATION_ACCURACY_M
-) -> pl.DataFrame:
+def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Location error of accepted VBs over all, by net element and by speed, against Q_LOCACC and the CI limit.
 
-    `passages` with `speed_mps` as from `with_speed`; bands of 40 km/h from 0.
+    Each acceptance is held against the location accuracy of its own balise. Bands of 40 km/h from 0.
     """
     accepted = _in_order(passages).filter(
         (pl.col("kind") == BaliseKind.VIRTUAL)
@@ -167,8 +190,7 @@ def campaign_accuracy(
     )
     groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
     parts = [
-        _accuracy(accepted.with_columns(grouped_by=pl.lit(name), group=group), config, location_accuracy_m)
-        for name, group in groups.items()
+        _accuracy(accepted.with_columns(grouped_by=pl.lit(name), group=group), config) for name, group in groups.items()
     ]
     return conform(pl.concat(parts), CampaignAccuracy)
 
@@ -181,18 +203,21 @@ def _speed_band() -> pl.Expr:
     return band.fill_null("unknown")
 
 
-def _accuracy(accepted: pl.DataFrame, config: Configuration, location_accuracy_m: float) -> pl.DataFrame:
+def _accuracy(accepted: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     keys = ["solution", "grouped_by", "group"]
-    size, limit_m = pl.col("location_error_m").abs(), config.lds.ci_limit_m
+    size, own_m, limit_m = pl.col("location_error_m").abs(), pl.col("location_accuracy_m"), config.lds.ci_limit_m
     counted = (
         accepted.group_by(keys, maintain_order=True)
         .agg(
             accepted_judged=pl.len().cast(pl.Int64),
             **_spread(),
-            within_location_accuracy=(size <= location_accuracy_m).sum().cast(pl.Int64),
+            location_error_median_m=pl.col("location_error_m").median(),
+            location_accuracy_m=own_m.min(),
+            location_accuracy_max_m=own_m.max(),
+            within_location_accuracy=(size <= own_m).sum().cast(pl.Int64),
             within_ci_limit=(size <= limit_m).sum().cast(pl.Int64),
         )
-        .with_columns(location_accuracy_m=pl.lit(location_accuracy_m), ci_limit_m=pl.lit(limit_m))
+        .with_columns(ci_limit_m=pl.lit(limit_m))
     )
     table = _with_estimates(
         counted,

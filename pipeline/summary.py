@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.clean import StreamCounts
+from pipeline.hazards.independent import independent_episodes, missed_detection
 from pipeline.statistics import UNKNOWN, Estimate, poisson_rate
 from pipeline.timeline import (
     Flags,
@@ -24,11 +25,21 @@ from pipeline.timeline import (
     share_of_time,
     uptime,
 )
-from schemas.config import Configuration
+from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform
-from schemas.enums import BaliseKind, Evidence, Hazard, LdsState, PassageStatus, RunStatus, Verdict
+from schemas.enums import (
+    BaliseKind,
+    Evidence,
+    Hazard,
+    LdsState,
+    MonitorState,
+    PassageStatus,
+    RunStatus,
+    ThrVerdict,
+    Verdict,
+)
 from schemas.run import IngestNotes
-from schemas.tables import CONTRACT_VERSION, Runs
+from schemas.tables import CONTRACT_VERSION, SCALES, Runs
 
 Row = dict[str, object]
 
@@ -84,6 +95,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | _accuracy(results.epochs)
         | _balises(results.passages, config.hazards.failure_limit_m)
         | _hazards(results.hazards)
+        | _levels(results, config.safety)
         | _alarms(results, clock)
         | _exposure(results.epochs)
         | _state_shares(results.epochs, clock)
@@ -226,7 +238,8 @@ def _positions(epochs: pl.DataFrame, clock: _Clock, config: Configuration) -> Ro
     distance = _floats(epochs, "odometer_m")
     speed = _floats(epochs, "speed_mps")
     moving = moved(clock.t_ns, distance, speed, config.matching.deadband_mps)
-    mtbf_h = uptime(clock.t_ns, _flags(epochs, trusted(config)), clock.limit_s).mean_time_between_losses_h
+    trust = uptime(clock.t_ns, _flags(epochs, trusted(config)), clock.limit_s)
+    mtbf_h = trust.mean_time_between_losses_h
     return {
         "availability": availability(clock.t_ns, _flags(epochs, pl.col("tvb")), moving, clock.limit_s),
         "outages": len(lost),
@@ -234,6 +247,8 @@ def _positions(epochs: pl.DataFrame, clock: _Clock, config: Configuration) -> Ro
         "cross_bias_m": epochs.filter("on_track")["cross_track_m"].median(),
         "mtbf_h": mtbf_h,
         "continuity_15s": math.exp(-CONTINUITY_S / 3600.0 / mtbf_h) if mtbf_h else None,
+        "trusted_s": trust.up_s if epochs.height else None,
+        "trusted_losses": trust.losses,
     }
 
 
@@ -278,16 +293,6 @@ def is_passage() -> pl.Expr:
     return ~beyond
 
 
-def missed_detection() -> pl.Expr:
-    """A hazard with a failure that was not negated by `t_failure` + budget (DOMAIN section 5).
-
-    Where no budget is known any delay of the negation is one too many.
-    """
-    budget_ns = (pl.col("budget_s").fill_null(0.0) * 1e9).round().cast(pl.Int64).cast(pl.Duration("ns"))
-    late = pl.col("t_negated").is_null() | (pl.col("t_negated") > pl.col("t_failure") + budget_ns)
-    return pl.col("t_failure").is_not_null() & late
-
-
 def _hazards(hazards: pl.DataFrame) -> Row:
     classes = {
         Hazard.VB_JUMP_1A: "hazards_1a",
@@ -305,20 +310,52 @@ def _hazards(hazards: pl.DataFrame) -> Row:
     }
 
 
+def _levels(results: SolutionResults, safety: SafetyConfig) -> Row:
+    """Whether the failures were negated within the allowed T_D of each service level (TVB eq. 7)."""
+    faults = independent_episodes(results.hazards.with_columns(run_id=pl.lit("")))
+    failed = faults.filter("failed")
+    allowed_s = [safety.allowed_time_to_detect_s(level) for level in safety.service_levels]
+    within = [failed.filter(pl.col("hazardous_s") <= limit_s).height for limit_s in allowed_s]
+    return {
+        "failures": failed.height,
+        "service_levels": list(safety.service_levels),
+        "level_allowed_s": allowed_s,
+        "level_within": within,
+        "level_verdict": [_verdict(failed.height, count, results.evidence) for count in within],
+    }
+
+
+def _verdict(failures: int, within: int, evidence: Evidence | None) -> ThrVerdict:
+    if failures:
+        return ThrVerdict.KEPT if within == failures else ThrVerdict.EXCEEDED
+    return ThrVerdict.UNKNOWN if evidence is None else ThrVerdict.NO_FAILURE
+
+
 def _alarms(results: SolutionResults, clock: _Clock) -> Row:
-    """Alarms and the rate of false ones, which needs a truth and a verdict on every alarm."""
+    """Alarms and the rate of false ones, which needs a truth and a verdict on every alarm.
+
+    The rate counts the time in which the along-track bank judged; where it never did there is none.
+    """
     alarms = results.alarms
     false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
     truth = results.evidence is not None and results.epochs["error_along_m"].is_not_null().any()
     judged = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
-    rate: Estimate = poisson_rate(false, (clock.duration_s or 0.0) / 3600.0) if judged else UNKNOWN
+    monitored_s = float(clock.held_s[_flags(results.epochs, _along_evaluated())].sum())
+    rate: Estimate = poisson_rate(false, monitored_s / 3600.0) if judged else UNKNOWN
     return {
+        "held_s": float(clock.held_s.sum()) if len(clock.held_s) else None,
+        "monitored_s": monitored_s if len(clock.held_s) else None,
         "alarms": alarms.height,
         "false_alarms": false if truth else None,
         "false_alarm_rate_per_h": rate.value,
         "false_alarm_rate_low_per_h": rate.low,
         "false_alarm_rate_high_per_h": rate.high,
     }
+
+
+def _along_evaluated() -> pl.Expr:
+    """A monitor of the along-track bank has a verdict."""
+    return pl.any_horizontal(pl.col(f"along_{scale}_state") != MonitorState.NOT_EVALUATED for scale in SCALES)
 
 
 def _exposure(epochs: pl.DataFrame) -> Row:

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import StrEnum
 
 import dataframely as dy
 
-from schemas.columns import count, one_of, real, text
+from schemas.columns import count, one_of, real, text, texts
 from schemas.config import SafetyConfig
-from schemas.enums import BaliseKind
+from schemas.enums import BaliseKind, Evidence, ThrVerdict
 from schemas.tables import Runs
-
-
-class ThrVerdict(StrEnum):
-    """Whether the position failures of a run were negated within the allowed T_D (TVB eq. 7)."""
-
-    KEPT = "kept"
-    EXCEEDED = "exceeded"
-    NO_FAILURE = "no_failure"
-    UNKNOWN = "unknown"
 
 
 def _estimate(name: str, meaning: str, unit: str = "1", ending: str = "") -> dict[str, dy.Column]:
@@ -52,7 +42,6 @@ def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
     """Contract of `campaign/runs.parquet`; the service levels are those of the configuration."""
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
     columns |= _estimate("hazard_rate", "faults per hour", "1/h", "_per_h")
-    columns |= {"failures": count("faults with a position failure")}
     columns |= _estimate("missed_share", "share of failures not negated within the budget")
     columns |= _estimate("unsafe_share", "share of accepted VBs beyond the failure limit")
     columns |= _estimate("outage_rate", "outages per hour", "1/h", "_per_h")
@@ -103,7 +92,9 @@ def _accuracy_schema() -> type[dy.Schema]:
         "group": text("the net element or speed band"),
         "accepted_judged": count("acceptances of known location error"),
         **_spread("location_error", "location error of acceptances"),
-        "location_accuracy_m": real("m", "Q_LOCACC that they are held against", min=0),
+        "location_error_median_m": real("m", "median location error of acceptances"),
+        "location_accuracy_m": real("m", "smallest Q_LOCACC among them; each is held against its own", min=0),
+        "location_accuracy_max_m": real("m", "largest Q_LOCACC among them", min=0),
         "within_location_accuracy": count("of these within Q_LOCACC"),
         **_estimate("within_location_accuracy_share", "share within Q_LOCACC"),
         "ci_limit_m": real("m", "limit of the confidence interval", min=0),
@@ -115,6 +106,9 @@ def _accuracy_schema() -> type[dy.Schema]:
 
 
 CampaignAccuracy = _accuracy_schema()
+
+
+STANFORD = ("nominal", "misleading", "hazardous", "unavailable")
 
 
 def _figures_schema() -> type[dy.Schema]:
@@ -131,13 +125,25 @@ def _figures_schema() -> type[dy.Schema]:
         "missed": count("of these not negated within the budget"),
         **_estimate("missed_share", "share of failures not negated within the budget"),
         "missed_rate_upper_per_h": real("1/h", "one-sided 95 % upper bound of missed failures per hour", min=0),
-        "hours_judged": real("h", "time in runs whose alarms all have a verdict", min=0),
+        "hours_judged": real("h", "monitored time in runs whose alarms all have a verdict", min=0),
         "false_alarms": count("false alarms in it"),
         **_estimate("false_alarm_rate", "false alarms per judged hour", "1/h", "_per_h"),
         "accepted": count("virtual balises accepted"),
         "unsafe_accepted": count("of these beyond the failure limit"),
         "outages": count("stretches without a usable position"),
         **_estimate("outage_rate", "outages per hour", "1/h", "_per_h"),
+        "trusted_losses": count("how often a valid, confident, unambiguous position was lost"),
+        **_estimate("mtbf", "mean time between these losses", "h", "_h"),
+        **_estimate("continuity_15s", "exp(-15 s / MTBF) (LOC eq. 8)"),
+        **{
+            f"share_{state}": real("1", f"share of time in {state.upper()}; null where it is not known", min=0, max=1)
+            for state in ("p0", "p1", "p2", "p3")
+        },
+        **{f"stanford_{kind}": count(f"epochs of all runs: {kind}, by confidence") for kind in STANFORD},
+        **{
+            f"stanford_hpl_{kind}": count(f"epochs of all runs: {kind}, by the receiver's HPL", nullable=True)
+            for kind in STANFORD
+        },
         "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
         "hours_needed": real("h", "hours that show THR_VB at 95 % with this many misses", min=0),
         "hours_still_needed": real("h", "of these still to run without a further miss", min=0),
@@ -170,10 +176,40 @@ class CampaignDetection(dy.Schema):
     time_to_detect_max_s = real("s", "largest T_D")
 
 
+class CampaignLevels(dy.Schema):
+    """One row per run, solution and service level: would the run have kept this level's allowed T_D (TVB eq. 7)?"""
+
+    run_id = text("run")
+    solution = text("solution")
+    service_level = text("service level of the configuration")
+    allowed_s = real("s", "allowed T_D of the level", min=0)
+    evidence = one_of(Evidence, "what served as truth", nullable=True)
+    failures = count("faults with a position failure")
+    within = count("of these negated within the allowed T_D")
+    never_negated = count("of these never negated")
+    hazardous_max_s = real("s", "longest hazardous time of those negated", min=0)
+    verdict = one_of(ThrVerdict, "kept, exceeded, no failure to judge, or no truth")
+
+
+class CampaignMap(dy.Schema):
+    """One row per place where several runs raised the same alarm across the track: the map is in doubt there."""
+
+    netelement_id = text("net element")
+    from_m = real("m", "measure of the first alarm there")
+    to_m = real("m", "measure of the last alarm there")
+    axis = text("cross, up, or both: what the monitors that failed look at")
+    runs = count("runs with such an alarm")
+    solutions = texts("solutions concerned")
+    alarms = count("alarms there")
+    run_ids = texts("these runs")
+
+
 CAMPAIGN_TABLES: dict[str, type[dy.Schema]] = {
     "campaign_runs": CampaignRuns,
     "campaign_balises": CampaignBalises,
     "campaign_accuracy": CampaignAccuracy,
     "campaign_figures": CampaignFigures,
     "campaign_detection": CampaignDetection,
+    "campaign_levels": CampaignLevels,
+    "campaign_map": CampaignMap,
 }

@@ -49,6 +49,19 @@ def texts(meaning: str, **rules: Any) -> dy.List:
     return dy.List(dy.String(nullable=False), description=meaning, **rules)
 
 
+def counts(meaning: str, **rules: Any) -> dy.List:
+    return dy.List(dy.Int64(nullable=False, min=0), description=meaning, metadata={"unit": "1"}, **rules)
+
+
+def reals(unit: str, meaning: str, **rules: Any) -> dy.List:
+    return dy.List(dy.Float64(nullable=False), description=meaning, metadata={"unit": unit}, **rules)
+
+
+def ones_of(kind: type[StrEnum], meaning: str, **rules: Any) -> dy.List:
+    inner = dy.Enum([member.value for member in kind], nullable=False)
+    return dy.List(inner, description=meaning, **rules)
+
+
 def one_of(kind: type[StrEnum], meaning: str, **rules: Any) -> dy.Enum:
     return dy.Enum([member.value for member in kind], description=meaning, **rules)
 

@@ -95,6 +95,15 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
 
+class ThrVerdict(StrEnum):
+    """Whether the position failures of a run were negated within the allowed T_D (TVB eq. 7)."""
+
+    KEPT = "kept"
+    EXCEEDED = "exceeded"
+    NO_FAILURE = "no_failure"
+    UNKNOWN = "unknown"
+
+
 class SigmaSource(StrEnum):
     RECEIVER = "receiver"
     TABLE = "table"

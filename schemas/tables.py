@@ -6,7 +6,7 @@ from typing import Any
 
 import dataframely as dy
 
-from schemas.columns import count, flag, instant, one_of, real, text, texts
+from schemas.columns import count, counts, flag, instant, one_of, ones_of, real, reals, text, texts
 from schemas.enums import (
     BaliseKind,
     Cause,
@@ -23,6 +23,7 @@ from schemas.enums import (
     RunStatus,
     SigmaSource,
     Suspect,
+    ThrVerdict,
     Timing,
     Verdict,
 )
@@ -113,6 +114,8 @@ class Passages(dy.Schema):
     cause = one_of(Cause, "wrong position or no position")
     suspect_after_the_fact = flag("accepted between a fault's onset and its detection")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
+    location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
+    speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
 
 
 class Alarms(dy.Schema):
@@ -127,6 +130,8 @@ class Alarms(dy.Schema):
     verdict = one_of(Verdict, "true: a fault was there; unknown without truth")
     suspect = one_of(Suspect, "what the replay holds to be at fault")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that it belongs to")
+    netelement_id = text("net element of the position at the first fail", nullable=True)
+    measure_m = real("m", "measure of the position at the first fail")
 
 
 class _EpochsBeforeMonitors(dy.Schema):
@@ -273,6 +278,17 @@ class Runs(dy.Schema):
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
     notes = text("what reading and matching found out about the run", nullable=True)
+    failures = count("faults with a position failure; the rows of one fault count once")
+    service_levels = texts("service levels of the configuration, in order", nullable=True)
+    level_allowed_s = reals("s", "allowed T_D of each of them (TVB eq. 7)", nullable=True)
+    level_within = counts("failures negated within it", nullable=True)
+    level_verdict = ones_of(
+        ThrVerdict, "kept or exceeded, no failure to judge, or unknown without evidence", nullable=True
+    )
+    held_s = real("s", "time that the epochs stand for, gaps apart", min=0)
+    monitored_s = real("s", "of this with a verdict of the along-track bank", min=0)
+    trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
+    trusted_losses = count("how often that was lost")
 
 
 TABLES: dict[str, type[dy.Schema]] = {

@@ -20,16 +20,23 @@ _BLIND_S = 1.0
 
 
 def alarms_table(
-    fails: Fails, judged: list[Judged], solution: str, witnesses: Witnesses, config: HazardConfig
+    fails: Fails,
+    judged: list[Judged],
+    solution: str,
+    witnesses: Witnesses,
+    epochs: pl.DataFrame,
+    config: HazardConfig,
 ) -> pl.DataFrame:
-    """One row per alarm episode in order of time."""
+    """One row per alarm episode in order of time; its place is that of the position at its first fail."""
     rows: list[dict[str, Any]] = []
     for number, span in enumerate(fails.alarms):
         row = {"solution": solution, "alarm_id": number, **_row(span, judged, witnesses, config)}
         if row["verdict"] == Verdict.FALSE.value and number and _rings_on(fails, number):
             row["suspect"] = rows[-1]["suspect"]
         rows.append(row)
-    return pl.DataFrame(rows, schema=schema_of(Alarms))
+    places = epochs.select("netelement_id", "measure_m")[[span.first for span in fails.alarms]]
+    table = pl.DataFrame(rows, schema=schema_of(Alarms)).drop(places.columns)
+    return table.hstack(places).select(Alarms.column_names())
 
 
 def _rings_on(fails: Fails, number: int) -> bool:

@@ -20,6 +20,7 @@ from pipeline.hazards.passages import (
     link_unoffered,
     location_errors,
     positions_at,
+    speeds_at,
     suspicious_passages,
     wrongly_offered,
 )
@@ -73,7 +74,7 @@ def classify(
         timing = time_hazard(draft, series, jumps, fails, faults, config.hazards)
         judged += _judge(draft, timing, series, fails, witnesses, truth, passages)
     hazards = hazards_table(judged, solution, epochs, series, locate, config.budget_s)
-    alarms = alarms_table(fails, judged, solution, witnesses, config.hazards)
+    alarms = alarms_table(fails, judged, solution, witnesses, epochs, config.hazards)
     spans = faulty_spans(series, judged, jumps, fails, faults, config.hazards)
     seen = _passages(series, judged, spans, epochs, truth, passages, balises, config)
     return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, config))
@@ -126,7 +127,8 @@ def _passages(
     positioned = positions_at(epochs, t_true, gap_s)
     error = location_errors(passages, epochs, truth, gap_s)
     wrong = wrongly_offered(passages, error, epochs, truth, config.hazards)
-    return judge_passages(passages, error, wrong, t_true, links, suspicious, positioned)
+    speed = speeds_at(passages, t_true, epochs, gap_s)
+    return judge_passages(passages, error, wrong, t_true, links, suspicious, positioned, speed)
 
 
 def _epochs(

@@ -35,10 +35,12 @@ def judge_passages(
     links: Links,
     suspicious: Bools,
     positioned: Bools,
+    speed_mps: Floats,
 ) -> pl.DataFrame:
     """Passages with the columns of the truth filled in.
 
-    `wrong`: offered early or late beyond the limit; `positioned`: a position was there when the train passed.
+    `wrong`: offered early or late beyond the limit; `positioned`: a position was there when the train passed;
+    `speed_mps`: from `speeds_at`.
     """
     mode, cause = _modes(passages, wrong, error, links, positioned)
     filled = passages.with_columns(
@@ -48,6 +50,7 @@ def judge_passages(
         pl.Series("cause", cause, dtype=_CAUSES),
         pl.Series("suspect_after_the_fact", suspicious),
         pl.Series("hazard_id", [None if h < 0 else h for h in links.hazard.tolist()], dtype=pl.Int64),
+        pl.Series("speed_mps", speed_mps, nan_to_null=True),
     )
     return filled.select(Passages.column_names())
 
@@ -72,6 +75,18 @@ def location_errors(passages: pl.DataFrame, epochs: pl.DataFrame, truth: pl.Data
         near = np.clip(np.searchsorted(x, at), 0, x.size - 1)
         error[rows[mine]] = (balise[mine] - train) * direction[near]
     return error
+
+
+def speeds_at(passages: pl.DataFrame, t_true: list[int | None], epochs: pl.DataFrame, gap_s: float) -> Floats:
+    """Speed of the train at the offer, else where it passed by the truth [m/s]; NaN where neither is known."""
+    at_ns = passages["t_offered"].dt.timestamp("ns").fill_null(pl.Series(t_true, dtype=pl.Int64))
+    speed = np.full(passages.height, np.nan)
+    rows = np.flatnonzero(at_ns.is_not_null().to_numpy())
+    if rows.size and epochs.height:
+        stamps = times_ns(epochs)
+        x, at = (stamps - stamps[0]) / NS_PER_S, (at_ns.drop_nulls().to_numpy() - stamps[0]) / NS_PER_S
+        speed[rows] = interpolate_known(at, x, np.abs(floats(epochs, "speed_mps")), gap_s)
+    return speed
 
 
 def wrongly_offered(

@@ -129,6 +129,7 @@ def _row(passage: Passage, journey: Journey, solution: str) -> dict[str, object]
         "failure_mode": FailureMode.NONE.value,
         "cause": Cause.NONE.value,
         "suspect_after_the_fact": False,
+        "location_accuracy_m": balise.accuracy_m,
         "t_reckoned": _reckoned_ns(passage, journey),
     }
 

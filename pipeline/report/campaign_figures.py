@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.hazards.independent import independent_episodes
 from pipeline.report.markup import UNKNOWN, number
-from pipeline.safety.episodes import independent_episodes
 from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
 from pipeline.summary import is_passage
 from schemas.config import SafetyConfig
@@ -113,7 +113,7 @@ def _false_alarms(runs: pl.DataFrame) -> Figure:
     judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
     if judged.is_empty():
         return Figure("false alarms", "not known", "no run with a truth that judges every alarm")
-    hours = _total(judged, "duration_s") / 3600.0
+    hours = _total(judged, "monitored_s") / 3600.0
     count = int(_total(judged, "false_alarms"))
     return Figure("false alarms", f"{count} in {number(hours)} h judged", _rate(poisson_rate(count, hours)))
 

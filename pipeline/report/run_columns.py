@@ -46,7 +46,8 @@ HAZARD_COLUMNS = (
 )  # fmt: skip
 PASSAGE_COLUMNS = (
     ("kind", "kind"), ("direction", "direction"), ("t_offered", "offered"), ("t_true", "passed"),
-    ("location_error_m", "location error [m]"), ("window_open_m", "window opens [m]"),
+    ("location_error_m", "location error [m]"), ("location_accuracy_m", "Q_LOCACC [m]"),
+    ("speed_mps", "speed [m/s]"), ("window_open_m", "window opens [m]"),
     ("odometer_distance_m", "odometer [m]"), ("window_close_m", "window closes [m]"),
     ("confidence_m", "confidence [m]"), ("linking_error", "linking error"), ("reaction", "reaction"),
     ("failure_mode", "ETCS failure"), ("cause", "cause"), ("suspect_after_the_fact", "suspect after the fact"),
@@ -55,6 +56,7 @@ PASSAGE_COLUMNS = (
 ALARM_COLUMNS = (
     ("t_start", "from"), ("t_end", "to"), ("monitors", "monitors in order of failing"),
     ("peak_ratio", "peak ratio"), ("verdict", "verdict"), ("suspect", "suspect"), ("hazard_id", "hazard"),
+    ("netelement_id", "net element"), ("measure_m", "measure [m]"),
 )  # fmt: skip
 PLOTS = (
     ("plan", "Plan", "GNSS positions coloured by the state of the LDS; balises by what became of them; "

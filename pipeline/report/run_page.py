@@ -144,7 +144,7 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
     )
     epochs = tables.epochs.filter(pl.col("solution") == name)
     parts = [
-        section(f"figures-{key}", f"Figures of {name}" if several else "Figures", *notes, _figures(row)),
+        section(f"figures-{key}", f"Figures of {name}" if several else "Figures", *notes, _figures(row), _levels(key, row)),
         section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
         _drawings(key),
         section(f"passages-{key}", "Passages", _passages(key, passages)),
@@ -174,6 +174,17 @@ def _figures(row: Row) -> str:
         for state in ("p0", "p1", "p2", "p3")
     )
     return pairs([*values, ("false alarm rate", rate if known else "not known"), ("share of time", shares)])
+
+
+def _levels(key: str, run: Row) -> str:
+    """What the run would be worth at each service level (TVB eq. 7)."""
+    columns = ("service_levels", "level_allowed_s", "level_within", "level_verdict")
+    rows = [
+        [cell(level), cell(allowed_s, 4), cell(f"{within} of {run['failures']}"), cell(verdict.replace("_", " "))]
+        for level, allowed_s, within, verdict in zip(*(run[name] or [] for name in columns), strict=True)
+    ]
+    titles = ["service level", "allowed T_D [s]", "failures negated within it", "verdict"]
+    return table(f"table-levels-{key}", "Position failures against the allowed T_D (TVB eq. 7)", titles, rows)
 
 
 def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:

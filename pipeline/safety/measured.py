@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataframely as dy
 import polars as pl
 
-from pipeline.safety.episodes import independent_episodes
+from pipeline.hazards.independent import independent_episodes
+from pipeline.safety.continuity import continuity
 from pipeline.statistics import (
     Estimate,
     clopper_pearson,
@@ -14,7 +15,8 @@ from pipeline.statistics import (
     poisson_rate,
     poisson_rate_upper,
 )
-from schemas.campaign import CampaignDetection, CampaignFigures
+from pipeline.summary import CONTINUITY_S
+from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
 from schemas.conform import conform
 from schemas.enums import Evidence, RunStatus
@@ -57,14 +59,48 @@ def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyCo
     return _table(rows, CampaignFigures)
 
 
-def _hours(runs: pl.DataFrame) -> float:
-    return float(runs["duration_s"].fill_null(0.0).sum()) / 3600.0
+def _hours(runs: pl.DataFrame, column: str = "duration_s") -> float:
+    return float(runs[column].fill_null(0.0).sum()) / 3600.0
+
+
+def _continuity(runs: pl.DataFrame) -> Row:
+    """MTBF of trusted positions over all runs and its continuity (LOC eq. 8); bounds from the losses counted."""
+    losses = int(runs["trusted_losses"].sum())
+    rate = poisson_rate(losses, _hours(runs, "trusted_s"))
+    known = [rate.value, rate.high, rate.low]
+    value, low, high = (1.0 / per_h if per_h else None for per_h in known)
+    mtbf = Estimate(value, low, high)
+    kept = Estimate(*(None if part is None else continuity(CONTINUITY_S, part) for part in (value, low, high)))
+    return {
+        "trusted_losses": losses,
+        **columns_of("mtbf", mtbf, "_h"),
+        **columns_of("continuity_15s", kept),
+    }
+
+
+def _shares(runs: pl.DataFrame) -> Row:
+    """Shares of the time in P0 to P3 over the runs; P0 and P1 where the runs know them, P2 and P3 of all."""
+    row: Row = {}
+    for name in ("share_p0", "share_p1", "share_p2", "share_p3"):
+        known = runs.filter(pl.col(name).is_not_null() & (pl.col("held_s") > 0))
+        held_s = float(known["held_s"].sum())
+        row[name] = min(1.0, float((known[name] * known["held_s"]).sum()) / held_s) if held_s else None
+    return row
+
+
+def _stanford(runs: pl.DataFrame) -> Row:
+    """Counts of the along-track Stanford diagram, by confidence and, where there is one, by the receiver's HPL."""
+    row: Row = {f"stanford_{kind}": int(runs[f"stanford_{kind}"].sum()) for kind in STANFORD}
+    for kind in STANFORD:
+        counts = runs[f"stanford_hpl_{kind}"]
+        row[f"stanford_hpl_{kind}"] = int(counts.sum()) if counts.count() else None
+    return row
 
 
 def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
     seen = _hours(runs.filter(pl.col("evidence").is_not_null()))
     judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
-    hours, hours_judged = _hours(runs.filter(pl.col("evidence").is_in(_TRUTH))), _hours(judged)
+    hours, hours_judged = _hours(runs.filter(pl.col("evidence").is_in(_TRUTH))), _hours(judged, "monitored_s")
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
     false_alarms, outages = int(judged["false_alarms"].sum()), int(runs["outages"].sum())
     return {
@@ -85,6 +121,9 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
         "unsafe_accepted": int(runs["unsafe_accepted"].sum()),
         "outages": outages,
         **columns_of("outage_rate", poisson_rate(outages, _hours(runs)), "_per_h"),
+        **_continuity(runs),
+        **_shares(runs),
+        **_stanford(runs),
         "thr_vb_per_h": thr_vb_per_h,
         "hours_needed": hours_to_substantiate(thr_vb_per_h, missed),
         "hours_still_needed": hours_still_needed(thr_vb_per_h, missed, hours),

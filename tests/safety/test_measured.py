@@ -1,12 +1,13 @@
 """Campaign figures from small tables worked by hand."""
 
+import math
 from typing import Any
 
 import polars as pl
 import pytest
 
+from pipeline.hazards.independent import independent_episodes
 from pipeline.safety import detection_by_level, measured_figures, plain_statements
-from pipeline.safety.episodes import independent_episodes
 from pipeline.statistics import clopper_pearson, poisson_rate
 from schemas.config import SafetyConfig
 from schemas.tables import Runs
@@ -25,6 +26,8 @@ def runs(height: int, **columns: Any) -> pl.DataFrame:
         "solution": "primary",
         "status": "ok",
         "duration_s": 3600.0,
+        "held_s": 3600.0,
+        "monitored_s": 3600.0,
         "evidence": "reference",
         "false_alarm_rate_per_h": 0.0,
         "false_alarms": 0,
@@ -69,6 +72,7 @@ def test_rates_over_the_campaign() -> None:
         status=["ok", "partial", "ok", "ok", "failed", "ok"],
         evidence=["reference", "balise", "odometer", None, None, "reference"],
         duration_s=[3600.0, 1800.0, 7200.0, 3600.0, None, 1800.0],
+        monitored_s=[3600.0, 1440.0, 7200.0, 3600.0, None, 1800.0],
         false_alarms=[2, 0, None, None, None, 1],
         false_alarm_rate_per_h=[2.0, 0.0, None, None, None, None],
         balises_accepted=[10, 5, 5, 5, 0, 5],
@@ -83,14 +87,14 @@ def test_rates_over_the_campaign() -> None:
     )
     found = measured_figures(catalogue, faults, CONFIG).row(0, named=True)
     assert (found["runs"], found["runs_failed"], found["hours"]) == (5, 1, 5.0)
-    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (4.0, 2.0, 1.5)
+    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (4.0, 2.0, 1.4)
     rate = poisson_rate(3, 4.0)
     assert (found["hazards"], found["hazard_rate_per_h"]) == (3, 0.75)
     assert (found["hazard_rate_low_per_h"], found["hazard_rate_high_per_h"]) == (rate.low, rate.high)
     share = clopper_pearson(1, 2)
     assert (found["failures"], found["missed"], found["missed_share"]) == (2, 1, 0.5)
     assert (found["missed_share_low"], found["missed_share_high"]) == (share.low, share.high)
-    assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.5))
+    assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.4))
     assert (found["accepted"], found["unsafe_accepted"], found["outages"]) == (30, 1, 3)
 
 
@@ -144,3 +148,38 @@ def test_measured_times_against_every_level() -> None:
     assert (row["detected"], row["time_to_detect_median_s"], row["time_to_detect_max_s"]) == (4, 5.6, 25.0)
     bounds = clopper_pearson(3, 4)
     assert (row["within_share_low"], row["within_share_high"]) == (bounds.low, bounds.high)
+
+
+def test_shares_continuity_and_stanford_counts_over_the_campaign() -> None:
+    """Two runs of 1 h and 3 h; the truth of the second is missing, and it lost its position four times in 2 h."""
+    catalogue = runs(
+        2,
+        held_s=[3600.0, 10800.0],
+        share_p0=[0.9, None],
+        share_p1=[0.02, None],
+        share_p2=[0.08, 0.04],
+        share_p3=[0.0, 0.2],
+        trusted_s=[3600.0, 7200.0],
+        trusted_losses=[0, 4],
+        stanford_nominal=[10, 20],
+        stanford_hazardous=[0, 3],
+        stanford_hpl_nominal=[None, 7],
+    )
+    found = measured_figures(catalogue, NO_HAZARDS, CONFIG).row(0, named=True)
+    assert (found["share_p0"], found["share_p1"]) == (0.9, 0.02)
+    assert (found["share_p2"], found["share_p3"]) == (pytest.approx(0.05), pytest.approx(0.15))
+    assert (found["trusted_losses"], found["mtbf_h"]) == (4, 0.75)
+    rate = poisson_rate(4, 3.0)
+    assert rate.low is not None
+    assert rate.high is not None
+    assert (found["mtbf_low_h"], found["mtbf_high_h"]) == (1 / rate.high, 1 / rate.low)
+    assert found["continuity_15s"] == pytest.approx(math.exp(-15 / 3600 / 0.75))
+    assert found["continuity_15s_low"] < found["continuity_15s"] < found["continuity_15s_high"]
+    assert (found["stanford_nominal"], found["stanford_hazardous"]) == (30, 3)
+    assert (found["stanford_hpl_nominal"], found["stanford_hpl_hazardous"]) == (7, None)
+
+
+def test_without_a_loss_the_mtbf_has_a_lower_bound_alone() -> None:
+    found = measured_figures(runs(1, trusted_s=7200.0), NO_HAZARDS, CONFIG).row(0, named=True)
+    assert (found["mtbf_h"], found["mtbf_high_h"]) == (None, None)
+    assert found["mtbf_low_h"] == pytest.approx(2.0 / 3.6889, rel=1e-4)

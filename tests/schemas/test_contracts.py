@@ -97,7 +97,7 @@ def test_a_table_with_nan_or_a_forbidden_null_is_a_defect():
     alarms = Alarms.create_empty()
     row = {
         "solution": "primary", "alarm_id": 0, "t_start": 0, "t_end": 1, "monitors": ["along_raw"], "peak_ratio": 2.0,
-        "verdict": "true", "suspect": "gnss", "hazard_id": None,
+        "verdict": "true", "suspect": "gnss", "hazard_id": None, "netelement_id": None, "measure_m": None,
     }  # fmt: skip
     good = pl.DataFrame([row], schema_overrides=alarms.schema)
     assert conform(good, Alarms).schema == alarms.schema

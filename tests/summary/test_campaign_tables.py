@@ -5,12 +5,12 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_runs, with_speed
+from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs
 from pipeline.statistics import clopper_pearson, poisson_rate
 from schemas.campaign import CampaignAccuracy, CampaignBalises, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig, ServiceLevel
 from schemas.tables import Runs
-from tests.summary.tables import NS, epochs, hazards, passages, table
+from tests.summary.tables import NS, hazards, passages, table
 
 CONFIG = Configuration()
 
@@ -158,7 +158,9 @@ class TestAccuracy:
             netelement_id=["ne1", "ne2", "ne1", "ne1", "ne1", "ne1"],
             location_error_m=[1.0, -13.0, 2.0, 15.0, None, 99.0],
             status=["accepted"] * 5 + ["rejected_window"],
-        ).with_columns(speed_mps=pl.Series([0.0, 11.2, 11.0, None, 5.0, 5.0]))
+            speed_mps=[0.0, 11.2, 11.0, None, 5.0, 5.0],
+            location_accuracy_m=12.0,
+        )
         found = campaign_accuracy(frame, CONFIG)
         CampaignAccuracy.validate(found)
         rows = {(row["grouped_by"], row["group"]): row for row in found.iter_rows(named=True)}
@@ -173,8 +175,35 @@ class TestAccuracy:
         assert rows["speed_band_kmh", "000-040"]["location_error_mean_m"] == 1.5
         assert rows["netelement_id", "ne2"]["location_error_sigma_m"] is None
 
-    def test_speed_is_that_of_the_epoch_before_the_offer(self) -> None:
-        frame = met(["a"] * 4, t_offered=[5 * NS, None, round(2.9 * NS), -NS])
-        found = with_speed(frame, epochs([0, 1, 2, 3, 4], speed_mps=[1.0, 2.0, -3.0, 4.0, None]))
-        assert found["speed_mps"].to_list() == [4.0, None, 3.0, None]
-        assert found.drop("speed_mps").equals(frame)
+    def test_each_against_the_accuracy_of_its_own_balise(self) -> None:
+        """4 m off: beyond the 3 m of the first balise, within the 5 m of the second."""
+        frame = met(["a"] * 3, location_error_m=[4.0, -4.0, 2.0], location_accuracy_m=[3.0, 5.0, 3.0])
+        row = campaign_accuracy(frame, CONFIG).row(0, named=True)
+        assert (row["accepted_judged"], row["within_location_accuracy"]) == (3, 2)
+        assert (row["location_accuracy_m"], row["location_accuracy_max_m"]) == (3.0, 5.0)
+        assert row["location_error_median_m"] == 2.0
+
+
+class TestLevels:
+    def test_every_run_against_every_level(self) -> None:
+        catalogue = runs(["a", "b", "c"], evidence=["reference", "reference", None])
+        found = campaign_levels(
+            catalogue,
+            faults(["a", "a"], t_failure=[NS, 2 * NS], t_negated=[2 * NS, 3 * NS], hazardous_s=[1.0, 0.2]),
+            CONFIG.safety,
+        )
+        told = found.select("run_id", "service_level", "failures", "within", "verdict").rows()
+        assert told[:4] == [
+            ("a", "npa", 2, 2, "kept"),
+            ("a", "lpv200", 2, 1, "exceeded"),
+            ("a", "egnos_observed", 2, 2, "kept"),
+            ("a", "horizontal_sis", 2, 2, "kept"),
+        ]
+        assert {row[4] for row in told[4:8]} == {"no_failure"}
+        assert {row[4] for row in told[8:]} == {"unknown"}
+        assert found["hazardous_max_s"][:5].to_list() == [1.0] * 4 + [None]
+
+    def test_a_failure_never_negated_keeps_no_level(self) -> None:
+        found = campaign_levels(runs(["a"]), faults(["a"], t_failure=[NS]), CONFIG.safety)
+        assert set(found["verdict"]) == {"exceeded"}
+        assert found["never_negated"].to_list() == [1] * 4

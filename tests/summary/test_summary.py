@@ -14,7 +14,7 @@ from pipeline.summary import Alignment, Provenance, SolutionResults, failed_row,
 from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence
 from schemas.run import IngestNotes
-from schemas.tables import CONTRACT_VERSION, Runs
+from schemas.tables import CONTRACT_VERSION, SCALES, Runs
 from tests.summary.tables import NS, alarms, epochs, hazards, passages
 
 PROVENANCE = Provenance("c" * 64, "i" * 64, "balise 0.1.0")
@@ -286,6 +286,26 @@ class TestHazards:
         assert row(epochs(seconds(3)), hazards=frame)["missed_detections"] == 1
 
 
+class TestLevels:
+    def test_every_service_level(self) -> None:
+        """Hazardous for 1 s and for 0.4 s: within NPA, EGNOS as observed and the horizontal SIS, not within LPV-200."""
+        frame = hazards(2, t_onset=[0, NS], t_failure=[NS, 9 * NS], t_negated=[2 * NS, 9 * NS], hazardous_s=[1.0, 0.4])
+        found = row(epochs(seconds(3)), hazards=frame)
+        assert found["failures"] == 2
+        assert found["service_levels"] == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
+        assert found["level_allowed_s"] == pytest.approx([24.12, 0.5025, 1.675, 100.5])
+        assert found["level_within"] == [2, 1, 2, 2]
+        assert found["level_verdict"] == ["kept", "exceeded", "kept", "kept"]
+
+    def test_never_negated_keeps_none(self) -> None:
+        found = row(epochs(seconds(3)), hazards=hazards(1, t_onset=0, t_failure=NS))
+        assert found["level_verdict"] == ["exceeded"] * 4
+
+    def test_no_failure_is_not_the_same_as_no_evidence(self) -> None:
+        assert row(epochs(seconds(3)))["level_verdict"] == ["no_failure"] * 4
+        assert row(epochs(seconds(3)), evidence=None)["level_verdict"] == ["unknown"] * 4
+
+
 HOUR = seconds(3601)
 
 
@@ -295,6 +315,20 @@ class TestFalseAlarms:
         assert (found["alarms"], found["false_alarms"], found["false_alarm_rate_per_h"]) == (3, 2, 2.0)
         assert found["false_alarm_rate_low_per_h"] == pytest.approx(0.2422, abs=5e-5)
         assert found["false_alarm_rate_high_per_h"] == pytest.approx(7.2247, abs=5e-5)
+
+    def test_no_rate_where_the_along_bank_never_judged(self) -> None:
+        blind = {f"along_{scale}_state": "not_evaluated" for scale in SCALES}
+        found = row(epochs(HOUR, **blind), alarms=alarms(1, verdict="false"))
+        assert (found["false_alarms"], found["false_alarm_rate_per_h"], found["monitored_s"]) == (1, None, 0.0)
+
+    def test_rate_counts_the_time_judged(self) -> None:
+        """The bank judged in the first half hour of the hour only, and the last 400 s of that through its average."""
+        raw = ["pass"] * 1400 + ["not_evaluated"] * 2201
+        blind = {f"along_{scale}_state": "not_evaluated" for scale in SCALES}
+        blind["along_ewma_0p1_state"] = ["not_evaluated"] * 1400 + ["fail"] * 400 + ["not_evaluated"] * 1801
+        found = row(epochs(HOUR, **(blind | {"along_raw_state": raw})), alarms=alarms(1, verdict="false"))
+        assert (found["held_s"], found["monitored_s"]) == (3600.0, 1800.0)
+        assert found["false_alarm_rate_per_h"] == 2.0
 
     def test_not_known_without_truth(self) -> None:
         found = row(epochs(HOUR, error_along_m=None), evidence=None, alarms=alarms(1, verdict="unknown"))

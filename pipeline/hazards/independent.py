@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.summary import missed_detection
+
+def missed_detection() -> pl.Expr:
+    """A hazard with a failure that was not negated by `t_failure` + budget (DOMAIN section 5).
+
+    Where no budget is known any delay of the negation is one too many.
+    """
+    budget_ns = (pl.col("budget_s").fill_null(0.0) * 1e9).round().cast(pl.Int64).cast(pl.Duration("ns"))
+    late = pl.col("t_negated").is_null() | (pl.col("t_negated") > pl.col("t_failure") + budget_ns)
+    return pl.col("t_failure").is_not_null() & late
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
