@@ -45,7 +45,7 @@ def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], re
     rows = [_rows(part, supplements, remarks) for part in parts if not part.source.recipe.supplement]
     joined = pl.concat(rows, how="diagonal_relaxed")
     frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
-    return conform(frame.drop(ORDINAL), stream, place, breaches)
+    return conform(frame, stream, place, breaches)
 
 
 def _supplemented(frame: pl.DataFrame, part: Decoded, supplements: Sequence[Decoded]) -> pl.DataFrame:

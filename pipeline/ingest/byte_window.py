@@ -5,25 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import IO
 
-_PIECE = 4 * 1024 * 1024
+import numpy as np
+
+_PIECE = 1024 * 1024
 
 
 class ByteWindow:
     """Parts of a file by offset, asked for in growing order; every byte is shown once to `on_bytes`."""
 
-    def __init__(self, stream: IO[bytes], size: int, on_bytes: Callable[[bytes], object]) -> None:
+    def __init__(self, stream: IO[bytes], size: int, on_bytes: Callable[[memoryview], object]) -> None:
         self.size = size
         self._stream = stream
         self._on_bytes = on_bytes
         self._start = 0
-        self._data = b""
+        self._data = memoryview(b"")
 
     def at(self, offset: int, length: int) -> memoryview:
         """These bytes; they must lie inside the file."""
         if offset + length > self._end:
             self._advance(offset, length)
         first = offset - self._start
-        return memoryview(self._data)[first : first + length]
+        return self._data[first : first + length]
 
     def available(self, offset: int) -> memoryview:
         """From `offset` to the end of the piece in memory: at least one byte."""
@@ -35,29 +37,33 @@ class ByteWindow:
 
     def _advance(self, offset: int, length: int) -> None:
         while self._end <= offset:  # what is skipped (an attachment) passes piece by piece
-            self._start = self._end
-            self._data = self._read(_PIECE)
+            self._load(self._data[:0], _PIECE)
         kept = self._data[offset - self._start :]
-        missing = length - len(kept)
-        self._data = kept + self._read(max(_PIECE, missing)) if missing > 0 else kept
-        self._start = offset
+        self._load(kept, max(_PIECE, length - len(kept)))
 
-    def _read(self, count: int) -> bytes:
-        """Up to `count` bytes, fewer only at the end of the file."""
-        pieces, missing = [], min(count, self.size - self._end)
-        while missing > 0:
-            piece = self._stream.read(missing)
-            if not piece:
+    def _load(self, kept: memoryview, count: int) -> None:
+        """Go on to the next `count` bytes of the file, fewer only at its end, behind those that are kept."""
+        count = min(count, self.size - self._end)
+        # New memory each time: views of the old are still waiting to be decompressed and hashed.
+        memory = memoryview(np.empty(len(kept) + count, dtype=np.uint8).data)
+        memory[: len(kept)] = kept
+        self._fill(memory[len(kept) :])
+        self._start, self._data = self._end - len(kept), memory
+
+    def _fill(self, room: memoryview) -> None:
+        read: Callable[[memoryview], int] = self._stream.readinto  # type: ignore[attr-defined]
+        filled = 0
+        while filled < len(room):
+            count = read(room[filled:])
+            if not count:
                 raise OSError(f"the file became shorter while it was read (expected {self.size} bytes)")
-            self._on_bytes(piece)
-            pieces.append(piece)
-            missing -= len(piece)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+            filled += count
+        self._on_bytes(room)
 
     def drain(self) -> None:
         """Show the rest of the file to `on_bytes`."""
         while self._end < self.size:
-            self._start, self._data = self._end, self._read(_PIECE)
+            self._load(self._data[:0], _PIECE)
 
     def ends_with(self, tail: bytes) -> bool:
         """Whether the file ends so."""

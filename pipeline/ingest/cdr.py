@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import polars as pl
 
@@ -36,7 +37,8 @@ Definition = tuple[Member, ...]
 _TIME = (Member("sec", "uint32", None), Member("nanosec", "uint32", None))
 
 
-def parse_definitions(name: str, text: str) -> dict[str, Definition]:
+@lru_cache(maxsize=64)  # the logs of a campaign share their schemas
+def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
     """All messages of a concatenated definition by short name (`pkg/Type`)."""
     found: dict[str, Definition] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
     for index, section in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Self
 
-_MOST_WAITING = 4  # pieces in memory that are still to be hashed
+_MOST_WAITING = 16  # pieces in memory that are still to be hashed
 
 
 class BackgroundDigest:
@@ -27,7 +27,7 @@ class BackgroundDigest:
     ) -> None:
         self._worker.shutdown()
 
-    def update(self, piece: bytes) -> None:
+    def update(self, piece: memoryview) -> None:
         if len(self._waiting) >= _MOST_WAITING:
             self._waiting.popleft().result()
         self._waiting.append(self._worker.submit(self._hash.update, piece))

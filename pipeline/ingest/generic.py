@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import polars as pl
 
 from pipeline.ingest.mcap_block import Messages
-from pipeline.ingest.mcap_model import Channel
+from pipeline.ingest.mcap_model import Channel, Schema, as_mcap_schema
 from schemas.errors import InputError
 
 Value = Any
@@ -57,9 +58,8 @@ def _refuse_literal(literal: str) -> Value:
 
 def _protobuf_decoder(channel: Channel) -> Decode:
     from google.protobuf.message import DecodeError
-    from mcap_protobuf.decoder import DecoderFactory
 
-    decode = _made(lambda: DecoderFactory().decoder_for("protobuf", channel.mcap_schema()), channel)
+    decode = _made(_stock_protobuf, channel)
 
     def checked(payload: bytes) -> Value:
         try:
@@ -71,9 +71,7 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    from mcap_ros2.decoder import DecoderFactory
-
-    decode = _made(lambda: DecoderFactory().decoder_for("cdr", channel.mcap_schema()), channel)
+    decode = _made(_stock_ros2, channel)
 
     def checked(payload: bytes) -> Value:
         if len(payload) < 4 or payload[0] != 0 or payload[1] not in (0, 1):
@@ -87,10 +85,25 @@ def _cdr_decoder(channel: Channel) -> Decode:
     return checked
 
 
-def _made(make: Callable[[], Decode | None], channel: Channel) -> Decode:
+# A schema takes as long to parse as ten thousand messages to decode, and the logs of a campaign share theirs.
+@lru_cache(maxsize=64)
+def _stock_protobuf(schema: Schema | None) -> Decode | None:
+    from mcap_protobuf.decoder import DecoderFactory
+
+    return DecoderFactory().decoder_for("protobuf", as_mcap_schema(schema))
+
+
+@lru_cache(maxsize=64)
+def _stock_ros2(schema: Schema | None) -> Decode | None:
+    from mcap_ros2.decoder import DecoderFactory
+
+    return DecoderFactory().decoder_for("cdr", as_mcap_schema(schema))
+
+
+def _made(make: Callable[[Schema | None], Decode | None], channel: Channel) -> Decode:
     """A decoder of the `mcap` family, whose schema parsers raise whatever they stumble over."""
     try:
-        decode = make()
+        decode = make(channel.schema)
     except Exception as error:
         raise InputError(
             f"has a schema that cannot be parsed: {error}", place=channel.place, found=channel.schema_name

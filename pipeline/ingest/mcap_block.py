@@ -90,20 +90,22 @@ def block_of(data: Bytes, starts: Ints, locate: Locate, first_ordinal: int) -> B
     if starts.max() > len(data) - MESSAGE_HEAD_SIZE:
         raise DamageError(locate(int(starts.max())), "a message is shorter than its header")
     heads = gathered(data, starts, MESSAGE_HEAD)
-    channels = heads["channel"]
+    channels, lengths = heads["channel"], heads["length"].astype(np.int64)
     found = np.flatnonzero(np.bincount(channels)).tolist()
     if len(found) == 1:
-        return {found[0]: messages_of(data, starts, heads, locate, first_ordinal)}
+        return {found[0]: messages_of(data, starts, lengths, heads, locate, first_ordinal)}
     return {
-        channel: messages_of(data, starts[mine], heads[mine], locate, first_ordinal)
+        channel: messages_of(data, starts[mine], lengths[mine], heads[mine], locate, first_ordinal)
         for channel in found
         for mine in (channels == channel,)
     }
 
 
-def messages_of(data: Bytes, starts: Ints, heads: npt.NDArray[Any], locate: Locate, first_ordinal: int) -> Messages:
-    """Messages of one channel, whose heads were gathered."""
-    lengths = heads["length"].astype(np.int64) - _FIXED_FIELDS
+def messages_of(
+    data: Bytes, starts: Ints, lengths: Ints, heads: npt.NDArray[Any], locate: Locate, first_ordinal: int
+) -> Messages:
+    """Messages of one channel, whose heads were gathered; `lengths` are those of the records."""
+    lengths = lengths - _FIXED_FIELDS
     if lengths.min() < 0:
         raise DamageError(locate(int(starts[lengths.argmin()])), "a message is shorter than its header")
     return Messages(data, starts + MESSAGE_HEAD_SIZE, lengths, starts + first_ordinal, heads)

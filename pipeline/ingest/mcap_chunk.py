@@ -51,6 +51,7 @@ class Named:
     """Records that indexes name."""
 
     starts: Ints
+    lengths: Ints
     ends: Ints
     heads: npt.NDArray[Any]
 
@@ -71,7 +72,10 @@ def messages_in(data: Bytes, chunks: Sequence[Placed], first_ordinal: int, on_re
         _check_unindexed(data, others, chunks)
         starts = np.concatenate([others, *(part.starts for part in named.values())])
         return block_of(data, np.sort(starts), locate, first_ordinal)
-    return {channel: messages_of(data, *_in_order(part), locate, first_ordinal) for channel, part in named.items()}
+    return {
+        channel: messages_of(data, part.starts, part.lengths, part.heads, locate, first_ordinal)
+        for channel, part in ((channel, _in_order(part)) for channel, part in named.items())
+    }
 
 
 def _chunk_at(chunks: Sequence[Placed], place: int) -> Placed:
@@ -93,24 +97,35 @@ def _by_channel(chunks: Sequence[Placed]) -> dict[int, list[tuple[Placed, memory
 
 def _named(data: Bytes, channel: int, parts: Sequence[tuple[Placed, memoryview]]) -> Named:
     """The records that the indexes of a channel name, held against what stands there."""
-    chunks = [chunk for chunk, _ in parts]
-    pairs = np.frombuffer(b"".join(entries for _, entries in parts), dtype="<u8").reshape(-1, 2)
-    part = np.repeat(np.arange(len(parts)), [len(entries) // 16 for _, entries in parts])
-    bases, sizes = np.array([(chunk.base, chunk.size) for chunk in chunks], dtype=np.int64).T[:, part]
+    counts = np.array([len(entries) for _, entries in parts]) // 16
+    bases, sizes = np.array([(chunk.base, chunk.size) for chunk, _ in parts]).T
+    pairs = np.frombuffer(b"".join(entries for _, entries in parts), dtype="<i8").reshape(-1, 2)
+    log_times, offsets = pairs[:, 0], pairs[:, 1]
 
     def check(wrong: npt.NDArray[np.bool_], kind: str) -> None:
         if wrong.any():
-            raise DamageError(chunks[part[wrong.argmax()]].offset, kind)
+            place = int(counts.cumsum().searchsorted(wrong.argmax(), "right"))
+            raise DamageError(parts[place][0].offset, kind)
 
-    check(pairs[:, 1] > (sizes - MESSAGE_HEAD_SIZE).view(np.uint64), "a message index points outside its chunk")
-    starts = pairs[:, 1].view(np.int64) + bases
+    room = np.repeat(sizes - MESSAGE_HEAD_SIZE, counts)
+    check(_beyond(offsets, room), "a message index points outside its chunk")
+    starts = offsets + np.repeat(bases, counts)
     heads = gathered(data, starts, MESSAGE_HEAD)
-    agrees = (heads["opcode"] == _MESSAGE) & (heads["channel"] == channel)
-    check(~(agrees & (heads["log_time"] == pairs[:, 0].view(np.int64))), "a message index disagrees with its chunk")
-    check(heads["length"] > len(data), "a record runs past the end of its chunk")
-    ends = starts + heads["length"].astype(np.int64) + HEAD_SIZE
-    check(ends > bases + sizes, "a record runs past the end of its chunk")
-    return Named(starts, ends, heads)
+    differs = (heads["opcode"] != _MESSAGE) | (heads["channel"] != channel) | (heads["log_time"] != log_times)
+    check(differs, "a message index disagrees with its chunk")
+    lengths = heads["length"].astype(np.int64)
+    room -= offsets
+    room += MESSAGE_HEAD_SIZE - HEAD_SIZE
+    check(_beyond(lengths, room), "a record runs past the end of its chunk")
+    ends = starts + lengths
+    ends += HEAD_SIZE
+    return Named(starts, lengths, ends, heads)
+
+
+def _beyond(values: Ints, limits: Ints) -> npt.NDArray[np.bool_]:
+    """Whether these unsigned numbers, held as signed ones, are above their limits."""
+    beyond: npt.NDArray[np.bool_] = values.view(np.uint64) > limits.view(np.uint64)
+    return beyond
 
 
 def _between(data: Bytes, chunks: Sequence[Placed], named: Sequence[Named], on_record: OnRecord) -> Ints:
@@ -119,10 +134,13 @@ def _between(data: Bytes, chunks: Sequence[Placed], named: Sequence[Named], on_r
     Records that follow each other without gap: sorted, each end but the last is the next start.
     """
     # Stable, for it merges what is sorted already, as each channel is.
-    starts = np.sort(np.concatenate([*(part.starts for part in named), [len(data)]]), kind="stable")
-    ends = np.sort(np.concatenate([[0], *(part.ends for part in named)]), kind="stable")
-    if (starts < ends).any():
-        place = int(starts[(starts < ends).argmax()])
+    starts = np.concatenate([*(part.starts for part in named), [len(data)]])
+    ends = np.concatenate([[0], *(part.ends for part in named)])
+    starts.sort(kind="stable")
+    ends.sort(kind="stable")
+    overlaps = starts < ends
+    if overlaps.any():
+        place = int(starts[overlaps.argmax()])
         kind = "records of a chunk overlap, or its message index names one twice"
         raise DamageError(_chunk_at(chunks, place).offset, kind)
     found: list[int] = []
@@ -174,9 +192,9 @@ def _check_unindexed(data: Bytes, starts: Ints, chunks: Sequence[Placed]) -> Non
             raise DamageError(chunk.offset, "a message index lacks messages of its chunk")
 
 
-def _in_order(part: Named) -> tuple[Ints, npt.NDArray[Any]]:
+def _in_order(part: Named) -> Named:
     """By place in the file (an index is sorted by log time)."""
     if (part.starts[1:] > part.starts[:-1]).all():
-        return part.starts, part.heads
+        return part
     order = np.argsort(part.starts)
-    return part.starts[order], part.heads[order]
+    return Named(part.starts[order], part.lengths[order], part.ends[order], part.heads[order])

@@ -36,12 +36,11 @@ class Channel:
     def schema_encoding(self) -> str:
         return self.schema.encoding if self.schema else ""
 
-    def mcap_schema(self) -> Any:
-        """The schema as the decoder packages want it."""
-        from mcap.records import Schema as McapSchema
 
-        if self.schema is None:
-            return None
-        return McapSchema(
-            id=self.schema.id, data=self.schema.data, encoding=self.schema.encoding, name=self.schema.name
-        )
+def as_mcap_schema(schema: Schema | None) -> Any:
+    """The schema as the decoder packages want it."""
+    from mcap.records import Schema as McapSchema
+
+    if schema is None:
+        return None
+    return McapSchema(id=schema.id, data=schema.data, encoding=schema.encoding, name=schema.name)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
+from typing import NamedTuple
 
 from pipeline.ingest.mcap_model import Schema
 
@@ -42,6 +43,10 @@ class DamageError(Exception):
 
 
 _U16, _U32, _U64 = Struct("<H"), Struct("<I"), Struct("<Q")
+_CHUNK_HEAD = Struct("<QQQI")
+_INDEX_ENTRY = Struct("<QQ")
+_CHUNK_INDEX_HEAD, _CHUNK_INDEX_SIZES = Struct("<QQQQ"), Struct("<QQ")
+_COUNT_OF_CHANNEL = Struct("<HQ")
 
 
 class Cursor:
@@ -70,6 +75,10 @@ class Cursor:
     def u64(self) -> int:
         return int(_U64.unpack(self._take(8))[0])
 
+    def fixed(self, fields: Struct) -> tuple[int, ...]:
+        """Several numbers at once."""
+        return fields.unpack(self._take(fields.size))
+
     def data(self, size: int) -> memoryview:
         return self._take(size)
 
@@ -88,12 +97,12 @@ class Cursor:
         if self._at != len(self._body):
             raise DamageError(self._offset, f"a {self._record} record is longer than its fields")
 
-    def numbers(self, entry: Struct) -> list[tuple[int, ...]]:
+    def array(self, entry: Struct) -> memoryview:
         """An array that is prefixed by its length in bytes."""
         content = self._take(self.u32())
         if len(content) % entry.size:
             raise DamageError(self._offset, f"an array of a {self._record} record ends inside an entry")
-        return list(entry.iter_unpack(content))
+        return content
 
 
 @dataclass(frozen=True)
@@ -105,8 +114,7 @@ class ChannelRecord:
     metadata: tuple[tuple[str, str], ...]
 
 
-@dataclass(frozen=True)
-class ChunkRecord:
+class ChunkRecord(NamedTuple):
     """A chunk as it stands in the file; `records` is still compressed."""
 
     offset: int
@@ -118,8 +126,7 @@ class ChunkRecord:
     records: memoryview
 
 
-@dataclass(frozen=True)
-class ChunkSummary:
+class ChunkSummary(NamedTuple):
     """What the file's chunk index says of a chunk, and what the walk found."""
 
     start_ns: int
@@ -171,8 +178,8 @@ def _pairs(cursor: Cursor) -> list[tuple[str, str]]:
 
 def parse_chunk(body: memoryview, offset: int) -> ChunkRecord:
     cursor = Cursor(body, offset, "Chunk")
-    start_ns, end_ns, size = cursor.u64(), cursor.u64(), cursor.u64()
-    crc, compression = cursor.u32(), cursor.text()
+    start_ns, end_ns, size, crc = cursor.fixed(_CHUNK_HEAD)
+    compression = cursor.text()
     records = cursor.data(cursor.u64())
     cursor.finish()
     return ChunkRecord(offset, start_ns, end_ns, size, crc, compression, records)
@@ -182,19 +189,18 @@ def parse_message_index(body: memoryview, offset: int) -> tuple[int, memoryview]
     """Channel and the array of (log time, offset in the chunk), 16 bytes each."""
     cursor = Cursor(body, offset, "MessageIndex")
     channel_id = cursor.u16()
-    entries = cursor.data(cursor.u32())
+    entries = cursor.array(_INDEX_ENTRY)
     cursor.finish()
-    if len(entries) % 16:
-        raise DamageError(offset, "the array of a MessageIndex record ends inside an entry")
     return channel_id, entries
 
 
 def parse_chunk_index(body: memoryview, offset: int) -> ChunkSummary:
     cursor = Cursor(body, offset, "ChunkIndex")
-    start_ns, end_ns, chunk_offset, length = cursor.u64(), cursor.u64(), cursor.u64(), cursor.u64()
-    cursor.numbers(Struct("<HQ"))
+    start_ns, end_ns, chunk_offset, length = cursor.fixed(_CHUNK_INDEX_HEAD)
+    cursor.array(_COUNT_OF_CHANNEL)
     cursor.u64()
-    compression, compressed_size, size = cursor.text(), cursor.u64(), cursor.u64()
+    compression = cursor.text()
+    compressed_size, size = cursor.fixed(_CHUNK_INDEX_SIZES)
     cursor.finish()
     return ChunkSummary(start_ns, end_ns, chunk_offset, length, compression, compressed_size, size)
 
@@ -206,9 +212,9 @@ def parse_statistics(body: memoryview, offset: int) -> Statistics:
     cursor.u32()
     attachments, metadata, chunks = cursor.u32(), cursor.u32(), cursor.u32()
     start_ns, end_ns = cursor.u64(), cursor.u64()
-    counts = cursor.numbers(Struct("<HQ"))
+    counts = dict(_COUNT_OF_CHANNEL.iter_unpack(cursor.array(_COUNT_OF_CHANNEL)))
     cursor.finish()
-    return Statistics(messages, attachments, metadata, chunks, start_ns, end_ns, dict(counts))  # type: ignore[arg-type]
+    return Statistics(messages, attachments, metadata, chunks, start_ns, end_ns, counts)
 
 
 def parse_attachment_lengths(head: memoryview, length: int, offset: int) -> None:

@@ -84,7 +84,7 @@ class BlockSink(Protocol):
 
 
 def walk_log(
-    path: files.Address, config: IngestConfig, streams: BlockSink, on_bytes: Callable[[bytes], object]
+    path: files.Address, config: IngestConfig, streams: BlockSink, on_bytes: Callable[[memoryview], object]
 ) -> McapWalk:
     """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind."""
     limit = int(config.chunk_limit_mib * _MIB)

@@ -61,6 +61,7 @@ class McapWalk:
         self._schemas: dict[int, Schema] = {}
         self._definitions: dict[int, records.ChannelRecord] = {}
         self._pending: list[Pending] = []
+        self._pending_size = 0
         self._unpacker = Decompressor()
         self._memory = np.empty(0, dtype=np.uint8)
         self._ordinal = 0
@@ -88,8 +89,7 @@ class McapWalk:
 
     def _waits_for(self, opcode: int) -> bool:
         """Whether the chunks met last wait: for their indexes, or for neighbours to be taken with them."""
-        size = sum(pending.chunk.size for pending in self._pending)
-        return opcode == Op.MESSAGE_INDEX or (opcode == Op.CHUNK and size < _TOGETHER)
+        return opcode == Op.MESSAGE_INDEX or (opcode == Op.CHUNK and self._pending_size < _TOGETHER)
 
     @property
     def without_crc(self) -> int:
@@ -163,7 +163,7 @@ class McapWalk:
         if opcode not in _HANDLERS:
             self._other_record(opcode, position)
             return following
-        self._check_size(Op(opcode).name, length, position)
+        self._check_size(_NAMES[opcode], length, position)
         body = self._window.at(position + HEAD_SIZE, length)
         _HANDLERS[opcode](self, body, position)
         return following
@@ -211,6 +211,7 @@ class McapWalk:
             told = f"a chunk declares {chunk.size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
             raise DamageError(position, told)
         self._pending.append(Pending(chunk, len(body) + HEAD_SIZE))
+        self._pending_size += chunk.size
 
     def _message_index(self, body: memoryview, position: int) -> None:
         if not self._pending:
@@ -233,7 +234,7 @@ class McapWalk:
     def _finished_chunks(self) -> Block:
         """The messages of the chunks that waited, which are taken at once."""
         pending, self._pending = self._pending, []
-        size = sum(waiting.chunk.size for waiting in pending)
+        size, self._pending_size = self._pending_size, 0
         if size > len(self._memory):
             self._memory = np.empty(max(size, _TOGETHER + _SLACK), dtype=np.uint8)
         data = self._memory[:size]
@@ -282,6 +283,7 @@ class McapWalk:
         return position + HEAD_SIZE + length
 
 
+_NAMES = {int(op): op.name for op in Op}
 _HANDLERS: dict[int, Callable[[McapWalk, memoryview, int], None]] = {
     Op.HEADER: McapWalk._header,
     Op.SCHEMA: McapWalk._schema,

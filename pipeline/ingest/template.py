@@ -103,10 +103,13 @@ class TemplateDecoder:
         left: list[Messages] = []
         for length, group in _by_length(messages):
             rest = self._decode_group(length, group, parts, left)
-            left += [rest] if len(rest) else []
+            left += [rest] if rest else []
         return parts, left
 
-    def _decode_group(self, length: int, messages: Messages, parts: list[Part], aside: list[Messages]) -> Messages:
+    def _decode_group(
+        self, length: int, messages: Messages, parts: list[Part], aside: list[Messages]
+    ) -> Messages | None:
+        """Messages of one length into `parts` and `aside`; those that are left."""
         known = self._templates.setdefault(length, [])
         tried = 0
         while len(messages):
@@ -122,7 +125,7 @@ class TemplateDecoder:
             agree = template.matching(rows)
             if agree.all():
                 parts.append(Part(messages, template=template, rows=rows))
-                return messages.chosen(~agree)
+                return None
             if agree.any():
                 parts.append(Part(messages.chosen(agree), template=template, rows=rows.chosen(agree)))
                 messages = messages.chosen(~agree)
