@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.align import align, threshold_factor
+from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean
 from pipeline.evidence_notes import evidence_notes, return_notes
 from pipeline.hazards import HazardResult, classify, establish_truth
@@ -168,7 +169,8 @@ def _single_monitors(
     other = context.config.monitors.channel_reference
     satellites = context.run.satellites
     ranges = None if satellites is None else satellites.filter(pl.col("solution") == solution)
-    compared = matches[other].epochs if other in matches and other != solution else None
+    named = other in matches and other != solution
+    compared = on_path_of(aligned, matches[other].epochs) if other is not None and named else None
     return {
         "along_doppler": doppler_monitor(aligned, context.config, context.factor),
         "channel": channel_monitor(aligned, compared, context.factor),

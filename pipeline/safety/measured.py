@@ -6,16 +6,15 @@ import dataframely as dy
 import polars as pl
 
 from pipeline.hazards.independent import independent_episodes
-from pipeline.safety.continuity import continuity
+from pipeline.safety.tally import columns_of, continuity_columns
 from pipeline.statistics import (
-    Estimate,
     clopper_pearson,
     hours_still_needed,
     hours_to_substantiate,
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.summary import CONTINUITY_S
+from pipeline.timeline import Uptime
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
 from schemas.conform import conform
@@ -24,15 +23,6 @@ from schemas.enums import Evidence, RunStatus
 Row = dict[str, object]
 
 _TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
-
-
-def columns_of(name: str, estimate: Estimate, unit: str = "") -> Row:
-    """An estimate as three columns `name`, `name_low`, `name_high`, with their unit at the end."""
-    return {
-        f"{name}{unit}": estimate.value,
-        f"{name}_low{unit}": estimate.low,
-        f"{name}_high{unit}": estimate.high,
-    }
 
 
 def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
@@ -63,21 +53,6 @@ def _hours(runs: pl.DataFrame, column: str = "duration_s") -> float:
     return float(runs[column].fill_null(0.0).sum()) / 3600.0
 
 
-def _continuity(runs: pl.DataFrame) -> Row:
-    """MTBF of trusted positions over all runs and its continuity (LOC eq. 8); bounds from the losses counted."""
-    losses = int(runs["trusted_losses"].sum())
-    rate = poisson_rate(losses, _hours(runs, "trusted_s"))
-    known = [rate.value, rate.high, rate.low]
-    value, low, high = (1.0 / per_h if per_h else None for per_h in known)
-    mtbf = Estimate(value, low, high)
-    kept = Estimate(*(None if part is None else continuity(CONTINUITY_S, part) for part in (value, low, high)))
-    return {
-        "trusted_losses": losses,
-        **columns_of("mtbf", mtbf, "_h"),
-        **columns_of("continuity_15s", kept),
-    }
-
-
 def _shares(runs: pl.DataFrame) -> Row:
     """Shares of the time in P0 to P3 over the runs; P0 and P1 where the runs know them, P2 and P3 of all."""
     row: Row = {}
@@ -103,6 +78,7 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
     hours, hours_judged = _hours(runs.filter(pl.col("evidence").is_in(_TRUTH))), _hours(judged, "monitored_s")
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
     false_alarms, outages = int(judged["false_alarms"].sum()), int(runs["outages"].sum())
+    losses = int(runs["trusted_losses"].sum())
     return {
         "runs": runs.height,
         "hours": _hours(runs),
@@ -121,7 +97,8 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
         "unsafe_accepted": int(runs["unsafe_accepted"].sum()),
         "outages": outages,
         **columns_of("outage_rate", poisson_rate(outages, _hours(runs)), "_per_h"),
-        **_continuity(runs),
+        "trusted_losses": losses,
+        **continuity_columns(Uptime(float(runs["trusted_s"].sum()), losses)),
         **_shares(runs),
         **_stanford(runs),
         "thr_vb_per_h": thr_vb_per_h,

@@ -1,139 +1,251 @@
 """Reactive and composite fail-safety on the same run (LOC section III, Fig. 3 and 4), and redundant channels.
 
-Reactive: one solution diagnosed by all monitors but the comparison of channels. Composite: the
-comparison of two solutions alone (monitor `channel`). Both are judged on the same hazards and alarms.
+Reactive 1oo1: one solution, diagnosed by all monitors but the comparison of channels. Composite 2oo2: the
+comparison of two solutions alone, both of which are needed. Reactive 1oo2: two reactive channels, one of which is
+enough (LOC eq. 11). All are judged after the fact on the same faults, whatever the replay itself compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import permutations
 
-import numpy as np
 import polars as pl
 
+from pipeline.align import threshold_factor
+from pipeline.channels import on_path_of
 from pipeline.hazards.fails import Fails, fails_of
-from pipeline.safety.measured import columns_of
-from pipeline.statistics import UNKNOWN, clopper_pearson, poisson_rate
+from pipeline.monitors.single import channel_monitor
+from pipeline.safety.composite_alarms import Side, verdicts_of
+from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from pipeline.summary import trusted
-from pipeline.timeline import Instants, Uptime, gap_limit_s, held_s, nominal_period_s, share_of_time, uptime
+from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s, uptime
 from schemas.config import Configuration
 from schemas.enums import MonitorState, Verdict
-from schemas.tables import MONITORS
+from schemas.tables import MONITORS, SCALES
 
 COMPARISON = "channel"
-ARCHITECTURES: dict[str, tuple[str, ...]] = {
-    "reactive": tuple(name for name in MONITORS if name != COMPARISON),
-    "composite": (COMPARISON,),
-}
-# What has to be evaluated for the architecture to diagnose anything along the track.
-_NEEDED = {"reactive": "along_raw", "composite": COMPARISON}
+REACTIVE, COMPOSITE, REDUNDANT = "reactive 1oo1", "composite 2oo2", "reactive 1oo2"
+_DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
+_ALONG = tuple(f"along_{scale}" for scale in SCALES)
+EPOCH_COLUMNS = (
+    *("t", "solution", "netelement_id", "measure_m", "path_m", "on_track", "gate_probability", "confidence_m"),
+    *("sigma_along_m", "error_along_m"),
+    *(f"{name}_{part}" for name in _DIAGNOSIS for part in ("state", "value", "threshold")),
+)
+"""Columns of the epochs that the comparison takes."""
 
-Row = dict[str, object]
+Key = tuple[str, str, str | None]
+"""Solution, architecture, and the other solution where it takes two."""
 
 
 @dataclass(frozen=True)
-class _Detection:
-    """Of one fault: T_D [s], none where it was not found, and whether it was negated within the budget."""
+class _Channel:
+    """Epochs under one kind of diagnosis: its fails, where it judged, and where it worked."""
 
-    time_to_detect_s: float | None
-    failed: bool
-    missed: bool
+    t_ns: Instants
+    limit_s: float
+    held_s: Floats
+    fails: Fails
+    judged: Flags
+    working: Flags
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Tables of one solution; `faults` one row per fault."""
+
+    epochs: pl.DataFrame
+    faults: pl.DataFrame
+    alarms: pl.DataFrame
+    by_reference: bool
+
+    @property
+    def side(self) -> Side:
+        return Side(self.epochs, self.faults, self.alarms, self.by_reference)
 
 
 def side_by_side(
-    epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
-) -> pl.DataFrame:
-    """One row per architecture for one solution of one run, from its output tables.
+    epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
+) -> dict[Key, Tally]:
+    """What each architecture made of one run, from its tables with all solutions.
 
-    `availability` is the share of time, gaps apart, in which the architecture diagnoses and does not fail;
-    `mtbf_h` the time between the losses of that. False alarms carry the verdict of the alarm they belong to.
+    `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
+    are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
+    fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right.
     """
-    rows = [_architecture_row(name, epochs, hazards, alarms, config) for name in ARCHITECTURES]
+    names = sorted(runs["solution"].to_list())
+    solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
+    channels = {name: _reactive(one.epochs, config) for name, one in solutions.items()}
+    found: dict[Key, Tally] = {}
+    for name, channel in channels.items():
+        one = solutions[name]
+        verdicts = _verdicts_in_table(channel.fails, one.alarms)
+        found[name, REACTIVE, None] = _tally(channel, _faults(one.faults, None, channel, config), verdicts)
+    for name, other in permutations(names, 2):
+        found[name, COMPOSITE, other] = _composite(solutions[name], solutions[other], config)
+        if name < other:
+            found[name, REDUNDANT, other] = Tally(None, None, _redundant(channels[name], channels[other]))
+    return found
+
+
+def side_by_side_table(found: dict[Key, Tally]) -> pl.DataFrame:
+    """One row per architecture and solution or pair; `mtbf_expected_h` from the MTBF of the channels alone.
+
+    Of two independent channels: both needed, half the MTBF where they are equal; one enough, their product over
+    one hour (LOC eq. 11).
+    """
+    rows: list[Row] = []
+    for (solution, architecture, other), tally in sorted(found.items(), key=lambda item: _order(item[0])):
+        expected = None if other is None else _expected_h(architecture, found, solution, other)
+        rows.append(
+            {"architecture": architecture, "solution": solution, "other": other}
+            | tally.row()
+            | {"mtbf_expected_h": expected}
+        )
     return pl.DataFrame(rows, infer_schema_length=None)
 
 
-def _architecture_row(
-    name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
-) -> Row:
-    t_ns = epochs["t"].to_physical().to_numpy()
-    limit_s = gap_limit_s(nominal_period_s(t_ns), config.align.gap_reset_s)
-    fails = _fails(epochs, ARCHITECTURES[name], config.lds.recovery_s)
-    working = epochs[f"{_NEEDED[name]}_state"].cast(pl.String).to_numpy() != MonitorState.NOT_EVALUATED.value
-    working[fails.epochs] = False
-    faults = [_detection(fault, fails, config) for fault in _faults(hazards)]
-    failures = sum(item.failed for item in faults)
-    detected = [item.time_to_detect_s for item in faults if item.time_to_detect_s is not None]
-    missed = sum(item.missed for item in faults)
-    return {
-        "architecture": name,
-        "hazards": len(faults),
-        "detected": len(detected),
-        "failures": failures,
-        "missed": missed,
-        **columns_of("missed_share", clopper_pearson(missed, failures)),
-        "time_to_detect_median_s": float(np.median(detected)) if detected else None,
-        "time_to_detect_max_s": max(detected, default=None),
-        "alarms": len(fails.alarms),
-        **_false_alarms(fails, alarms, t_ns),
-        "availability": share_of_time(held_s(t_ns, limit_s), working),
-        "mtbf_h": uptime(t_ns, working, limit_s).mean_time_between_losses_h,
-    }
+def _order(key: Key) -> tuple[int, str, str]:
+    return (REACTIVE, COMPOSITE, REDUNDANT).index(key[1]), key[0], key[2] or ""
 
 
-def _fails(epochs: pl.DataFrame, monitors: Iterable[str], recovery_s: float) -> Fails:
-    columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
-    return fails_of(epochs.select("t", *columns, negated=pl.lit(value=False)), recovery_s)
+def _expected_h(architecture: str, found: dict[Key, Tally], solution: str, other: str) -> float | None:
+    alone = [found[name, REACTIVE, None].working for name in (solution, other)]
+    one, two = (part.up_s / part.losses / 3600.0 if part.losses else None for part in alone)
+    if one is None or two is None:
+        return None
+    return one * two / (one + two) if architecture == COMPOSITE else one * two
 
 
-def _faults(hazards: pl.DataFrame) -> list[Row]:
-    """One row per fault; those that the end of another made are part of it."""
-    instants = [pl.col(name).to_physical() for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
-    return hazards.filter(pl.col("caused_by").is_null()).select(*instants, "budget_s").to_dicts()
-
-
-def _detection(fault: Row, fails: Fails, config: Configuration) -> _Detection:
-    onset, failure, end = (_whole(fault[name]) for name in ("t_onset", "t_failure", "t_end"))
-    begin = onset if onset is not None else _whole(fault["t_hazard"]) or 0
-    last = end if end is not None else int(fails.t_ns[-1])
-    standing = fails.standing_at(begin) is not None
-    first = fails.first_in(begin, last + 1)
-    detected = begin if standing else first[0] if first is not None else None
-    reaction_s = config.hazards.reaction_s
-    reaction_ns = round((nominal_period_s(fails.t_ns) or 0.0 if reaction_s is None else reaction_s) * 1e9)
-    allowed_ns = round(float(str(fault["budget_s"] or 0.0)) * 1e9)
-    late = detected is None or (failure is not None and detected + reaction_ns > failure + allowed_ns)
-    return _Detection(
-        time_to_detect_s=None if detected is None else (detected - begin) / 1e9,
-        failed=failure is not None,
-        missed=failure is not None and late,
+def _solution(
+    name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
+) -> _Solution:
+    own = pl.col("solution") == name
+    evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
+    return _Solution(
+        epochs.filter(own).sort("t"), _one_per_fault(hazards.filter(own)), alarms.filter(own), evidence == ["reference"]
     )
 
 
-def _whole(value: object) -> int | None:
-    return value if isinstance(value, int) else None
+def _one_per_fault(hazards: pl.DataFrame) -> pl.DataFrame:
+    """`begin, failure, end` [ns] and `budget_s`; the rows of one fault, and those that its end made, are one."""
+    instants = [pl.col(name).to_physical() for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
+    return (
+        hazards.filter(pl.col("caused_by").is_null())
+        .select(*instants, "budget_s")
+        .group_by(begin=pl.coalesce("t_onset", "t_hazard"), maintain_order=True)
+        .agg(
+            failure=pl.col("t_failure").min(),
+            end=pl.when(pl.col("t_end").is_null().any()).then(None).otherwise(pl.col("t_end").max()),
+            budget_s=pl.col("budget_s").first(),
+        )
+    )
 
 
-def _false_alarms(fails: Fails, alarms: pl.DataFrame, t_ns: Instants) -> Row:
+def _reactive(epochs: pl.DataFrame, config: Configuration) -> _Channel:
+    judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
+    return _channel(epochs, _DIAGNOSIS, judged, trusted(config), config)
+
+
+def _evaluated(monitor: str) -> pl.Expr:
+    return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
+
+
+def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally:
+    placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
+    positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
+    factor = threshold_factor(config.monitors.false_alarm_probability)
+    compared = channel_monitor(positioned, placed, factor).select(
+        pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
+    )
+    both = other.epochs.select("t", other_trusted=trusted(config))
+    own = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared)
+    frame = own.join(both, on="t", how="left", maintain_order="left")
+    channel = _channel(
+        frame, (COMPARISON,), _evaluated(COMPARISON), pl.col("own_trusted") & pl.col("other_trusted"), config
+    )
+    verdicts = verdicts_of(channel.fails.alarms, (one.side, other.side), config.hazards)
+    return _tally(channel, _faults(one.faults, other.faults, channel, config), verdicts)
+
+
+def _channel(
+    epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, position: pl.Expr, config: Configuration
+) -> _Channel:
+    columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
+    fails = fails_of(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
+    t_ns = epochs["t"].to_physical().to_numpy()
+    limit_s = gap_limit_s(nominal_period_s(t_ns), config.align.gap_reset_s)
+    seen = epochs.select(judged.fill_null(value=False)).to_series().to_numpy()
+    working = seen & epochs.select(position.fill_null(value=False)).to_series().to_numpy()
+    for span in fails.alarms:
+        working &= (t_ns < span.start_ns) | (t_ns > span.end_ns + round(config.lds.recovery_s * 1e9))
+    return _Channel(t_ns, limit_s, held_s(t_ns, limit_s), fails, seen, working)
+
+
+def _tally(channel: _Channel, faults: Faults, verdicts: list[Verdict]) -> Tally:
+    judged_s = float(channel.held_s[channel.judged].sum())
+    alarms = Alarms(len(verdicts), verdicts.count(Verdict.FALSE), verdicts.count(Verdict.UNKNOWN), judged_s)
+    return Tally(faults, alarms, _working(channel))
+
+
+def _working(channel: _Channel) -> Working:
+    up = uptime(channel.t_ns, channel.working, channel.limit_s)
+    return Working(float(channel.held_s.sum()), float(channel.held_s[channel.working].sum()), up.up_s, up.losses)
+
+
+def _redundant(one: _Channel, other: _Channel) -> Working:
+    """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
+    parts = [pl.DataFrame({"t_ns": channel.t_ns, "working": channel.working}) for channel in (one, other)]
+    merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working").any()).sort("t_ns")
+    t_ns, working = merged["t_ns"].to_numpy(), merged["working"].to_numpy()
+    limit_s = max(one.limit_s, other.limit_s)
+    whole_s, up = float(held_s(t_ns, limit_s).sum()), uptime(t_ns, working, limit_s)
+    return Working(whole_s, min(up.up_s, whole_s), up.up_s, up.losses)
+
+
+def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel, config: Configuration) -> Faults:
+    """`others`: faults of the other solution, so that common ones can be told apart."""
+    hazards = failures = missed = common = common_missed = 0
+    delays: list[float] = []
+    for begin, failure, end, budget_s in faults.select("begin", "failure", "end", "budget_s").iter_rows():
+        last = int(channel.t_ns[-1]) if end is None else end
+        detected = _detected_ns(channel.fails, begin, last)
+        late = failure is not None and _is_late(detected, failure, budget_s, channel, config)
+        shared = failure is not None and others is not None and _overlaps(others, begin, last)
+        hazards, failures, missed = hazards + 1, failures + (failure is not None), missed + late
+        common, common_missed = common + shared, common_missed + (shared and late)
+        if detected is not None:
+            delays.append((detected - begin) / 1e9)
+    return Faults(hazards, failures, missed, common, common_missed, tuple(delays))
+
+
+def _detected_ns(fails: Fails, begin: int, last: int) -> int | None:
+    """An alarm that stands at the onset detects at once, else the first fail until the fault's end."""
+    if fails.standing_at(begin) is not None:
+        return begin
+    first = fails.first_in(begin, last + 1)
+    return None if first is None else first[0]
+
+
+def _is_late(
+    detected: int | None, failure: int, budget_s: float | None, channel: _Channel, config: Configuration
+) -> bool:
+    reaction_s = config.hazards.reaction_s
+    if reaction_s is None:
+        reaction_s = nominal_period_s(channel.t_ns) or 0.0
+    return detected is None or detected + round(reaction_s * 1e9) > failure + round((budget_s or 0.0) * 1e9)
+
+
+def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
+    meets = (pl.col("begin") <= last) & (pl.col("end").is_null() | (pl.col("end") >= begin))
+    return faults.filter(pl.col("failure").is_not_null() & meets).height > 0
+
+
+def _verdicts_in_table(fails: Fails, alarms: pl.DataFrame) -> list[Verdict]:
+    """Each alarm of the architecture has the verdict of the alarm of the replay that it began in."""
     spans = alarms.select(pl.col("t_start", "t_end").to_physical(), pl.col("verdict").cast(pl.String)).rows()
-    verdicts = [
-        next((verdict for start, end, verdict in spans if start <= span.start_ns <= end), Verdict.UNKNOWN.value)
+    return [
+        next((Verdict(verdict) for start, end, verdict in spans if start <= span.start_ns <= end), Verdict.UNKNOWN)
         for span in fails.alarms
     ]
-    false = verdicts.count(Verdict.FALSE.value)
-    hours = (int(t_ns[-1]) - int(t_ns[0])) / 3.6e12 if len(t_ns) else 0.0
-    rate = UNKNOWN if Verdict.UNKNOWN.value in verdicts else poisson_rate(false, hours)
-    return {"false_alarms": false, **columns_of("false_alarm_rate", rate, "_per_h")}
-
-
-def redundant_uptime(epochs: pl.DataFrame, config: Configuration) -> Uptime:
-    """Time in which at least one of a run's solutions gave a trusted position (1oo2, LOC eq. 11).
-
-    `epochs` of all solutions; a solution's epoch counts at its own time.
-    """
-    merged = epochs.select("t", good=trusted(config).fill_null(value=False)).group_by("t").agg(pl.col("good").any())
-    merged = merged.sort("t")
-    t_ns = merged["t"].to_physical().to_numpy()
-    parts = epochs.partition_by("solution", maintain_order=True)
-    periods = [nominal_period_s(part["t"].to_physical().to_numpy()) or 0.0 for part in parts]
-    return uptime(t_ns, merged["good"].to_numpy(), gap_limit_s(max(periods, default=0.0), config.align.gap_reset_s))

@@ -1,133 +1,242 @@
-"""Reactive and composite fail-safety on one run of 200 s at 1 Hz, worked by hand."""
+"""Reactive and composite fail-safety on one run of 200 s at 1 Hz with two solutions, worked by hand.
+
+Both stand on the path at 20 m/s with sigma 1 m, so the comparison fails beyond 5.3267 sqrt(2) = 7.53 m.
+"""
 
 from typing import Any
 
 import polars as pl
 import pytest
 
-from pipeline.safety.side_by_side import redundant_uptime, side_by_side
+from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, REDUNDANT, side_by_side, side_by_side_table
 from schemas.config import Configuration, HazardConfig
-from tests.summary.tables import NS, alarms, epochs, hazards
+from schemas.tables import Runs
+from tests.summary.tables import NS, alarms, epochs, hazards, table
 
 CONFIG = Configuration()
 N = 200
+WITHIN, BEYOND = 7.5, 7.6
 
 
-def run(fails: dict[str, list[int]], blind: dict[str, list[int]] | None = None, **columns: Any) -> pl.DataFrame:
-    """All monitors of both architectures evaluated, failing at the seconds given."""
-    blind = blind or {}
-    states: dict[str, Any] = {}
-    for name in ("along_raw", "channel", *fails):
-        failing, out = fails.get(name, []), blind.get(name, [])
-        states[f"{name}_state"] = [
-            "fail" if k in failing else "not_evaluated" if k in out else "pass" for k in range(N)
-        ]
-    return epochs([float(k) for k in range(N)], **(states | columns))
+def solution(
+    name: str,
+    off: dict[int, float] | None = None,
+    fails: dict[str, list[int]] | None = None,
+    blind: list[int] | None = None,
+    **columns: Any,
+) -> pl.DataFrame:
+    """One solution, `off` so many metres at the seconds given, monitors failing or the along bank blind at others."""
+    error = [(off or {}).get(k, 0.0) for k in range(N)]
+    place = [100.0 + 20.0 * k + e for k, e in enumerate(error)]
+    states: dict[str, Any] = {
+        f"{monitor}_state": ["fail" if k in seconds else "pass" for k in range(N)]
+        for monitor, seconds in (fails or {}).items()
+    }
+    for scale in ("raw", "ewma_0p1", "ewma_0p01", "ewma_0p001") if blind else ():
+        states[f"along_{scale}_state"] = ["not_evaluated" if k in (blind or []) else "pass" for k in range(N)]
+    plain = {"netelement_id": "ne1", "measure_m": place, "path_m": place, "sigma_along_m": 1.0, "error_along_m": error}
+    return epochs([float(k) for k in range(N)], **(plain | {"solution": name} | states | columns))
 
 
-def fault(onset: int | None, failure: int | None, end: int | None = 150, **columns: Any) -> dict[str, Any]:
-    return {"t_onset": onset, "t_failure": failure, "t_end": end, "t_hazard": onset or 0, **columns}
+def fault(name: str, onset: int, failure: int | None, end: int | None = 150, **columns: Any) -> dict[str, Any]:
+    return {"solution": name, "t_onset": onset, "t_failure": failure, "t_end": end, "t_hazard": onset, **columns}
 
 
 def rows_of(*faults: dict[str, Any]) -> pl.DataFrame:
     instants = ("t_onset", "t_failure", "t_end", "t_hazard")
     columns: dict[str, Any] = {name: [None if f[name] is None else f[name] * NS for f in faults] for name in instants}
     columns["caused_by"] = [f.get("caused_by") for f in faults]
-    return hazards(len(faults), budget_s=1.675, **columns)
+    return hazards(len(faults), budget_s=1.675, solution=[f["solution"] for f in faults], **columns)
 
 
-def compared(frame: pl.DataFrame, faults: pl.DataFrame, found: pl.DataFrame | None = None, config: Any = CONFIG) -> Any:
-    table = side_by_side(frame, faults, alarms() if found is None else found, config)
-    return {row["architecture"]: row for row in table.iter_rows(named=True)}
+def compared(
+    *solutions: pl.DataFrame,
+    faults: pl.DataFrame | None = None,
+    found: pl.DataFrame | None = None,
+    config: Any = CONFIG,
+    evidence: str | None = "reference",
+) -> Any:
+    """Rows by solution and architecture."""
+    names = [part["solution"][0] for part in solutions]
+    runs = table(Runs, len(names), solution=names, evidence=evidence)
+    known = alarms() if found is None else found
+    tallies = side_by_side(pl.concat(solutions), rows_of() if faults is None else faults, known, runs, config)
+    rows = side_by_side_table(tallies).iter_rows(named=True)
+    return {(row["solution"], row["architecture"]): row for row in rows}
 
 
-def test_each_detects_with_its_own_monitors() -> None:
-    frame = run({"along_ewma_0p01": [110], "channel": [101, 102]})
-    found = compared(frame, rows_of(fault(100, 108)))
-    assert (found["reactive"]["time_to_detect_max_s"], found["composite"]["time_to_detect_max_s"]) == (10.0, 1.0)
-    assert (found["reactive"]["missed"], found["composite"]["missed"]) == (1, 0)
-    assert (found["reactive"]["detected"], found["composite"]["detected"]) == (1, 1)
+def during(first: int, last: int, metres: float) -> dict[int, float]:
+    return dict.fromkeys(range(first, last + 1), metres)
 
 
-@pytest.mark.parametrize(("failing", "missed"), [(108, 0), (109, 1)])
-def test_missed_is_later_than_the_budget(failing: int, missed: int) -> None:
-    """Failure at 108 s, reaction one epoch, budget 1.675 s: a fail at 108 s is in time, at 109 s it is not."""
-    frame = run({"along_raw": [failing]})
-    assert compared(frame, rows_of(fault(100, 108)))["reactive"]["missed"] == missed
-    quick = Configuration(hazards=HazardConfig(reaction_s=0.1))
-    assert compared(frame, rows_of(fault(100, 108)), config=quick)["reactive"]["missed"] == 0
+class TestFaults:
+    def test_of_one_solution_each_architecture_finds_in_its_own_way(self) -> None:
+        """A drift of 1 m/s from 100 s: beyond 7.53 m at 107 s; the slow average fails at 110 s only."""
+        drift = {k: float(k - 99) for k in range(100, 150)}
+        gps = solution("gps", drift, {"along_ewma_0p01": list(range(110, 150))})
+        found = compared(gps, solution("galileo"), faults=rows_of(fault("gps", 100, 109)))
+        reactive, composite = found["gps", REACTIVE], found["gps", COMPOSITE]
+        assert (reactive["time_to_detect_max_s"], composite["time_to_detect_max_s"]) == (10.0, 7.0)
+        assert (reactive["detected"], composite["detected"]) == (1, 1)
+        assert (reactive["missed"], composite["missed"]) == (1, 0)
+        assert found["galileo", COMPOSITE]["hazards"] == 0
+
+    def test_common_to_both_the_comparison_is_blind_to(self) -> None:
+        off = during(100, 149, 40.0)
+        both = [solution(name, off, {"along_raw": [100]}) for name in ("gps", "galileo")]
+        faults = rows_of(fault("gps", 100, 100), fault("galileo", 100, 100))
+        found = compared(*both, faults=faults)
+        for name in ("gps", "galileo"):
+            reactive, composite = found[name, REACTIVE], found[name, COMPOSITE]
+            assert (reactive["detected"], reactive["missed"], reactive["missed_share"]) == (1, 0, 0.0)
+            assert (composite["detected"], composite["missed"], composite["missed_share"]) == (0, 1, 1.0)
+            assert (composite["common_failures"], composite["common_missed"]) == (1, 1)
+            assert (composite["alarms"], reactive["common_failures"]) == (0, 0)
+
+    def test_of_each_at_other_times_are_not_common(self) -> None:
+        gps, galileo = solution("gps", during(50, 69, 40.0)), solution("galileo", during(100, 119, 40.0))
+        faults = rows_of(fault("gps", 50, 50, 70), fault("galileo", 100, 100, 120))
+        found = compared(gps, galileo, faults=faults)
+        assert [found[name, COMPOSITE]["common_failures"] for name in ("gps", "galileo")] == [0, 0]
+        assert [found[name, COMPOSITE]["missed"] for name in ("gps", "galileo")] == [0, 0]
+        assert [found[name, REACTIVE]["missed"] for name in ("gps", "galileo")] == [1, 1]
+
+    @pytest.mark.parametrize(("failing", "missed"), [(108, 0), (109, 1)])
+    def test_missed_is_later_than_the_budget(self, failing: int, missed: int) -> None:
+        """Failure at 108 s, reaction one epoch, budget 1.675 s: a fail at 108 s is in time, at 109 s it is not."""
+        parts = solution("gps", None, {"along_raw": [failing]}), solution("galileo")
+        faults = rows_of(fault("gps", 100, 108))
+        assert compared(*parts, faults=faults)["gps", REACTIVE]["missed"] == missed
+        quick = Configuration(hazards=HazardConfig(reaction_s=0.1))
+        assert compared(*parts, faults=faults, config=quick)["gps", REACTIVE]["missed"] == 0
+
+    def test_a_fail_after_the_episode_finds_nothing(self) -> None:
+        for second, detected in ((150, 1), (151, 0)):
+            off = {second: BEYOND}
+            found = compared(solution("gps", off), solution("galileo"), faults=rows_of(fault("gps", 100, 108)))
+            assert found["gps", COMPOSITE]["detected"] == detected
+
+    def test_an_alarm_that_stands_already(self) -> None:
+        gps = solution("gps", {90: BEYOND, 105: BEYOND})
+        found = compared(gps, solution("galileo"), faults=rows_of(fault("gps", 100, 108)))
+        assert found["gps", COMPOSITE]["time_to_detect_max_s"] == 0.0
+
+    def test_rows_of_one_fault_and_what_it_caused_are_one(self) -> None:
+        faults = rows_of(fault("gps", 100, 101), fault("gps", 100, None), fault("gps", 120, None, caused_by=0))
+        found = compared(solution("gps"), solution("galileo"), faults=faults)["gps", COMPOSITE]
+        assert (found["hazards"], found["failures"], found["missed"]) == (1, 1, 1)
+
+    def test_what_the_replay_compared_does_not_count_as_independent_diagnosis(self) -> None:
+        gps = solution("gps", None, {"channel": [101]})
+        found = compared(gps, solution("galileo"), faults=rows_of(fault("gps", 100, 101)))
+        assert found["gps", REACTIVE]["detected"] == 0
 
 
-def test_never_found() -> None:
-    found = compared(run({}), rows_of(fault(100, 108), fault(100, None)))["composite"]
-    assert (found["hazards"], found["failures"], found["detected"], found["missed"]) == (2, 1, 0, 1)
-    assert (found["time_to_detect_median_s"], found["missed_share"]) == (None, 1.0)
+class TestFalseAlarms:
+    def test_of_the_comparison_while_both_are_right(self) -> None:
+        """8 m apart for a second, each within max(5 m, 3 sigma) of the truth: 1 in 199 s."""
+        parts = solution("gps", {60: 4.0}), solution("galileo", {60: -4.0})
+        found = compared(*parts)
+        for name in ("gps", "galileo"):
+            row = found[name, COMPOSITE]
+            assert (row["alarms"], row["false_alarms"]) == (1, 1)
+            assert row["false_alarm_rate_per_h"] == pytest.approx(3600 / 199)
+        assert (found["gps", REACTIVE]["alarms"], found["gps", REACTIVE]["false_alarm_rate_per_h"]) == (0, 0.0)
+
+    @pytest.mark.parametrize(("apart", "alarm"), [(WITHIN, 0), (BEYOND, 1)])
+    def test_threshold_of_the_comparison(self, apart: float, alarm: int) -> None:
+        found = compared(solution("gps", {60: apart}), solution("galileo"))
+        assert found["gps", COMPOSITE]["alarms"] == alarm
+
+    def test_while_the_other_is_wrong_is_none(self) -> None:
+        found = compared(solution("gps"), solution("galileo", {60: 30.0}))
+        assert (found["gps", COMPOSITE]["alarms"], found["gps", COMPOSITE]["false_alarms"]) == (1, 0)
+        assert found["gps", COMPOSITE]["false_alarm_rate_per_h"] == 0.0
+
+    def test_of_the_diagnosis_have_the_verdict_of_the_alarm(self) -> None:
+        gps = solution("gps", None, {"along_raw": [20, 100]})
+        known = alarms(
+            2, solution="gps", t_start=[20 * NS, 100 * NS], t_end=[21 * NS, 100 * NS], verdict=["false", "true"]
+        )
+        row = compared(gps, solution("galileo"), found=known)["gps", REACTIVE]
+        assert (row["alarms"], row["false_alarms"]) == (2, 1)
+        assert row["false_alarm_rate_per_h"] == pytest.approx(3600 / 199)
+
+    def test_no_rate_where_nobody_can_tell(self) -> None:
+        parts = solution("gps", {60: BEYOND}), solution("galileo")
+        row = compared(*parts, evidence="odometer")["gps", COMPOSITE]
+        assert (row["alarms"], row["false_alarms"], row["false_alarm_rate_per_h"]) == (1, 0, None)
+        row = compared(*(part.with_columns(error_along_m=pl.lit(None, pl.Float64)) for part in parts))["gps", COMPOSITE]
+        assert (row["alarms"], row["false_alarm_rate_per_h"]) == (1, None)
 
 
-def test_a_fail_after_the_episode_finds_nothing() -> None:
-    assert compared(run({"channel": [151]}), rows_of(fault(100, 108)))["composite"]["detected"] == 0
-    assert compared(run({"channel": [150]}), rows_of(fault(100, 108)))["composite"]["detected"] == 1
+class TestAvailability:
+    def test_diagnosis_that_judges_and_does_not_fail_and_recovers(self) -> None:
+        """Bank blind for 20 s from 50 s, comparison failing for 10 s from 100 s and for 30 s after that."""
+        gps = solution("gps", during(100, 109, BEYOND), blind=list(range(50, 70)))
+        found = compared(gps, solution("galileo"))
+        assert found["gps", REACTIVE]["availability"] == pytest.approx(1 - 20 / 199)
+        assert found["gps", COMPOSITE]["availability"] == pytest.approx(1 - 40 / 199)
+        # Up 99 s and, from 140 s on, 59 s; lost once.
+        assert found["gps", COMPOSITE]["mtbf_h"] == pytest.approx((99 + 59) / 3600)
+        assert found["galileo", REACTIVE]["mtbf_h"] is None
+        assert found["galileo", REACTIVE]["mtbf_low_h"] == pytest.approx(199 / 3600 / 3.6889, rel=1e-4)
 
+    def test_the_comparison_needs_both_positions(self) -> None:
+        gps = solution("gps", confidence_m=[99.0 if 50 <= k < 60 else 8.0 for k in range(N)])
+        found = compared(gps, solution("galileo"))
+        for key in (("gps", REACTIVE), ("gps", COMPOSITE), ("galileo", COMPOSITE)):
+            assert found[key]["availability"] == pytest.approx(1 - 10 / 199)
+        assert found["galileo", REACTIVE]["availability"] == 1.0
 
-def test_an_alarm_that_stands_already() -> None:
-    found = compared(run({"channel": [90, 105]}), rows_of(fault(100, 108)))
-    assert found["composite"]["time_to_detect_max_s"] == 0.0
-
-
-def test_what_a_fault_caused_is_part_of_it() -> None:
-    found = compared(run({"channel": [101]}), rows_of(fault(100, 101), fault(120, None, caused_by=0)))
-    assert found["composite"]["hazards"] == 1
-
-
-def test_false_alarms_have_the_verdict_of_the_alarm() -> None:
-    frame = run({"along_raw": [20], "channel": [21, 100]})
-    known = alarms(2, t_start=[20 * NS, 100 * NS], t_end=[21 * NS, 100 * NS], verdict=["false", "true"])
-    found = compared(frame, rows_of(), known)
-    assert (found["reactive"]["alarms"], found["reactive"]["false_alarms"]) == (1, 1)
-    assert (found["composite"]["alarms"], found["composite"]["false_alarms"]) == (2, 1)
-    assert found["reactive"]["false_alarm_rate_per_h"] == pytest.approx(3600 / 199)
-
-
-def test_no_rate_of_alarms_without_verdict() -> None:
-    found = compared(run({"channel": [21]}), rows_of())
-    assert (found["composite"]["false_alarms"], found["composite"]["false_alarm_rate_per_h"]) == (0, None)
-
-
-def test_availability_is_diagnosis_that_does_not_fail() -> None:
-    """Channel blind for 20 s from 50 s and failing for 10 s from 100 s: 30 of 199 s."""
-    frame = run({"channel": list(range(100, 110))}, {"channel": list(range(50, 70))})
-    found = compared(frame, rows_of())
-    assert found["reactive"]["availability"] == 1.0
-    assert found["composite"]["availability"] == pytest.approx(1 - 30 / 199)
-    assert found["reactive"]["mtbf_h"] is None
-    # Up 49, 30 and 89 s from first to last good epoch of each stretch, lost twice.
-    assert found["composite"]["mtbf_h"] == pytest.approx((49 + 30 - 1 + 89) / 2 / 3600)
-
-
-def test_no_epochs() -> None:
-    found = compared(epochs([]), rows_of())
-    assert (found["reactive"]["availability"], found["composite"]["alarms"]) == (None, 0)
+    def test_no_common_epoch_no_comparison(self) -> None:
+        late = solution("galileo").with_columns(pl.col("t") + pl.duration(nanoseconds=400_000_000))
+        row = compared(solution("gps"), late)["gps", COMPOSITE]
+        assert (row["availability"], row["judged_h"], row["false_alarm_rate_per_h"]) == (0.0, 0.0, None)
 
 
 class TestRedundantChannels:
-    def both(self, first: list[int], second: list[int], offset_s: float = 0.0) -> pl.DataFrame:
+    def both(self, first: list[int], second: list[int], offset_s: float = 0.0) -> Any:
         """Two solutions at 1 Hz, each without confidence at the seconds given."""
         parts = []
-        for name, lost, shift in (("gps", first, 0.0), ("galileo", second, offset_s)):
+        for name, lost, shift in (("galileo", first, 0.0), ("gps", second, offset_s)):
             confidence = [99.0 if k in lost else 8.0 for k in range(N)]
-            parts.append(epochs([k + shift for k in range(N)], solution=name, confidence_m=confidence))
-        return pl.concat(parts)
+            shifted = pl.col("t") + pl.duration(nanoseconds=round(shift * NS))
+            parts.append(solution(name, confidence_m=confidence).with_columns(shifted))
+        return compared(*parts)
 
     def test_one_is_enough(self) -> None:
-        found = redundant_uptime(self.both(list(range(50, 60)), list(range(100, 110))), CONFIG)
-        assert (found.losses, found.up_s) == (0, 199.0)
+        found = self.both(list(range(50, 60)), list(range(100, 110)))
+        row = found["galileo", REDUNDANT]
+        assert (row["availability"], row["mtbf_h"]) == (1.0, None)
+        # Each alone lost once in 189 s of work, in hours: eq. 11 makes their product over 1 h of it.
+        alone = [found[name, REACTIVE]["mtbf_h"] for name in ("galileo", "gps")]
+        assert alone == pytest.approx([188 / 3600] * 2)
+        assert row["mtbf_expected_h"] == pytest.approx((188 / 3600) ** 2)
+        assert found["galileo", COMPOSITE]["mtbf_expected_h"] == pytest.approx(94 / 3600)
 
     def test_lost_only_where_both_are(self) -> None:
-        found = redundant_uptime(self.both(list(range(50, 60)), list(range(55, 65))), CONFIG)
-        assert found.losses == 1
-        assert found.up_s == 199.0 - 6.0
-        assert found.mean_time_between_losses_h == pytest.approx(193 / 3600)
+        row = self.both(list(range(50, 60)), list(range(55, 65)))["galileo", REDUNDANT]
+        assert row["availability"] == pytest.approx(193 / 199)
+        assert row["mtbf_h"] == pytest.approx(193 / 3600)
+        assert row["hazards"] is None
 
     def test_stamps_of_the_solutions_need_not_agree(self) -> None:
-        found = redundant_uptime(self.both(list(range(50, 60)), list(range(100, 110)), offset_s=0.4), CONFIG)
-        assert (found.losses, found.up_s) == (0, pytest.approx(199.4))
+        row = self.both(list(range(50, 60)), list(range(100, 110)), offset_s=0.4)["galileo", REDUNDANT]
+        assert (row["availability"], row["mtbf_h"]) == (pytest.approx(1.0), None)
+
+
+def test_tallies_of_runs_add_up() -> None:
+    runs = table(Runs, 2, solution=["gps", "galileo"], evidence="reference")
+    faults = rows_of(fault("gps", 100, 109))
+    one = side_by_side(pl.concat([solution("gps", {105: BEYOND}), solution("galileo")]), faults, alarms(), runs, CONFIG)
+    two = side_by_side(pl.concat([solution("gps"), solution("galileo")]), faults, alarms(), runs, CONFIG)
+    total = (one["gps", COMPOSITE, "galileo"] + two["gps", COMPOSITE, "galileo"]).row()
+    assert (total["failures"], total["missed"], total["missed_share"]) == (2, 1, 0.5)
+    assert (total["time_to_detect_max_s"], total["judged_h"]) == (5.0, pytest.approx(2 * 199 / 3600))
+    redundant = one["galileo", REDUNDANT, "gps"] + two["galileo", REDUNDANT, "gps"]
+    assert (redundant.row()["hazards"], redundant.working.held_s) == (None, 398.0)
+
+
+def test_one_solution_has_nothing_to_be_compared_with() -> None:
+    assert set(compared(solution("gps"))) == {("gps", REACTIVE)}

@@ -1,0 +1,130 @@
+"""Several solutions in one run: compared with each other, and composite beside reactive fail-safety (LOC Fig. 3, 4)."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from pipeline.channels import on_path_of
+from pipeline.replay import replay
+from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
+from schemas.config import Configuration
+from tests.replay.journeys import VEHICLE, journey
+
+OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
+SLOW = {"kind": "ramp", "rate_mps": 0.3, "start_s": 100.0, "duration_s": 120.0}
+THERE_AND_BACK = {
+    "start_m": 200.0,
+    "phases": [
+        {"speed_mps": 30.0},
+        {"stop_at_m": 7500.0, "hold_s": 10.0},
+        {"speed_mps": -20.0, "hold_m": 4000.0},
+        {"speed_mps": 0.0},
+    ],
+}
+
+
+def two(first, second):
+    """The logs of one journey as two solutions."""
+    other = second.gnss.with_columns(solution=pl.lit("galileo"))
+    return first.with_streams(gnss=pl.concat([first.gnss, other]).sort("t"))
+
+
+def rows(tables, config=None):
+    settings = config or Configuration()
+    found = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, settings)
+    return {(row["solution"], row["architecture"]): row for row in side_by_side_table(found).iter_rows(named=True)}
+
+
+def with_reference(name):
+    return Configuration.model_validate({"monitors": {"channel_reference": name}})
+
+
+def test_fault_of_one_solution_is_found_by_both_architectures():
+    faulty, site = journey(OFFSET)
+    sound, _ = journey(seed=9)
+    found = rows(replay(two(faulty, sound), site, VEHICLE))
+    for architecture in (REACTIVE, COMPOSITE):
+        row = found["primary", architecture]
+        assert (row["failures"], row["detected"], row["missed"]) == (1, 1, 0)
+        assert row["time_to_detect_max_s"] == pytest.approx(0.0, abs=0.11)
+    assert found["galileo", REACTIVE]["alarms"] == found["galileo", COMPOSITE]["false_alarms"] == 0
+    # The comparison takes down both channels, the diagnosis the faulty one.
+    assert found["galileo", REACTIVE]["availability"] > 0.95
+    assert found["galileo", COMPOSITE]["availability"] < 0.75
+
+
+def test_fault_common_to_both_solutions_only_the_diagnosis_finds():
+    one, site = journey(OFFSET)
+    other, _ = journey(OFFSET, seed=9)
+    found = rows(replay(two(one, other), site, VEHICLE))
+    for name in ("primary", "galileo"):
+        assert (found[name, REACTIVE]["detected"], found[name, REACTIVE]["missed"]) == (1, 0)
+        composite = found[name, COMPOSITE]
+        assert (composite["detected"], composite["missed"], composite["common_missed"]) == (0, 1, 1)
+
+
+def test_slow_drift_of_one_the_comparison_finds_before_it_fails():
+    drifting, site = journey(SLOW)
+    sound, _ = journey(seed=9)
+    found = rows(replay(two(drifting, sound), site, VEHICLE))
+    composite = found["primary", COMPOSITE]
+    assert (composite["detected"], composite["missed"]) == (1, 0)
+    # 5.3267 sqrt(2) sigma of about 1 m at 0.3 m/s are 25 s, give or take the noise of both.
+    assert 10.0 < composite["time_to_detect_max_s"] < 45.0
+
+
+def test_compared_after_the_fact_is_what_the_monitor_sees():
+    faulty, site = journey(OFFSET)
+    sound, _ = journey(seed=9)
+    run = two(faulty, sound)
+    seen = replay(run, site, VEHICLE, with_reference("galileo")).epochs
+    fails = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") == "fail"))
+    tallies = side_by_side(*_tables(replay(run, site, VEHICLE)), Configuration())
+    judged = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") != "not_evaluated"))
+    composite = tallies["primary", COMPOSITE, "galileo"]
+    assert composite.faults.time_to_detect_s == pytest.approx([(fails["t"][0] - seen["t"][0]).total_seconds() - 150.0])
+    assert composite.alarms.judged_s == pytest.approx(judged.height * 0.1, abs=0.2)
+
+
+def _tables(tables):
+    return tables.epochs, tables.hazards, tables.alarms, tables.runs
+
+
+@pytest.mark.parametrize("reference", ["galileo", "primary"])
+def test_a_solution_that_begins_on_the_way_back_is_compared_on_the_same_path(reference):
+    """Its own path grows the other way; it used to fail the comparison at every epoch."""
+    run, site = journey(motion=THERE_AND_BACK)
+    begin = run.gnss["t"][0] + pl.duration(seconds=350)
+    late, _ = journey(motion=THERE_AND_BACK, seed=9)
+    both = two(run, late.with_streams(gnss=late.gnss.filter(pl.col("t") > begin)))
+    tables = replay(both, site, VEHICLE, with_reference(reference))
+    compared = tables.epochs.filter(pl.col("channel_state") != "not_evaluated")
+    assert compared.height > 2000
+    assert set(compared["channel_state"]) == {"pass"}
+    assert tables.alarms.height == 0
+
+
+def test_a_path_from_another_origin_against_the_measure_and_over_a_border():
+    """Element A of 1000 m, then B; the other solution is on B throughout, and its path runs from 100 m on B back."""
+    mine = pl.DataFrame(
+        {
+            "t": [0, 1, 2, 3],
+            "netelement_id": ["A", "A", "A", "B"],
+            "measure_m": [970.0, 980.0, 990.0, 5.0],
+            "path_m": [970.0, 980.0, 990.0, 1005.0],
+        }
+    )
+    other = pl.DataFrame(
+        {
+            "t": [0, 1, 2, 3, 9],
+            "netelement_id": ["B", "B", "B", "B", "B"],
+            "measure_m": [3.0, 2.0, 1.0, 8.0, 20.0],
+            "path_m": [97.0, 98.0, 99.0, 92.0, 80.0],
+        }
+    )
+    assert on_path_of(mine, other)["path_m"].to_list() == [None] * 5  # one epoch on B does not tell its sense
+    longer = pl.concat([mine, mine[3:].with_columns(t=pl.lit(9, pl.Int64), measure_m=pl.lit(25.0), path_m=pl.lit(1025.0))])
+    assert on_path_of(longer, other)["path_m"].to_list() == [1003.0, 1002.0, 1001.0, 1008.0, 1020.0]
+    apart = other.with_columns(netelement_id=pl.lit("C"))
+    assert on_path_of(longer, apart)["path_m"].to_list() == [None] * 5
