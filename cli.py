@@ -224,6 +224,7 @@ def calibrate(
     out: Annotated[Path, typer.Option("--out", help="Vehicle file to write.")],
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
+    solution: Annotated[str, typer.Option(help="Solution of the runs to measure on.")] = "primary",
     as_json: Json = False,
 ) -> None:
     """Measure odometer scale, GNSS latency and the monitors' sigmas on fault-free runs."""
@@ -237,7 +238,7 @@ def calibrate(
 
     settings, train = _settings(config, vehicle)
     logs = [read_run(address, settings.ingest) for address in find_runs(runs).values()]
-    found = measure(logs, read_site(site), train, settings)
+    found = measure(logs, read_site(site), train, settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     if as_json:
         _print_json({"vehicle": found.vehicle.model_dump(), "runs": found.runs, "sigmas": found.sigmas})

@@ -57,6 +57,7 @@ def calibrate(
     where no run can be compared with an odometer.
     """
     config, base = config or Configuration(), vehicle or Vehicle()
+    _check_solution(logs, solution)
     estimates = [(log.run_id, _estimate(log, site, base, config, solution)) for log in logs]
     found = [estimate for _, estimate in estimates if estimate is not None]
     if not found:
@@ -76,6 +77,17 @@ def calibrate(
         sigma_intercept_m=None if worst is None else worst.intercept_m,
         sigma_slope=None if worst is None else worst.slope,
     )
+
+
+def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
+    known = sorted({name for log in logs for name in log.solutions()})
+    if solution not in known:
+        raise InputError(
+            "is a solution of no run",
+            place=solution,
+            found=", ".join(known),
+            remedy="Name one of these with --solution.",
+        )
 
 
 def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> RunEstimate | None:

@@ -32,6 +32,8 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
             warnings.filterwarnings("ignore", message="POLARS_MAX_BLOCKING_THREAD_COUNT")
             return pl.SQLContext(tables).execute(sql).collect()
     except pl.exceptions.PolarsError as error:
+        if not is_url(out):
+            store.check_tables(out, [name for name in TABLES if name in tables])
         raise UsageError(
             f"cannot be answered: {_first_line(error)}",
             place="SQL",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -10,8 +11,8 @@ from urllib.parse import quote, unquote
 import polars as pl
 
 from pipeline import storage
-from pipeline.ingest.files import Address, is_url, join
-from schemas.config import Settings, to_toml
+from pipeline.ingest.files import Address, exists, is_url, join, read_bytes
+from schemas.config import Configuration, Settings, settings_from, to_toml
 from schemas.conform import conform
 from schemas.errors import UsageError
 from schemas.run import RunTables
@@ -82,13 +83,47 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
         return pl.LazyFrame(schema=schema)
     paths = [table_address(out, table, run) for run in runs]
     if is_url(out):
-        return _read_remote([str(path) for path in paths], runs).select(list(schema))
+        return _read_remote(table, [str(path) for path in paths], runs).select(list(schema))
     if run_id is not None and not Path(paths[0]).exists():
         raise UsageError("has no such run", place=str(out), found=run_id)
-    scan = pl.scan_parquet(
-        [Path(path) for path in paths], hive_partitioning=True, hive_schema={"run_id": pl.String}, glob=False
-    )
+    files = [Path(path) for path in paths]
+    for file, run in zip(files, runs, strict=True):
+        _check_columns(table, run, _schema_of(table, run, file))
+    scan = pl.scan_parquet(files, hive_partitioning=True, hive_schema={"run_id": pl.String}, glob=False)
     return scan.select(list(schema))
+
+
+def check_tables(out: Address, tables: Iterable[str]) -> None:
+    """Refuse results of another build of the program, whose tables have other columns; local results only."""
+    for table in tables:
+        for run in run_ids(out):
+            _check_columns(table, run, _schema_of(table, run, Path(table_address(out, table, run))))
+
+
+def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]:
+    try:
+        return pl.read_parquet_schema(file)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise UsageError(
+            f"cannot be read: {str(error).strip().splitlines()[0]}",
+            place=f"run {run_id}, table `{table}`",
+            remedy="Replay this run again with --force.",
+        ) from None
+
+
+def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) -> None:
+    expected = TABLES[table].create_empty().schema
+    lost = [name for name in expected if name not in found]
+    other = [f"{name} as {found[name]}, not {kind}" for name, kind in expected.items() if found.get(name, kind) != kind]
+    if lost or other:
+        parts = ([f"no {', '.join(lost)}"] if lost else []) + other
+        raise UsageError(
+            "was written by another build of the program",
+            place=f"run {run_id}, table `{table}`",
+            found="; ".join(parts),
+            expected=f"the columns of contract {CONTRACT_VERSION} as of this build",
+            remedy="Replay this run again into the same output; `balise replay` sees that it is due.",
+        )
 
 
 def run_ids(out: Address) -> list[str]:
@@ -146,6 +181,14 @@ def _remove_unfinished(files: Iterable[Path]) -> None:
         file.unlink(missing_ok=True)
 
 
+def read_config(out: Address) -> Configuration | None:
+    """The configuration that a result was made with; None where it holds none."""
+    address = join(out, "config.toml")
+    if not exists(address):
+        return None
+    return settings_from(tomllib.loads(read_bytes(address).decode()), Configuration, str(address))
+
+
 def write_config(out: Address, settings: Settings) -> None:
     """`OUT/config.toml`: the resolved configuration."""
     storage.write_bytes(join(out, "config.toml"), to_toml(settings).encode())
@@ -155,13 +198,14 @@ def _partition(run_id: str) -> str:
     return f"run_id={quote(run_id, safe=' +,()[]@!~')}"
 
 
-def _read_remote(paths: list[str], runs: list[str]) -> pl.LazyFrame:
+def _read_remote(table: str, paths: list[str], runs: list[str]) -> pl.LazyFrame:
     contents = storage.read_many(paths)
-    frames = [
-        pl.read_parquet(contents[path]).lazy().with_columns(run_id=pl.lit(run))
-        for path, run in zip(paths, runs, strict=True)
-        if path in contents
-    ]
+    frames = []
+    for path, run in zip(paths, runs, strict=True):
+        if path in contents:
+            frame = pl.read_parquet(contents[path])
+            _check_columns(table, run, frame.schema)
+            frames.append(frame.lazy().with_columns(run_id=pl.lit(run)))
     if not frames:
         raise UsageError("has no such run", found=", ".join(runs[:5]))
-    return pl.concat(frames)
+    return pl.concat(frames, how="diagonal")

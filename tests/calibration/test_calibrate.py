@@ -98,6 +98,14 @@ def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]
         calibrate([logs[0].with_streams(odometer=None)], site)
 
 
+def test_the_solution_is_the_one_named(fault_free: tuple[list[RunLog], Site]) -> None:
+    logs, site = fault_free
+    renamed = [log.with_streams(gnss=log.gnss.with_columns(solution=pl.lit("galileo"))) for log in logs]
+    with pytest.raises(InputError, match="primary: is a solution of no run; found galileo"):
+        calibrate(renamed, site)
+    assert calibrate(renamed, site, solution="galileo").vehicle == calibrate(logs, site).vehicle
+
+
 def test_a_recorded_minute_gives_its_known_scale_and_latency() -> None:
     """comma2k19: wheels read 0.85 % short and fixes lag by some 85 ms, by least squares against the pose."""
     segment = Path(__file__).parents[3] / "shared" / "data" / "comma2k19" / "segment"

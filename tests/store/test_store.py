@@ -209,3 +209,31 @@ def test_remote_store_holds_the_same_bytes(tmp_path: Path) -> None:
     store.sweep(out)
     assert store.run_ids(out) == ["b c"]
     assert storage.read_many([str(store.table_address(out, "epochs", "a"))]) == {}
+
+
+def as_of_another_build(out: object, run_id: str) -> None:
+    """The run's `runs` file lacks a column and has another in another type."""
+    place = store.table_address(out, "runs", run_id)  # type: ignore[arg-type]
+    content = storage.read_many([str(place)])[str(place)] if str(out).startswith("memory") else Path(place).read_bytes()
+    frame = pl.read_parquet(content).drop("notes").cast({"outages": pl.Int32})
+    storage.write_bytes(place, store.parquet_bytes(frame, {}))
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_results_of_another_build_are_named(tmp_path: Path, remote: bool) -> None:
+    out = "memory://another-build/out" if remote else tmp_path
+    for run_id in ("a", "b"):
+        store.write_run(tables_of(run_id), out, METADATA)
+    as_of_another_build(out, "b")
+    message = "run b, table `runs`: was written by another build .* no notes; outages as Int32.*[Rr]eplay"
+    with pytest.raises(UsageError, match=message):
+        store.read_table(out, "runs")
+    assert store.read_table(out, "runs", "a").collect().height == 1
+    assert store.read_table(out, "hazards").collect().height == 0
+
+
+def test_configuration_comes_back(tmp_path: Path) -> None:
+    assert store.read_config(tmp_path) is None
+    config = Configuration.model_validate({"lds": {"ci_limit_m": 12.5}, "safety": {"demands_per_hour": 64.0}})
+    store.write_config(tmp_path, config)
+    assert store.read_config(tmp_path) == config

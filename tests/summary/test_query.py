@@ -1,5 +1,6 @@
 """SQL over a result on disk."""
 
+import shutil
 from pathlib import Path
 
 import polars as pl
@@ -53,7 +54,7 @@ def test_a_condition_on_the_run_reads_no_other(out: Path, tmp_path: Path) -> Non
             target.parent.mkdir(parents=True)
             target.write_bytes(Path(table_address(out, name, run)).read_bytes() if run == "a" else b"broken")
     assert run_sql(tmp_path, "SELECT * FROM hazards WHERE run_id = 'a'").height == 3
-    with pytest.raises(UsageError, match="cannot be answered"):
+    with pytest.raises(UsageError, match="run d=e, table `hazards`: cannot be read"):
         run_sql(tmp_path, "SELECT * FROM hazards")
 
 
@@ -91,3 +92,11 @@ def test_what_cannot_be_answered_says_what_can(out: Path, sql: str, said: str) -
 def test_not_a_result(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no complete run"):
         run_sql(tmp_path, "SELECT 1")
+
+
+def test_a_result_of_another_build_is_named(out: Path, tmp_path: Path) -> None:
+    shutil.copytree(out, tmp_path / "old")
+    file = next((tmp_path / "old/passages").rglob("*.parquet"))
+    pl.read_parquet(file).drop("speed_mps").write_parquet(file)
+    with pytest.raises(UsageError, match=r"table `passages`: was written by another build .* no speed_mps"):
+        run_sql(tmp_path / "old", "SELECT max(speed_mps) FROM passages")
