@@ -37,7 +37,7 @@ class Decompressor:
                 room[:] = chunk.records
             return len(chunk.records)
         if chunk.compression == "zstd" and _zstd_frame_size(chunk.records) == len(chunk.records):
-            return _from_stream(self._zstd.stream_reader(chunk.records), room)
+            return _from_stream(self._zstd.stream_reader(chunk.records, read_size=len(chunk.records)), room)
         if chunk.compression == "zstd":  # several frames, or none: the strict way
             room[:] = memoryview(pa.decompress(chunk.records, chunk.size, codec="zstd"))
             return chunk.size
@@ -69,7 +69,7 @@ def _zstd_frame_size(content: memoryview) -> int | None:
     sizes = (1 if single_segment else 0, 2, 4, 8)
     at = 5 + (1 - single_segment) + (0, 1, 2, 4)[descriptor & 3] + sizes[descriptor >> 6]
     while at + 3 <= len(content):
-        block = int.from_bytes(content[at : at + 3], "little")
+        block = content[at] | content[at + 1] << 8 | content[at + 2] << 16
         kind, size = block >> 1 & 3, block >> 3
         at += 3 + (1 if kind == 1 else size)
         if block & 1:

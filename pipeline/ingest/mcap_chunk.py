@@ -138,13 +138,14 @@ def _between(data: Bytes, chunks: Sequence[Placed], named: Sequence[Named], on_r
     ends = np.concatenate([[0], *(part.ends for part in named)])
     starts.sort(kind="stable")
     ends.sort(kind="stable")
-    overlaps = starts < ends
-    if overlaps.any():
-        place = int(starts[overlaps.argmax()])
+    apart = np.flatnonzero(starts != ends)
+    overlaps = apart[starts[apart] < ends[apart]]
+    if len(overlaps):
+        place = int(starts[overlaps[0]])
         kind = "records of a chunk overlap, or its message index names one twice"
         raise DamageError(_chunk_at(chunks, place).offset, kind)
     found: list[int] = []
-    for gap in np.flatnonzero(starts > ends).tolist():
+    for gap in apart.tolist():
         found += _walk_gap(data, chunks, int(ends[gap]), int(starts[gap]), on_record)
     return np.array(found, dtype=np.int64)
 

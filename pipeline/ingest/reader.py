@@ -114,8 +114,8 @@ class SourceReader:
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""
         self._take_fields()
-        ordinals = np.concatenate([np.zeros(0, np.int64), *self._columns[ORDINAL]])
-        order = None if self._in_order else np.argsort(ordinals, kind="stable")
+        parts = [np.asarray(part) for part in self._columns[ORDINAL]]
+        order = None if self._in_order else np.argsort(np.concatenate(parts), kind="stable")
         types: dict[str, pl.DataType] = {name: pl.Int64() for name in (ORDINAL, *self._times)}
         types |= self.source.types
         series = []
