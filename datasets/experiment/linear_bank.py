@@ -29,7 +29,8 @@ AXES: tuple[str, ...] = ("along", "cross", "up")
 class BankSpec:
     """A bank that a user may configure: EWMA weights at 1 s (1 = raw), sensors, probability, rate of epochs.
 
-    Without alphas it is the bank that goes with the reading of the odometer's noise.
+    Without alphas it is the bank that goes with the reading of the odometer's noise. `age_s`: how long the bank has
+    run since its restart when a fault begins; none is so long that nothing of the restart is left.
     """
 
     alphas: tuple[float, ...] = ()
@@ -39,6 +40,7 @@ class BankSpec:
     rate_hz: float = 1.0
     odometer_m: float = 0.05
     map_m: float = 1.0
+    age_s: float | None = None
 
     @classmethod
     def of(cls, config: MonitorConfig, sensors: Sensors, rate_hz: float = 1.0) -> BankSpec:
@@ -58,7 +60,7 @@ class BankSpec:
 
 @dataclass(frozen=True)
 class LinearBank:
-    """Monitors along, and with track across and up; stationary, as long after a restart.
+    """Monitors along, and with track across and up; stationary, unless the bank has an age.
 
     `advance` A and `noise` B as above; `sources` is the number of error states before the monitors; `slope`
     (monitors,) final response to a range ramp of 1 m/s; `alpha` (monitors,) weight of one epoch.
@@ -81,33 +83,62 @@ class LinearBank:
 
     @property
     def sigma(self) -> Array:
-        """Of each monitor [m/s]."""
+        """Of each monitor, long after the restart [m/s]."""
         diagonal: Array = np.sqrt(np.diag(self.covariance)[self.sources :])
         return diagonal
 
     @property
     def threshold(self) -> Array:
-        """k_T sigma (DIAG eq. 17) [m/s]."""
+        """k_T sigma (DIAG eq. 17), long after the restart [m/s]."""
         return threshold_factor(self.spec.false_alarm_probability) * self.sigma
+
+    def covariances(self, epochs: int) -> Array:
+        """Covariance of the state at epochs 0 .. n of the fault, (epochs + 1, states, states)."""
+        states = len(self.advance)
+        if self.spec.age_s is None:
+            return np.broadcast_to(self.covariance, (epochs + 1, states, states))
+        pushed = self.noise @ self.noise.T
+        current = np.zeros((states, states))
+        # At a restart the position errors go on as they were, and the monitors have seen nothing.
+        current[: self.sources, : self.sources] = self.covariance[: self.sources, : self.sources]
+        result = np.empty((epochs + 1, states, states))
+        age = round(self.spec.age_s * self.spec.rate_hz)
+        for k in range(age + epochs + 1):
+            if k >= age:
+                result[k - age] = current
+            current = self.advance @ current @ self.advance.T + pushed
+        return result
+
+    def sigmas(self, epochs: int) -> Array:
+        """Of each monitor at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
+        variances = np.diagonal(self.covariances(epochs)[1:], axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variances[:, self.sources :]))
+
+    def thresholds(self, epochs: int) -> Array:
+        """k_T sigma at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
+        return threshold_factor(self.spec.false_alarm_probability) * self.sigmas(epochs)
 
     def response(self, epochs: int) -> Array:
         """To a range ramp of 1 m/s that starts at epoch 0, at epochs 1 .. n; shape (epochs, monitors)."""
         k = np.arange(1, epochs + 1)[:, None]
         return np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
 
-    def covariance_with(self, monitor: int, epoch: int, epochs: int) -> Array:
-        """Covariance of all monitors at epochs 1 .. n with one monitor at one epoch (1-based), (epochs, monitors)."""
-        P, A = self.covariance, self.advance
+    def covariance_with(self, monitor: int, epoch: int, covariances: Array) -> Array:
+        """Covariance of all monitors at epochs 1 .. n with one monitor at one epoch (1-based), (epochs, monitors).
+
+        `covariances` (n + 1, states, states): those of the state, as above.
+        """
+        P, A, epochs = covariances, self.advance, len(covariances) - 1
         result = np.empty((epochs, self.slope.size))
         place = self.sources + monitor
-        later = P[:, place].copy()
+        later = P[epoch, :, place].copy()
         for k in range(epoch, epochs + 1):
             result[k - 1] = later[self.sources :]
             later = A @ later
-        earlier = np.zeros(P.shape[0])
+        earlier = np.zeros(len(A))
         earlier[place] = 1.0
         for k in range(epoch, 0, -1):
-            result[k - 1] = (P @ earlier)[self.sources :]
+            result[k - 1] = (P[k] @ earlier)[self.sources :]
             earlier = A.T @ earlier
         return result
 
@@ -123,8 +154,8 @@ class LinearBank:
         return result
 
     def start(self, runs: int, rng: np.random.Generator) -> Array:
-        """Stationary states, shape (states, runs)."""
-        values, vectors = np.linalg.eigh(self.covariance)
+        """States at the fault's onset, shape (states, runs)."""
+        values, vectors = np.linalg.eigh(self.covariances(0)[0])
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ rng.standard_normal((values.size, runs)))
 

@@ -64,7 +64,7 @@ def test_results_do_not_depend_on_the_number_of_jobs() -> None:
 
 def test_time_until_a_miss_is_rare_enough() -> None:
     bank = linear_bank(GPS, 0.0, BankSpec())
-    earlier, later = (epochs_until(bank, 1.0, target, seed=1, jobs=1) for target in (1e-3, 1e-9))
+    earlier, later = epochs_until(bank, 1.0, (1e-3, 1e-9), seed=1, jobs=1)
     assert earlier is not None
     assert later is not None
     assert earlier < later < failure_epoch(bank, 1.0)

@@ -4,17 +4,19 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from datasets.experiment.geometry import TAUS_S, default_geometry
+from datasets.experiment.geometry import TAUS_S, Constellation, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import BANKS
 from datasets.experiment.rare import (
     false_alarm_probability,
     missed_detection_probability,
-    most_probable_miss,
     plain_false_alarm,
     plain_missed_detection,
+    populations,
 )
-from datasets.experiment.sigmas import limit_sigmas
+from datasets.experiment.rare_rows import first_below
+from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
+from datasets.experiment.splitting import most_probable_miss
 from datasets.experiment.workers import generator
 
 GPS = default_geometry("gps")
@@ -38,7 +40,7 @@ def test_sigmas_are_those_of_the_closed_form(rate_hz: float) -> None:
 def test_covariances_over_time_are_those_of_simulated_paths() -> None:
     system = bank(reading="position")
     paths = np.stack([noise.copy() for noise in system.paths(40, 40_000, generator(1))])
-    wanted = system.covariance_with(2, 25, 40)
+    wanted = system.covariance_with(2, 25, system.covariances(40))
     measured = (paths * paths[24, 2]).mean(axis=2)
     scale = system.sigma * system.sigma[2]
     assert (np.abs(measured - wanted) / scale).max() < 5.0 / np.sqrt(40_000)
@@ -105,3 +107,67 @@ def test_results_do_not_depend_on_the_number_of_jobs() -> None:
     system = bank()
     one, two = (missed_detection_probability(system, 60, 0.3, runs=1000, seed=8, jobs=jobs) for jobs in (1, 2))
     assert one == two
+
+
+@pytest.mark.parametrize(
+    ("constellation", "changes", "rate", "epochs", "decade"),
+    [
+        # A sample of shifted noise alone said 7.6e-10 here, once in 500 runs, or lost every run.
+        ("gps_galileo", {"sensors": "odometer_and_track"}, 0.1, 576, -7),
+        ("gps", {"sensors": "odometer_and_track"}, 0.03, 1040, -4),
+        ("gps", {"reading": "position"}, 0.03, 960, -5),
+    ],
+)
+def test_many_near_thresholds_leave_runs_alive(
+    constellation: Constellation, changes: dict[str, object], rate: float, epochs: int, decade: int
+) -> None:
+    system = linear_bank(default_geometry(constellation), 0.0, BankSpec(**changes))  # type: ignore[arg-type]
+    one, two = (missed_detection_probability(system, epochs, rate, runs=4000, seed=seed) for seed in (1, 2))
+    assert np.floor(np.log10(one.value)) == decade
+    assert one.relative_error < 0.3
+    assert one.value == pytest.approx(two.value, abs=4 * np.hypot(one.relative_error, two.relative_error) * two.value)
+
+
+def test_a_miss_that_counting_sees_once_in_a_thousand_over_a_long_time() -> None:
+    """Dual constellation, 0.03 m/s, twelve monitors: some 1400 epochs near thresholds, where a shift alone fails."""
+    system = linear_bank(default_geometry("gps_galileo"), 0.0, BankSpec(sensors="odometer_and_track"))
+    clever = missed_detection_probability(system, 1_700, 0.03, runs=2_000, seed=3)
+    plain = plain_missed_detection(system, 1_700, 0.03, runs=2_000, seed=4)
+    assert 0.002 < plain.value < 0.3
+    spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
+    assert clever.value == pytest.approx(plain.value, abs=4 * spread)
+
+
+@pytest.mark.parametrize("age_s", [0.0, 40.0])
+def test_a_young_bank_has_its_own_sigmas_and_misses(age_s: float) -> None:
+    young, old = bank(age_s=age_s), bank()
+    axis = GPS.axes(0.0)[0]
+    variances = np.einsum("a,jab,b->j", axis, GPS.source_covariances_m2, axis)
+    exact = bank_sigmas(np.array(BANKS["increments"]), int(age_s) + 60, variances, TAUS_S, 0.05, 0.0)
+    assert young.sigmas(60) == pytest.approx(exact[int(age_s) :], rel=1e-7)
+    clever = missed_detection_probability(young, 60, 0.3, runs=4000, seed=9)
+    plain = plain_missed_detection(young, 60, 0.3, runs=60_000, seed=10)
+    spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
+    assert clever.value == pytest.approx(plain.value, abs=4 * spread)
+    assert clever.value != pytest.approx(missed_detection_probability(old, 60, 0.3, runs=4000, seed=9).value, rel=0.3)
+
+
+def test_a_bank_older_than_its_memory_is_the_stationary_one() -> None:
+    assert bank(age_s=10_000.0).sigmas(3) == pytest.approx(bank().sigmas(3), rel=1e-6)
+
+
+def test_false_alarms_are_not_sampled_of_a_young_bank() -> None:
+    with pytest.raises(ValueError, match="stationary"):
+        false_alarm_probability(bank(age_s=0.0), 10)
+
+
+def test_the_first_time_below_a_target_by_hand() -> None:
+    """Halved every epoch: below 1e-3 from epoch 10 on; an estimate of zero is no proof of rarity."""
+    assert first_below(lambda epochs: 0.5**epochs, (1e-3, 1e-6, 1e-40), 100) == [10, 20, None]
+    assert first_below(lambda epochs: 0.0, (1e-3,), 100) == [None]
+
+
+def test_runs_are_shared_by_populations_of_some_size() -> None:
+    assert populations(20_000) == [1_000] * 20
+    assert populations(1_100) == [250] * 4 + [100]
+    assert populations(7) == [7]
