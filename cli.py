@@ -141,14 +141,20 @@ def synth(
 
 
 @app.command()
-def safety(config: ConfigFile = None, as_json: Json = False) -> None:
-    """Tolerable hazard rates, allowed detection times, Markov and continuity tables, errata of the sources."""
+def safety(
+    out: Annotated[str | None, typer.Argument(help="A result of `balise replay`, for what it measured.")] = None,
+    config: ConfigFile = None,
+    as_json: Json = False,
+) -> None:
+    """Safety budget with its errata; of a result, what it measured against it, each figure with its bounds."""
+    if out is not None:
+        _assess(out, config, as_json)
+        return
     from pipeline.present import show_table
     from pipeline.safety import safety_tables
-    from pipeline.safety.errata import errata_table
 
     settings, _ = _settings(config, None)
-    tables = {**safety_tables(settings.safety), "errata": errata_table()}
+    tables = safety_tables(settings.safety)
     if as_json:
         _print_json(tables)
         return
@@ -392,6 +398,21 @@ def _print_json(value: Any) -> None:
     from pipeline.present import to_json
 
     print(to_json(value))
+
+
+def _assess(out: str, config: Path | None, as_json: bool) -> None:
+    from pipeline.assessment import assess, for_reading
+    from pipeline.present import show_table
+
+    settings = None if config is None else _settings(config, None)[0]
+    found = assess(out, settings)
+    if as_json:
+        _print_json({"statements": found.statements, **found.tables})
+        return
+    for name, table in for_reading(found.tables).items():
+        show_table(table, name)
+        print()
+    print("\n".join(found.statements))
 
 
 def _one_table(columns: Any, table: str) -> Any:

@@ -36,6 +36,14 @@ def plain_table(frame: pl.DataFrame, title: str = "") -> str:
     return "\n".join(lines)
 
 
+def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
+    """A wide table turned: one line per column, one column per row, headed by its keys."""
+    heads = [" ".join(str(part) for part in row if part not in (None, "")) for row in frame.select(keys).iter_rows()]
+    names = [name for name in frame.columns if name not in keys]
+    rows = [(name, *(_text(value) for value in frame[name].to_list())) for name in names]
+    return pl.DataFrame(rows, schema=dict.fromkeys(["figure", *heads], pl.String), orient="row")
+
+
 def to_json(value: Any) -> str:
     """JSON of frames, instants and plain values; what is not known is null."""
     return json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)

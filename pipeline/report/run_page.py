@@ -143,8 +143,9 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
         frame.filter(pl.col("solution") == name) for frame in (tables.hazards, tables.passages, tables.alarms)
     )
     epochs = tables.epochs.filter(pl.col("solution") == name)
+    title = f"Figures of {name}" if several else "Figures"
     parts = [
-        section(f"figures-{key}", f"Figures of {name}" if several else "Figures", *notes, _figures(row), _levels(key, row)),
+        section(f"figures-{key}", title, *notes, _figures(row), _levels(key, row)),
         section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
         _drawings(key),
         section(f"passages-{key}", "Passages", _passages(key, passages)),

@@ -93,7 +93,7 @@ def side_by_side_table(found: dict[Key, Tally]) -> pl.DataFrame:
     """One row per architecture and solution or pair; `mtbf_expected_h` from the MTBF of the channels alone.
 
     Of two independent channels: both needed, half the MTBF where they are equal; one enough, their product over
-    one hour (LOC eq. 11).
+    one hour (LOC eq. 11), which holds for MTBFs well beyond that hour and is left out below it.
     """
     rows: list[Row] = []
     for (solution, architecture, other), tally in sorted(found.items(), key=lambda item: _order(item[0])):
@@ -115,7 +115,9 @@ def _expected_h(architecture: str, found: dict[Key, Tally], solution: str, other
     one, two = (part.up_s / part.losses / 3600.0 if part.losses else None for part in alone)
     if one is None or two is None:
         return None
-    return one * two / (one + two) if architecture == COMPOSITE else one * two
+    if architecture == COMPOSITE:
+        return one * two / (one + two)
+    return one * two if min(one, two) > 1.0 else None
 
 
 def _solution(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -207,7 +208,61 @@ def test_dictionary(balise: Balise) -> None:
 
 def test_safety(balise: Balise) -> None:
     tables = json.loads(balise("safety", "--json").out)
-    assert "errata" in tables
+    assert {"allocation", "allowed_time_to_detect", "markov", "architectures", "fail_safety", "errata"} <= set(tables)
+    assert balise("safety").out.count("1.36e-4 h") == 1
+
+
+def test_safety_of_a_result(balise: Balise, result: Path, tmp_path: Path) -> None:
+    said = json.loads(balise("safety", result, "--json").out)
+    assert {"figures", "time_to_detect", "levels", "levels_of_runs", "accuracy", "side_by_side", "map"} <= set(said)
+    assert said["figures"] == json.loads(balise("sql", result, "SELECT * FROM campaign_figures", "--json").out)
+    assert "cannot substantiate a THR_VB of 6.70e-10/h" in " ".join(said["statements"])
+    assert {row["service_level"] for row in said["levels"]} == {"npa", "lpv200", "egnos_observed", "horizontal_sis"}
+    shown = balise("safety", result)
+    assert shown.status == 0
+    assert "hours_still_needed" in shown.out
+    assert said["statements"][-1] in shown.out
+
+
+def test_safety_of_a_result_by_another_service_level(balise: Balise, result: Path, tmp_path: Path) -> None:
+    levels = (
+        '[safety.service_levels.own]\nintegrity_risk = 1e-6\nexposure_s = 3600.0\n[hazards]\nservice_level = "own"\n'
+    )
+    (tmp_path / "own.toml").write_text(levels)
+    said = json.loads(balise("safety", result, "--config", tmp_path / "own.toml", "--json").out)
+    assert {row["service_level"] for row in said["levels"]} == {"own"}
+    assert said["levels"][0]["allowed_s"] == pytest.approx(2.412)
+
+
+def test_safety_of_no_result(balise: Balise, tmp_path: Path) -> None:
+    said = balise("safety", tmp_path)
+    assert said.status == 2
+    assert "holds no complete run; expected the output folder of `balise replay`" in said.err
+
+
+def test_calibrate_names_the_solutions_there_are(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    said = balise(
+        *("calibrate", small_trial.paths[0], "--site", small_trial.site, "--solution", "gallileo"),
+        *("--out", tmp_path / "train.toml"),
+    )
+    assert said.status == 1
+    assert "gallileo: is a solution of no run; found primary" in said.err
+
+
+def test_inspect_names_balises_that_linking_cannot_tell_apart(
+    balise: Balise, small_trial: SmallTrial, tmp_path: Path
+) -> None:
+    site = shutil.copytree(small_trial.site, tmp_path / "site")
+    balises = pl.read_parquet(site / "balises.parquet")
+    near = balises.sort("measure_m")[:1]
+    moved = [
+        near.with_columns(balise_id=pl.lit(name), measure_m=pl.col("measure_m") + along_m)
+        for name, along_m in (("NEAR1", 400.0), ("NEAR2", 480.0))
+    ]
+    pl.concat([near, *moved]).write_parquet(site / "balises.parquet")
+    said = balise("inspect", site)
+    assert "balises NEAR1, NEAR2" in said.out
+    assert "80.0 m apart, 103.2 m needed" in said.out
 
 
 def test_version(balise: Balise) -> None:

@@ -1,0 +1,166 @@
+"""What a result measured, for an assessor: figures with their bounds, and what they do and do not show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline import storage, store
+from pipeline.campaign_tables import campaign_accuracy, campaign_levels
+from pipeline.hazards.map_errors import map_places
+from pipeline.ingest.files import Address
+from pipeline.present import tall
+from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements
+from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
+from pipeline.safety.tally import Tally
+from schemas.config import Configuration
+from schemas.enums import RunStatus, ThrVerdict
+from schemas.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """`statements` in words; `tables` by name."""
+
+    statements: list[str]
+    tables: dict[str, pl.DataFrame]
+
+
+def assess(out: Address, config: Configuration | None = None) -> Assessment:
+    """Everything that `balise safety OUT` says, from the tables of all complete runs.
+
+    `config` instead of the result's own, to judge it by other service levels.
+    """
+    if not store.run_ids(out):
+        raise UsageError(
+            "holds no complete run",
+            place=storage.redacted(str(out)),
+            expected="the output folder of `balise replay`",
+        )
+    settings = config or store.read_config(out) or Configuration()
+    names = ("runs", "hazards", "passages", "alarms")
+    runs, hazards, passages, alarms = (store.read_table(out, name).collect() for name in names)
+    figures = measured_figures(runs, hazards, settings.safety)
+    detection = detection_by_level(hazards, settings.safety)
+    levels = campaign_levels(runs, hazards, settings.safety)
+    of_runs = compare_architectures(out, runs, hazards, alarms, settings)
+    tables = {
+        "figures": figures,
+        "time_to_detect": detection,
+        "levels": levels_summary(levels),
+        "levels_of_runs": levels,
+        "accuracy": campaign_accuracy(passages, settings),
+        "side_by_side": over_all_runs(of_runs),
+        "side_by_side_of_runs": by_run(of_runs),
+        "map": map_places(alarms),
+    }
+    return Assessment([*_reservations(runs), *plain_statements(figures), *_level_statements(detection)], tables)
+
+
+def compare_architectures(
+    out: Address, runs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
+) -> dict[str, dict[Key, Tally]]:
+    """`side_by_side` of every run that holds several solutions; one run's epochs in memory at a time."""
+    done = runs.filter(pl.col("status") != RunStatus.FAILED)
+    several = done.group_by("run_id").len().filter(pl.col("len") > 1)["run_id"].sort()
+    found = {}
+    for run_id in several.to_list():
+        epochs = store.read_table(out, "epochs", run_id).select(EPOCH_COLUMNS).collect()
+        of_hazards, of_alarms, of_runs = (frame.filter(pl.col("run_id") == run_id) for frame in (hazards, alarms, done))
+        found[run_id] = side_by_side(epochs, of_hazards, of_alarms, of_runs, config)
+    return found
+
+
+def by_run(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
+    """The architectures of each run, one run below the other."""
+    parts = [
+        side_by_side_table(of_run).insert_column(0, pl.lit(run_id).alias("run_id")) for run_id, of_run in found.items()
+    ]
+    return pl.concat(parts, how="vertical_relaxed") if parts else pl.DataFrame()
+
+
+def over_all_runs(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
+    """The architectures over all runs that hold the solutions concerned; `runs` says how many."""
+    total: dict[Key, Tally] = {}
+    runs: dict[Key, int] = {}
+    for of_run in found.values():
+        for key, tally in of_run.items():
+            total[key] = total[key] + tally if key in total else tally
+            runs[key] = runs.get(key, 0) + 1
+    table = side_by_side_table(total)
+    if table.is_empty():
+        return table
+    keys = zip(table["solution"], table["architecture"], table["other"], strict=True)
+    return table.insert_column(3, pl.Series("runs", [runs[key] for key in keys], dtype=pl.Int64))
+
+
+def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
+    """Runs by verdict, per solution and service level."""
+    counts = {verdict.value: (pl.col("verdict") == verdict.value).sum().cast(pl.Int64) for verdict in ThrVerdict}
+    return (
+        levels.group_by("solution", "service_level", "allowed_s", maintain_order=True)
+        .agg(**counts)
+        .sort("solution", maintain_order=True)
+    )
+
+
+def _reservations(runs: pl.DataFrame) -> list[str]:
+    """What keeps the figures from being those of traffic."""
+    injected = runs.filter(pl.col("notes").str.contains("faults were injected").fill_null(value=False))
+    failed = runs.filter(pl.col("status") == RunStatus.FAILED)["run_id"].n_unique()
+    said = []
+    if injected.height:
+        said.append(
+            f"Faults were injected into {injected['run_id'].n_unique()} of {runs['run_id'].n_unique()} runs: rates of "
+            "hazards, misses and outages per hour are those of the trial, not of traffic."
+        )
+    if failed:
+        said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and count nowhere.")
+    return said
+
+
+def _level_statements(detection: pl.DataFrame) -> list[str]:
+    """Per solution: how many failures were negated in the time that each service level allows."""
+    said = []
+    for (solution,), rows in detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True):
+        levels = [
+            f"{row['within']} within {row['allowed_s']:.4g} s ({row['service_level']}; 95 %: "
+            f"{row['within_share_low']:.1%} to {row['within_share_high']:.1%})"
+            for row in rows.iter_rows(named=True)
+        ]
+        failures, never = rows["failures"][0], rows["never_negated"][0]
+        said.append(
+            f"{solution}: of {failures} position failures {never} were never negated; " + ", ".join(levels) + "."
+        )
+    return said
+
+
+_SHORT = {
+    "time_to_detect": (
+        *("solution", "service_level", "allowed_s", "failures", "within", "within_share_low", "within_share_high"),
+        *("never_negated", "hazardous_median_s", "hazardous_p95_s", "hazardous_max_s"),
+        *("time_to_detect_median_s", "time_to_detect_p95_s", "time_to_detect_max_s"),
+    ),
+    "accuracy": (
+        *("solution", "grouped_by", "group", "accepted_judged", "location_error_mean_m", "location_error_sigma_m"),
+        *("location_error_p95_m", "location_error_max_m", "location_accuracy_m", "within_location_accuracy_share_low"),
+        *("within_location_accuracy", "within_ci_limit"),
+    ),
+}
+
+
+def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
+    """The tables as they fit a screen: without those of single runs, wide ones in fewer columns or turned."""
+    shown = {
+        "figures": tall(tables["figures"], ("solution",)),
+        "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
+        "runs by verdict per service level": tables["levels"],
+        "location error of accepted virtual balises": tables["accuracy"].select(_SHORT["accuracy"]),
+        "composite and reactive fail-safety side by side": tables["side_by_side"],
+        "places where the map is in doubt": tables["map"],
+    }
+    side = "composite and reactive fail-safety side by side"
+    if shown[side].height:
+        shown[side] = tall(shown[side], ("architecture", "solution", "other"))
+    return {name: table for name, table in shown.items() if table.height}
