@@ -9,6 +9,7 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.report.architectures import architectures_section, map_section
 from pipeline.report.availability import availability_map
 from pipeline.report.campaign_figures import Figure, headline, level_figures, share_text
 from pipeline.report.markup import Cell, badge, cell, figure, link, number, page, pairs, section, table
@@ -21,13 +22,17 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Campaign:
-    """Tables of all runs, `run_id` in front; `pieces` as from `availability_pieces`; `hrefs` of the runs' pages."""
+    """Tables of all runs, `run_id` in front; `pieces` as from `availability_pieces`; `hrefs` of the runs' pages;
+    `architectures` as from `over_all_runs`, `map` as from `map_places`.
+    """
 
     runs: pl.DataFrame
     hazards: pl.DataFrame
     passages: pl.DataFrame
     pieces: pl.DataFrame
     hrefs: Mapping[str, str]
+    architectures: pl.DataFrame
+    map: pl.DataFrame
 
 
 _RUN_COLUMNS = (
@@ -62,6 +67,8 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     body = [
         section("runs", "Runs", _run_counts(campaign.runs), _runs_table(campaign)),
         *(_solution(f"s{index}", name, campaign, made, len(solutions) > 1) for index, name in enumerate(solutions)),
+        architectures_section("architectures", campaign.architectures),
+        map_section(campaign.map),
         section("provenance", "Provenance", _provenance(campaign.runs), _configuration(made)),
     ]
     # Figures come before the long table where there are any.

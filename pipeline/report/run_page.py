@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 import polars as pl
 
+from pipeline.report.architectures import architectures_section
 from pipeline.report.markup import (
     UNKNOWN,
     Cell,
@@ -28,6 +29,8 @@ from pipeline.report.plan_view import plan_data
 from pipeline.report.run_columns import ALARM_COLUMNS, FIGURES, HAZARD_COLUMNS, PASSAGE_COLUMNS, PLOTS
 from pipeline.report.series import moments_of, reasons, time_data
 from pipeline.report.stanford import stanford_data
+from pipeline.safety.side_by_side import Key, side_by_side_table
+from pipeline.safety.tally import Tally
 from schemas.config import Configuration
 from schemas.run import RunTables, Site
 
@@ -43,12 +46,18 @@ class Made:
     site: Site | None
 
 
-def run_page(tables: RunTables, metadata: Mapping[str, str], made: Made) -> str:
-    """HTML of one run with all its solutions; one is shown at a time, all of them are in the page."""
+def run_page(
+    tables: RunTables, metadata: Mapping[str, str], made: Made, architectures: Mapping[Key, Tally] | None = None
+) -> str:
+    """HTML of one run with all its solutions; one is shown at a time, all of them are in the page.
+
+    `architectures`: the run's solutions side by side, where there are several.
+    """
     rows = list(tables.runs.iter_rows(named=True))
     names = [row["solution"] for row in rows if row["solution"]]
     parts = [_solution(f"s{number}", row, tables, len(rows) > 1) for number, row in enumerate(rows)]
-    body = "\n".join([_navigation(names), *parts, _provenance(rows, metadata, made)])
+    side_by_side = architectures_section("architectures", side_by_side_table(dict(architectures or {})))
+    body = "\n".join([_navigation(names), *parts, side_by_side, _provenance(rows, metadata, made)])
     data = {
         "run": tables.run_id,
         "limits": _limits(made.config),

@@ -8,9 +8,13 @@ from urllib.parse import quote
 
 import polars as pl
 
+from pipeline.assessment import over_all_runs
+from pipeline.hazards.map_errors import map_places
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, run_page
+from pipeline.safety.side_by_side import Key, side_by_side
+from pipeline.safety.tally import Tally
 from pipeline.store import metadata_of, read_table, run_ids, table_address
 from schemas.config import Configuration, read_toml, settings_from
 from schemas.errors import OutputError, UsageError
@@ -33,14 +37,18 @@ def write_report(out: Path, site: Site | None = None) -> list[Path]:
     names = {run: page_name(run) for run in runs}
     pages = {out / "report" / "runs" / name: run for run, name in names.items()}
     written = [*_write_assets(out / "report" / "assets")]
+    found: dict[str, dict[Key, Tally]] = {}
     for path, run in pages.items():
         metadata = metadata_of(Path(str(table_address(out, "runs", run))))
         _check_site(site, metadata, run)
-        written.append(_write(path, run_page(_tables(out, run), metadata, made).encode()))
+        tables = _tables(out, run)
+        if tables.runs.height > 1:
+            found[run] = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, made.config)
+        written.append(_write(path, run_page(tables, metadata, made, found.get(run)).encode()))
     for leftover in sorted(set((out / "report" / "runs").glob("*.html")) - set(pages)):
         leftover.unlink()
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
-    index = _write(out / "report" / "index.html", campaign_page(_campaign(out, made, hrefs), made).encode())
+    index = _write(out / "report" / "index.html", campaign_page(_campaign(out, made, hrefs, found), made).encode())
     return [index, *written]
 
 
@@ -70,7 +78,7 @@ def _tables(out: Path, run: str) -> RunTables:
     return RunTables(run, **frames)
 
 
-def _campaign(out: Path, made: Made, hrefs: dict[str, str]) -> Campaign:
+def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dict[Key, Tally]]) -> Campaign:
     needed = ("solution", "netelement_id", "measure_m", "speed_mps", "tvb", "alarm")
     epochs = read_table(out, "epochs").select(pl.col(name) for name in needed)
     return Campaign(
@@ -79,6 +87,8 @@ def _campaign(out: Path, made: Made, hrefs: dict[str, str]) -> Campaign:
         passages=read_table(out, "passages").collect(),
         pieces=availability_pieces(epochs, made.config.matching.deadband_mps),
         hrefs=hrefs,
+        architectures=over_all_runs(found),
+        map=map_places(read_table(out, "alarms").collect()),
     )
 
 

@@ -246,3 +246,44 @@ def test_command(replayed: dict[str, RunTables], tmp_path: Path) -> None:
     plan = data_of(tmp_path, "runs/jump_two.html")["solutions"]["primary"]["plan"]
     assert plan["geographic"] is False
     assert len(unpacked(plan["x"])) == replayed["jump_two"].epochs["path_m"].is_not_null().sum()
+
+
+def rows_of_table(html: str, identity: str) -> list[list[str]]:
+    """Texts of a table's body."""
+    found = re.search(rf'<table class="data" id="{identity}">.*?<tbody>(.*?)</tbody>', html, re.DOTALL)
+    assert found is not None
+    cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in found[1].strip().splitlines()]
+    return [[re.sub(r"<[^>]+>", "", text) for text in row] for row in cells]
+
+
+def test_architectures_stand_side_by_side_where_there_are_two_solutions(out: Path) -> None:
+    """The second solution is a copy of the first, so the comparison is blind to the drift of both."""
+    for page, identity in (("runs/drift_early.html", "table-architectures"), ("index.html", "table-architectures")):
+        rows = rows_of_table(text_of(out, page), identity)
+        assert [row[0] for row in rows] == ["reactive 1oo1"] * 2 + ["composite 2oo2"] * 2 + ["reactive 1oo2"]
+        for row in rows[:2]:
+            assert row[3:7] == ["1", "1", "1", "0"]
+        for row in rows[2:4]:
+            assert row[3:7] == ["1", "0", "1", "1"]
+            assert row[8] == "1"
+        assert rows[4][3] == "–"
+    assert "table-architectures" not in text_of(out, "runs/jump_two.html")
+
+
+def test_levels_stand_on_the_page_of_a_run(out: Path) -> None:
+    rows = rows_of_table(text_of(out, "runs/jump_two.html"), "table-levels-s0")
+    assert [row[0] for row in rows] == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
+    assert {row[3] for row in rows} <= {"kept", "exceeded", "no failure", "unknown"}
+
+
+def test_places_where_the_map_is_in_doubt(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    for run_id in ("a", "b"):
+        tables = replayed["jump_two"]
+        first = tables.alarms[:1].with_columns(
+            monitors=pl.lit(["cross_raw"]),
+            verdict=pl.lit("false", tables.alarms.schema["verdict"]),
+            hazard_id=pl.lit(None, pl.Int64),
+        )
+        write_run(RunTables(**{**vars(tables), "run_id": run_id, "alarms": first}), tmp_path, {})
+    write_report(tmp_path)
+    assert rows_of_table(text_of(tmp_path, "index.html"), "table-map")[0][3:6] == ["cross", "2", "2"]
