@@ -7,6 +7,7 @@ an epoch has no odometer.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -278,6 +279,9 @@ class _Learner:
         self._t_s, self._path_m, self._sigma_m = (
             values[self._rows] for values in (arrays.t_s, arrays.path_m, arrays.sigma_m)
         )
+        # Single times are looked up in lists, which is several times faster than in arrays.
+        self._times: list[float] = self._t_s.tolist()
+        self._stretches: list[int] = track.stretch_at(self._t_s).tolist()
         self._scale_known = vehicle.odometer_scale is not None
         self._latency_known = vehicle.gnss_latency_s is not None
 
@@ -314,7 +318,8 @@ class _Learner:
         position = begin
         while position < self._rows.size:
             end = min(position + _BLOCK, self._rows.size)
-            history += self._updates(history[-1][1], position, end)
+            current = max(index for index, (effective, _) in enumerate(history) if effective <= position)
+            history = history[current:] + self._updates(history[-1][1], position, end)
             self._put(history, position)
             series = self._series(position, end, begin)
             result, bank = run_axis(series, self._alphas, bank)
@@ -335,7 +340,7 @@ class _Learner:
         position = self._next(state.t_s + period_s, begin)
         while position < end:
             t_s, path_m, sigma_m = self._observation(position)
-            if self._broken(state.t_s, t_s):
+            if self._broken(self._next(state.t_s, 0), position):
                 state = self._filter.restart(state, t_s, path_m)
             state = self._filter.update(state, t_s, path_m, sigma_m, self._arrays.jitter_s)
             states.append((self._next(t_s + SPEED_SPAN_S, position + 1), state))
@@ -343,24 +348,21 @@ class _Learner:
         return states
 
     def _put(self, history: list[tuple[int, FilterState]], begin: int) -> None:
-        """Fill the estimates in use from position `begin` on."""
-        current = max(index for index, (effective, _) in enumerate(history) if effective <= begin)
-        changes = [(max(effective, begin), state) for effective, state in history[current:]]
-        self._learned.put([(self._epoch(effective), state.estimate()) for effective, state in changes])
+        """Fill the estimates in use from position `begin` on, where the first of these is in use."""
+        self._learned.put([(self._epoch(max(effective, begin)), state.estimate()) for effective, state in history])
 
     def _epoch(self, position: int) -> int:
         """Index among all epochs; the end for a position past the last."""
         return int(self._rows[position]) if position < self._rows.size else int(self._learned.scale.size)
 
-    def _broken(self, before_s: float, now_s: float) -> bool:
-        if now_s - before_s > self._config.align.gap_reset_s:
-            return True
-        stretches = self._track.stretch_at(np.array([before_s, now_s]))
-        return bool(stretches[0] != stretches[1])
+    def _broken(self, before: int, now: int) -> bool:
+        """Whether the odometer's distance was lost, or too much time passed, between two positions."""
+        lost = self._stretches[before] != self._stretches[now]
+        return lost or self._times[now] - self._times[before] > self._config.align.gap_reset_s
 
     def _next(self, t_s: float, at_least: int) -> int:
         """First position at or after this time, and not before `at_least`."""
-        return max(at_least, int(np.searchsorted(self._t_s, t_s)))
+        return max(at_least, bisect_left(self._times, t_s))
 
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
         """Along-track increments of these positions; the one at `restart` has none before it."""

@@ -11,6 +11,7 @@ tells what the data really say about scale and latency; the offset walks with th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -85,36 +86,41 @@ class ScaleLatencyFilter:
     ) -> FilterState:
         """The state after the epoch at `t_s` with GNSS path position, its sigma and the stamps' jitter."""
         mean, covariance = self._predict(state, t_s)
-        at = t_s - mean[_LATENCY]
-        around = at + np.array([-SPEED_SPAN_S, 0.0, SPEED_SPAN_S])
+        _, scale_error, latency_s, *_ = mean.tolist()
+        at = t_s - latency_s
+        around = (at - SPEED_SPAN_S, at, at + SPEED_SPAN_S)
         before, distance, after = np.interp(around, self.track.t_s, self.track.distance_m).tolist()
         # Centred, as a speed from the same odometer noise as the innovation would bias the latency upwards.
         speed = (after - before) / (2.0 * SPEED_SPAN_S)
-        row = np.empty(mean.size)
-        row[_OFFSET] = 1.0
-        row[_SCALE] = distance - state.origin_m
-        row[_LATENCY] = -(1.0 + mean[_SCALE]) * speed
-        row[_ERRORS:] = sigma_m * np.sqrt(self.shares)
-        expected = mean[_OFFSET] + (1.0 + mean[_SCALE]) * row[_SCALE] + row[_ERRORS:] @ mean[_ERRORS:]
+        way_m = distance - state.origin_m
+        row = self._loads * sigma_m
+        row[_OFFSET], row[_SCALE], row[_LATENCY] = 1.0, way_m, -(1.0 + scale_error) * speed
+        # All but the latency, about whose mean the distance was read, and the scale's own way.
+        expected = float(row @ mean) + way_m - float(row[_LATENCY]) * latency_s
         spread = covariance @ row
         white = _WHITE_SHARE * sigma_m**2 + (jitter_s * speed) ** 2
         gain = spread / (row @ spread + white)
-        return replace(
-            state,
-            mean=mean + gain * (path_m - expected),
-            covariance=covariance - np.outer(gain, spread),
-            t_s=t_s,
-        )
+        mean += gain * (path_m - expected)
+        covariance -= gain[:, None] * spread
+        return FilterState(mean, covariance, t_s, state.origin_m)
+
+    @cached_property
+    def _loads(self) -> Array:
+        """By how much of a sigma each state moves the position; zero for offset, scale and latency."""
+        return np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
+
+    @cached_property
+    def _decay_rates_per_s(self) -> Array:
+        return np.concatenate([np.zeros(_ERRORS), 1.0 / self.taus_s])
 
     def _predict(self, state: FilterState, t_s: float) -> tuple[Array, Array]:
         dt = t_s - state.t_s
-        decay = np.ones(state.mean.size)
-        decay[_ERRORS:] = np.exp(-dt / self.taus_s)
-        noise = np.zeros(state.mean.size)
+        decay = np.exp(-dt * self._decay_rates_per_s)
+        noise = 1.0 - decay * decay
         noise[_OFFSET] = self.track.white_rate_m2_per_s * dt
-        noise[_ERRORS:] = 1.0 - decay[_ERRORS:] ** 2
-        covariance = state.covariance * np.outer(decay, decay)
-        covariance[np.diag_indices(noise.size)] += noise
+        covariance = state.covariance * decay[:, None]
+        covariance *= decay
+        covariance.reshape(-1)[:: noise.size + 1] += noise
         return state.mean * decay, covariance
 
 

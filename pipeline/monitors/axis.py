@@ -82,9 +82,11 @@ def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisR
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
     keep = (1.0 - weight) * moving[:, None]
     gain = weight / series.dt_s[:, None]
-    variance, covariance = variance_of_ewma(
-        keep, gain, series.sigma_m, series.sigma_before_m, series.decorrelation, series.white_m2, state
+    # One channel after the other in memory, as the recursions go along the rows.
+    sigma_m, before_m, decorrelation = (
+        np.asfortranarray(item) for item in (series.sigma_m, series.sigma_before_m, series.decorrelation)
     )
+    variance, covariance = variance_of_ewma(keep, gain, sigma_m, before_m, decorrelation, series.white_m2, state)
     # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
     # survey's sigma, judges it; inside the EWMAs it would ring for long.
     smooth_rate = np.where(series.border, 0.0, series.rate_mps)

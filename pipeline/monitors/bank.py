@@ -29,9 +29,9 @@ class _AxisBank:
         self._factor = factor
         self._enabled = np.array(enabled)
         width = len(SCALES)
-        self.value = np.full((epochs, width), np.nan)
-        self.threshold = np.full((epochs, width), np.nan)
-        self.state = np.full((epochs, width), _NOT_EVALUATED, dtype=np.int8)
+        self.value = np.full((epochs, width), np.nan, order="F")
+        self.threshold = np.full((epochs, width), np.nan, order="F")
+        self.state = np.full((epochs, width), _NOT_EVALUATED, dtype=np.int8, order="F")
         self._series = axis.series
         self._done = 0
         self._block = max(axis.series.epoch.size, 1)
@@ -72,6 +72,10 @@ class _AxisBank:
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
         columns: list[pl.Series] = []
+        reasons = {
+            on: self.axis.reasons.fill_null(FIRST_EPOCH if on else DISABLED)
+            for on in dict.fromkeys(self._enabled.tolist())
+        }
         for index, scale in enumerate(SCALES):
             name = f"{self.axis.name}_{scale}"
             state = self.state[:, index]
@@ -79,18 +83,17 @@ class _AxisBank:
                 pl.Series(f"{name}_value", self.value[:, index], nan_to_null=True),
                 pl.Series(f"{name}_threshold", self.threshold[:, index], nan_to_null=True),
                 _state_series(f"{name}_state", state),
-                self._reasons(state, bool(self._enabled[index])).alias(f"{name}_reason"),
+                _where_not_evaluated(f"{name}_reason", state, reasons[bool(self._enabled[index])]),
             ]
         return columns
-
-    def _reasons(self, state: npt.NDArray[np.int8], enabled: bool) -> pl.Series:
-        without = pl.Series(state == _NOT_EVALUATED)
-        known = self.axis.reasons.fill_null(FIRST_EPOCH if enabled else DISABLED)
-        return pl.select(pl.when(without).then(known)).to_series()
 
 
 def _state_series(name: str, codes: npt.NDArray[np.int8]) -> pl.Series:
     return pl.Series(name, STATES, dtype=pl.Enum(STATES)).gather(pl.Series(codes.astype(np.uint32)))
+
+
+def _where_not_evaluated(name: str, codes: npt.NDArray[np.int8], reasons: pl.Series) -> pl.Series:
+    return pl.select(pl.when(pl.Series(codes == _NOT_EVALUATED)).then(reasons).alias(name)).to_series()
 
 
 class MonitorBank:

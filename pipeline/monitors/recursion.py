@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.lapack import dtbtrs
 
 Array = npt.NDArray[np.float64]
 
@@ -20,30 +21,23 @@ STEP_OF_SIGMA = 1.5
 def linear_recurrence(decay: Array, drive: Array, initial: Array) -> Array:
     """Solve `y[k] = decay[k] * y[k-1] + drive[k]` with `y[-1] = initial`, shapes (n, c), (n, c), (c,).
 
-    Two-level scan: blocks advance side by side from zero, then take up what the block before left.
-    Exact but for rounding, as only factors within [0, 1] are multiplied.
+    In Fortran order, one channel after the other. A recurrence of first order is a triangular system of two
+    diagonals, which LAPACK solves row by row: term by term the loop that this stands for.
     """
-    n, channels = drive.shape
-    if n == 0:
-        return drive.copy()
-    block = max(1, int(np.sqrt(n)))
-    blocks = -(-n // block)
-    pad = ((0, blocks * block - n), (0, 0))
-    y = np.pad(drive, pad).reshape(blocks, block, channels)
-    product = np.pad(np.broadcast_to(decay, drive.shape), pad).reshape(blocks, block, channels)
-    for step in range(1, block):
-        y[:, step] += product[:, step] * y[:, step - 1]
-        product[:, step] *= product[:, step - 1]
-    carry = np.asarray(initial, dtype=np.float64)
-    for index in range(blocks):
-        y[index] += product[index] * carry
-        carry = y[index, -1]
-    return y.reshape(-1, channels)[:n]
+    y = np.array(np.broadcast_to(drive, (len(decay), len(initial))), dtype=np.float64, order="F")
+    if not len(y):
+        return y
+    y[0] += decay[0] * initial
+    band = np.ones((2, len(y)), order="F")
+    for channel in range(y.shape[1]):
+        np.negative(decay[1:, channel], out=band[1, :-1])
+        y[:, channel : channel + 1], _ = dtbtrs(band, y[:, channel : channel + 1], uplo="L", diag="U", overwrite_b=1)
+    return y
 
 
 def ewma_weight(alpha: Array, dt_s: Array) -> Array:
-    """Weight of a new sample after `dt_s`: 1 - (1 - alpha)^(dt / 1 s); shape (n, alphas)."""
-    return 1.0 - (1.0 - alpha[None, :]) ** dt_s[:, None]
+    """Weight of a new sample after `dt_s`: 1 - (1 - alpha)^(dt / 1 s); shape (n, alphas), in Fortran order."""
+    return 1.0 - ((1.0 - alpha[:, None]) ** dt_s[None, :]).T
 
 
 @dataclass(frozen=True)
@@ -86,22 +80,22 @@ def variance_of_ewma(
         v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi r - 1) + (alpha g)^2 white
         c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
-    n, sources = sigma_m.shape
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
     carried = (1.0 - decorrelation) * ratio
     own = sigma_m * (sigma_m - sigma_before_m + decorrelation * sigma_before_m)
-    flat = (n, gain.shape[1] * sources)
-    drive = (gain[:, :, None] * own[:, None, :]).reshape(flat)
-    decay = (keep[:, :, None] * carried[:, None, :]).reshape(flat)
-    covariance = linear_recurrence(decay, drive, state.covariance.reshape(-1)).reshape(n, -1, sources)
-    before = np.concatenate([state.covariance[None], covariance[:-1]])
-    coupling = np.einsum("kas,ks->ka", before, np.where(ratio == 1.0, -decorrelation, carried - 1.0))
+    change = np.where(ratio == 1.0, -decorrelation, carried - 1.0)
+    coupling, covariances = np.empty_like(gain), np.empty_like(state.covariance)
+    for index, before in enumerate(state.covariance):
+        covariance = linear_recurrence(keep[:, index, None] * carried, gain[:, index, None] * own, before)
+        coupling[1:, index] = (covariance[:-1] * change[1:]).sum(axis=1)
+        coupling[:1, index] = (before * change[:1]).sum(axis=1)
+        covariances[index] = covariance[-1] if len(gain) else before
     increment = increment_variance(sigma_m, sigma_before_m, decorrelation) + white_m2
     fresh = gain**2 * increment[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
     new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
-    return np.maximum(variance, gain**2 * new_m2[:, None]), covariance[-1] if n else state.covariance
+    return np.maximum(variance, gain**2 * new_m2[:, None]), covariances
 
 
 def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
