@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import polars as pl
 
 from schemas.errors import InputError
@@ -56,6 +57,8 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
 
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
+    if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
+        return frame, StreamCounts(0, 0)
     late = _out_of_order(frame, [key for key in keys if key == "solution"])
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
     unique = ordered.unique(subset=keys, keep="first", maintain_order=True)

@@ -21,7 +21,7 @@ from pipeline.monitors.single import channel_monitor, doppler_monitor
 from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
 from pipeline.telegrams import place_reads, places_near
 from schemas.config import Configuration, LdsConfig, Vehicle, digest_of
-from schemas.conform import conform
+from schemas.conform import conform, shaped
 from schemas.enums import Evidence
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
@@ -212,4 +212,4 @@ def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:
 
 def _table(name: str, parts: list[pl.DataFrame]) -> pl.DataFrame:
     """Rows of all solutions, by the contract."""
-    return pl.concat([conform(part, TABLES[name]) for part in parts])
+    return conform(pl.concat([shaped(part, TABLES[name]) for part in parts]), TABLES[name])
