@@ -6,8 +6,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds.journey import Floats, Journey
-from pipeline.lds.linking import Passage
-from pipeline.lds.machine import LocationSystem, Standing
+from pipeline.lds.machine import LocationSystem
+from pipeline.lds.passage import Passage
+from pipeline.lds.standing import Standing
 from schemas.config import LdsConfig
 from schemas.enums import Cause, Direction, FailureMode, LdsMode
 from schemas.tables import Epochs, Passages

@@ -156,3 +156,10 @@ def _travelled_m(odometer_m: Floats, travel: Integers) -> Floats:
         steps_m = np.diff(odometer_m[known], prepend=odometer_m[known[0]])
         travelled_m[known] = np.cumsum(steps_m * np.roll(travel[known], 1))
     return travelled_m
+
+
+def turning_epochs(journey: Journey) -> frozenset[int]:
+    """Epochs at which direction or leg differ from those of the epoch before, odometer known."""
+    known = np.flatnonzero(np.isfinite(journey.odometer_m))
+    changed = (np.diff(journey.heading[known]) != 0) | (np.diff(journey.leg[known]) != 0)
+    return frozenset(known[1:][changed].tolist())

@@ -10,56 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.lds.crossings import Balise
+from pipeline.lds.passage import Offer, Passage, Reference, blame
 from pipeline.lds.windows import Window, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction
 
-_SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
 MISSED_IN_A_ROW = 2
-
-
-@dataclass(slots=True)
-class Passage:
-    """A row of `passages` in the making. `reckoned_odometer_m`: where the train passes it by linking."""
-
-    balise: Balise
-    t_ns: int
-    heading: int
-    status: PassageStatus = PassageStatus.MISSED
-    t_offered_ns: int | None = None
-    window: Window | None = None
-    odometer_distance_m: float | None = None
-    confidence_m: float | None = None
-    linking_error: LinkingError = LinkingError.NONE
-    reaction: Reaction = Reaction.NONE
-    reckoned_odometer_m: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Offer:
-    """A balise offered to the train: a crossing of the position, or a telegram read.
-
-    `refusal`: why it does not count as a detection, `None` where it does. `sense`: direction in
-    which the position passes the balise, `heading`: direction of travel.
-    """
-
-    balise: Balise
-    t_ns: int
-    sense: int
-    heading: int
-    odometer_m: float | None
-    travelled_m: float
-    confidence_m: float | None
-    refusal: PassageStatus | None
-
-
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """The last relevant balise: where odometer and way run stood when it was detected."""
-
-    balise: Balise
-    odometer_m: float | None
-    travelled_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +169,9 @@ class LinkingChain:
         if expected.balise_id == balise.balise_id and self._window(balise).holds(distance_m):
             passage.status = PassageStatus.ACCEPTED
         elif expected.balise_id != balise.balise_id and self._window(expected).holds(distance_m):
-            _blame(passage, LinkingError.ORDER, expected.reaction)
+            blame(passage, LinkingError.ORDER, expected.reaction)
         else:
-            _blame(passage, LinkingError.EARLY, balise.reaction)
+            blame(passage, LinkingError.EARLY, balise.reaction)
 
     def _position_ahead(self, balise: Balise) -> int | None:
         """Index of the expected balise that this offer stands against, `None` where it is not ahead.
@@ -244,9 +200,9 @@ class LinkingChain:
             passage.status = absence
             self._unoffered[balise.balise_id] = passage
         self._missed_in_a_row += 1
-        _blame(passage, LinkingError.MISSED, balise.reaction)
+        blame(passage, LinkingError.MISSED, balise.reaction)
         if self._missed_in_a_row >= MISSED_IN_A_ROW:
-            _blame(passage, LinkingError.MISSED, Reaction.SERVICE_BRAKE)
+            blame(passage, LinkingError.MISSED, Reaction.SERVICE_BRAKE)
 
     def _refer_to(self, offer: Offer) -> None:
         """An accepted balise becomes the reference; what lies beyond it is expected next."""
@@ -294,10 +250,3 @@ class LinkingChain:
             passage.reckoned_odometer_m = self.reference.odometer_m + along_m
         self.passages.append(passage)
         return passage
-
-
-def _blame(passage: Passage, error: LinkingError, reaction: Reaction) -> None:
-    """The first linking error of a passage stays, the most severe reaction counts."""
-    if passage.linking_error is LinkingError.NONE:
-        passage.linking_error = error
-    passage.reaction = max(passage.reaction, reaction, key=_SEVERITY.index)

@@ -7,42 +7,23 @@ reference known, no usable position just now. *Fail-safe*: position negated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isnan
-from typing import Literal
 
 import numpy as np
 
 from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.crossings import Balise, Crossing, Seen, find_crossings
-from pipeline.lds.journey import Journey
+from pipeline.lds.footing import Footing
+from pipeline.lds.journey import Journey, turning_epochs
 from pipeline.lds.link_monitors import LinkDistance, LinkOrder, disorder
-from pipeline.lds.linking import LinkingChain, Offer, Reference
+from pipeline.lds.linking import LinkingChain
+from pipeline.lds.passage import Offer
 from pipeline.lds.reads import Read
 from pipeline.lds.rearming import Latch
 from pipeline.lds.recovery import Anchor, Recovery
+from pipeline.lds.standing import Negation, Return, Standing
 from schemas.config import LdsConfig
 from schemas.enums import PassageStatus
-
-Return = Literal["re-link", "physical balise", "initialisation"]
-
-
-@dataclass(slots=True)
-class Negation:
-    """The position was not used from `first_epoch` on until `end_epoch` (`None`: to the end)."""
-
-    first_epoch: int
-    end_epoch: int | None = None
-    ended_by: Return | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """What the LDS stands on from an epoch on: its reference, and whether a chain has begun."""
-
-    epoch: int
-    reference: Reference | None
-    chain_begun: bool
 
 
 class LocationSystem:
@@ -66,7 +47,7 @@ class LocationSystem:
         self._reads: dict[int, list[Read]] = {}
         for read in reads:
             self._reads.setdefault(read.epoch, []).append(read)
-        self._turns = _turns(journey)
+        self._turns = turning_epochs(journey)
         self._has_odometer = journey.has_odometer
         self._latch = Latch(journey, config)
         self.virtual = LinkingChain(virtual, config)
@@ -87,8 +68,7 @@ class LocationSystem:
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
         self._consistent_at_ns = 0
-        self._last_tvb: int | None = None
-        self._accepted: Anchor | None = None  # where the last VB was accepted
+        self._footing = Footing(journey, limits)
 
     def run(self) -> None:
         """Walk along all epochs."""
@@ -187,8 +167,9 @@ class LocationSystem:
             self._chain_from = k
         if offer.odometer_m is not None:
             offset_m = offer.balise.path_m - offer.odometer_m
-            self._accepted = Anchor(offset_m, float(self._journey.sigma_m[k]), offer.t_ns, offer.travelled_m)
-            self.distance.measure_from(self._accepted, k)
+            anchor = Anchor(offset_m, float(self._journey.sigma_m[k]), offer.t_ns, offer.travelled_m)
+            self._footing.accept(anchor)
+            self.distance.measure_from(anchor, k)
         self._stand(k)
 
     def _read_balises(self, k: int) -> None:
@@ -200,8 +181,12 @@ class LocationSystem:
             offer = Offer(read.balise, read.t_ns, heading, heading, read.odometer_m, read.travelled_m, None, None)
             passage = self.physical.offer(offer)
             self._latch.disarm(read.balise, read.odometer_m)
-            if self._recovery is not None and passage.status is PassageStatus.ACCEPTED:
+            if passage.status is not PassageStatus.ACCEPTED:
+                continue
+            if self._recovery is not None:
                 self._recovery.stand_on(read)
+            else:
+                self._footing.read(read)
 
     def _turn(self, k: int) -> None:
         journey = self._journey
@@ -242,7 +227,7 @@ class LocationSystem:
         begun = self._has_initialised(k) if self._chain_from is None else k > self._chain_from
         if begun:
             self.tvb[k] = True
-            self._last_tvb = k
+            self._footing.validate(k)
 
     def _has_initialised(self, k: int) -> bool:
         """Consistent for `init_s` without a break: a TVB may arise between two VBs (SR)."""
@@ -259,6 +244,7 @@ class LocationSystem:
         return True
 
     def _negate(self, k: int) -> None:
+        self._footing.negate(k)
         self._recovery = Recovery(k, self._journey, self._bank, self._config, self._limits)
         self.negations.append(Negation(k))
         self.negated[k] = True
@@ -271,26 +257,18 @@ class LocationSystem:
         seen = self.evaluated[k] if self._has_odometer else usable
         if not recovery.is_over(k, self._t_ns[k], seen, usable, disordered):
             return
-        anchor = recovery.read or self._last_validated()
+        anchor = recovery.read or self._footing.last_validated()
         if anchor is None:
             self._initialise_anew(k)
-        elif recovery.relinks(k, anchor):
+        elif self._footing.relinks(recovery, k, anchor):
             self._return(k, "re-link" if recovery.read is None else "physical balise")
             self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
-
-    def _last_validated(self) -> Anchor | None:
-        """Where the last TVB was, or the last accepted VB if that came later."""
-        accepted = self._accepted
-        if self._last_tvb is None:
-            return accepted
-        if accepted is not None and accepted.t_ns > self._t_ns[self._last_tvb]:
-            return accepted
-        return Anchor.at_epoch(self._journey, self._last_tvb)
 
     def _initialise_anew(self, k: int) -> None:
         """Nothing was validated before the fault, so there is nothing to re-link to."""
         self.virtual.forget()
         self.distance.forget(k)
+        self._footing.forget()
         self._chain_from = None
         self._return(k, "initialisation")
         self._stand(k)
@@ -315,10 +293,3 @@ class LocationSystem:
         absence = self._absence(len(self._t_ns) - 1) if known.size else PassageStatus.MISSED
         if absence is not PassageStatus.MISSED:
             self.virtual.finish(float(self._journey.odometer_m[known[-1]]), self._t_ns[-1], absence)
-
-
-def _turns(journey: Journey) -> frozenset[int]:
-    """Epochs at which direction or leg differ from those of the epoch before, odometer known."""
-    known = np.flatnonzero(np.isfinite(journey.odometer_m))
-    changed = (np.diff(journey.heading[known]) != 0) | (np.diff(journey.leg[known]) != 0)
-    return frozenset(known[1:][changed].tolist())

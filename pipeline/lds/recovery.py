@@ -46,6 +46,14 @@ def relink_bound_m(anchor: Anchor, k: int, journey: Journey, limits: LdsLimits) 
     return bound_m if bound_m <= limits.failure_limit_m else None
 
 
+def read_anchor(read: Read, journey: Journey) -> Anchor | None:
+    """A physical balise says where the train is, so what GNSS minus odometer should be."""
+    if read.odometer_m is None or not isfinite(read.travelled_m):
+        return None
+    sigma_m = float(np.nan_to_num(journey.sigma_m[read.epoch]))
+    return Anchor(read.balise.path_m - read.odometer_m, sigma_m, read.t_ns, read.travelled_m)
+
+
 class Recovery:
     """One negation: since when nothing has failed fast, and what was read of physical balises meanwhile."""
 
@@ -56,11 +64,8 @@ class Recovery:
         self.read: Anchor | None = None
 
     def stand_on(self, read: Read) -> None:
-        """A balise says where the train is, so what GNSS minus odometer should be."""
-        if read.odometer_m is not None and isfinite(read.travelled_m):
-            sigma_m = float(np.nan_to_num(self._journey.sigma_m[read.epoch]))
-            offset_m = read.balise.path_m - read.odometer_m
-            self.read = Anchor(offset_m, sigma_m, read.t_ns, read.travelled_m)
+        """From now on the re-link is measured from this balise."""
+        self.read = read_anchor(read, self._journey) or self.read
 
     def is_over(self, k: int, t_ns: int, seen: bool, usable: bool, disordered: bool) -> bool:
         """`recovery_s` without a failure of the fast monitors, all of it seen, and a usable position now."""

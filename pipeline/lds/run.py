@@ -10,8 +10,9 @@ from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.columns import epoch_columns, passage_rows
 from pipeline.lds.crossings import balises_of
 from pipeline.lds.journey import journey_of
-from pipeline.lds.machine import LocationSystem, Negation
+from pipeline.lds.machine import LocationSystem
 from pipeline.lds.reads import reads_of
+from pipeline.lds.standing import Negation
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
 

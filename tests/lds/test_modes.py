@@ -204,6 +204,76 @@ def test_a_physical_balise_frees_a_position_that_was_off_before_the_alarm() -> N
         assert result.negations[0].end_epoch == end
 
 
+def drift_from(k_0: int, rate_mps: float, odometer_m: list[float]) -> list[float]:
+    return [x + max(0.0, rate_mps * (k - k_0)) for k, x in enumerate(odometer_m)]
+
+
+def test_a_slow_drift_does_not_come_back_step_by_step() -> None:
+    """0.1 m/s, found 60 s after each restart: 3 m farther off at the first return, 12 m at the next, which 7.7 m and
+    a little for the time bound.
+    """
+    odometer_m = steps(0.0, 20.0, 400)
+    bank = ScriptedBank([100, 190, 280, 370])
+    result = run(epochs_of(drift_from(40, 0.1, odometer_m), odometer_m), balises_at(V1), bank)
+    assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(100, 130), (190, None)]
+
+
+def test_false_alarms_one_after_the_other_all_return() -> None:
+    bank = ScriptedBank([100, 190, 280])
+    result = run(epochs_of(steps(0.0, 20.0, 400)), balises_at(V1), bank)
+    assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(100, 130), (190, 220), (280, 310)]
+
+
+def test_a_position_that_healed_while_negated_needs_a_balise() -> None:
+    odometer_m = steps(0.0, 20.0, 400)
+    drift = drift_from(40, 0.1, odometer_m)
+    healed = [x if k < 250 else at_m for k, (x, at_m) in enumerate(zip(drift, odometer_m, strict=True))]
+    result = run(epochs_of(healed, odometer_m), balises_at(V1), ScriptedBank([100, 190, 250]))
+    # At the last TVB before the second alarm it was 15 m off, and in step with that the healed position is not;
+    # only a balise can tell.
+    assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(100, 130), (190, None)]
+    balises = balises_at({"V1": 110.0, "P1": 5410.0}, kind=["virtual", "physical"])
+    by_read = run(epochs_of(healed, odometer_m), balises, ScriptedBank([100, 190, 250]), reads_at([(270.5, "P1")]))
+    assert [(n.first_epoch, n.end_epoch, n.ended_by) for n in by_read.negations] == [
+        (100, 130, "re-link"),
+        (190, 280, "physical balise"),
+    ]
+
+
+def test_a_balise_that_let_a_drift_return_bounds_the_next_return_too() -> None:
+    """4 m off at the return by P1: 7 m at the last TVB before the next alarm, which 3 m later would pass alone."""
+    odometer_m = steps(0.0, 20.0, 400)
+    balises = balises_at({"V1": 110.0, "P1": 2110.0}, kind=["virtual", "physical"])
+    drift = drift_from(90, 0.1, odometer_m)
+    result = run(epochs_of(drift, odometer_m), balises, ScriptedBank([100, 150, 240]), reads_at([(105.5, "P1")]))
+    assert [(n.first_epoch, n.end_epoch, n.ended_by) for n in result.negations] == [
+        (100, 130, "physical balise"),
+        (150, None, None),
+    ]
+
+
+def test_a_balise_read_between_two_alarms_is_what_the_next_return_is_measured_from() -> None:
+    """9 m off at the first alarm and its return, right again from 140 s on; only P1 can say that this is right."""
+    odometer_m = steps(0.0, 20.0, 300)
+    off = [x + (9.0 if 50 <= k < 140 else 0.0) for k, x in enumerate(odometer_m)]
+    balises = balises_at({"V1": 110.0, "P1": 3010.0}, kind=["virtual", "physical"])
+    for reads, end in ((None, None), (reads_at([(150.5, "P1")]), 190)):
+        result = run(epochs_of(off, odometer_m), balises, ScriptedBank([100, 160]), reads)
+        assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(100, 130), (160, end)]
+
+
+def test_what_the_odometer_can_no_longer_tell_does_not_hold_a_return_back() -> None:
+    """Scale known to 0.2 %: after 100 s at 20 m/s the bound of the first return is beyond 20 m, so the second alarm
+    is measured from its own last TVB.
+    """
+    odometer_m = steps(0.0, 20.0, 400)
+    moved = [x + (12.0 if k >= 200 else 0.0) for k, x in enumerate(odometer_m)]
+    for scale_sigma, end in ((0.002, 280), (1e-5, None)):
+        epochs = epochs_of(moved, odometer_m, scale_sigma=[scale_sigma] * 400)
+        result = run(epochs, balises_at(V1), ScriptedBank([100, 250]))
+        assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(100, 130), (250, end)]
+
+
 def test_linking_goes_on_while_negated() -> None:
     # V2 and V3 pass under alarm: offered, rejected, missed in their windows, the second brakes.
     places = {"V1": 110.0, "V2": 510.0, "V3": 710.0, "V4": 1310.0}

@@ -124,7 +124,9 @@ def test_a_path_from_another_origin_against_the_measure_and_over_a_border():
         }
     )
     assert on_path_of(mine, other)["path_m"].to_list() == [None] * 5  # one epoch on B does not tell its sense
-    longer = pl.concat([mine, mine[3:].with_columns(t=pl.lit(9, pl.Int64), measure_m=pl.lit(25.0), path_m=pl.lit(1025.0))])
+    longer = pl.concat(
+        [mine, mine[3:].with_columns(t=pl.lit(9, pl.Int64), measure_m=pl.lit(25.0), path_m=pl.lit(1025.0))]
+    )
     assert on_path_of(longer, other)["path_m"].to_list() == [1003.0, 1002.0, 1001.0, 1008.0, 1020.0]
     apart = other.with_columns(netelement_id=pl.lit("C"))
     assert on_path_of(longer, apart)["path_m"].to_list() == [None] * 5
