@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from schemas.config import Configuration
@@ -31,6 +33,14 @@ class Bank(Protocol):
 
     def along_evaluated(self, epoch: int) -> bool:
         """The along-track monitors have a verdict (pass or fail) at this epoch."""
+        ...
+
+    def quiet_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on at which a monitor fails, or that is not looked at yet; at most `end`."""
+        ...
+
+    def along_evaluated_between(self, epoch: int, end: int) -> NDArray[np.bool_]:
+        """`along_evaluated` of the epochs [epoch, end), none of them beyond what `quiet_until` answered."""
         ...
 
     def restart(self, epoch: int) -> None:

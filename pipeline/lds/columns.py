@@ -49,11 +49,11 @@ def _modes(system: LocationSystem, index: np.ndarray, journey: Journey) -> pl.Se
             for standing in system.standings
         ]
     )[index]
-    usable = np.array([refusal is None for refusal in journey.refusal], dtype=bool)
-    in_use = np.where(usable, LdsMode.LINKED.value, LdsMode.ODOMETRY.value)
-    mode = np.where(linked, in_use, LdsMode.INITIALISING.value)
-    mode = np.where(system.negated, LdsMode.FAIL_SAFE.value, mode)
-    return pl.Series("lds_mode", mode.tolist(), dtype=pl.String).cast(Epochs.columns()["lds_mode"].dtype)
+    modes = [mode.value for mode in LdsMode]
+    in_use = np.where(journey.usable, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
+    mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
+    mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
+    return pl.Series("lds_mode", modes, dtype=Epochs.columns()["lds_mode"].dtype).gather(mode)
 
 
 def _reported_m(

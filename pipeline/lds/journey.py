@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import polars as pl
@@ -43,6 +44,19 @@ class Journey:
     travelled_m: Floats
     blind: Bools
     gap_ns: int
+
+    @cached_property
+    def usable(self) -> Bools:
+        """A detection at this epoch would count."""
+        return np.array([refusal is None for refusal in self.refusal], dtype=bool)
+
+    @cached_property
+    def ambiguous(self) -> Bools:
+        """The place on the track is in doubt."""
+        ambiguous = np.zeros(len(self.refusal), dtype=bool)
+        for k in np.flatnonzero(~self.usable).tolist():
+            ambiguous[k] = self.refusal[k] is PassageStatus.REJECTED_AMBIGUOUS
+        return ambiguous
 
     @property
     def has_odometer(self) -> bool:

@@ -9,15 +9,15 @@ import polars as pl
 
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.crossings import Crossing
-from pipeline.lds.journey import Bools, Floats, Journey
+from pipeline.lds.journey import Bools, Floats, Integers, Journey
 from pipeline.lds.recovery import Anchor
 from schemas.config import LdsConfig
-from schemas.enums import MonitorState, PassageStatus
+from schemas.enums import MonitorState
 from schemas.tables import Epochs
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
-_STRETCH = 512
+_STRETCH = 4096
 
 DISABLED = "disabled by configuration"
 NO_ODOMETER = "no odometer"
@@ -26,6 +26,9 @@ AMBIGUOUS = "match ambiguous or off track"
 NO_REFERENCE = "no balise or validated position to measure from"
 NO_SIGMA = "no standard deviation of the position"
 FIRST_EPOCH = "no epoch before"
+_REASONS = (DISABLED, NO_ODOMETER, NO_POSITION, AMBIGUOUS, NO_REFERENCE, NO_SIGMA, FIRST_EPOCH)
+_NO_REASON = -1  # a reason is held as its place in the list above
+_STATES = tuple(state.value for state in MonitorState)
 
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: LdsConfig, limits: LdsLimits) -> int:
@@ -48,10 +51,10 @@ class LinkOrder:
 
     def __init__(self, journey: Journey, limits: LdsLimits) -> None:
         self._reason = _order_reasons(journey, "link_order" in limits.disabled)
-        self._value = np.array([0.0 if reason is None else np.nan for reason in self._reason])
+        self._value = np.where(self._reason == _NO_REASON, 0.0, np.nan)
 
     def is_evaluated(self, k: int) -> bool:
-        return self._reason[k] is None
+        return bool(self._reason[k] == _NO_REASON)
 
     def note(self, k: int, out_of_order: int) -> None:
         self._value[k] = out_of_order
@@ -71,11 +74,11 @@ class LinkDistance:
     def __init__(self, journey: Journey, config: LdsConfig, limits: LdsLimits) -> None:
         self._journey, self._config, self._limits = journey, config, limits
         self._reason = _distance_reasons(journey, "link_distance" in limits.disabled)
-        self._possible = np.array([reason is None for reason in self._reason], dtype=bool)
+        self._possible = self._reason == _NO_REASON
         self._offset_m = journey.path_m - journey.odometer_m
         self._value = np.full(journey.t_ns.size, np.nan)
         self._threshold = np.full(journey.t_ns.size, np.nan)
-        self._fails = [False] * journey.t_ns.size
+        self._fails = np.zeros(journey.t_ns.size, dtype=bool)
         self._anchor: Anchor | None = None
         self._done = 0
 
@@ -88,11 +91,21 @@ class LinkDistance:
             return False
         if k >= self._done:
             self._evaluate(self._anchor, k)
-        return self._fails[k]
+        return bool(self._fails[k])
+
+    def quiet_until(self, k: int, end: int) -> int:
+        """The first epoch from `k` on that fails or is not evaluated yet; at most `end`."""
+        if self._anchor is None:
+            return end
+        if k >= self._done:
+            self._evaluate(self._anchor, k)
+        ahead = self._fails[k : min(self._done, end)]
+        first = int(ahead.argmax())
+        return k + (first if ahead[first] else ahead.size)
 
     def _evaluate(self, anchor: Anchor, k: int) -> None:
         """A stretch ahead at once: elementwise, so every epoch still knows only its own past."""
-        self._done = min(k + _STRETCH, len(self._fails))
+        self._done = min(k + _STRETCH, self._fails.size)
         ahead = slice(k, self._done)
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         noise_m = self._limits.threshold_factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
@@ -100,7 +113,7 @@ class LinkDistance:
         possible = self._possible[ahead]
         self._value[ahead] = np.where(possible, self._offset_m[ahead] - anchor.offset_m, np.nan)
         self._threshold[ahead] = np.where(possible, threshold_m, np.nan)
-        self._fails[ahead] = (np.abs(self._value[ahead]) > self._threshold[ahead]).tolist()
+        self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
     def forget(self, k: int) -> None:
         """From epoch `k` on there is nothing to measure from."""
@@ -109,17 +122,17 @@ class LinkDistance:
 
     def columns(self) -> dict[str, pl.Series]:
         """`link_distance_*` as in the contract of epochs."""
-        unknown = np.isnan(self._value).tolist()
-        reason = [why or (NO_REFERENCE if x else None) for why, x in zip(self._reason, unknown, strict=True)]
+        unknown = np.isnan(self._value) & self._possible
+        reason = np.where(unknown, _REASONS.index(NO_REFERENCE), self._reason)
         return _columns("link_distance", self._value, self._threshold, reason)
 
 
-def _order_reasons(journey: Journey, disabled: bool) -> list[str | None]:
+def _order_reasons(journey: Journey, disabled: bool) -> Integers:
     """Per step, so both its ends must be good for it; a step ends at the epoch that it is noted at."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
-    odometer, ambiguous, sigma = _odometer(journey), _ambiguous(journey), np.isfinite(journey.sigma_m)
+    odometer, ambiguous, sigma = _odometer(journey), journey.ambiguous, np.isfinite(journey.sigma_m)
     masks = (
         (np.full(odometer.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
@@ -132,13 +145,13 @@ def _order_reasons(journey: Journey, disabled: bool) -> list[str | None]:
     return _reasons(odometer.size, masks)
 
 
-def _distance_reasons(journey: Journey, disabled: bool) -> list[str | None]:
+def _distance_reasons(journey: Journey, disabled: bool) -> Integers:
     odometer = _odometer(journey)
     masks = (
         (np.full(odometer.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
-        (_ambiguous(journey), AMBIGUOUS),
+        (journey.ambiguous, AMBIGUOUS),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
     )
     return _reasons(odometer.size, masks)
@@ -149,27 +162,27 @@ def _odometer(journey: Journey) -> Bools:
     return known
 
 
-def _ambiguous(journey: Journey) -> Bools:
-    return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in journey.refusal], dtype=bool)
-
-
-def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> list[str | None]:
-    reasons = np.full(size, None, dtype=object)
+def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> Integers:
+    """The first reason that applies."""
+    reasons = np.full(size, _NO_REASON)
     for mask, reason in reversed(masks):
-        reasons[mask] = reason
-    found: list[str | None] = reasons.tolist()
-    return found
+        reasons[mask] = _REASONS.index(reason)
+    return reasons
 
 
-def _columns(monitor: str, value: Floats, threshold: Floats, reasons: list[str | None]) -> dict[str, pl.Series]:
-    state = np.where(np.abs(value) > threshold, MonitorState.FAIL.value, MonitorState.PASS.value)
-    state = np.where(np.isnan(value), MonitorState.NOT_EVALUATED.value, state)
+def _columns(monitor: str, value: Floats, threshold: Floats, reasons: Integers) -> dict[str, pl.Series]:
+    fail, passed, unknown = (
+        _STATES.index(state) for state in (MonitorState.FAIL, MonitorState.PASS, MonitorState.NOT_EVALUATED)
+    )
+    state = np.where(np.isnan(value), unknown, np.where(np.abs(value) > threshold, fail, passed))
     kind = Epochs.columns()[f"{monitor}_state"].dtype
     return {
         f"{monitor}_value": _nullable(f"{monitor}_value", value),
         f"{monitor}_threshold": _nullable(f"{monitor}_threshold", threshold),
-        f"{monitor}_state": pl.Series(f"{monitor}_state", state.tolist(), dtype=pl.String).cast(kind),
-        f"{monitor}_reason": pl.Series(f"{monitor}_reason", reasons, dtype=pl.String),
+        f"{monitor}_state": pl.Series(f"{monitor}_state", _STATES, dtype=kind).gather(state),
+        f"{monitor}_reason": pl.Series(f"{monitor}_reason", [*_REASONS, None], dtype=pl.String).gather(
+            np.where(reasons == _NO_REASON, len(_REASONS), reasons)
+        ),
     }
 
 

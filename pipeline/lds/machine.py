@@ -6,6 +6,7 @@ reference known, no usable position just now. *Fail-safe*: position negated.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from math import isnan
 
@@ -62,7 +63,9 @@ class LocationSystem:
         self.tvb, self.alarm, self.negated, self.evaluated = ([False] * size for _ in range(4))
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
-        self._along_m: list[float] = (journey.odometer_m * journey.heading).tolist()
+        self._way_m = journey.odometer_m * journey.heading
+        self._along_m: list[float] = self._way_m.tolist()
+        self._events = sorted({*self._turns, *self._reads, *self._crossings})
         self._refusal = journey.refusal
         self._recovery: Recovery | None = None  # while negated
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
@@ -72,27 +75,59 @@ class LocationSystem:
 
     def run(self) -> None:
         """Walk along all epochs."""
-        for k in range(len(self._t_ns)):
-            if k in self._turns:
-                self._turn(k)
-            if k in self._reads:
-                self._read_balises(k)
-            bank_failed = self._bank.failed(k)
-            disordered = k in self._crossings and self._pass_balises(k, bank_failed)
-            if self._latch:
-                self._latch.advance(k)
-            self._close_windows(k)
-            self.evaluated[k] = self._bank.along_evaluated(k)
-            failing = bank_failed or disordered or self.distance.fails(k)
-            if failing:
-                self.alarm[k] = True
-            if self._recovery is not None:
-                self._seek_return(self._recovery, k, disordered)
-            elif failing:
-                self._negate(k)
-            elif self.evaluated[k] and self._refusal[k] is None:
-                self._validate(k)
+        k, size = 0, len(self._t_ns)
+        while k < size:
+            end = self._uneventful_until(k)
+            if end > k:
+                self._pass_uneventful(k, end)
+            else:
+                self._step(k)
+                end = k + 1
+            k = end
         self._finish()
+
+    def _uneventful_until(self, k: int) -> int:
+        """The first epoch from `k` on that has to be stepped through; those before it can only be TVBs.
+
+        So it is on linked way where no balise, read, turn, alarm or end of a window is near.
+        """
+        if self._recovery is not None or self._latch or self._chain_from is None or k <= self._chain_from:
+            return k
+        near = bisect_left(self._events, k)
+        end = self._events[near] if near < len(self._events) else len(self._t_ns)
+        for monitors in (self._bank, self.distance):
+            end = monitors.quiet_until(k, end) if end > k else k
+        closing = self._way_m[k:end] > min(self.virtual.closing_m, self.physical.closing_m)
+        return k + int(closing.argmax()) if closing.any() else end
+
+    def _pass_uneventful(self, k: int, end: int) -> None:
+        evaluated = self._bank.along_evaluated_between(k, end)
+        validated = evaluated & self._journey.usable[k:end]
+        self.evaluated[k:end] = evaluated.tolist()
+        self.tvb[k:end] = validated.tolist()
+        if validated.any():
+            self._footing.validate(k + int(np.flatnonzero(validated)[-1]))
+
+    def _step(self, k: int) -> None:
+        if k in self._turns:
+            self._turn(k)
+        if k in self._reads:
+            self._read_balises(k)
+        bank_failed = self._bank.failed(k)
+        disordered = k in self._crossings and self._pass_balises(k, bank_failed)
+        if self._latch:
+            self._latch.advance(k)
+        self._close_windows(k)
+        self.evaluated[k] = self._bank.along_evaluated(k)
+        failing = bank_failed or disordered or self.distance.fails(k)
+        if failing:
+            self.alarm[k] = True
+        if self._recovery is not None:
+            self._seek_return(self._recovery, k, disordered)
+        elif failing:
+            self._negate(k)
+        elif self.evaluated[k] and self._refusal[k] is None:
+            self._validate(k)
 
     # Balises
 

@@ -148,6 +148,17 @@ class MonitorBank:
         self._look(epoch)
         return bool(self._along[epoch])
 
+    def quiet_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on at which a monitor fails, or that is not looked at yet; at most `end`."""
+        self._look(epoch)
+        ahead = self._any[epoch : min(self._known_to + 1, end)]
+        first = int(ahead.argmax())
+        return epoch + (first if ahead[first] else ahead.size)
+
+    def along_evaluated_between(self, epoch: int, end: int) -> npt.NDArray[np.bool_]:
+        """`along_evaluated` of the epochs [epoch, end)."""
+        return self._along[epoch:end]
+
     def restart(self, epoch: int) -> None:
         """All recursions start anew at this epoch; their first increment is from it to the next."""
         for axis in self._axes:

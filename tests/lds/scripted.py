@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from pipeline.lds import LdsLimits, LdsResult, run_lds
@@ -37,6 +38,12 @@ class ScriptedBank:
 
     def along_evaluated(self, epoch: int) -> bool:
         return epoch > self.started and epoch not in self.blind
+
+    def quiet_until(self, epoch: int, end: int) -> int:
+        return next((k for k in range(epoch, end) if self.failed(k)), end)
+
+    def along_evaluated_between(self, epoch: int, end: int) -> np.ndarray:
+        return np.array([self.along_evaluated(k) for k in range(epoch, end)], dtype=bool)
 
     def restart(self, epoch: int) -> None:
         self.restarted.append(epoch)

@@ -7,10 +7,12 @@ from collections import Counter
 from itertools import pairwise
 
 import polars as pl
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.lds import LdsResult
+from pipeline.lds.machine import LocationSystem
 from tests.lds.scripted import ScriptedBank, balises_at, epochs_of, reads_at, run
 
 _NOT_OFFERED = ("missed", "not_available")
@@ -127,3 +129,16 @@ def test_what_comes_later_changes_no_decision_before(seed: int) -> None:
     part = chaos.replayed()
     columns = ["lds_mode", "tvb", "lrvb_id", "negated", "alarm", "exposure_s", "link_order_value"]
     assert part.epochs.select(columns).equals(whole.epochs.head(cut).select(columns))
+
+
+@given(seed=st.integers(0, 100_000))
+@settings(max_examples=30, deadline=None)
+def test_uneventful_stretches_are_what_single_steps_make_of_them(seed: int) -> None:
+    chaos = Chaos(seed)
+    at_once = chaos.replayed()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LocationSystem, "_uneventful_until", lambda system, k: k)
+        stepped = chaos.replayed()
+    assert at_once.epochs.equals(stepped.epochs)
+    assert at_once.passages.equals(stepped.passages)
+    assert (at_once.negations, at_once.restarts) == (stepped.negations, stepped.restarts)
