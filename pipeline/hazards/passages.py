@@ -139,8 +139,9 @@ def link_unoffered(passages: pl.DataFrame, t_true: list[int | None], judged: lis
 
 
 def suspicious_passages(passages: pl.DataFrame, spans: list[tuple[int, int]]) -> Bools:
-    """Accepted in `onset <= t < detection` of a fault."""
+    """VBs accepted in `onset <= t < detection` of a fault; a telegram does not rest on the position."""
     accepted = (passages["status"] == PassageStatus.ACCEPTED.value).to_numpy()
+    accepted &= (passages["kind"] == BaliseKind.VIRTUAL.value).to_numpy()
     offered = passages["t_offered"].dt.timestamp("ns").fill_null(-1).to_numpy()
     inside = np.zeros(passages.height, dtype=np.bool_)
     for onset_ns, until_ns in spans:

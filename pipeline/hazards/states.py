@@ -8,7 +8,7 @@ import polars as pl
 from pipeline.hazards.arrays import Bools, Floats, flags, floats, times_ns
 from pipeline.hazards.series import direction_of
 from schemas.config import HazardConfig, LdsConfig
-from schemas.enums import LdsState, PassageStatus
+from schemas.enums import BaliseKind, LdsState, PassageStatus
 
 _STATES = pl.Enum([member.value for member in LdsState])
 
@@ -67,8 +67,9 @@ def odometer_beyond_confidence(
     """
     t_ns = times_ns(epochs)
     travelled, place = floats(epochs, "odometer_m"), floats(truth, "truth_path_m")
+    virtual = pl.col("kind") == BaliseKind.VIRTUAL.value
     accepted = passages.filter(
-        (pl.col("status") == PassageStatus.ACCEPTED.value) & pl.col("t_offered").is_not_null()
+        virtual & (pl.col("status") == PassageStatus.ACCEPTED.value) & pl.col("t_offered").is_not_null()
     ).sort("t_offered")
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
     known = np.isfinite(travelled) & np.isfinite(place) & (truth["evidence"] != "odometer").fill_null(False).to_numpy()

@@ -15,6 +15,8 @@ _LOOKBACKS_S = (1.0, 30.0, 300.0)
 # What an alarm is about shows when it comes; a long one sees other things too.
 _COMING_S = 30.0
 _ACROSS = ("cross_", "up_")
+# A reference is steadier than this over the seconds before an alarm, a map need not be.
+_MAP_ERROR_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,9 @@ class Witnesses:
     error_up_m: Floats
     noise_up_m: Floats
     truth_m: Floats
+    truth_cross_m: Floats
+    truth_up_m: Floats
+    truth_sigma_m: Floats
     odometer_m: Floats
     stretch: Ints
     scale_sigma: Floats
@@ -60,6 +65,9 @@ def witnesses_of(
         error_up_m=errors["up"],
         noise_up_m=3.0 * np.hypot(floats(epochs, "sigma_up_m"), truth_sigma),
         truth_m=floats(truth, "truth_path_m"),
+        truth_cross_m=floats(truth, "truth_cross_m"),
+        truth_up_m=floats(truth, "truth_up_m"),
+        truth_sigma_m=np.nan_to_num(truth_sigma),
         odometer_m=floats(epochs, "odometer_m"),
         stretch=epochs["odometer_stretch"].fill_null(-1).cast(pl.Int64).to_numpy(),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
@@ -91,10 +99,24 @@ def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, .
         if any(name.startswith(axis) for name in monitors) and _beyond(error, noise, first, last):
             return Suspect.GNSS
     across = all(name.startswith(_ACROSS) for name in monitors)
-    if across and w.by_reference[first : last + 1].all():
-        # The reference clears the position and no along-track monitor failed: what is left is the map.
-        return Suspect.MAP
-    return Suspect.UNKNOWN
+    return Suspect.MAP if across and reference_left_map(w, first, last, monitors) else Suspect.UNKNOWN
+
+
+def reference_left_map(w: Witnesses, first: int, last: int, monitors: tuple[str, ...]) -> bool:
+    """The reference itself moved against the map around an alarm across the track: one run is then enough.
+
+    Else a map error shows over several runs only (`map_errors`): one alarm may be chance.
+    """
+    for axis, place in (("cross_", w.truth_cross_m), ("up_", w.truth_up_m)):
+        if not any(name.startswith(axis) for name in monitors):
+            continue
+        for lookback_s in _LOOKBACKS_S[:2]:
+            begin = int(np.searchsorted(w.t_ns, w.t_ns[first] - round(lookback_s * NS_PER_S)))
+            moved = place[begin : last + 1]
+            moved = moved[np.isfinite(moved)]
+            if moved.size > 1 and float(np.ptp(moved)) > max(_MAP_ERROR_M, 6.0 * float(w.truth_sigma_m[first])):
+                return True
+    return False
 
 
 def suspect_of_error(w: Witnesses, first: int, last: int, monitors: tuple[str, ...] = ()) -> Suspect:

@@ -46,6 +46,7 @@ class Journey:
     negated: tuple[tuple[float, float], ...] = ()
     accepted: dict[str, float] = field(default_factory=dict)
     faults: tuple[tuple[float, float, str, str], ...] = ()
+    survey: tuple[float, float, float] | None = None  # from s, to s, metres that the surveyed track is off across
 
     def but(self, **changes):
         return replace(self, **changes)
@@ -91,7 +92,7 @@ class Journey:
             "path_m": pl.Series(path, nan_to_null=True),
             "netelement_id": ["A"] * size,
             "measure_m": pl.Series(path, nan_to_null=True),
-            "cross_track_m": np.zeros(size),
+            "cross_track_m": self.across_m(t),
             "vertical_m": np.zeros(size),
             "on_track": ~out,
             "fix_valid": ~out,
@@ -164,8 +165,19 @@ class Journey:
         place = self.start_m + self.speed_mps * t
         zeros = np.zeros(t.size)
         return pl.DataFrame(
-            {"t": stamps(t), "path_m": place, "cross_track_m": zeros, "vertical_m": zeros, "sigma_m": zeros + 0.01}
+            {
+                "t": stamps(t),
+                "path_m": place,
+                "cross_track_m": self.across_m(t),
+                "vertical_m": zeros,
+                "sigma_m": zeros + 0.01,
+            }
         )
+
+    def across_m(self, t):
+        """Distance of the true place from the surveyed track."""
+        begin, end, size = self.survey or (0.0, 0.0, 0.0)
+        return np.where((t >= begin - 1e-9) & (t < end - 1e-9), size, 0.0)
 
     def reads_frame(self):
         times = [(place - self.start_m) / self.speed_mps for place in self.reads]

@@ -123,3 +123,10 @@ def test_each_true_passage_is_given_to_one_offer():
     assert [seconds(row["t_true"]) for row in rows] == [None, None, pytest.approx(45.0)]
     assert [row["hazard_id"] for row in rows] == [0, 1, None]
     assert [row["failure_mode"] for row in rows] == ["insertion", "insertion", "none"]
+
+
+def test_a_telegram_is_not_suspect_for_a_fault_of_the_position():
+    """V3 as a physical balise, read while the position is 45 m off and no monitor has found it."""
+    journey = Journey(steps=((31.0, 60.0, 45.0),))
+    offers = [{"balise_id": "V3", "t_offered": 35.0}, {"balise_id": "V3", "t_offered": 35.0, "kind": "physical"}]
+    assert [row["suspect_after_the_fact"] for row in passages(journey, offers)] == [True, False]

@@ -1,0 +1,77 @@
+"""States of the LDS through the whole replay: P2 negated, P3 diagnosis faulty, P1 wrong, P0, the first that applies."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from pipeline.replay import replay
+from schemas.config import Configuration, Vehicle
+from tests.replay.journeys import QUIET, VEHICLE, journey, seconds
+
+# The wheel counts 1 m for 1.08 m, and the vehicle file admits it: no increment monitor can see that.
+WORN = {"scale": 1.08}
+ADMITTED = Vehicle(odometer_scale=1.0, odometer_scale_sigma=0.05, gnss_latency_s=0.0, gnss_latency_sigma_s=0.002)
+# 8 % of the distance counted exceed 5 m + 5 % of it from here on.
+BEYOND_M = 5.0 / 0.03
+
+
+def states(odometer, vehicle, *faults, disabled=(), **settings):
+    run, site = journey(*faults, odometer=odometer, **settings)
+    config = Configuration.model_validate({"monitors": {"disabled": list(disabled)}})
+    return replay(run, site, vehicle, config)
+
+
+def test_odometer_error_beyond_5_m_and_5_percent_since_the_lrvb_is_p3():
+    tables = states(WORN, ADMITTED, disabled=["link_distance"])
+    epochs = tables.epochs.filter(pl.col("distance_from_lrvb_m").is_not_null() & (pl.col("lds_mode") == "linked"))
+    way_m = pl.col("distance_from_lrvb_m")
+    within, beyond = epochs.filter(way_m < BEYOND_M - 15.0), epochs.filter(way_m > BEYOND_M + 15.0)
+    assert min(within.height, beyond.height) > 400
+    assert set(within["lds_state"]) == {"P0"}
+    assert set(beyond["lds_state"]) == {"P3"}
+    row = tables.runs.row(0, named=True)
+    assert row["share_p3"] == pytest.approx((tables.epochs["lds_state"] == "P3").mean(), abs=0.001)
+    assert row["share_p0"] + row["share_p3"] == pytest.approx(1.0)
+    # The position is right all along: nothing of this is a hazard.
+    assert tables.hazards.height == 0
+
+
+def test_negated_comes_before_a_faulty_diagnosis():
+    """The linking monitor finds the same odometer; while the position is negated the state is P2, nearer P3."""
+    tables = states(WORN, ADMITTED)
+    negated = tables.epochs.filter(pl.col("lds_mode") == "fail_safe")
+    assert negated.height > 100
+    assert set(negated["lds_state"]) == {"P2"}
+    assert "P3" in set(tables.epochs.filter(pl.col("distance_from_lrvb_m") > BEYOND_M + 15.0)["lds_state"])
+
+
+def test_an_odometer_that_slips_within_its_confidence_is_p0_again_after_the_recovery():
+    """30 m lost, found at once; since the LRVB, 2 km before, that is within 5 m + 5 %."""
+    slip = {"kind": "slip", "rate_mps": 15.0, "start_s": 150.0, "duration_s": 2.0}
+    tables = states({}, VEHICLE, slip)
+    told = tables.epochs["lds_state"].rle().struct.unnest()
+    assert told.filter(pl.col("len") > 5)["value"].to_list() == ["P0", "P2", "P0"]
+    assert tables.hazards.height == 0
+
+
+def test_position_off_by_more_than_the_failure_limit_and_not_negated_is_p1():
+    """A ramp that no monitor sees is P1 from 20 m on."""
+    ramp = {"kind": "ramp", "rate_mps": 0.5, "start_s": 100.0, "duration_s": 80.0}
+    every = [
+        f"{axis}_{scale}" for axis in ("along", "cross", "up") for scale in ("ewma_0p1", "ewma_0p01", "ewma_0p001")
+    ]
+    tables = states({}, VEHICLE, ramp, disabled=[*every, "link_distance", "link_order", "along_doppler"], gnss=QUIET)
+    failed = tables.epochs.filter(pl.col("lds_state") == "P1")
+    assert failed["error_along_m"].min() > 20.0
+    assert seconds(tables, "t_failure") == pytest.approx([140.0], abs=0.3)
+    assert tables.epochs.filter(pl.col("error_along_m") > 20.0).height == failed.height > 300
+
+
+def test_without_an_odometer_the_state_is_p3_throughout():
+    run, site = journey()
+    tables = replay(run.with_streams(odometer=None), site, VEHICLE)
+    assert set(tables.epochs["lds_state"]) == {"P3"}
+    assert not tables.epochs["tvb"].any()
+    assert tables.runs["false_alarm_rate_per_h"].to_list() == [None]
+    assert tables.runs["balises_accepted"].item() == 8
