@@ -35,8 +35,11 @@ def path_on_chain(
     used = leg.visit[feet.segment[near]]
     part = slice(int(used.min()), int(used.max()) + 1)
     forward = grows_with(position, np.arange(len(fixes)), travelled(fixes, odometer), config.orientation_distance_m)
-    covered = leg_of(track, leg.visits[part] if forward else turned(leg.visits[part]))
-    feet = _carried_over(fixes.points.take(known), feet, leg, covered, part, forward)
+    if forward and len(leg.visits[part]) == len(leg.visits):
+        covered = leg
+    else:
+        covered = leg_of(track, leg.visits[part] if forward else turned(leg.visits[part]))
+        feet = _carried_over(fixes.points.take(known), feet, leg, covered, part, forward)
     everywhere = no_feet(len(fixes))
     everywhere.put(known, feet)
     ones, zeros = np.ones(len(fixes)), np.zeros(len(fixes), dtype=np.int64)

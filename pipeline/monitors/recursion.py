@@ -107,6 +107,8 @@ def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
     before = np.concatenate([sigma_m[:1], sigma_m[:-1]])
     low, high = np.minimum(sigma_m, before), np.maximum(sigma_m, before)
     steps = (high > STEP_OF_SIGMA * low) & (decorrelation < 1.0)
+    if not steps.any():
+        return sigma_m
     return np.where(np.logical_or.accumulate(steps, axis=0), before, sigma_m)
 
 
