@@ -6,10 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import zstandard
-from mcap.records import Chunk
-from mcap.stream_reader import StreamReader
-
+from benchmarks.ingest import read_and_decompress
 from benchmarks.notebook import notebook
 from benchmarks.results import Figure, best_of, stopwatch
 from benchmarks.trials import write_cdr_trial
@@ -47,16 +44,6 @@ def measure(folder: Path) -> list[Figure]:
         Figure("peak memory, one hour", peak_mb, "MB", MEMORY_ONE_HOUR_MB),
         Figure("peak memory, ten hours", ten_mb, "MB", MEMORY_TEN_HOURS_MB),
     ]
-
-
-def read_and_decompress(log: Path) -> int:
-    """Bytes of all chunks of a log, decompressed and thrown away: what no reader can do without."""
-    total = 0
-    with log.open("rb") as file:
-        for record in StreamReader(file, emit_chunks=True, skip_magic=False).records:
-            if isinstance(record, Chunk):
-                total += len(zstandard.decompress(record.data, max_output_size=record.uncompressed_size))
-    return total
 
 
 def _command_peak_mb(log: Path, site: Path, out: Path) -> float:

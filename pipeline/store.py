@@ -78,7 +78,7 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     if table not in TABLES:
         raise UsageError("is no table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
-    schema = {"run_id": pl.String(), **TABLES[table].create_empty().schema}
+    schema = {"run_id": pl.String(), **_contract(table)}
     if not runs:
         return pl.LazyFrame(schema=schema)
     paths = [table_address(out, table, run) for run in runs]
@@ -100,6 +100,10 @@ def check_tables(out: Address, tables: Iterable[str]) -> None:
             _check_columns(table, run, _schema_of(table, run, Path(table_address(out, table, run))))
 
 
+def _contract(table: str) -> dict[str, pl.DataType]:
+    return {name: column.dtype for name, column in TABLES[table].columns().items()}
+
+
 def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]:
     try:
         return pl.read_parquet_schema(file)
@@ -112,7 +116,7 @@ def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]
 
 
 def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) -> None:
-    expected = TABLES[table].create_empty().schema
+    expected = _contract(table)
     lost = [name for name in expected if name not in found]
     other = [f"{name} as {found[name]}, not {kind}" for name, kind in expected.items() if found.get(name, kind) != kind]
     if lost or other:
