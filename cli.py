@@ -261,7 +261,9 @@ def experiment(
     repetitions: Annotated[int | None, typer.Option(min=1, help="Instead of the published number.")] = None,
     seed: int = 1,
     jobs: Annotated[int, typer.Option(min=0, help="Processes; 0 takes one per core.")] = 0,
-    config: Annotated[Path | None, typer.Option("--config", help="The bank to judge, for `rare` and `bank`.")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="The bank to judge: `rare`, `bank`, `catalogue`.")
+    ] = None,
 ) -> None:
     """Run a published experiment again, at its own size."""
     from datasets.experiment import EXPERIMENTS

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from datasets.experiment.bank import write_bank
+from datasets.experiment.catalogue import write_catalogue
 from datasets.experiment.diagnostics import write_experiment
 from datasets.experiment.false_alarms import write_thresholds
 from datasets.experiment.findings import write_findings
@@ -17,7 +18,7 @@ from schemas.config import Configuration
 class Experiment(Protocol):
     """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 
-    `config` is the bank to judge, for `rare` and `bank`; the published experiments refuse one.
+    `config` is the bank to judge, for `rare`, `bank` and `catalogue`; the published experiments refuse one.
     """
 
     def __call__(
@@ -37,4 +38,5 @@ EXPERIMENTS: dict[str, Experiment] = {
     "thresholds": write_thresholds,
     "rare": write_rare,
     "bank": write_bank,
+    "catalogue": write_catalogue,
 }

@@ -101,12 +101,15 @@ def _block_size(bank: LinearBank, epochs: int) -> int:
 def pooled(block: Callable[[W], Array], works: list[W], runs: int, jobs: int) -> Probability:
     """Mean of independent unbiased estimates of equal weight, its relative error, and the gain over counting."""
     estimates = np.concatenate(mapped(block, works, jobs))
-    mean = float(estimates.mean())
-    if mean == 0.0:
+    greatest = float(estimates.max())
+    if greatest == 0.0:
         return Probability(0.0, float("inf"), 1.0, runs)
-    variance = float(estimates.var(ddof=1)) / estimates.size if estimates.size > 1 else float("inf")
-    gain = mean * (1.0 - mean) / runs / variance if variance > 0 else float("inf")
-    return Probability(mean, float(np.sqrt(variance)) / mean, gain, runs)
+    # In units of the greatest, so that the squares of 1e-200 are still numbers.
+    shares = estimates / greatest
+    error = float(np.sqrt(shares.var(ddof=1) / shares.size) / shares.mean()) if shares.size > 1 else float("inf")
+    mean = greatest * float(shares.mean())
+    gain = (1.0 - mean) / mean / runs / error**2 if error > 0 else float("inf")
+    return Probability(mean, error, gain, runs)
 
 
 def _false_alarm_block(work: _Work) -> Array:

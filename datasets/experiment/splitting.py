@@ -24,8 +24,10 @@ Index = npt.NDArray[np.int64]
 Step = Callable[[int, Array], tuple[Array, Array]]
 
 _MOST_CONSTRAINTS = 120
-# The shifted path stays this many sigmas inside the thresholds: with many constraints at once more runs survive.
-_MARGIN = 0.4
+# The shifted path stays this many sigmas inside the thresholds: with many constraints at once more runs survive. A slow
+# ramp whose mean never comes near a threshold needs more of it, until the shift is worth something.
+_MARGINS = (0.4, 1.0, 1.5, 2.0, 2.5)
+_LEAST_HALF_SQUARE = 2.0
 # Runs are drawn anew where the weights are worth fewer than this share of them.
 _LEAST_EFFECTIVE = 0.5
 
@@ -46,9 +48,17 @@ def most_probable_miss(bank: LinearBank, epochs: int, rate_mps: float) -> Shift:
     Constraints are added one by one where the path still exceeds; with multipliers l and covariance C of the
     constrained values, the noise of all monitors moves by -C l and its squared norm is l' C l.
     """
+    covariances = bank.covariances(epochs)
+    for margin in _MARGINS:
+        shift = _shift(bank, epochs, rate_mps, margin, covariances)
+        if shift.half_square >= _LEAST_HALF_SQUARE:
+            break
+    return shift
+
+
+def _shift(bank: LinearBank, epochs: int, rate_mps: float, margin: float, covariances: Array) -> Shift:
     towards = np.where(bank.slope < 0, -1.0, 1.0)
     ramp, threshold, sigma = rate_mps * bank.response(epochs), bank.thresholds(epochs), bank.sigmas(epochs)
-    covariances = bank.covariances(epochs)
     epoch: list[int] = []
     monitor: list[int] = []
     columns: list[Array] = []
@@ -58,14 +68,14 @@ def most_probable_miss(bank: LinearBank, epochs: int, rate_mps: float) -> Shift:
     for _ in range(_MOST_CONSTRAINTS):
         excess = (towards * (ramp + mean) - threshold) / sigma
         worst = np.unravel_index(int(excess.argmax()), excess.shape)
-        if excess[worst] < -0.5 * _MARGIN:
+        if excess[worst] < -0.5 * margin:
             break
         epoch.append(int(worst[0]) + 1)
         monitor.append(int(worst[1]))
         columns.append(towards[worst[1]] * bank.covariance_with(monitor[-1], epoch[-1], covariances))
         at, which = np.array(epoch) - 1, np.array(monitor)
         gram = np.array([(towards[which] * column[at, which]) for column in columns])
-        needed = towards[which] * ramp[at, which] - threshold[at, which] + _MARGIN * sigma[at, which]
+        needed = towards[which] * ramp[at, which] - threshold[at, which] + margin * sigma[at, which]
         multiplier = least_norm(gram, needed)
         mean = -np.einsum("c,ckm->km", multiplier, np.array(columns))
     signed = multiplier * towards[np.array(monitor, dtype=np.int64)] if monitor else multiplier

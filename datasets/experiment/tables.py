@@ -19,7 +19,7 @@ def refuse_configuration(experiment: str, config: Configuration | None) -> None:
             "takes no configuration",
             place=f"experiment {experiment}",
             expected="the published settings",
-            remedy="`rare` and `bank` judge the bank of a configuration.",
+            remedy="`rare`, `bank` and `catalogue` judge the bank of a configuration.",
         )
 
 
@@ -37,3 +37,12 @@ def write_tables(out: Path, tables: Mapping[str, pl.DataFrame], settings: Mappin
     except OSError as error:
         raise OutputError(f"cannot be written: {error.strerror}", place=str(out)) from None
     return [*written, path]
+
+
+def write_page(path: Path, text: str) -> Path:
+    """A page of text beside the tables."""
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
+    return path

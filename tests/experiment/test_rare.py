@@ -171,3 +171,19 @@ def test_runs_are_shared_by_populations_of_some_size() -> None:
     assert populations(20_000) == [1_000] * 20
     assert populations(1_100) == [250] * 4 + [100]
     assert populations(7) == [7]
+
+
+def test_a_ramp_below_all_thresholds_is_sampled_well_too() -> None:
+    """0.03 m/s, noise on position, two constellations: the mean never comes near a threshold, and still 4e-9 miss."""
+    system = linear_bank(default_geometry("gps_galileo"), 0.0, BankSpec(reading="position"))
+    assert most_probable_miss(system, 2_720, 0.03).half_square > 2.0
+    result = missed_detection_probability(system, 2_720, 0.03, runs=4_000, seed=11)
+    assert 1e-9 < result.value < 1e-8
+    assert result.relative_error < 0.2
+
+
+def test_the_error_of_a_probability_below_the_smallest_square() -> None:
+    system = linear_bank(default_geometry("gps_galileo"), 0.0, BankSpec(reading="position"))
+    result = missed_detection_probability(system, 120, 1.0, runs=2_000, seed=12)
+    assert 0.0 < result.value < 1e-155
+    assert 0.0 < result.relative_error < 0.6

@@ -1,0 +1,195 @@
+"""Which monitor sees which fault first, how soon and how often, and what none sees: the program's own replay decides.
+
+Every fault of the catalogue is put into the same journeys, which are replayed with and without it. A monitor sees the
+fault where it fails at an epoch from the onset on at which it does not fail in the healthy replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from datasets.experiment.catalogue_faults import CatalogueFault, Journey, catalogue
+from datasets.experiment.catalogue_tables import faults_table, monitors_table
+from datasets.experiment.catalogue_text import catalogue_page
+from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fault
+from datasets.experiment.diagnostics import SEED
+from datasets.experiment.tables import write_page, write_tables
+from datasets.experiment.workers import mapped
+from datasets.motion import build_motion
+from pipeline.replay import replay
+from schemas.config import Configuration
+from schemas.run import RunTables
+from schemas.tables import MONITORS
+
+REPETITIONS = 40
+RATE_HZ = 1.0
+_SOLUTION, _OTHER = "primary", "dual"
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One journey with one noise, and the faults that go into it."""
+
+    journey: Journey
+    number: int
+    faults: tuple[CatalogueFault, ...]
+    seed: int
+    config: Configuration
+
+
+def run_catalogue(
+    repetitions: int = REPETITIONS,
+    seed: int = SEED,
+    jobs: int = 1,
+    config: Configuration | None = None,
+    faults: Sequence[CatalogueFault] | None = None,
+) -> pl.DataFrame:
+    """One row per fault and repetition, in the order of the catalogue; see `judged`."""
+    chosen = list(faults) if faults is not None else list(catalogue())
+    settings = compared(config or Configuration())
+    tasks = [
+        _Task(journey, number, tuple(one for one in chosen if one.journey == journey), seed, settings)
+        for journey in dict.fromkeys(one.journey for one in chosen)
+        for number in range(repetitions)
+    ]
+    rows = [row for part in mapped(_replayed, tasks, jobs) for row in part]
+    order = {one.name: place for place, one in enumerate(chosen)}
+    rows.sort(key=lambda row: (order[str(row["fault"])], row["repetition"]))
+    return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
+
+
+def compared(config: Configuration) -> Configuration:
+    """The configuration with the two solutions compared, unless it names another one itself."""
+    if config.monitors.channel_reference is not None:
+        return config
+    monitors = config.monitors.model_copy(update={"channel_reference": _OTHER})
+    return config.model_copy(update={"monitors": monitors})
+
+
+def _replayed(task: _Task) -> list[dict[str, object]]:
+    ready = stage(JOURNEYS[task.journey], 1_000 * task.seed + task.number, RATE_HZ)
+    healthy_run, site = with_fault(ready, CatalogueFault("healthy", 0.0, ""))
+    healthy = replay(healthy_run, site, ready.vehicle, task.config)
+    rows = []
+    for fault in task.faults:
+        run, site = with_fault(ready, fault)
+        tables = replay(run, site, ready.vehicle, task.config)
+        rows.append(
+            {"fault": fault.name, "kind": fault.kind, "size": fault.size, "unit": fault.unit}
+            | {"journey": fault.journey, "repetition": task.number}
+            | judged(ready, tables, None if fault.is_healthy else healthy, task.config)
+        )
+    return rows
+
+
+def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: Configuration) -> dict[str, object]:
+    """What one replay shows of the fault; times from its onset.
+
+    `seen_s`: by monitor when it first failed; `first`: those that failed at the first of these epochs, loudest first.
+    Without a healthy replay beside it every failure counts. `failure_s`: first epoch with an along-track error beyond
+    the limit. `unsafe`: balises accepted beyond it.
+    """
+    epochs = _from_onset(tables.epochs, ready)
+    beside = healthy.epochs if healthy is not None else tables.epochs.clear()
+    seen = _first_fails(epochs, _from_onset(beside, ready))
+    detected_s = min(seen.values(), default=None)
+    beyond = epochs.filter(pl.col("error_along_m").abs() > config.hazards.failure_limit_m)
+    return {
+        "detected_s": detected_s,
+        "way_m": None if detected_s is None else _way_m(ready, detected_s),
+        "first": _loudest(epochs, seen, detected_s),
+        "failure_s": beyond["since_s"][0] if beyond.height else None,
+        "unsafe": _unsafe(tables, ready, config) - (_unsafe(healthy, ready, config) if healthy else 0),
+        "linking_errors": _linking_errors(tables) - (_linking_errors(healthy) if healthy else 0),
+        "seen_s": [seen.get(monitor) for monitor in MONITORS],
+        "budget_s": config.budget_s,
+        "reaction_s": config.hazards.reaction_s if config.hazards.reaction_s is not None else 1.0 / RATE_HZ,
+    }
+
+
+def _from_onset(epochs: pl.DataFrame, ready: Stage) -> pl.DataFrame:
+    since = (pl.col("t").dt.timestamp("ns") - ready.onset_ns) / 1e9
+    return epochs.filter(pl.col("solution") == _SOLUTION).with_columns(since_s=since).filter(pl.col("since_s") >= 0.0)
+
+
+def _first_fails(epochs: pl.DataFrame, healthy: pl.DataFrame) -> dict[str, float]:
+    """By monitor the seconds to its first failure that the healthy replay does not have."""
+    states = [f"{monitor}_state" for monitor in MONITORS]
+    both = epochs.select("t", "since_s", *states).join(
+        healthy.select("t", *states), on="t", how="left", suffix="_healthy", maintain_order="left"
+    )
+    found = {}
+    for monitor, state in zip(MONITORS, states, strict=True):
+        fails = (pl.col(state) == "fail") & (pl.col(f"{state}_healthy") != "fail").fill_null(True)
+        first = both.filter(fails)["since_s"]
+        if first.len():
+            found[monitor] = float(first[0])
+    return found
+
+
+def _loudest(epochs: pl.DataFrame, seen: dict[str, float], detected_s: float | None) -> list[str]:
+    """Monitors that failed first, by their value over the threshold."""
+    if detected_s is None:
+        return []
+    row = epochs.row(by_predicate=pl.col("since_s") == detected_s, named=True)
+    first = [monitor for monitor, since_s in seen.items() if since_s == detected_s]
+    return sorted(first, key=lambda monitor: -abs(row[f"{monitor}_value"]) / row[f"{monitor}_threshold"])
+
+
+def _way_m(ready: Stage, since_s: float) -> float:
+    """Way of the train from the onset to the detection [m]."""
+    motion = build_motion(ready.scenario.runs[0].motion)
+    begin_s = ready.plan.onset_s
+    at = motion.distance_m(pl.Series([begin_s, begin_s + since_s]).to_numpy())
+    return float(at[1] - at[0])
+
+
+def _unsafe(tables: RunTables, ready: Stage, config: Configuration) -> int:
+    """Virtual balises accepted from the onset on with an error beyond the limit."""
+    wrong = (pl.col("status") == "accepted") & (pl.col("location_error_m").abs() > config.hazards.failure_limit_m)
+    return tables.passages.filter(
+        (pl.col("solution") == _SOLUTION)
+        & wrong
+        & (pl.col("kind") == "virtual")
+        & (pl.col("t_offered").dt.timestamp("ns") >= ready.onset_ns)
+    ).height
+
+
+def _linking_errors(tables: RunTables) -> int:
+    ours = tables.passages.filter(pl.col("solution") == _SOLUTION)
+    return ours.filter(pl.col("linking_error") != "none").height
+
+
+def write_catalogue(
+    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
+) -> list[Path]:
+    """`catalogue.parquet` by fault, `monitors.parquet` by fault and monitor, `runs.parquet`, and `catalogue.md`."""
+    count = repetitions or REPETITIONS
+    runs = run_catalogue(count, seed, jobs, config)
+    faults, monitors = faults_table(runs), monitors_table(runs)
+    settings = {"experiment": "catalogue", "repetitions": count, "seed": seed, "rate_hz": RATE_HZ}
+    written = write_tables(out, {"catalogue": faults, "monitors": monitors, "runs": runs}, settings)
+    return [*written, write_page(out / "catalogue.md", catalogue_page(faults, monitors))]
+
+
+_SCHEMA: dict[str, pl.DataType | type[pl.DataType]] = {
+    "fault": pl.String,
+    "kind": pl.String,
+    "size": pl.Float64,
+    "unit": pl.String,
+    "journey": pl.String,
+    "repetition": pl.Int64,
+    "detected_s": pl.Float64,
+    "way_m": pl.Float64,
+    "first": pl.List(pl.String),
+    "failure_s": pl.Float64,
+    "unsafe": pl.Int64,
+    "linking_errors": pl.Int64,
+    "seen_s": pl.List(pl.Float64),
+    "budget_s": pl.Float64,
+    "reaction_s": pl.Float64,
+}

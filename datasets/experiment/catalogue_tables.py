@@ -1,0 +1,113 @@
+"""The catalogue's replays as tables: by fault, and by fault and monitor, shares with exact bounds."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.statistics import clopper_pearson
+from schemas.tables import MONITORS
+
+
+def faults_table(runs: pl.DataFrame) -> pl.DataFrame:
+    """One row per fault, in the order of the runs."""
+    parts = runs.partition_by("fault", maintain_order=True)
+    return pl.DataFrame([_fault_row(part) for part in parts], infer_schema_length=None)
+
+
+def _fault_row(runs: pl.DataFrame) -> dict[str, object]:
+    """Of one fault; Pmd is over the runs whose position failed, in time means negated within budget after that."""
+    found = runs.filter(pl.col("detected_s").is_not_null())
+    failed = runs.filter(pl.col("failure_s").is_not_null())
+    missed = failed.filter(~(pl.col("detected_s") <= pl.col("failure_s")).fill_null(False)).height
+    negated_s = pl.col("detected_s") + pl.col("reaction_s")
+    in_time = failed.filter((negated_s <= pl.col("failure_s") + pl.col("budget_s")).fill_null(False)).height
+    first = _ranking(found)
+    return {
+        **{name: runs[name][0] for name in ("fault", "kind", "size", "unit", "journey")},
+        "runs": runs.height,
+        **_share("detected", found.height, runs.height),
+        "first_monitor": first[0][0] if first else None,
+        "first_monitors": ", ".join(f"{name} {share:.0%}" for name, share in first),
+        "time_to_detect_median_s": found["detected_s"].median(),
+        "time_to_detect_max_s": found["detected_s"].max(),
+        "way_median_m": found["way_m"].median(),
+        "way_max_m": found["way_m"].max(),
+        "failed": failed.height,
+        "failure_median_s": failed["failure_s"].median(),
+        "missed_at_failure": missed,
+        **_share("pmd_at_failure", missed, failed.height),
+        **_share("within_budget", in_time, failed.height),
+        "runs_with_unsafe": runs.filter(pl.col("unsafe") > 0).height,
+        "unsafe_accepted": int(runs["unsafe"].clip(lower_bound=0).sum()),
+        "seen_by_linking_alone": runs.filter(pl.col("detected_s").is_null() & (pl.col("linking_errors") > 0)).height,
+    }
+
+
+def _share(name: str, count: int, trials: int) -> dict[str, float | None]:
+    share = clopper_pearson(count, trials)
+    return {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
+
+
+def _ranking(found: pl.DataFrame) -> list[tuple[str, float]]:
+    """Monitors by the share of detections that they were the first or loudest of the first of."""
+    loudest = found.select(monitor=pl.col("first").list.first())
+    counted = loudest.group_by("monitor").len().sort(["len", "monitor"], descending=[True, False])
+    return [(str(name), count / found.height) for name, count in counted.iter_rows()]
+
+
+def monitors_table(runs: pl.DataFrame) -> pl.DataFrame:
+    """One row per fault and monitor that saw it in some run.
+
+    `first`: share of runs in which no other failed earlier; `alone`: in which no other failed at all; `lead_s`: median
+    of how much earlier than every other it failed, where it did.
+    """
+    rows = []
+    for part in runs.partition_by("fault", maintain_order=True):
+        table: list[list[float | None]] = part["seen_s"].to_list()
+        for place, monitor in enumerate(MONITORS):
+            row = _monitor_row(monitor, place, table)
+            if row is not None:
+                rows.append({"fault": part["fault"][0], **row})
+    return pl.DataFrame(rows, schema=_MONITORS_SCHEMA)
+
+
+def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> dict[str, object] | None:
+    """`runs`: by run the seconds to the first failure of each monitor."""
+    own, leads, first, alone = [], [], 0, 0
+    for seen in runs:
+        mine = seen[place]
+        if mine is None:
+            continue
+        others = min((s for k, s in enumerate(seen) if k != place and s is not None), default=None)
+        own.append(mine)
+        alone += others is None
+        first += others is None or others >= mine
+        if others is not None and others > mine:
+            leads.append(others - mine)
+    if not own:
+        return None
+    return {
+        "monitor": monitor,
+        "runs": len(runs),
+        **_share("seen", len(own), len(runs)),
+        "first": first / len(runs),
+        "alone": alone / len(runs),
+        "lead_s": pl.Series(leads, dtype=pl.Float64).median(),
+        "time_to_detect_median_s": pl.Series(own).median(),
+        "time_to_detect_max_s": max(own),
+    }
+
+
+_MONITORS_SCHEMA = {
+    "fault": pl.String,
+    "monitor": pl.String,
+    "runs": pl.Int64,
+    "seen": pl.Float64,
+    "seen_low": pl.Float64,
+    "seen_high": pl.Float64,
+    "first": pl.Float64,
+    "alone": pl.Float64,
+    "lead_s": pl.Float64,
+    "time_to_detect_median_s": pl.Float64,
+    "time_to_detect_max_s": pl.Float64,
+}
