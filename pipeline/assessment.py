@@ -99,7 +99,8 @@ def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
     """Runs by verdict, per solution and service level."""
     counts = {verdict.value: (pl.col("verdict") == verdict.value).sum().cast(pl.Int64) for verdict in ThrVerdict}
     return (
-        levels.group_by("solution", "service_level", "allowed_s", maintain_order=True)
+        levels.filter(pl.col("solution") != "")
+        .group_by("solution", "service_level", "allowed_s", maintain_order=True)
         .agg(**counts)
         .sort("solution", maintain_order=True)
     )

@@ -18,7 +18,8 @@ _COLUMNS = (
     ("missed_share", "missed share (95 %)"), ("common_missed", "missed, common to both"),
     ("time_to_detect_median_s", "T_D median [s]"), ("time_to_detect_max_s", "T_D max [s]"), ("alarms", "alarms"),
     ("false_alarms", "false alarms"), ("false_alarm_rate", "false alarms per h (95 %)"),
-    ("availability", "availability"), ("mtbf", "MTBF [h] (95 %)"), ("mtbf_expected_h", "MTBF if independent [h]"),
+    ("wrong_in_use_s", "wrong and in use [s]"), ("availability", "availability"),
+    ("mtbf", "MTBF [h] (95 %)"), ("mtbf_expected_h", "MTBF if independent [h]"),
     ("continuity_15s", "continuity over 15 s"),
 )  # fmt: skip
 _BOUNDED = {"missed_share": "", "false_alarm_rate": "_per_h", "mtbf": "_h"}

@@ -157,8 +157,10 @@ def _statement(row: Row) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
     head = (
         f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
-        f" in {row['hours_with_truth']:.6g} h with a truth."
+        f" at virtual balises in {row['hours_with_truth']:.6g} h with a truth."
     )
+    if row["share_p1"]:
+        head += f" Beyond the failure limit and not negated, at a balise or not: {row['share_p1']:.3%} of the time."
     if row["hours_still_needed"] == 0.0:
         return f"{head} This substantiates a {claim}."
     return (

@@ -21,7 +21,7 @@ from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from pipeline.summary import trusted
 from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s, uptime
 from schemas.config import Configuration
-from schemas.enums import MonitorState, Verdict
+from schemas.enums import Evidence, MonitorState, Verdict
 from schemas.tables import MONITORS, SCALES
 
 COMPARISON = "channel"
@@ -49,6 +49,8 @@ class _Channel:
     fails: Fails
     judged: Flags
     working: Flags
+    known: Flags
+    wrong: Flags
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class _Solution:
     faults: pl.DataFrame
     alarms: pl.DataFrame
     by_reference: bool
+    with_truth: bool
 
     @property
     def side(self) -> Side:
@@ -76,7 +79,7 @@ def side_by_side(
     """
     names = sorted(runs["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
-    channels = {name: _reactive(one.epochs, config) for name, one in solutions.items()}
+    channels = {name: _reactive(one, config) for name, one in solutions.items()}
     found: dict[Key, Tally] = {}
     for name, channel in channels.items():
         one = solutions[name]
@@ -126,7 +129,11 @@ def _solution(
     own = pl.col("solution") == name
     evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
     return _Solution(
-        epochs.filter(own).sort("t"), _one_per_fault(hazards.filter(own)), alarms.filter(own), evidence == ["reference"]
+        epochs=epochs.filter(own).sort("t"),
+        faults=_one_per_fault(hazards.filter(own)),
+        alarms=alarms.filter(own),
+        by_reference=evidence == [Evidence.REFERENCE.value],
+        with_truth=evidence in ([Evidence.REFERENCE.value], [Evidence.BALISE.value]),
     )
 
 
@@ -145,9 +152,9 @@ def _one_per_fault(hazards: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _reactive(epochs: pl.DataFrame, config: Configuration) -> _Channel:
+def _reactive(one: _Solution, config: Configuration) -> _Channel:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
-    return _channel(epochs, _DIAGNOSIS, judged, trusted(config), config)
+    return _channel(one, one.epochs, _DIAGNOSIS, judged, trusted(config), config)
 
 
 def _evaluated(monitor: str) -> pl.Expr:
@@ -164,25 +171,37 @@ def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally
     both = other.epochs.select("t", other_trusted=trusted(config))
     own = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared)
     frame = own.join(both, on="t", how="left", maintain_order="left")
-    channel = _channel(
-        frame, (COMPARISON,), _evaluated(COMPARISON), pl.col("own_trusted") & pl.col("other_trusted"), config
-    )
+    trust = pl.col("own_trusted") & pl.col("other_trusted")
+    channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
     verdicts = verdicts_of(channel.fails.alarms, (one.side, other.side), config.hazards)
     return _tally(channel, _faults(one.faults, other.faults, channel, config), verdicts)
 
 
 def _channel(
-    epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, position: pl.Expr, config: Configuration
+    one: _Solution,
+    epochs: pl.DataFrame,
+    monitors: tuple[str, ...],
+    judged: pl.Expr,
+    position: pl.Expr,
+    config: Configuration,
 ) -> _Channel:
+    """`epochs`: those of the solution, with the columns that `monitors`, `judged` and `position` take."""
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = fails_of(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     t_ns = epochs["t"].to_physical().to_numpy()
     limit_s = gap_limit_s(nominal_period_s(t_ns), config.align.gap_reset_s)
-    seen = epochs.select(judged.fill_null(value=False)).to_series().to_numpy()
-    working = seen & epochs.select(position.fill_null(value=False)).to_series().to_numpy()
+    seen = _flags(epochs, judged)
+    working = seen & _flags(epochs, position)
     for span in fails.alarms:
         working &= (t_ns < span.start_ns) | (t_ns > span.end_ns + round(config.lds.recovery_s * 1e9))
-    return _Channel(t_ns, limit_s, held_s(t_ns, limit_s), fails, seen, working)
+    known = _flags(one.epochs, pl.col("error_along_m").is_not_null() & pl.lit(one.with_truth))
+    wrong = known & _flags(one.epochs, pl.col("error_along_m").abs() > config.hazards.failure_limit_m)
+    return _Channel(t_ns, limit_s, held_s(t_ns, limit_s), fails, seen, working, known, wrong)
+
+
+def _flags(epochs: pl.DataFrame, condition: pl.Expr) -> Flags:
+    """A condition with false for null."""
+    return epochs.select(condition.fill_null(value=False).alias("flag"))["flag"].to_numpy()
 
 
 def _tally(channel: _Channel, faults: Faults, verdicts: list[Verdict]) -> Tally:
@@ -193,7 +212,15 @@ def _tally(channel: _Channel, faults: Faults, verdicts: list[Verdict]) -> Tally:
 
 def _working(channel: _Channel) -> Working:
     up = uptime(channel.t_ns, channel.working, channel.limit_s)
-    return Working(float(channel.held_s.sum()), float(channel.held_s[channel.working].sum()), up.up_s, up.losses)
+    held = channel.held_s
+    return Working(
+        held_s=float(held.sum()),
+        working_s=float(held[channel.working].sum()),
+        up_s=up.up_s,
+        losses=up.losses,
+        truth_s=float(held[channel.known].sum()),
+        wrong_s=float(held[channel.wrong & channel.working].sum()),
+    )
 
 
 def _redundant(one: _Channel, other: _Channel) -> Working:

@@ -48,12 +48,18 @@ class Alarms:
 
 @dataclass(frozen=True)
 class Working:
-    """Time with epochs, of this in work [s], and how often work was lost after it had gone on for `up_s`."""
+    """Time with epochs, of this in work [s], and how often work was lost after it had gone on for `up_s`.
+
+    `truth_s`: time with a reference or balise reads; `wrong_s`: of this in work with an error beyond the failure limit,
+    whether it hit a virtual balise or not (the architecture's P1).
+    """
 
     held_s: float = 0.0
     working_s: float = 0.0
     up_s: float = 0.0
     losses: int = 0
+    truth_s: float = 0.0
+    wrong_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,8 @@ class Tally:
             **_fault_columns(self.faults),
             **_alarm_columns(self.alarms),
             "availability": self.working.working_s / self.working.held_s if self.working.held_s > 0 else None,
+            "wrong_in_use_s": self.working.wrong_s if self.working.truth_s > 0 else None,
+            "wrong_in_use_share": self.working.wrong_s / self.working.truth_s if self.working.truth_s > 0 else None,
             **continuity_columns(Uptime(self.working.up_s, self.working.losses)),
         }
 

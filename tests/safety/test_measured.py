@@ -105,7 +105,8 @@ def test_a_trial_without_a_miss_says_what_it_lacks() -> None:
     assert found["hours_still_needed"] == found["hours_needed"] - 100.0
     assert found["missed_rate_upper_per_h"] == pytest.approx(2.9957 / 100, rel=1e-4)
     (sentence,) = plain_statements(figures)
-    assert "0 missed detections of 0 position failures in 100 h" in sentence
+    assert "0 missed detections of 0 position failures at virtual balises in 100 h" in sentence
+    assert "not negated" not in sentence
     assert "cannot substantiate" in sentence
     assert "4.47e+09 h" in sentence
 
@@ -114,6 +115,15 @@ def test_a_trial_that_is_long_enough_says_so() -> None:
     loose = SafetyConfig(thr_vb_per_h=0.1)
     (sentence,) = plain_statements(measured_figures(runs(100), NO_HAZARDS, loose))
     assert "This substantiates a THR_VB of 1.00e-01/h" in sentence
+
+
+def test_a_position_wrong_between_balises_is_not_kept_quiet() -> None:
+    """No virtual balise was hit, yet for 0.4 % of the time the position was wrong and in use."""
+    figures = measured_figures(runs(2, held_s=3600.0, share_p1=[0.008, 0.0]), NO_HAZARDS, CONFIG)
+    assert (
+        "Beyond the failure limit and not negated, at a balise or not: 0.400% of the time"
+        in plain_statements(figures)[0]
+    )
 
 
 def test_no_runs_no_rows() -> None:

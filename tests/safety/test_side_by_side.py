@@ -196,6 +196,27 @@ class TestAvailability:
         assert (row["availability"], row["judged_h"], row["false_alarm_rate_per_h"]) == (0.0, 0.0, None)
 
 
+class TestWrongInUse:
+    """Errors beyond the failure limit count whether a virtual balise was near or not."""
+
+    def test_offset_that_only_the_comparison_sees(self) -> None:
+        """30 m off from 50 to 59 s, no hazard: 10 s in use under a diagnosis that is silent."""
+        found = compared(solution("gps", during(50, 59, 30.0)), solution("galileo"))
+        assert (found["gps", REACTIVE]["wrong_in_use_s"], found["gps", COMPOSITE]["wrong_in_use_s"]) == (10.0, 0.0)
+        assert found["gps", REACTIVE]["wrong_in_use_share"] == pytest.approx(10 / 199)
+        assert found["galileo", REACTIVE]["wrong_in_use_s"] == 0.0
+        assert found["galileo", REDUNDANT]["wrong_in_use_s"] is None
+
+    def test_offset_of_both_that_only_the_diagnosis_sees(self) -> None:
+        off = during(50, 59, 30.0)
+        found = compared(*(solution(name, off, {"along_raw": [52]}) for name in ("gps", "galileo")))
+        assert (found["gps", REACTIVE]["wrong_in_use_s"], found["gps", COMPOSITE]["wrong_in_use_s"]) == (2.0, 10.0)
+
+    def test_not_known_by_the_odometer_alone(self) -> None:
+        found = compared(solution("gps", during(50, 59, 30.0)), solution("galileo"), evidence="odometer")
+        assert found["gps", REACTIVE]["wrong_in_use_s"] is None
+
+
 class TestRedundantChannels:
     def both(self, first: list[int], second: list[int], offset_s: float = 0.0) -> Any:
         """Two solutions at 1 Hz, each without confidence at the seconds given."""
