@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from scipy.special import chdtri
 
 from datasets.experiment.diagnostics import SEED
-from datasets.experiment.geometry import CONSTELLATIONS, Geometry, default_geometry
+from datasets.experiment.geometry import Geometry, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
 from datasets.experiment.plan import Plan, Sensors, bank_forms
-from datasets.experiment.ranges import RangePlan, held_rows, statistic
+from datasets.experiment.range_alarms import range_alarms
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.thresholds import (
@@ -108,44 +107,7 @@ def verification_table(repetitions: int = REPETITIONS, seed: int = SEED, jobs: i
                         "at_1e_7": float(two_sided(threshold_factor(EXTRAPOLATED) * ratio[form])),
                     }
                 )
-    rows += _pseudorange_rows(repetitions, seed)
     return pl.DataFrame(rows)
-
-
-def _pseudorange_rows(repetitions: int, seed: int) -> list[dict[str, object]]:
-    """The pseudorange monitor: epochs drawn independently, both constellations."""
-    rows: list[dict[str, object]] = []
-    for number, constellation in enumerate(CONSTELLATIONS):
-        plan = RangePlan(default_geometry(constellation))
-        one, rng = statistic(plan, 0.0), generator(seed, 53, number)
-        freedom = one.project.shape[0]
-        limits = [float(chdtri(freedom, p)) for p in PROBABILITIES]
-        counts = np.zeros(len(limits), dtype=np.int64)
-        sigma = np.sqrt(plan.geometry.range_variance_m2.sum(axis=1))[:, None]
-        held = held_rows(plan, 0.0)
-        for size in in_blocks(repetitions, 50_000):
-            errors = sigma * rng.standard_normal((sigma.size, size))
-            survey = plan.survey_m * rng.standard_normal((2, size))
-            value = np.square(one.project @ (errors - held @ survey)).sum(axis=0)
-            counts += np.array([(value > limit).sum() for limit in limits])
-        for probability, alarms in zip(PROBABILITIES, counts, strict=True):
-            share = clopper_pearson(int(alarms), repetitions)
-            rows.append(
-                {
-                    "way": "exact",
-                    "monitor": f"pseudorange_{constellation}",
-                    "sigma_ratio": 1.0,
-                    "intended": probability,
-                    "expected": probability,
-                    "runs": repetitions,
-                    "alarms": int(alarms),
-                    "measured": share.value,
-                    "measured_low": share.low,
-                    "measured_high": share.high,
-                    "at_1e_7": EXTRAPOLATED,
-                }
-            )
-    return rows
 
 
 @dataclass(frozen=True)
@@ -239,12 +201,13 @@ def _per_hour(value: float | None, low: float | None, high: float | None) -> dic
 def write_thresholds(
     out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
 ) -> list[Path]:
-    """`regression.parquet`, `verification.parquet`, `alarms_per_hour.parquet`."""
+    """`regression`, `verification`, `pseudorange` and `alarms_per_hour`, one Parquet file each."""
     refuse_configuration("thresholds", config)
     count = repetitions or REPETITIONS
     tables = {
         "regression": regression_table(),
         "verification": verification_table(count, seed, jobs),
+        "pseudorange": range_alarms(PROBABILITIES, count, seed, jobs),
         "alarms_per_hour": alarms_per_hour(min(_RARE_RUNS, count), min(_COUNTED_RUNS, count), seed, jobs),
     }
     return write_tables(out, tables, {"experiment": "thresholds", "repetitions": count, "seed": seed})

@@ -7,6 +7,7 @@ import pytest
 from datasets.experiment.false_alarms import alarm_rate, verification_plan, verification_table
 from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec
+from datasets.experiment.range_alarms import range_alarms
 from datasets.experiment.thresholds import (
     Line,
     SkyMonitor,
@@ -78,3 +79,17 @@ def test_counted_and_sampled_rates_agree() -> None:
     low, high = float(counted["alarms_per_h_low"]), float(counted["alarms_per_h_high"])  # type: ignore[arg-type]
     assert low < 10 * float(sampled["alarms_per_h"]) * 1.3  # type: ignore[arg-type]
     assert 10 * float(sampled["alarms_per_h"]) * 0.6 < high  # type: ignore[arg-type]
+
+
+def test_the_pseudorange_monitor_alarms_as_often_as_intended_at_every_heading() -> None:
+    """Surveys of the stated sigma give the intended share; a bias at one place its own, which theory gives too."""
+    table = range_alarms((1e-2, 1e-3), epochs=100_000, seed=5)
+    assert set(table["constellation"]) == {"gps", "gps_galileo"}
+    assert table["heading_deg"].n_unique() == 6
+    drawn = table.filter(pl.col("survey_error_sigmas").is_null())
+    assert (drawn["expected"] == drawn["intended"]).all()
+    wanted = 100_000 * table["expected"].to_numpy()
+    assert (np.abs(table["alarms"].to_numpy() - wanted) < 4.0 * np.sqrt(wanted) + 2.0).all()
+    by_survey = table.filter(pl.col("intended") == 1e-3).group_by("survey_error_sigmas").agg(pl.col("expected").mean())
+    shares = dict(by_survey.iter_rows())
+    assert shares[0.0] < 1e-3 < shares[2.0]
