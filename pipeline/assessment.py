@@ -43,7 +43,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
     runs, hazards, passages, alarms = (store.read_table(out, name).collect() for name in names)
     figures = measured_figures(runs, hazards, settings.safety)
     detection = detection_by_level(hazards, settings.safety)
-    levels = campaign_levels(runs, hazards, settings.safety)
+    levels = campaign_levels(runs, hazards, settings.safety, settings.hazards.reaction_s)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
         "figures": figures,
@@ -55,7 +55,8 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         "side_by_side_of_runs": by_run(of_runs),
         "map": map_places(alarms),
     }
-    return Assessment([*_reservations(runs), *plain_statements(figures), *_level_statements(detection)], tables)
+    said = [*_reservations(runs), *_slow_receivers(levels), *plain_statements(figures), *_level_statements(detection)]
+    return Assessment(said, tables)
 
 
 def compare_architectures(
@@ -97,11 +98,13 @@ def over_all_runs(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
 
 def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
     """Runs by verdict, per solution and service level."""
-    counts = {verdict.value: (pl.col("verdict") == verdict.value).sum().cast(pl.Int64) for verdict in ThrVerdict}
+    counts: dict[str, pl.Expr] = {
+        verdict.value: (pl.col("verdict") == verdict.value).sum().cast(pl.Int64) for verdict in ThrVerdict
+    }
     return (
         levels.filter(pl.col("solution") != "")
         .group_by("solution", "service_level", "allowed_s", maintain_order=True)
-        .agg(**counts)
+        .agg(**counts, receiver_too_slow=(~pl.col("receiver_quick_enough")).sum().cast(pl.Int64))
         .sort("solution", maintain_order=True)
     )
 
@@ -119,6 +122,20 @@ def _reservations(runs: pl.DataFrame) -> list[str]:
     if failed:
         said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and count nowhere.")
     return said
+
+
+def _slow_receivers(levels: pl.DataFrame) -> list[str]:
+    """Service levels whose allowed time is over before the next epoch can negate anything (TVB section 5)."""
+    slow = levels.filter(~pl.col("receiver_quick_enough"))
+    return [
+        f"{solution}: epochs come too slowly for {level} in {runs} runs: period and negation take "
+        f"{needed_s:.4g} s of the {allowed_s:.4g} s allowed."
+        for solution, level, allowed_s, runs, needed_s in slow.group_by(
+            "solution", "service_level", "allowed_s", maintain_order=True
+        )
+        .agg(pl.col("run_id").n_unique(), pl.col("receiver_needs_s").max())
+        .iter_rows()
+    ]
 
 
 def _level_statements(detection: pl.DataFrame) -> list[str]:

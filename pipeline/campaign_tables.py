@@ -47,11 +47,16 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
     return conform(table.sort(_RUN), campaign_runs_schema(safety.service_levels))
 
 
-def campaign_levels(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
+def campaign_levels(
+    runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig, reaction_s: float | None = None
+) -> pl.DataFrame:
     """One row per run, solution and service level: would the run have kept this level's allowed T_D (TVB eq. 7)?
 
-    The columns of `campaign_runs` for each level, one below the other.
+    The columns of `campaign_runs` for each level, one below the other. `reaction_s` as in the configuration: the time
+    that negation takes, none for one epoch; with the period of the epochs it is the least that any fault takes.
     """
+    period_s = 1.0 / pl.col("gnss_rate_hz")
+    needed_s = period_s + (period_s if reaction_s is None else reaction_s)
     wide = campaign_runs(runs, hazards, safety)
     parts = [
         wide.select(
@@ -62,6 +67,8 @@ def campaign_levels(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyCon
             allowed_s=f"allowed_{level}_s",
             within=f"within_{level}",
             verdict=f"verdict_{level}",
+            receiver_needs_s=needed_s,
+            receiver_quick_enough=needed_s <= safety.allowed_time_to_detect_s(level),
         )
         for level in safety.service_levels
     ]

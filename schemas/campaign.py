@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import dataframely as dy
 
-from schemas.columns import count, one_of, real, text, texts
+from schemas.columns import count, flag, one_of, real, text, texts
 from schemas.config import SafetyConfig
 from schemas.enums import BaliseKind, Evidence, ThrVerdict
 from schemas.tables import Runs
@@ -189,6 +189,8 @@ class CampaignLevels(dy.Schema):
     never_negated = count("of these never negated")
     hazardous_max_s = real("s", "longest hazardous time of those negated", min=0)
     verdict = one_of(ThrVerdict, "kept, exceeded, no failure to judge, or no truth")
+    receiver_needs_s = real("s", "period of the epochs and negation: the least that any fault takes", min=0)
+    receiver_quick_enough = flag("that is within the allowed T_D (TVB section 5)", nullable=True)
 
 
 class CampaignMap(dy.Schema):

@@ -207,3 +207,13 @@ class TestLevels:
         found = campaign_levels(runs(["a"]), faults(["a"], t_failure=[NS]), CONFIG.safety)
         assert set(found["verdict"]) == {"exceeded"}
         assert found["never_negated"].to_list() == [1] * 4
+
+    def test_a_receiver_too_slow_for_a_level_is_named(self) -> None:
+        """1 Hz and one epoch for negation take 2 s, 10 Hz 0.2 s; LPV-200 allows 0.5025 s, EGNOS as observed 1.675 s."""
+        catalogue = runs(["a", "b", "c"], gnss_rate_hz=[1.0, 10.0, None])
+        found = campaign_levels(catalogue, faults([]), CONFIG.safety)
+        told = found.select("run_id", "service_level", "receiver_quick_enough").rows()
+        assert [row[2] for row in told] == [True, False, False, True] + [True] * 4 + [None] * 4
+        assert found["receiver_needs_s"][0] == 2.0
+        quick = campaign_levels(catalogue, faults([]), CONFIG.safety, reaction_s=0.1)
+        assert quick["receiver_quick_enough"][:4].to_list() == [True, False, True, True]
