@@ -1,4 +1,8 @@
-"""Fifty campaigns killed at random moments, each taken up again: tables equal to an undisturbed one."""
+"""Campaigns killed at random moments, each taken up again: all files equal to those of an undisturbed one.
+
+Killed without warning are, in turn, the campaign itself, one of its workers, a worker of a Dask cluster, and the
+cluster's scheduler, each at a moment drawn from the time that an undisturbed campaign of that kind takes.
+"""
 
 from __future__ import annotations
 
@@ -9,77 +13,195 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
-from benchmarks.results import Figure
+from benchmarks.cluster import ROOT, Cluster, kill_one, workers_of
+from benchmarks.results import Figure, stopwatch
 from benchmarks.trials import write_campaign
-from schemas.tables import TABLES
+from pipeline import store
 
 TRIALS = 50
 STOP_S = 2.0
+_SEED = 5
+_CAMPAIGN_S = 300.0
+
+
+class Victim(StrEnum):
+    """Who is killed."""
+
+    PARENT = "parent"
+    WORKER = "worker"
+    DASK_WORKER = "Dask worker"
+    SCHEDULER = "Dask scheduler"
+
+    @property
+    def on_cluster(self) -> bool:
+        return self in (Victim.DASK_WORKER, Victim.SCHEDULER)
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One trial: when, whether somebody was hit before the campaign ended, and what it left."""
+
+    victim: Victim
+    moment_s: float
+    hit: bool
+    complete: int
+    half_done: tuple[str, ...]
+    different: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Job:
+    """The campaign that is disturbed."""
+
+    logs: Path
+    site: Path
+    folder: Path
+
+    def start(self, out: Path, scheduler: str | None = None, jobs: int = 2) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "cli", "replay", str(self.logs), "--site", str(self.site), "--out", str(out)]
+        where = ["--jobs", str(jobs)] if scheduler is None else ["--scheduler", scheduler]
+        return subprocess.Popen(
+            [*command, *where, "--quiet"],
+            cwd=ROOT,
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def finish(self, out: Path, scheduler: str | None = None) -> float:
+        """Run to the end; seconds that took. Raises where it did not end well."""
+        with stopwatch() as watch:
+            status = self.start(out, scheduler).wait(timeout=_CAMPAIGN_S)
+        if status:
+            raise RuntimeError(f"the campaign into {out} ended with status {status}")
+        return watch.seconds
 
 
 def measure(folder: Path) -> list[Figure]:
-    """Kills of parent and workers in turn, and how long Ctrl-C takes."""
+    """Fifty kills of four kinds, and how long Ctrl-C takes."""
     site, logs = write_campaign(folder, 12, minutes=3.0)
-    whole = folder / "undisturbed"
-    _replay(logs, site, whole).wait()
-    wanted = _tables(whole)
-    chance = random.Random(5)
-    different = 0
-    for trial in range(TRIALS):
-        out = folder / "killed"
-        shutil.rmtree(out, ignore_errors=True)
-        campaign = _replay(logs, site, out)
-        time.sleep(chance.uniform(0.2, 6.0))
-        _kill(campaign, worker=trial % 2 == 1, chance=chance)
-        campaign.wait()
-        _replay(logs, site, out).wait()
-        different += _tables(out) != wanted
-    return [
-        Figure("campaigns killed and taken up again", TRIALS, "trials"),
-        Figure("of these with other tables", different, "trials", 0),
-        Figure("Ctrl-C to the end", _interrupt_s(logs, site, folder / "interrupted", chance), "s", STOP_S),
-    ]
+    job = Job(logs, site, folder)
+    kills = disturb(job, list(Victim), TRIALS, _SEED)
+    figures = []
+    for victim in Victim:
+        chosen = [kill for kill in kills if kill.victim is victim]
+        figures += [
+            Figure(f"kills of the {victim}", len(chosen), "trials"),
+            Figure(f"kills of the {victim}: hit before the end", sum(kill.hit for kill in chosen), "trials"),
+            Figure(f"kills of the {victim}: runs left half done", sum(len(k.half_done) for k in chosen), "files", 0),
+            Figure(f"kills of the {victim}: other files", sum(len(k.different) for k in chosen), "files", 0),
+        ]
+    longest = max(interrupt_s(job, random.Random(_SEED + trial)) for trial in range(5))
+    return [*figures, Figure("Ctrl-C to the end", longest, "s", STOP_S)]
 
 
-def _replay(logs: Path, site: Path, out: Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "cli", "replay", str(logs), "--site", str(site), "--out", str(out)]
-    return subprocess.Popen([*command, "--jobs", "2", "--quiet"], start_new_session=True)
+def disturb(job: Job, victims: Sequence[Victim], trials: int, seed: int) -> list[Kill]:
+    """Kill and take up again, the victims in turn; the moments follow from the seed."""
+    chance = random.Random(seed)
+    whole = job.folder / "undisturbed"
+    shutil.rmtree(whole, ignore_errors=True)
+    local_s = job.finish(whole)
+    wanted = contents(whole)
+    kills = []
+    with _clusters(job, any(victim.on_cluster for victim in victims)) as clusters:
+        cluster_s = _timed_on(job, next(clusters)) if clusters is not None else 0.0
+        for trial in range(trials):
+            victim = victims[trial % len(victims)]
+            moment_s = chance.uniform(0.1, 1.0) * (cluster_s if victim.on_cluster else local_s)
+            cluster = next(clusters) if clusters is not None and victim.on_cluster else None
+            kills.append(_one(job, victim, moment_s, cluster, chance, wanted))
+    return kills
 
 
-def _kill(campaign: subprocess.Popen[bytes], worker: bool, chance: random.Random) -> None:
-    """The parent, or one of its children, without warning."""
-    listed = Path(f"/proc/{campaign.pid}/task/{campaign.pid}/children")
-    try:
-        children = [int(pid) for pid in listed.read_text().split() if _is_worker(pid)]
-        os.kill(chance.choice(children) if worker and children else campaign.pid, signal.SIGKILL)
-    except (FileNotFoundError, ProcessLookupError):
+def _one(
+    job: Job,
+    victim: Victim,
+    moment_s: float,
+    cluster: Cluster | None,
+    chance: random.Random,
+    wanted: dict[str, bytes],
+) -> Kill:
+    out = job.folder / "killed"
+    shutil.rmtree(out, ignore_errors=True)
+    campaign = job.start(out, cluster.address if cluster else None)
+    time.sleep(moment_s)
+    hit = _kill(victim, campaign, cluster, chance)
+    campaign.wait(timeout=_CAMPAIGN_S)
+    complete = store.run_ids(out)
+    left = contents(out)
+    half_done = [name for name in wanted if _run_of(name) in complete and left.get(name) != wanted[name]]
+    status = job.start(out).wait(timeout=_CAMPAIGN_S)
+    found = contents(out)
+    different = [f"exit status {status}"] if status else []
+    different += [name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name)]
+    return Kill(victim, moment_s, hit, len(complete), tuple(half_done), tuple(different))
+
+
+def _kill(victim: Victim, campaign: subprocess.Popen[bytes], cluster: Cluster | None, chance: random.Random) -> bool:
+    if campaign.poll() is not None:
+        return False
+    if cluster is None:
+        return kill_one([campaign.pid] if victim is Victim.PARENT else workers_of(campaign.pid), chance)
+    if victim is Victim.DASK_WORKER:
+        return cluster.kill_worker(chance)
+    cluster.kill_scheduler()
+    return True
+
+
+@contextmanager
+def _clusters(job: Job, needed: bool) -> Iterator[Iterator[Cluster] | None]:
+    """A cluster for each trial that wants one: the last one as long as its scheduler lives."""
+    if not needed:
+        yield None
         return
+    current = [Cluster(job.folder / "cluster", workers=2)]
+
+    def each() -> Iterator[Cluster]:
+        while True:
+            if current[0].scheduler.poll() is not None:
+                current[0].stop()
+                current[0] = Cluster(job.folder / "cluster", workers=2)
+            yield current[0]
+
+    try:
+        yield each()
+    finally:
+        current[0].stop()
 
 
-def _is_worker(pid: str) -> bool:
-    """Python's tracker of semaphores is a child too, but none that does the work."""
-    return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+def _timed_on(job: Job, cluster: Cluster) -> float:
+    """How long an undisturbed campaign takes on the cluster [s]; the first one also starts its workers."""
+    out = job.folder / "on-cluster"
+    shutil.rmtree(out, ignore_errors=True)
+    job.finish(out, cluster.address)
+    shutil.rmtree(out)
+    return job.finish(out, cluster.address)
 
 
-def _interrupt_s(logs: Path, site: Path, out: Path, chance: random.Random) -> float:
-    """Longest of five interruptions [s]."""
-    longest = 0.0
-    for _ in range(5):
-        shutil.rmtree(out, ignore_errors=True)
-        campaign = _replay(logs, site, out)
-        time.sleep(chance.uniform(3.0, 6.0))
-        begun = time.perf_counter()
+def interrupt_s(job: Job, chance: random.Random) -> float:
+    """From Ctrl-C in the middle of a campaign to its end [s]."""
+    out = job.folder / "interrupted"
+    shutil.rmtree(out, ignore_errors=True)
+    campaign = job.start(out)
+    time.sleep(chance.uniform(1.0, 3.0))
+    with stopwatch() as watch:
         os.killpg(campaign.pid, signal.SIGINT)
-        campaign.wait()
-        longest = max(longest, time.perf_counter() - begun)
-    return longest
+        campaign.wait(timeout=_CAMPAIGN_S)
+    return watch.seconds
 
 
-def _tables(out: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(out)): path.read_bytes()
-        for table in (*TABLES, "campaign")
-        for path in sorted((out / table).rglob("*.parquet"))
-    }
+def contents(out: Path) -> dict[str, bytes]:
+    """Every file of a result but its log, which holds times."""
+    files = (path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "replay.log")
+    return {str(path.relative_to(out)): path.read_bytes() for path in files}
+
+
+def _run_of(name: str) -> str:
+    """The run that a file belongs to; nothing for files of the whole campaign."""
+    return next((part.removeprefix("run_id=") for part in Path(name).parts if part.startswith("run_id=")), "")

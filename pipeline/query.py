@@ -8,11 +8,10 @@ are plain Hive-partitioned Parquet, so DuckDB reads them from outside all the sa
 from __future__ import annotations
 
 import re
-import warnings
 
 import polars as pl
 
-from pipeline import storage, store
+from pipeline import catalogue, storage, store
 from pipeline.ingest.files import Address, exists, is_url, join
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
@@ -27,9 +26,7 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
     """
     tables = _tables(out, sql)
     try:
-        with warnings.catch_warnings():
-            # Thousands of small files are read by as many waiting threads; polars takes it for a deadlock.
-            warnings.filterwarnings("ignore", message="POLARS_MAX_BLOCKING_THREAD_COUNT")
+        with catalogue.patient():
             return pl.SQLContext(tables).execute(sql).collect()
     except pl.exceptions.PolarsError as error:
         if not is_url(out):
@@ -56,14 +53,10 @@ def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
 
 
 def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
-    if is_url(out):
-        return store.read_table(out, table)
-    contract = dict(TABLES[table].create_empty().schema)
-    paths = [str(store.table_address(out, table, run)) for run in runs]
-    scan = pl.scan_parquet(
-        paths, glob=False, hive_partitioning=True, hive_schema={"run_id": pl.String()}, schema=contract
-    )
-    return scan.select("run_id", *contract)
+    kept = catalogue.fresh(out, table)
+    if kept is not None:
+        return kept
+    return store.read_table(out, table) if is_url(out) else catalogue.scan(out, table, runs)
 
 
 def _campaign_tables(out: Address) -> dict[str, pl.LazyFrame]:

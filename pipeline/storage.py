@@ -14,7 +14,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -123,6 +123,44 @@ def folders_in(address: Address) -> list[str]:
         return sorted(name_of(entry["name"]) for entry in entries if entry["type"] == "directory")
 
     return _remote(address, names)
+
+
+def versions(folder: Address, name: str) -> dict[str, str] | None:
+    """What changes with the content of `folder/*/name`, by the folder between.
+
+    None where a store gives its objects no version that could be relied on.
+    """
+    if not is_url(folder):
+        return _local_versions(str(folder), name)
+
+    def listed(store: Any, path: str) -> dict[str, Any]:
+        try:
+            return dict(store.find(path, detail=True))
+        except FileNotFoundError:
+            return {}
+
+    found = {
+        place.split("/")[-2]: version_of(info)
+        for place, info in _remote(folder, listed).items()
+        if place.endswith(f"/{name}")
+    }
+    return None if None in found.values() else {part: str(version) for part, version in found.items()}
+
+
+def version_of(info: Mapping[str, Any]) -> str | None:
+    """An object's entity tag and size; weak tags stand for other content too, and are none."""
+    tag = info.get("ETag") or info.get("etag")
+    return None if not tag or str(tag).startswith("W/") else f"{tag} {info.get('size')}"
+
+
+def _local_versions(folder: str, name: str) -> dict[str, str]:
+    found = {}
+    for part in folders_in(folder):
+        # Gone or not complete: no version.
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            stat = os.stat(f"{folder}/{part}/{name}")  # noqa: PTH116 - ten thousand of them
+            found[part] = f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns} {stat.st_ino}"
+    return found
 
 
 def glob_remote(pattern: str) -> list[Address]:

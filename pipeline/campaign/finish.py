@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import polars as pl
 
-from pipeline import storage, store
+from pipeline import catalogue, storage, store
 from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs
 from pipeline.hazards.map_errors import map_places
 from pipeline.ingest.files import Address, join
@@ -18,8 +18,8 @@ from schemas.version import SOFTWARE
 
 def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFrame]:
     """Derive the tables of `OUT/campaign/` from all complete runs of the result."""
-    names = ("runs", "hazards", "passages", "alarms")
-    runs, hazards, passages, alarms = (store.read_table(out, name).collect() for name in names)
+    found = catalogue.gather(out)
+    runs, hazards, passages, alarms = (found[name] for name in ("runs", "hazards", "passages", "alarms"))
     tables = {
         "runs": campaign_runs(runs, hazards, config.safety),
         "balises": campaign_balises(passages, config),

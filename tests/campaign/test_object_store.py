@@ -12,9 +12,10 @@ import pytest
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, make_server
 
-from pipeline import storage, store
+from pipeline import catalogue, storage, store
 from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
+from pipeline.query import run_sql
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
 from schemas.tables import TABLES
@@ -98,6 +99,18 @@ def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -
     assert local.count(RunStatus.OK) == 1
     runs = store.read_table(f"{bucket}/out", "runs").collect()
     assert runs["run_id"].to_list() == ["run0", "run1", "run2", "run3"]
+
+
+def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
+    out = f"{bucket}/catalogued"
+    for count in (1, 2):
+        run_campaign(make_plan([str(path) for path in small_trial.paths[:count]], small_trial.site, out))
+        assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [count]
+        assert catalogue.fresh(out, "passages") is not None
+    place = str(store.table_address(out, "passages", "run0"))
+    storage.write_bytes(place, storage.read_many([place])[place] + b"more")
+    assert catalogue.fresh(out, "passages") is None
+    assert catalogue.fresh(out, "runs") is not None
 
 
 def test_store_that_refuses_now_and_then(

@@ -1,0 +1,107 @@
+"""A Dask cluster of this machine whose parts can be killed one by one."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+_START_S = 60.0
+
+
+class Cluster:
+    """A scheduler, and workers under a nanny that starts them again; each a process of its own."""
+
+    def __init__(self, folder: Path, workers: int = 1) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._workers = folder, workers
+        self.scheduler = self._start_scheduler()
+        self.nanny = self.start_workers()
+
+    @property
+    def address(self) -> str:
+        return str(json.loads(self._file.read_text())["address"])
+
+    def start_workers(self) -> subprocess.Popen[bytes]:
+        arguments = ("--nworkers", str(self._workers), "--nthreads", "1", "--no-dashboard")
+        return _dask("worker", "--scheduler-file", str(self._file), "--local-directory", str(self._folder), *arguments)
+
+    def kill_worker(self, chance: random.Random) -> bool:
+        """One worker without warning; the nanny lives. Whether there was one."""
+        return kill_one(workers_of(self.nanny.pid), chance)
+
+    def kill_scheduler(self) -> None:
+        self.scheduler.kill()
+        self.scheduler.wait()
+
+    def stop(self) -> None:
+        for process in (self.nanny, self.scheduler):
+            process.terminate()
+            try:
+                process.wait(timeout=30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _start_scheduler(self) -> subprocess.Popen[bytes]:
+        self._file = self._folder / f"scheduler-{secrets.token_hex(4)}.json"
+        scheduler = _dask(
+            *("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1"),
+            *("--scheduler-file", str(self._file)),
+        )
+        wait_for(lambda: self._file.exists() and self._file.read_text().rstrip().endswith("}"))
+        return scheduler
+
+
+def workers_of(pid: int) -> list[int]:
+    """Worker processes of a process; its tracker of semaphores is a child too, but none that does the work."""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+    return [int(child) for child in children if _is_worker(child)]
+
+
+def _is_worker(pid: str) -> bool:
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def kill_one(pids: list[int], chance: random.Random) -> bool:
+    """SIGKILL to one of the processes; false where there is none, or it ended by itself."""
+    if not pids:
+        return False
+    try:
+        os.kill(chance.choice(pids), signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def wait_for(condition: Callable[[], bool], limit_s: float = _START_S) -> None:
+    """Wait until something is so; `TimeoutError` where that is in vain."""
+    until = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > until:
+            raise TimeoutError("waited in vain")
+        time.sleep(0.02)
+
+
+def _dask(*arguments: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "dask", *arguments],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "POLARS_MAX_THREADS": "1"},
+    )

@@ -1,0 +1,125 @@
+"""The catalogue of a result: quicker, never another answer."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from pipeline import catalogue, storage, store
+from pipeline.campaign import run_campaign
+from pipeline.query import run_sql
+from schemas.errors import UsageError
+from tests.campaign.compare import plan_of
+from tests.campaign.test_local import undisturbed
+from tests.conftest import SmallTrial
+
+__all__ = ["undisturbed"]
+
+QUERIES = (
+    "SELECT * FROM passages ORDER BY run_id, solution, path_m, balise_id",
+    "SELECT run_id, solution, status, duration_s FROM runs ORDER BY run_id, solution",
+    "SELECT hazard, COUNT(*) AS n FROM hazards JOIN runs USING (run_id, solution) GROUP BY hazard ORDER BY hazard",
+    "SELECT COUNT(*) AS n FROM alarms WHERE run_id = 'run2'",
+)
+
+
+@pytest.fixture
+def out(undisturbed: Path, tmp_path: Path) -> Path:
+    """A result of four runs whose catalogue is of these very files."""
+    shutil.copytree(undisturbed, tmp_path / "out")
+    catalogue.gather(tmp_path / "out")
+    return tmp_path / "out"
+
+
+def is_fresh(out: Path) -> list[bool]:
+    return [catalogue.fresh(out, table) is not None for table in catalogue.CATALOGUED]
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_same_answers_with_and_without(out: Path, query: str) -> None:
+    assert is_fresh(out) == [True] * 4
+    with_it = run_sql(out, query)
+    shutil.rmtree(out / ".catalogue")
+    assert is_fresh(out) == [False] * 4
+    assert_frame_equal(with_it, run_sql(out, query))
+
+
+def test_it_is_what_answers(out: Path) -> None:
+    """Told apart by a catalogue that holds something else under the right digest."""
+    file = out / ".catalogue/passages.parquet"
+    digest = store.metadata_of(file)["files"]
+    file.write_bytes(store.parquet_bytes(pl.read_parquet(file).head(1), {"files": digest}))
+    assert run_sql(out, "SELECT COUNT(*) AS n FROM passages")["n"].to_list() == [1]
+
+
+def test_campaigns_keep_it(small_trial: SmallTrial, tmp_path: Path) -> None:
+    run_campaign(plan_of(small_trial, tmp_path, small_trial.paths[:1]))
+    assert is_fresh(tmp_path) == [True] * 4
+    run_campaign(plan_of(small_trial, tmp_path, small_trial.paths[1:2]))
+    assert is_fresh(tmp_path) == [True] * 4
+    assert run_sql(tmp_path, "SELECT run_id FROM runs ORDER BY run_id")["run_id"].to_list() == ["run0", "run1"]
+
+
+def test_a_run_that_came_or_went_makes_it_stale(out: Path) -> None:
+    shutil.rmtree(out / "runs/run_id=run3")
+    assert is_fresh(out) == [False] * 4
+    assert run_sql(out, "SELECT run_id FROM runs ORDER BY run_id")["run_id"].to_list() == ["run0", "run1", "run2"]
+    catalogue.gather(out)
+    for table in ("runs", "hazards", "passages", "alarms"):
+        shutil.copytree(out / table / "run_id=run0", out / table / "run_id=run9", dirs_exist_ok=True)
+    assert is_fresh(out) == [False] * 4
+    assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [4]
+
+
+def test_a_touched_file_makes_it_stale(out: Path) -> None:
+    """Also one of the same size, put back to its old time."""
+    file = out / "passages/run_id=run1/passages.parquet"
+    stat = file.stat()
+    file.write_bytes(file.read_bytes())
+    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert is_fresh(out) == [True, True, False, True]
+
+
+def test_tables_of_another_build_are_no_catalogue(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The files did not change, but the contract did: the runs' own files say what is wrong."""
+    monkeypatch.setitem(catalogue.TABLES, "passages", catalogue.TABLES["alarms"])
+    assert is_fresh(out) == [True, True, False, True]
+    with pytest.raises(UsageError, match="written by another build"):
+        run_sql(out, "SELECT * FROM passages")
+
+
+def test_damaged_catalogue_is_none(out: Path) -> None:
+    file = out / ".catalogue/runs.parquet"
+    file.write_bytes(file.read_bytes()[:100])
+    assert is_fresh(out) == [False, True, True, True]
+    assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [4]
+
+
+def test_what_changes_while_it_is_read_is_not_kept(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.rmtree(out / ".catalogue")
+    collected = catalogue._collected
+
+    def read_and_touch(place: Path, table: str) -> pl.DataFrame:
+        frame = collected(place, table)
+        file = Path(store.table_address(out, "hazards", "run0"))
+        file.write_bytes(file.read_bytes())
+        return frame
+
+    monkeypatch.setattr(catalogue, "_collected", read_and_touch)
+    catalogue.gather(out)
+    assert is_fresh(out) == [True, False, True, True]
+
+
+def test_no_copy_where_a_store_names_no_versions() -> None:
+    import fsspec
+
+    fsspec.filesystem("memory").pipe_file("/versions/runs/run_id=a/runs.parquet", b"x")
+    assert storage.versions("memory://versions/runs", "runs.parquet") is None
+    assert storage.versions("memory://versions/none", "runs.parquet") == {}
+    assert storage.version_of({"ETag": '"abc"', "size": 3}) == '"abc" 3'
+    assert storage.version_of({"etag": 'W/"abc"', "size": 3}) is None
