@@ -95,16 +95,26 @@ def test_a_run_backwards_mirrors_its_tables():
     assert error.abs().max() < 0.2
 
 
-def test_a_run_split_between_balises_loses_no_hazard():
-    run, site = journey(JUMP, OFFSET)
-    whole = replay(run, site, VEHICLE)
-    at = run.gnss["t"][0] + pl.duration(seconds=160)  # after the jump back, 20 s before the offset
-    parts = []
+def parts_of(run, site, at):
     for keep in (pl.col("t") < at, pl.col("t") >= at):
         logs = {name: run.stream(name).filter(keep) for name in ("gnss", "odometer", "reference", "balise_reads")}
-        parts.append(replay(RunLog("part", **logs), site, VEHICLE).hazards)
-    columns = ("hazard", "balise_ids", "t_hazard", "t_onset", "timing")
-    assert_frame_equal(pl.concat(parts).select(columns), whole.hazards.select(columns))
+        yield replay(RunLog("part", **logs), site, VEHICLE)
+
+
+@pytest.mark.parametrize("at_s", [60.0, 160.0, None])
+def test_a_run_split_between_balises_loses_no_hazard(at_s):
+    """Also where it is split at the instant at which a balise is passed."""
+    run, site = journey(JUMP, OFFSET)
+    whole = replay(run, site, VEHICLE)
+    passed = whole.passages.filter(pl.col("balise_id") == "VB1")["t_offered"][0]
+    at = passed if at_s is None else run.gnss["t"][0] + pl.duration(seconds=at_s)
+    parts = list(parts_of(run, site, at))
+    columns = ("hazard", "balise_ids", "t_hazard", "t_onset", "timing", "detected", "t_detected")
+    assert_frame_equal(pl.concat(part.hazards for part in parts).select(columns), whole.hazards.select(columns))
+    # The balise that is passed as the log is cut belongs to neither part, all others to one.
+    told = [row for part in parts for row in part.passages.filter(kind="virtual")["balise_id"].to_list()]
+    expected = whole.passages.filter(kind="virtual")["balise_id"].to_list()
+    assert told == [name for name in expected if at_s is not None or name != "VB1"]
 
 
 @pytest.mark.parametrize("kind", ["step", "ramp"])
@@ -131,17 +141,30 @@ def test_two_solutions_never_influence_each_other():
     assert together.hazards.filter(pl.col("solution") == "other").height == 0
 
 
-def test_more_evidence_never_removes_a_hazard_that_is_there():
-    run, site = journey(JUMP, OFFSET)
+EARLY = {"kind": "ramp", "rate_mps": 2.5, "at_m": 3450.0, "duration_s": 30.0}
+LATE = {"kind": "bias", "size_m": -120.0, "at_m": 3600.0, "duration_s": 90.0}
+
+
+def hits_of(tables):
+    """VBs hit by class and first VB; where the odometer is the evidence an accepted VB hides what comes after it."""
+    return {
+        (row["hazard"], row["balise_ids"][0]): set(row["balise_ids"]) for row in tables.hazards.iter_rows(named=True)
+    }
+
+
+@pytest.mark.parametrize("faults", [(JUMP, OFFSET), (EARLY,), (LATE,)])
+def test_more_evidence_never_removes_a_hazard_that_is_there(faults):
+    run, site = journey(*faults)
     weaker = (
         run.with_streams(reference=None, balise_reads=None),
         run.with_streams(reference=None),
         run.with_streams(reference=run.reference.filter(pl.col("t") < run.gnss["t"][1500])),
     )
-    full = {(row["hazard"], *row["balise_ids"]) for row in replay(run, site, VEHICLE).hazards.iter_rows(named=True)}
+    full = hits_of(replay(run, site, VEHICLE))
+    assert full
     for logs in weaker:
-        found = replay(logs, site, VEHICLE).hazards.iter_rows(named=True)
-        assert {(row["hazard"], *row["balise_ids"]) for row in found} <= full
+        for hazard, hits in hits_of(replay(logs, site, VEHICLE)).items():
+            assert hits <= full[hazard]
 
 
 def test_the_journey_is_the_one_meant():
