@@ -7,10 +7,12 @@ import polars as pl
 import pytest
 
 from datasets.experiment import EXPERIMENTS
-from datasets.experiment.bank import Fault, compare_banks, failure_s, fault_response, rank_banks
+from datasets.experiment.bank import FEWEST_RUNS, compare_banks, rank_banks
+from datasets.experiment.bank_faults import CATALOGUE, Fault, WhiteNoise, failure_s, fault_response
 from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.rare_tables import banks, epochs_until, failure_epoch
+from datasets.experiment.workers import generator
 from schemas.config import Configuration, MonitorConfig
 from schemas.errors import UsageError
 
@@ -33,6 +35,45 @@ def test_failures_by_hand() -> None:
     assert failure_s(Fault("step", "along", 25.0), GPS) == 0.0
     assert failure_s(Fault("step", "along", 10.0), GPS) is None
     assert failure_s(Fault("ramp", "cross", 1.0), GPS) is None
+    # At 30 m/s: 30 m behind at once; 30 m/s behind; an odometer that is wrong leaves the position right.
+    assert failure_s(Fault("latency", "along", 1.0), GPS) == 0.0
+    assert failure_s(Fault("latency", "along", 0.2), GPS) is None
+    assert failure_s(Fault("frozen", "along", 1.0), GPS) == pytest.approx(2.0 / 3.0)
+    assert failure_s(Fault("slip", "odometer", 3.0), GPS) is None
+
+
+def test_what_faults_make_of_position_minus_odometer_by_hand() -> None:
+    sizes = {
+        Fault("latency", "along", 0.2): -6.0,
+        Fault("frozen", "along", 1.0): -30.0,
+        Fault("slip", "odometer", 0.8): -0.8,
+        Fault("slide", "odometer", 0.8): 0.8,
+        Fault("scale", "odometer", 1.02): -0.6,
+        Fault("odometer late", "odometer", 0.2): 6.0,
+    }
+    for fault, size in sizes.items():
+        assert fault.rates(GPS, 3).tolist() == pytest.approx([size, 0.0, 0.0])
+    assert Fault("scale", "odometer", 1.02).name == "scale 1.02 odometer"
+    assert len({fault.name for fault in CATALOGUE}) == len(CATALOGUE)
+
+
+def test_noise_on_the_position_shakes_the_monitors_as_white_noise_does() -> None:
+    """Increments of white noise of 2 m: sigma 2 sqrt(2) raw; EWMA of weight a: 2 a sqrt(2 / (2 - a))."""
+    bank = linear_bank(GPS, 0.0, BankSpec(alphas=(1.0, 0.2)))
+    shaken = WhiteNoise(bank, (Fault("noise", "along", 2.0),), 40_000, generator(1))
+    for _ in range(60):
+        values = shaken.step(np.array([0]))
+    expected = 2.0 * np.array([np.sqrt(2.0), 0.2 * np.sqrt(2.0 / 1.8)])
+    assert values[0].std(axis=1) == pytest.approx(expected, rel=0.02)
+
+
+def test_too_few_runs_say_so() -> None:
+    """72 runs that all go well show more than 95 %, 71 do not."""
+    for runs, shown in ((FEWEST_RUNS, True), (FEWEST_RUNS - 1, False)):
+        comparison = compare_banks([BankSpec(rate_hz=10.0)], (Fault("step", "along", 25.0),), runs, seed=1)
+        ranking = rank_banks(comparison)
+        assert ranking["faults_in_time"][0] == int(shown)
+        assert ("cannot show 95 %" in ranking["reason"][0]) is not shown
 
 
 def test_ten_hertz_keeps_a_25_m_step_in_the_budget_and_1_hz_does_not() -> None:

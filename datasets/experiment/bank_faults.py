@@ -1,0 +1,154 @@
+"""The fault catalogue as the linear bank sees it: what each fault adds to the increments of its three axes.
+
+Kinds whose course is known beforehand, of `catalogue_faults`; those that hang on satellites, maps and balises need the
+replay. All begin at 0 s; the train runs at a steady speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.experiment.geometry import Geometry
+from datasets.experiment.linear_bank import AXES, LinearBank
+
+Array = npt.NDArray[np.float64]
+Kind = Literal["ramp", "step", "latency", "frozen", "slip", "slide", "scale", "odometer late", "noise"]
+Shape = Literal["ramp", "step", "noise"]
+
+HEADING_DEG = 30.0
+SPEED_MPS = 30.0
+_FAILURE_LIMIT_M = 20.0
+_SHAPES: dict[Kind, Shape] = {"step": "step", "latency": "step", "odometer late": "step", "noise": "noise"}
+_UNITS: dict[Kind, str] = {
+    "ramp": "m/s",
+    "step": "m",
+    "latency": "s",
+    "frozen": "",
+    "slip": "m/s",
+    "slide": "m/s",
+    "scale": "",
+    "odometer late": "s",
+    "noise": "m",
+}
+_ON_ODOMETER: tuple[Kind, ...] = ("slip", "slide", "scale", "odometer late")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """An error that begins at 0 s: a ramp [m/s], a step [m], or white noise [m] of GNSS against odometer or track.
+
+    `target`: `range` (of satellite 8, through the geometry), one axis of the position, or the odometer.
+    """
+
+    kind: Kind
+    target: str
+    size: float
+
+    @property
+    def name(self) -> str:
+        return " ".join(part for part in (self.kind, f"{self.size:g}", _UNITS[self.kind], self.target) if part)
+
+    @property
+    def shape(self) -> Shape:
+        return _SHAPES.get(self.kind, "ramp")
+
+    @property
+    def moves_position(self) -> bool:
+        """The position is wrong, not the odometer."""
+        return self.kind not in _ON_ODOMETER
+
+    def rates(self, geometry: Geometry, axes: int) -> Array:
+        """Per axis: the ramp [m/s], the step [m] or the sigma of the noise [m]."""
+        if self.target == "range":
+            return np.asarray(self.size * (geometry.axes(HEADING_DEG)[:axes] @ geometry.ramp_direction))
+        wanted = np.zeros(len(AXES))
+        wanted[AXES.index("along" if self.target == "odometer" else self.target)] = self._size_on_axis()
+        return wanted[:axes]
+
+    def _size_on_axis(self) -> float:
+        """Of GNSS minus odometer: late positions and fast odometers leave the GNSS behind."""
+        sizes: dict[Kind, float] = {
+            "latency": -SPEED_MPS * self.size,
+            "frozen": -SPEED_MPS,
+            "slip": -self.size,
+            "scale": -SPEED_MPS * (self.size - 1.0),
+            "odometer late": SPEED_MPS * self.size,
+        }
+        return sizes.get(self.kind, self.size)
+
+
+def _of(kind: Kind, target: str, *sizes: float) -> tuple[Fault, ...]:
+    return tuple(Fault(kind, target, size) for size in sizes)
+
+
+CATALOGUE: tuple[Fault, ...] = (
+    *_of("ramp", "range", 0.01, 0.03, 0.1, 0.3, 1.0, 5.0),
+    *_of("step", "range", 10.0, 30.0, 100.0),
+    *_of("ramp", "along", 0.01, 0.03, 0.1, 0.3, 1.0, 5.0),
+    *_of("step", "along", 3.0, 10.0, 25.0, 100.0),
+    *_of("ramp", "cross", 0.1, 1.0),
+    *_of("step", "cross", 3.0, 10.0, 25.0),
+    *_of("step", "up", 5.0, 15.0, 40.0),
+    *_of("latency", "along", 0.2, 1.0, 3.0),
+    *_of("frozen", "along", 1.0),
+    *_of("noise", "along", 1.0, 3.0, 10.0),
+    *_of("slip", "odometer", 0.3, 0.8, 3.0),
+    *_of("slide", "odometer", 0.3, 0.8, 3.0),
+    *_of("scale", "odometer", 1.001, 1.005, 1.02),
+    *_of("odometer late", "odometer", 0.2, 1.0),
+)
+
+
+def fault_response(bank: LinearBank, rates: Array, shape: Shape, epochs: int) -> Array:
+    """What the fault makes of every monitor at epochs 1 .. n on average, (epochs, monitors).
+
+    An EWMA answers a ramp with 1 - (1-a)^k of its rate, and a step, which is one increment, with a (1-a)^(k-1) / dt.
+    """
+    k = np.arange(1, epochs + 1)[:, None]
+    keep = 1.0 - bank.alpha
+    per_monitor = np.repeat(rates, len(bank.spec.weights))
+    if shape == "noise":
+        return np.zeros((epochs, per_monitor.size))
+    if shape == "ramp":
+        return np.asarray((1.0 - keep**k) * per_monitor)
+    return np.asarray(bank.alpha * keep ** (k - 1) * bank.spec.rate_hz * per_monitor)
+
+
+class WhiteNoise:
+    """What faults that are white noise on a position make of the monitors, epoch by epoch."""
+
+    def __init__(self, bank: LinearBank, faults: Sequence[Fault], runs: int, rng: np.random.Generator) -> None:
+        axes = bank.along_error.size
+        self._rng, self._runs, self._keep = rng, runs, (1.0 - bank.alpha)[:, None]
+        self._gain = (bank.alpha * bank.spec.rate_hz)[:, None]
+        sizes = np.zeros((len(faults), axes))
+        for row, fault in zip(sizes, faults, strict=True):
+            if fault.shape == "noise":
+                row[AXES.index(fault.target)] = fault.size
+        self._sizes = np.repeat(sizes, len(bank.spec.weights), axis=1)[:, :, None]
+        self._before = np.zeros(runs)
+        self._filtered = np.zeros((bank.alpha.size, runs))
+
+    def step(self, chosen: npt.NDArray[np.int64]) -> Array:
+        """At the next epoch, (chosen faults, monitors, runs); all such faults share their noise."""
+        if not self._sizes.any():
+            return np.zeros((1, 1, 1))
+        now = self._rng.standard_normal(self._runs)
+        self._filtered = self._keep * self._filtered + self._gain * (now - self._before)
+        self._before = now
+        return np.asarray(self._sizes[chosen] * self._filtered)
+
+
+def failure_s(fault: Fault, geometry: Geometry) -> float | None:
+    """When the mean along-track error of the position passes the limit [s]; None where it does not."""
+    along = abs(float(fault.rates(geometry, 1)[0]))
+    if not fault.moves_position or fault.shape == "noise":
+        return None
+    if fault.shape == "step":
+        return 0.0 if along > _FAILURE_LIMIT_M else None
+    return _FAILURE_LIMIT_M / along if along > 1e-9 else None
