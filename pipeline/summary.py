@@ -312,16 +312,19 @@ def _hazards(hazards: pl.DataFrame) -> Row:
 
 def _levels(results: SolutionResults, safety: SafetyConfig) -> Row:
     """Whether the failures were negated within the allowed T_D of each service level (TVB eq. 7)."""
-    faults = independent_episodes(results.hazards.with_columns(run_id=pl.lit("")))
-    failed = faults.filter("failed")
+    hazardous_s: list[float | None] = []
+    if results.hazards.height:
+        faults = independent_episodes(results.hazards.with_columns(run_id=pl.lit("")))
+        hazardous_s = faults.filter("failed")["hazardous_s"].to_list()
+    failures = len(hazardous_s)
     allowed_s = [safety.allowed_time_to_detect_s(level) for level in safety.service_levels]
-    within = [failed.filter(pl.col("hazardous_s") <= limit_s).height for limit_s in allowed_s]
+    within = [sum(spent_s is not None and spent_s <= limit_s for spent_s in hazardous_s) for limit_s in allowed_s]
     return {
-        "failures": failed.height,
+        "failures": failures,
         "service_levels": list(safety.service_levels),
         "level_allowed_s": allowed_s,
         "level_within": within,
-        "level_verdict": [_verdict(failed.height, count, results.evidence) for count in within],
+        "level_verdict": [_verdict(failures, count, results.evidence) for count in within],
     }
 
 
