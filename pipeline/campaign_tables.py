@@ -10,8 +10,8 @@ from collections.abc import Callable
 import polars as pl
 
 from pipeline.hazards.independent import independent_episodes
+from pipeline.run_figures import is_passage
 from pipeline.statistics import Estimate, clopper_pearson, poisson_rate
-from pipeline.summary import is_passage
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform

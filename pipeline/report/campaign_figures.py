@@ -8,8 +8,8 @@ import polars as pl
 
 from pipeline.hazards.independent import independent_episodes
 from pipeline.report.markup import UNKNOWN, number
+from pipeline.run_figures import is_passage
 from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
-from pipeline.summary import is_passage
 from schemas.config import SafetyConfig
 from schemas.enums import BaliseKind, PassageStatus, RunStatus
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.run_figures import CONTINUITY_S
 from pipeline.safety.continuity import continuity
 from pipeline.statistics import UNKNOWN, Estimate, clopper_pearson, poisson_rate
-from pipeline.summary import CONTINUITY_S
 from pipeline.timeline import Uptime
 
 Row = dict[str, object]

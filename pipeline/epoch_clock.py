@@ -1,0 +1,53 @@
+"""The epochs of one solution along time: how long each holds, and conditions on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s
+from schemas.config import Configuration
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The epochs' times and how long the state of each holds."""
+
+    t_ns: Instants
+    period_s: float | None
+    limit_s: float
+    held_s: Floats
+
+    @classmethod
+    def of(cls, epochs: pl.DataFrame, config: Configuration) -> Clock:
+        t_ns = epochs["t"].to_physical().to_numpy()
+        period_s = nominal_period_s(t_ns)
+        limit_s = gap_limit_s(period_s, config.align.gap_reset_s)
+        return cls(t_ns, period_s, limit_s, held_s(t_ns, limit_s))
+
+    @property
+    def duration_s(self) -> float | None:
+        return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
+
+
+def floats(frame: pl.DataFrame, column: str) -> Floats:
+    """A column with NaN for null."""
+    return frame[column].cast(pl.Float64).fill_null(math.nan).to_numpy()
+
+
+def flags(frame: pl.DataFrame, condition: pl.Expr) -> Flags:
+    """A condition with false for null."""
+    return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
+
+
+def usable() -> pl.Expr:
+    """An epoch with a position on the track."""
+    return pl.col("path_m").is_not_null() & pl.col("on_track")
+
+
+def trusted(config: Configuration) -> pl.Expr:
+    """An epoch whose position is valid, confident and unambiguous (CONTRACT section 3, `mtbf_h`)."""
+    confident = pl.col("confidence_m") <= config.lds.ci_limit_m
+    return usable() & confident & (pl.col("gate_probability") >= config.matching.ambiguity_probability)
