@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline import storage, store
+from pipeline import catalogue, storage, store
 from pipeline.campaign_tables import campaign_accuracy, campaign_levels
 from pipeline.hazards.map_errors import map_places
 from pipeline.ingest.files import Address
@@ -40,7 +40,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         )
     settings = config or store.read_config(out) or Configuration()
     names = ("runs", "hazards", "passages", "alarms")
-    runs, hazards, passages, alarms = (store.read_table(out, name).collect() for name in names)
+    runs, hazards, passages, alarms = (_table(out, name) for name in names)
     figures = measured_figures(runs, hazards, settings.safety)
     detection = detection_by_level(hazards, settings.safety)
     levels = campaign_levels(runs, hazards, settings.safety, settings.hazards.reaction_s)
@@ -57,6 +57,12 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
     }
     said = [*_reservations(runs), *_slow_receivers(levels), *plain_statements(figures), *_level_statements(detection)]
     return Assessment(said, tables)
+
+
+def _table(out: Address, name: str) -> pl.DataFrame:
+    """From the catalogue where it is fresh; nothing is written."""
+    kept = catalogue.fresh(out, name)
+    return (store.read_table(out, name) if kept is None else kept).collect()
 
 
 def compare_architectures(

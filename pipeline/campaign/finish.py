@@ -26,7 +26,7 @@ def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFram
         "accuracy": campaign_accuracy(passages, config),
         "figures": measured_figures(runs, hazards, config.safety),
         "detection": detection_by_level(hazards, config.safety),
-        "levels": campaign_levels(runs, hazards, config.safety),
+        "levels": campaign_levels(runs, hazards, config.safety, config.hazards.reaction_s),
         "map": map_places(alarms),
     }
     metadata = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config)}
