@@ -15,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
+
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
 _DEG = np.pi / 180.0
 _DAY_S = 86400.0
-# WGS 84
-_EQUATORIAL_RADIUS_M = 6378137.0
-_FLATTENING = 1.0 / 298.257223563
 _EARTH_RATE_RAD_PER_S = 7.2921151467e-5
 _GRAVITY_M3_PER_S2 = 3.986005e14
 _J2 = 1.08262982e-3
@@ -62,7 +61,7 @@ def _gps_slots() -> tuple[Slot, ...]:
     )
     axis_m, inclination_deg = 26_559_700.0, 55.0
     motion = np.sqrt(_GRAVITY_M3_PER_S2 / axis_m**3)
-    node = -1.5 * _J2 * (_EQUATORIAL_RADIUS_M / axis_m) ** 2 * motion * np.cos(inclination_deg * _DEG)
+    node = -1.5 * _J2 * (SEMI_MAJOR_AXIS_M / axis_m) ** 2 * motion * np.cos(inclination_deg * _DEG)
     turn = 2.0 * (_EARTH_RATE_RAD_PER_S - node)
     to_deg_per_day = _DAY_S / _DEG
     return tuple(
@@ -134,7 +133,8 @@ def look_angles(
 ) -> tuple[Array, Array]:
     """Azimuth (clockwise from north, [0, 360)) and elevation [deg], each of shape (times, slots)."""
     frame = _east_north_up(latitude_deg, longitude_deg)
-    line = satellite_positions(slots, t_ns) - _earth_fixed(latitude_deg, longitude_deg, height_m)
+    place_m = earth_centred_m(*(np.array([value]) for value in (latitude_deg, longitude_deg, height_m)))[0]
+    line = satellite_positions(slots, t_ns) - place_m
     east, north, up = np.moveaxis(line @ frame.T, -1, 0)
     azimuth = np.degrees(np.arctan2(east, north)) % 360.0
     return np.where(azimuth == 360.0, 0.0, azimuth), np.degrees(np.arctan2(up, np.hypot(east, north)))
@@ -170,15 +170,6 @@ def _sidereal_angle(t_ns: Times) -> Array:
     days = (t_ns - _instant_ns(2000, 1, 1)) * 1e-9 / _DAY_S - 0.5
     angle: Array = np.radians((280.46061837 + 360.98564736629 * days) % 360.0)
     return angle
-
-
-def _earth_fixed(latitude_deg: float, longitude_deg: float, height_m: float) -> Array:
-    latitude, longitude = latitude_deg * _DEG, longitude_deg * _DEG
-    squared = _FLATTENING * (2.0 - _FLATTENING)
-    normal = _EQUATORIAL_RADIUS_M / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)
-    across = (normal + height_m) * np.cos(latitude)
-    along_axis = (normal * (1.0 - squared) + height_m) * np.sin(latitude)
-    return np.array([across * np.cos(longitude), across * np.sin(longitude), along_axis])
 
 
 def _east_north_up(latitude_deg: float, longitude_deg: float) -> Array:

@@ -14,7 +14,7 @@ import polars as pl
 from scipy.ndimage import uniform_filter1d
 
 from datasets.scenario import LineSpec, ParallelSpec, SurveySpec
-from pipeline.geodesy import ECCENTRICITY_SQUARED, SEMI_MAJOR_AXIS_M
+from pipeline.geodesy import curvature_radii_m, moved_deg
 from schemas.errors import ConfigError
 from schemas.inputs import Balises, Links, Track
 
@@ -87,22 +87,8 @@ def offset_places(places: Places, left_m: Floats | float) -> Places:
 
 def shifted(places: Places, east_m: Floats, north_m: Floats, up_m: Floats) -> Places:
     """Places moved by a vector of the local horizon, small against the radius of the Earth."""
-    latitude = np.radians(places.latitude_deg)
-    meridian_m, normal_m = curvature_radii_m(latitude)
-    return Places(
-        places.latitude_deg + np.degrees(north_m / (meridian_m + places.height_m)),
-        places.longitude_deg + np.degrees(east_m / ((normal_m + places.height_m) * np.cos(latitude))),
-        places.height_m + up_m,
-        places.heading_deg,
-        places.slope,
-    )
-
-
-def curvature_radii_m(latitude: Floats) -> tuple[Floats, Floats]:
-    """Radii of curvature of the ellipsoid in the meridian and across it [m], latitude in radians."""
-    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
-    normal = SEMI_MAJOR_AXIS_M / np.sqrt(root)
-    return normal * (1.0 - ECCENTRICITY_SQUARED) / root, normal
+    latitude_deg, longitude_deg = moved_deg(places.latitude_deg, places.longitude_deg, places.height_m, east_m, north_m)
+    return Places(latitude_deg, longitude_deg, places.height_m + up_m, places.heading_deg, places.slope)
 
 
 def track_table(line: Line, rng: np.random.Generator) -> pl.DataFrame:

@@ -6,13 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from datasets.gnss_errors import gauss_markov
+from pipeline.monitors.sight import ionosphere_m2, troposphere_m2
 from schemas.config import NonNegative, Positive, Settings
 
 Floats = npt.NDArray[np.float64]
-
-# DO-229 A.4.4.10.4: height of the ionosphere's shell, radius of the Earth [km].
-_SHELL_KM = 350.0
-_EARTH_KM = 6378.1363
 
 
 class RangeErrorSpec(Settings):
@@ -34,11 +31,9 @@ class RangeErrorSpec(Settings):
 
 def range_variances_m2(spec: RangeErrorSpec, elevation_deg: Floats) -> Floats:
     """Variance by source (ionosphere, troposphere, orbit and clock, user), shape (4, ...) [m^2]."""
-    elevation = np.radians(elevation_deg)
-    ratio = _EARTH_KM * np.cos(elevation) / (_EARTH_KM + _SHELL_KM)
-    ionosphere = spec.ionosphere_zenith_m**2 / (1.0 - ratio**2)
-    troposphere = (spec.troposphere_zenith_m * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
-    level = np.ones_like(elevation)
+    ionosphere = ionosphere_m2(elevation_deg, spec.ionosphere_zenith_m)
+    troposphere = troposphere_m2(elevation_deg, spec.troposphere_zenith_m)
+    level = np.ones_like(troposphere)
     return np.stack([ionosphere, troposphere, spec.orbit_clock_m2 * level, spec.user_m2 * level])
 
 
@@ -52,7 +47,6 @@ def range_errors_m(spec: RangeErrorSpec, elevation_deg: Floats, step_s: float, r
     """Errors of all satellites, shape (epochs, satellites) [m]; the variance follows the elevation."""
     taus = (spec.ionosphere_tau_s, spec.troposphere_tau_s, spec.orbit_clock_tau_s, spec.user_tau_s)
     total = np.zeros_like(elevation_deg)
-    # Below the horizon nothing is received; the clip keeps the models in their range.
-    for variance, tau_s in zip(range_variances_m2(spec, elevation_deg.clip(min=0.0)), taus, strict=True):
+    for variance, tau_s in zip(range_variances_m2(spec, elevation_deg), taus, strict=True):
         total += np.sqrt(variance) * gauss_markov(1.0, tau_s, step_s, elevation_deg.shape, rng)
     return total

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from datasets.line import curvature_radii_m
 from pipeline.clean import clean
-from pipeline.geodesy import distances_m
+from pipeline.geodesy import curvature_radii_m, distances_m
 from pipeline.matching import match
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError

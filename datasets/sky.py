@@ -105,7 +105,7 @@ def track_satellites(
             errors = errors + np.where(hit & active(fault, t_s)[:, None], noise, 0.0)
         else:
             errors = errors + np.where(hit, offset_m(fault, t_s, rng)[:, None], 0.0)
-    sigma = range_sigma_m(spec.ranges, elevation.clip(min=0.0))
+    sigma = range_sigma_m(spec.ranges, elevation)
     return Ranges(svs, azimuth, elevation, sigma, errors, tracked)
 
 

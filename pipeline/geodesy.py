@@ -64,6 +64,25 @@ def distance_m(latitude_a_deg: float, longitude_a_deg: float, latitude_b_deg: fl
     return float(distances_m(*pair, np.zeros(2))[0])
 
 
+def curvature_radii_m(latitude: Floats) -> tuple[Floats, Floats]:
+    """Radii of curvature of the ellipsoid in the meridian and across it [m], latitude in radians."""
+    root = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
+    normal = SEMI_MAJOR_AXIS_M / np.sqrt(root)
+    return normal * (1.0 - ECCENTRICITY_SQUARED) / root, normal
+
+
+def moved_deg(
+    latitude_deg: Floats, longitude_deg: Floats, height_m: Floats, east_m: Floats, north_m: Floats
+) -> tuple[Floats, Floats]:
+    """Latitude and longitude moved by a vector of the local horizon, small against the radius of the Earth."""
+    latitude = np.radians(latitude_deg)
+    meridian_m, normal_m = curvature_radii_m(latitude)
+    return (
+        latitude_deg + np.degrees(north_m / (meridian_m + height_m)),
+        longitude_deg + np.degrees(east_m / ((normal_m + height_m) * np.cos(latitude))),
+    )
+
+
 def _sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     return np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
+from datasets.line import Places, offset_places
 from schemas.run import RunLog, Site
 
 _SECOND_NS = 1_000_000_000
-_METRES_PER_DEGREE = 111_320.0
 _PLACE = ("latitude_deg", "longitude_deg", "height_m")
 _VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
 
@@ -62,14 +62,11 @@ def map_left(run: RunLog, site: Site, onset_ns: int, size_m: float) -> tuple[Run
 
 
 def _moved_left(points: pl.DataFrame, size_m: float) -> pl.DataFrame:
-    latitude, longitude = points["latitude_deg"].to_numpy(), points["longitude_deg"].to_numpy()
-    shrink = np.cos(np.radians(latitude))
-    north, east = np.gradient(latitude), np.gradient(longitude) * shrink
-    length = np.hypot(north, east)
-    return points.with_columns(
-        latitude_deg=pl.Series(latitude + size_m * east / length / _METRES_PER_DEGREE),
-        longitude_deg=pl.Series(longitude - size_m * north / length / _METRES_PER_DEGREE / shrink),
-    )
+    latitude, longitude, height = (points[name].to_numpy() for name in _PLACE)
+    north, east = np.gradient(latitude), np.gradient(longitude) * np.cos(np.radians(latitude))
+    heading_deg = np.degrees(np.arctan2(east, north))
+    moved = offset_places(Places(latitude, longitude, height, heading_deg, np.zeros(height.size)), size_m)
+    return points.with_columns(latitude_deg=pl.Series(moved.latitude_deg), longitude_deg=pl.Series(moved.longitude_deg))
 
 
 def list_wrong(run: RunLog, site: Site, onset_ns: int, size_m: float) -> tuple[RunLog, Site]:

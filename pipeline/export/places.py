@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import SEMI_MAJOR_AXIS_M, Floats, Ints, points_of
+from pipeline.geodesy import Floats, Ints, moved_deg, points_of
 from pipeline.track import Track, track_of
 
 
@@ -54,8 +54,8 @@ def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Gro
     """
     heading = np.radians(ground.heading_deg)
     east, north = -left_m * sign * np.cos(heading), left_m * sign * np.sin(heading)
-    latitude = ground.latitude_deg + np.degrees(north / SEMI_MAJOR_AXIS_M)
-    longitude = ground.longitude_deg + np.degrees(east / SEMI_MAJOR_AXIS_M / np.cos(np.radians(ground.latitude_deg)))
+    level = np.nan_to_num(ground.height_m)
+    latitude, longitude = moved_deg(ground.latitude_deg, ground.longitude_deg, level, east, north)
     height = ground.height_m + np.nan_to_num(above_m)
     return Ground(latitude, longitude, height, ground.heading_deg)
 

@@ -34,14 +34,27 @@ def clock_columns(svs: Sequence[str]) -> Array:
     return np.array([[float(sv.startswith(system)) for system in systems] for sv in svs])
 
 
+def ionosphere_m2(elevation_deg: Array, zenith_m: float) -> Array:
+    """Variance of a vertical error of `zenith_m` seen at an elevation (DO-229 A.4.4.10.4, obliquity) [m^2]."""
+    elevation = np.radians(np.maximum(elevation_deg, 0.0))
+    ratio = _EARTH_RADIUS_KM * np.cos(elevation) / (_EARTH_RADIUS_KM + _IONOSPHERE_HEIGHT_KM)
+    variance: Array = zenith_m**2 / (1.0 - ratio**2)
+    return variance
+
+
+def troposphere_m2(elevation_deg: Array, zenith_m: float) -> Array:
+    """Variance of the troposphere's error of `zenith_m` seen at an elevation (DO-229 A.4.2.4) [m^2]."""
+    elevation = np.radians(np.maximum(elevation_deg, 0.0))
+    variance: Array = (zenith_m * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
+    return variance
+
+
 def range_variances_m2(elevation_deg: Array) -> Array:
     """Variances of range errors by elevation [m^2]: ionosphere, troposphere, orbit and clock, user; shape (..., 4).
 
     DIAG Table 1 for a range corrected by SBAS, with the elevation models of DO-229.
     """
-    elevation = np.radians(np.maximum(elevation_deg, 0.0))
-    ratio = _EARTH_RADIUS_KM * np.cos(elevation) / (_EARTH_RADIUS_KM + _IONOSPHERE_HEIGHT_KM)
-    ionosphere = _ZENITH_IONOSPHERE_M**2 / (1.0 - ratio**2)
-    troposphere = (_ZENITH_TROPOSPHERE_M * 1.001) ** 2 / (0.002001 + np.sin(elevation) ** 2)
-    level = np.ones_like(elevation)
+    ionosphere = ionosphere_m2(elevation_deg, _ZENITH_IONOSPHERE_M)
+    troposphere = troposphere_m2(elevation_deg, _ZENITH_TROPOSPHERE_M)
+    level = np.ones_like(troposphere)
     return np.stack([ionosphere, troposphere, _ORBIT_CLOCK_M2 * level, _USER_M2 * level], axis=-1)
