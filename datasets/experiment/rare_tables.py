@@ -182,12 +182,12 @@ def write_rare(
 ) -> list[Path]:
     """`missed`, `transients`, `false_alarms`, `pseudorange`, `agreement`; `repetitions` are the sampled runs."""
     runs = repetitions or RUNS
-    agreement = agreement_table(runs, 500 * runs, seed, jobs, config)
+    agreement = agreement_table(runs, 200 * runs, seed, jobs, config)
     tables = {
         "missed": missed_table(runs, seed, jobs, config),
         "transients": transient_table(runs, seed, jobs, config),
         "false_alarms": alarm_table(runs, seed, jobs, config),
         "pseudorange": range_table(runs, seed, jobs, config),
-        "agreement": pl.concat([agreement, pl.DataFrame(range_agreement(runs, 500 * runs, seed, jobs))]),
+        "agreement": pl.concat([agreement, pl.DataFrame(range_agreement(runs, 200 * runs, seed, jobs))]),
     }
     return write_tables(out, tables, {"experiment": "rare", "repetitions": runs, "seed": seed})
