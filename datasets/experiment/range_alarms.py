@@ -14,8 +14,7 @@ import polars as pl
 from scipy.special import chdtrc, chdtri
 
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
-from datasets.experiment.plan import HEADINGS_DEG
-from datasets.experiment.ranges import RangePlan, Statistic, held_rows, statistic
+from datasets.experiment.ranges import HEADINGS_DEG, RangePlan, Statistic, held_rows, statistic
 from datasets.experiment.workers import generator, in_blocks, mapped
 from pipeline.statistics import clopper_pearson
 

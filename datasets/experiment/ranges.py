@@ -18,7 +18,6 @@ from scipy.special import chdtri
 from datasets.experiment.bounds import expected
 from datasets.experiment.diagnostics import SEED
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, default_geometry
-from datasets.experiment.plan import HEADINGS_DEG
 from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks, mapped
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
@@ -29,6 +28,8 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 REPETITIONS = 5_000
+# Every course of a train: to the other side the error along the track is the same with the other sign.
+HEADINGS_DEG: tuple[float, ...] = tuple(15.0 * k for k in range(12))
 _BLOCK_REPETITIONS = 250
 _UNDETECTED = -1
 

@@ -70,6 +70,15 @@ def test_fault_free_value_is_chi_square() -> None:
     assert abs(alarms - 400) < 5 * np.sqrt(400)
 
 
+def test_the_slow_ramp_is_found_before_its_failure_at_every_heading() -> None:
+    """All courses, not only those of the paper, with residuals every half minute."""
+    plans = tuple(RangePlan(default_geometry(name), rates_mps=(0.01,), period_s=30.0) for name in CONSTELLATIONS)
+    table = run_ranges(200, seed=5, plans=plans)
+    assert sorted(set(table["heading_deg"])) == [15.0 * k for k in range(12)]
+    assert table["missed_at_failure"].sum() == 0
+    assert table["censored"].sum() == 0
+
+
 def test_the_slow_ramp_is_found_before_its_failure() -> None:
     plans = tuple(
         RangePlan(default_geometry(name), rates_mps=(0.01,), period_s=10.0, headings_deg=(0.0, 75.0))
