@@ -34,7 +34,8 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
             hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
         )
     )
-    seen = pl.when(pl.col("evidence").is_not_null()).then(pl.col("hours")).otherwise(0.0)
+    known_h = pl.col("evidence_s").fill_null(0.0) / 3600.0
+    seen = pl.when(pl.col("evidence").is_not_null()).then(known_h).otherwise(0.0)
     table = joined.with_columns(hours_seen=seen).pipe(
         _with_estimates,
         ("hazard_rate", "_per_h", poisson_rate, "faults", "hours_seen"),

@@ -137,16 +137,22 @@ def _verdict(failures: int, within: int, evidence: Evidence | None) -> ThrVerdic
 def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None, clock: Clock) -> Row:
     """Alarms and the rate of false ones, which needs a truth and a verdict on every alarm.
 
-    The rate counts the time in which the along-track bank judged; where it never did there is none.
+    The rate counts the time in which the along-track bank judged and the error was known; without any there is none.
     """
     false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
     truth = evidence is not None and epochs["error_along_m"].is_not_null().any()
     judged = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
-    monitored_s = float(clock.held_s[flags(epochs, _along_evaluated())].sum())
-    rate: Estimate = poisson_rate(false, monitored_s / 3600.0) if judged else UNKNOWN
+    monitored, seen = flags(epochs, _along_evaluated()), flags(epochs, pl.col("error_along_m").is_not_null())
+    judged_s = float(clock.held_s[monitored & seen].sum())
+    rate: Estimate = poisson_rate(false, judged_s / 3600.0) if judged else UNKNOWN
+    times = {
+        "held_s": clock.held_s,
+        "monitored_s": clock.held_s[monitored],
+        "evidence_s": clock.held_s[seen],
+        "judged_s": clock.held_s[monitored & seen],
+    }
     return {
-        "held_s": float(clock.held_s.sum()) if len(clock.held_s) else None,
-        "monitored_s": monitored_s if len(clock.held_s) else None,
+        **{name: float(held.sum()) if epochs.height else None for name, held in times.items()},
         "alarms": alarms.height,
         "false_alarms": false if truth else None,
         "false_alarm_rate_per_h": rate.value,

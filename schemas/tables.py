@@ -287,6 +287,8 @@ class Runs(dy.Schema):
     )
     held_s = real("s", "time that the epochs stand for, gaps apart", min=0)
     monitored_s = real("s", "of this with a verdict of the along-track bank", min=0)
+    evidence_s = real("s", "of this with a known error along the track", min=0)
+    judged_s = real("s", "of this with both: what the false alarm rate counts", min=0)
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
 

@@ -9,6 +9,7 @@ import polars as pl
 from pipeline.hazards.independent import independent_episodes
 from pipeline.report.markup import UNKNOWN, number
 from pipeline.run_figures import is_passage
+from pipeline.safety.measured import TRUTH
 from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
 from schemas.config import SafetyConfig
 from schemas.enums import BaliseKind, PassageStatus, RunStatus
@@ -57,8 +58,11 @@ def _extent(runs: pl.DataFrame) -> list[Figure]:
 
 
 def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> list[Figure]:
-    """Rates count faults, not rows, over the hours in which there was a truth to see them by."""
-    hours = _total(runs.filter(pl.col("evidence").is_not_null()), "duration_s") / 3600.0
+    """Rates count faults, not rows, over the hours in which there was evidence to see them by; what substantiates a
+    THR are hours with a truth alone (reference or balises).
+    """
+    seen = _total(runs.filter(pl.col("evidence").is_not_null()), "evidence_s") / 3600.0
+    hours = _total(runs.filter(pl.col("evidence").is_in(TRUTH)), "evidence_s") / 3600.0
     faults = independent_episodes(hazards)
     failures = faults.filter(pl.col("failed"))
     missed = failures.filter(pl.col("missed")).height
@@ -66,11 +70,11 @@ def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyCon
     needed = hours_still_needed(safety.thr_vb_per_h, missed, hours)
     claim = "" if upper is None else f"; one-sided 95 %: below {number(upper)} /h"
     return [
-        Figure("hours with a truth", f"{number(hours)} h", "in which a hazard could be seen at all"),
+        Figure("hours with evidence", f"{number(seen)} h", f"{number(hours)} h of these by reference or balises"),
         Figure(
             "faults that led to hazards",
             f"{faults.height} in {hazards.height} rows",
-            _rate(poisson_rate(faults.height, hours)),
+            _rate(poisson_rate(faults.height, seen)),
         ),
         Figure(
             "missed detections",
@@ -113,7 +117,7 @@ def _false_alarms(runs: pl.DataFrame) -> Figure:
     judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
     if judged.is_empty():
         return Figure("false alarms", "not known", "no run with a truth that judges every alarm")
-    hours = _total(judged, "monitored_s") / 3600.0
+    hours = _total(judged, "judged_s") / 3600.0
     count = int(_total(judged, "false_alarms"))
     return Figure("false alarms", f"{count} in {number(hours)} h judged", _rate(poisson_rate(count, hours)))
 

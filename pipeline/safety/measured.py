@@ -22,7 +22,7 @@ from schemas.enums import Evidence, RunStatus
 
 Row = dict[str, object]
 
-_TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
+TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
 
 
 def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
@@ -73,9 +73,10 @@ def _stanford(runs: pl.DataFrame) -> Row:
 
 
 def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
-    seen = _hours(runs.filter(pl.col("evidence").is_not_null()))
+    seen = _hours(runs.filter(pl.col("evidence").is_not_null()), "evidence_s")
     judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
-    hours, hours_judged = _hours(runs.filter(pl.col("evidence").is_in(_TRUTH))), _hours(judged, "monitored_s")
+    hours = _hours(runs.filter(pl.col("evidence").is_in(TRUTH)), "evidence_s")
+    hours_judged = _hours(judged, "judged_s")
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
     false_alarms, outages = int(judged["false_alarms"].sum()), int(runs["outages"].sum())
     losses = int(runs["trusted_losses"].sum())

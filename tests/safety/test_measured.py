@@ -27,7 +27,8 @@ def runs(height: int, **columns: Any) -> pl.DataFrame:
         "status": "ok",
         "duration_s": 3600.0,
         "held_s": 3600.0,
-        "monitored_s": 3600.0,
+        "evidence_s": 3600.0,
+        "judged_s": 3600.0,
         "evidence": "reference",
         "false_alarm_rate_per_h": 0.0,
         "false_alarms": 0,
@@ -72,7 +73,8 @@ def test_rates_over_the_campaign() -> None:
         status=["ok", "partial", "ok", "ok", "failed", "ok"],
         evidence=["reference", "balise", "odometer", None, None, "reference"],
         duration_s=[3600.0, 1800.0, 7200.0, 3600.0, None, 1800.0],
-        monitored_s=[3600.0, 1440.0, 7200.0, 3600.0, None, 1800.0],
+        evidence_s=[3600.0, 1800.0, 7200.0, 0.0, None, 900.0],
+        judged_s=[3600.0, 1440.0, 7200.0, 0.0, None, 900.0],
         false_alarms=[2, 0, None, None, None, 1],
         false_alarm_rate_per_h=[2.0, 0.0, None, None, None, None],
         balises_accepted=[10, 5, 5, 5, 0, 5],
@@ -87,9 +89,9 @@ def test_rates_over_the_campaign() -> None:
     )
     found = measured_figures(catalogue, faults, CONFIG).row(0, named=True)
     assert (found["runs"], found["runs_failed"], found["hours"]) == (5, 1, 5.0)
-    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (4.0, 2.0, 1.4)
-    rate = poisson_rate(3, 4.0)
-    assert (found["hazards"], found["hazard_rate_per_h"]) == (3, 0.75)
+    assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (3.75, 1.75, 1.4)
+    rate = poisson_rate(3, 3.75)
+    assert (found["hazards"], found["hazard_rate_per_h"]) == (3, 0.8)
     assert (found["hazard_rate_low_per_h"], found["hazard_rate_high_per_h"]) == (rate.low, rate.high)
     share = clopper_pearson(1, 2)
     assert (found["failures"], found["missed"], found["missed_share"]) == (2, 1, 0.5)

@@ -17,6 +17,7 @@ CONFIG = Configuration()
 
 def runs(ids: list[str], **columns: Any) -> pl.DataFrame:
     plain: dict[str, Any] = {"solution": "primary", "status": "ok", "duration_s": 1800.0, "evidence": "reference"}
+    plain["evidence_s"] = columns.get("duration_s", 1800.0)
     return table(Runs, len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
 
 

@@ -327,7 +327,13 @@ class TestFalseAlarms:
         blind = {f"along_{scale}_state": "not_evaluated" for scale in SCALES}
         blind["along_ewma_0p1_state"] = ["not_evaluated"] * 1400 + ["fail"] * 400 + ["not_evaluated"] * 1801
         found = row(epochs(HOUR, **(blind | {"along_raw_state": raw})), alarms=alarms(1, verdict="false"))
-        assert (found["held_s"], found["monitored_s"]) == (3600.0, 1800.0)
+        assert (found["held_s"], found["monitored_s"], found["judged_s"]) == (3600.0, 1800.0, 1800.0)
+        assert found["false_alarm_rate_per_h"] == 2.0
+
+    def test_rate_counts_the_time_with_a_truth(self) -> None:
+        """The truth is known in the first half hour of the hour only."""
+        found = row(epochs(HOUR, error_along_m=[0.5] * 1800 + [None] * 1801), alarms=alarms(1, verdict="false"))
+        assert (found["monitored_s"], found["evidence_s"], found["judged_s"]) == (3600.0, 1800.0, 1800.0)
         assert found["false_alarm_rate_per_h"] == 2.0
 
     def test_not_known_without_truth(self) -> None:
