@@ -16,12 +16,13 @@ import numpy.typing as npt
 import polars as pl
 
 from datasets.experiment.bank_faults import CATALOGUE, HEADING_DEG, Fault, WhiteNoise, failure_s, fault_response
+from datasets.experiment.bank_text import recommendation_page
 from datasets.experiment.diagnostics import SEED
 from datasets.experiment.geometry import Geometry, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
-from datasets.experiment.tables import write_tables
+from datasets.experiment.tables import write_page, write_tables
 from datasets.experiment.workers import generator, mapped
 from pipeline.statistics import clopper_pearson
 from schemas.config import Configuration, MonitorConfig
@@ -205,7 +206,7 @@ def _reason(row: dict[str, object]) -> str:
 def write_bank(
     out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
 ) -> list[Path]:
-    """`comparison.parquet` by bank and fault, `ranking.parquet` with the recommendation first.
+    """`comparison.parquet` by bank and fault, `ranking.parquet` with the best first, `recommendation.md`.
 
     A configured bank enters the comparison beside the candidates.
     """
@@ -218,5 +219,7 @@ def write_bank(
             for rate_hz in (1.0, 10.0)
         ]
     comparison = compare_banks(list(dict.fromkeys(specs)), repetitions=count, seed=seed, jobs=jobs)
-    tables = {"comparison": comparison, "ranking": rank_banks(comparison)}
-    return write_tables(out, tables, {"experiment": "bank", "repetitions": count, "seed": seed})
+    ranking = rank_banks(comparison)
+    settings = {"experiment": "bank", "repetitions": count, "seed": seed}
+    written = write_tables(out, {"comparison": comparison, "ranking": ranking}, settings)
+    return [*written, write_page(out / "recommendation.md", recommendation_page(ranking))]

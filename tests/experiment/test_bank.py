@@ -9,6 +9,7 @@ import pytest
 from datasets.experiment import EXPERIMENTS
 from datasets.experiment.bank import FEWEST_RUNS, compare_banks, rank_banks
 from datasets.experiment.bank_faults import CATALOGUE, Fault, WhiteNoise, failure_s, fault_response
+from datasets.experiment.bank_text import recommendation_page
 from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.rare_tables import banks, epochs_until, failure_epoch
@@ -124,3 +125,26 @@ def test_a_configured_bank_is_judged(tmp_path: Path) -> None:
     for name in ("diagnostics", "findings", "pseudorange", "thresholds"):
         with pytest.raises(UsageError, match="takes no configuration"):
             EXPERIMENTS[name](tmp_path, 1, 1, 1, config)
+
+
+def test_the_recommendation_says_why_and_where_the_default_stands() -> None:
+    """Default weights at 1e-8 come first: at 1e-7 and 10 Hz twelve monitors alarm more than once in 100 h."""
+    specs = [
+        BankSpec(
+            alphas=(1.0, 0.1, 0.01, 0.001),
+            sensors="odometer_and_track",
+            false_alarm_probability=probability,
+            rate_hz=10.0,
+            map_m=0.1,
+        )
+        for probability in (1e-7, 1e-8)
+    ]
+    ranking = rank_banks(compare_banks(specs, (Fault("step", "along", 25.0),), FEWEST_RUNS, seed=1))
+    assert ranking["probability"].to_list() == [1e-8, 1e-7]
+    page = recommendation_page(ranking)
+    assert (
+        "Recommended: weights 1, 0.1, 0.01, 0.001, odometer and track, 1e-08 per sample, 10 Hz. 1 of 1 faults" in page
+    )
+    assert "- rank 2, weights 1, 0.1, 0.01, 0.001, odometer and track, 1e-07 per sample, 10 Hz: differs" in page
+    assert "in probability 1e-07 for 1e-08. 1 of 1 faults negated in time" in page
+    assert "more often than one in 100 h" in page
