@@ -16,8 +16,8 @@ def recommendation_page(ranking: pl.DataFrame) -> str:
         "",
         f"Recommended: {_bank(best)}. {best['reason']}.",
         "",
-        "Ranked by: at most one false alarm in 100 h; then faults that are surely negated in time (95 %), faults seen at "
-        "all, mean share in time, fewer false alarms.",
+        "Ranked by: at most one false alarm in 100 h; then faults that are surely negated in time (95 %), faults seen "
+        "at all, mean share in time, fewer false alarms.",
         "",
         "| rank | bank | faults in time | seen | one false alarm in |",
         "|---|---|---|---|---|",
@@ -27,8 +27,8 @@ def recommendation_page(ranking: pl.DataFrame) -> str:
         "",
         *(_default(row, best) for row in ranking.filter(pl.col("replay_default")).iter_rows(named=True)),
         "",
-        "The default keeps the published probability of 1e-7 per sample and monitor (DIAG, eq. 17), so that results can "
-        "be compared with the paper's; `monitors.false_alarm_probability` sets another.",
+        "The default keeps the published probability of 1e-7 per sample and monitor (DIAG, eq. 17), so that results "
+        "can be compared with the paper's; `monitors.false_alarm_probability` sets another.",
     ]
     return "\n".join(lines) + "\n"
 
