@@ -64,6 +64,20 @@ def test_fault_common_to_both_solutions_only_the_diagnosis_finds():
         assert (composite["detected"], composite["missed"], composite["common_missed"]) == (0, 1, 1)
 
 
+def test_receivers_that_promise_too_much_raise_false_alarms_in_both_architectures():
+    """Stated sigma a fifth of the true one: nothing is ever wrong by 5 m, and every alarm is false."""
+    boastful = {"reported_factor": 0.2}
+    one, site = journey(gnss=boastful)
+    other, _ = journey(gnss=boastful, seed=9)
+    found = rows(replay(two(one, other), site, VEHICLE))
+    for name in ("primary", "galileo"):
+        for architecture in (REACTIVE, COMPOSITE):
+            row = found[name, architecture]
+            assert row["false_alarms"] == row["alarms"] > 0
+            assert row["false_alarm_rate_per_h"] == pytest.approx(row["alarms"] / row["judged_h"])
+            assert (row["hazards"], row["wrong_in_use_s"]) == (0, 0.0)
+
+
 def test_slow_drift_of_one_the_comparison_finds_before_it_fails():
     drifting, site = journey(SLOW)
     sound, _ = journey(seed=9)
