@@ -13,8 +13,8 @@ from pipeline.ingest import files
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
-from pipeline.lds.windows import overlapping_windows
 from pipeline.matching.describe import describe_site
+from pipeline.site_windows import window_findings
 from schemas.config import IngestConfig
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding
@@ -88,23 +88,7 @@ def inspect_site(path: Address) -> dict[str, pl.DataFrame]:
     site = read_site(path)
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
-    return {"Site": _figures(figures), "Findings": _findings((*description.findings, *_alike(site.balises)))}
-
-
-def _alike(balises: pl.DataFrame | None) -> list[Finding]:
-    """Announced balises of one net element whose expectation windows overlap (LOC section III)."""
-    if balises is None:
-        return []
-    return [
-        Finding(
-            "warning",
-            f"balises {row['balise_id']}, {row['next_balise_id']} on {row['place']}",
-            f"expectation windows from {row['reference_id']} overlap with {row['direction']} measure: "
-            f"{row['spacing_m']:.1f} m apart, {row['minimal_spacing_m']:.1f} m needed",
-            "Linking alone cannot tell them apart; set them farther apart, or rely on the diagnosis between them.",
-        )
-        for row in overlapping_windows(balises).iter_rows(named=True)
-    ]
+    return {"Site": _figures(figures), "Findings": _findings((*description.findings, *window_findings(site)))}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:

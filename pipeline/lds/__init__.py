@@ -13,7 +13,10 @@ Where the sources leave a choice, this package reads them so:
   (outage, monitor, confidence, ambiguity): `status` says what happened, `linking_error` what the train
   made of it.
 - Virtual balises and physical ones are two chains that know nothing of each other, with one exception: a
-  physical balise read while the position is negated says what GNSS minus odometer should be.
+  physical balise read while the position is negated, or after such a return, says what GNSS minus odometer
+  should be.
+- The last TVB before the alarm's onset: an alarm that follows upon a return may be about the same fault, so its
+  re-link also has to hold against what that return was measured from (`footing`), while the odometer can tell.
 - Linking holds in both directions of travel. Balises in whose window the train turned round may be found
   or not; the 5 % of the odometer then count on the whole way run since the reference.
 - Not announced (`linked` false): rejected while linking is in force, taken like any other before that.

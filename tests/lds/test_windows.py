@@ -8,12 +8,10 @@ from hypothesis import strategies as st
 
 from pipeline.lds.windows import (
     minimal_next_spacing_m,
-    overlapping_windows,
     window_after_turn_m,
     window_m,
 )
 from schemas.config import LdsConfig
-from tests.lds.scripted import balises_at
 
 CONFIG = LdsConfig()
 
@@ -72,24 +70,3 @@ def test_after_a_turn_the_whole_way_run_counts() -> None:
     # 100 m out and back: 5 % of 200 m, 29 m margin: (29 + 10) / 0.95 either side.
     window = window_after_turn_m(0.0, 200.0, 29.0, CONFIG)
     assert window == pytest.approx((-39.0 / 0.95, 39.0 / 0.95), abs=1e-9)
-
-
-def test_site_check_names_pairs_closer_than_the_minimal_spacing() -> None:
-    # B at 400 m from A: the next must be 103.2 m further. C is 100 m further, D 400 m from C.
-    found = overlapping_windows(balises_at({"A": 0.0, "B": 400.0, "C": 500.0, "D": 900.0}))
-    told = found.select("direction", "reference_id", "balise_id", "next_balise_id", "spacing_m").rows()
-    assert told == [
-        ("growing", "A", "B", "C", 100.0),
-        ("falling", "D", "C", "B", 100.0),
-    ]
-    assert found["minimal_spacing_m"].to_list() == pytest.approx([103.158, 103.158], abs=1e-3)
-
-
-def test_site_check_leaves_out_what_is_not_announced_and_keeps_kinds_apart() -> None:
-    places = {"A": 0.0, "B": 400.0, "X": 420.0, "P": 440.0, "C": 520.0}
-    balises = balises_at(
-        places,
-        linked=[True, True, False, True, True],
-        kind=["virtual", "virtual", "virtual", "physical", "virtual"],
-    )
-    assert overlapping_windows(balises).is_empty()
