@@ -84,16 +84,16 @@ def _missed(
 
 
 def range_agreement(runs: int, most_plain_runs: int, seed: int, jobs: int) -> list[dict[str, object]]:
-    """Sampling against counting at 1e-3 to 1e-5: residuals every 10 s, ramp of 0.1 m/s; alarms within 100 epochs."""
+    """Sampling against counting at 1e-3 to 1e-5: residuals every 10 s, ramp of 0.05 m/s; alarms within 100 epochs."""
     rows = []
     system = range_system(RangePlan(default_geometry("gps"), period_s=10.0), _HEADING_DEG)
     for target in (1e-3, 1e-4, 1e-5):
         plain_runs = min(int(_COUNTED_EVENTS / target), most_plain_runs)
         (epochs,) = first_below(
-            lambda n: missed_by_ranges(system, n, 0.1, _SEARCH_RUNS, seed, jobs).value, (target,), 1_000
+            lambda n: missed_by_ranges(system, n, 0.05, _SEARCH_RUNS, seed, jobs).value, (target,), 1_000
         )
         if epochs is not None:
-            clever = missed_by_ranges(system, epochs, 0.1, runs, seed, jobs)
+            clever = missed_by_ranges(system, epochs, 0.05, runs, seed, jobs)
             plain = plain_missed_by_ranges(system, epochs, 0.1, plain_runs, seed, jobs)
             rows.append(agreement_row("missed_detection", "pseudorange", epochs, clever, plain))
         tight = range_system(

@@ -31,6 +31,7 @@ _SEARCH_RUNS = 500
 _FAILURE_LIMIT_M = 20.0
 _LONGEST_S = 10_000
 _HOUR_S = 3_600
+_FAST_HZ, _SLOWEST_AT_FAST_MPS = 10.0, 0.1
 _ALARM_SHARE = 20
 # Counting is given so many events to see, as far as the runs allow.
 _COUNTED_EVENTS = 40
@@ -38,15 +39,15 @@ _COUNTED_EVENTS = 40
 AGES_S: tuple[float | None, ...] = (0.0, 10.0, 60.0, 300.0, None)
 
 
-def banks(config: Configuration | None) -> Iterator[tuple[Constellation, BankSpec, LinearBank]]:
-    """Both constellations and sensor sets, heading 0, 1 Hz: the configured bank, or those of both readings."""
+def banks(config: Configuration | None, rate_hz: float = 1.0) -> Iterator[tuple[Constellation, BankSpec, LinearBank]]:
+    """Both constellations and sensor sets, heading 0: the configured bank, or those of both readings."""
     specs = [
         spec
         for sensors in SENSORS
         for spec in (
-            [BankSpec.of(config.monitors, sensors)]
+            [BankSpec.of(config.monitors, sensors, rate_hz)]
             if config is not None
-            else [BankSpec(reading=reading, sensors=sensors) for reading in READINGS]
+            else [BankSpec(reading=reading, sensors=sensors, rate_hz=rate_hz) for reading in READINGS]
         )
     ]
     for constellation in CONSTELLATIONS:
@@ -75,13 +76,12 @@ def missed_table(
 ) -> pl.DataFrame:
     """Pmd at the mean failure, and the time that makes it as rare as each target, with the error of the estimate."""
     rows = []
-    for constellation, spec, bank in banks(config):
-        for rate in _RATES_MPS:
-            at_failure = failure_epoch(bank, rate)
-            rows.append(_missed_row(constellation, spec, bank, rate, at_failure, "failure", runs, seed, jobs))
-            for target, epochs in zip(TARGETS, epochs_until(bank, rate, TARGETS, seed, jobs), strict=True):
-                if epochs is not None:
-                    rows.append(_missed_row(constellation, spec, bank, rate, epochs, f"{target:g}", runs, seed, jobs))
+    for (constellation, spec, bank), rate in _asked(config):
+        at_failure = failure_epoch(bank, rate)
+        rows.append(_missed_row(constellation, spec, bank, rate, at_failure, "failure", runs, seed, jobs))
+        for target, epochs in zip(TARGETS, epochs_until(bank, rate, TARGETS, seed, jobs), strict=True):
+            if epochs is not None:
+                rows.append(_missed_row(constellation, spec, bank, rate, epochs, f"{target:g}", runs, seed, jobs))
     return pl.DataFrame(rows)
 
 
@@ -102,6 +102,7 @@ def _missed_row(
         "reading": spec.reading,
         "alphas": _weights(spec),
         "sensors": spec.sensors,
+        "rate_hz": spec.rate_hz,
         "rate_mps": rate,
         "chosen_for": reason,
         "time_s": epochs / spec.rate_hz,
@@ -132,10 +133,19 @@ def transient_table(
     return pl.DataFrame(rows, infer_schema_length=None)
 
 
+def _asked(config: Configuration | None) -> Iterator[tuple[tuple[Constellation, BankSpec, LinearBank], float]]:
+    """Banks and ramps; at 10 Hz the faster ramps of GPS, since slow ones differ little from 1 Hz."""
+    for one in banks(config):
+        yield from ((one, rate) for rate in _RATES_MPS)
+    for one in banks(config, _FAST_HZ):
+        yield from ((one, rate) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS and one[0] == "gps")
+
+
 def alarm_table(runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Configuration | None = None) -> pl.DataFrame:
     """Probability that a healthy bank alarms at least once within an hour."""
     rows = []
-    for constellation, spec, bank in banks(config):
+    chosen = [*banks(config), *(one for one in banks(config, _FAST_HZ) if one[0] == "gps")]
+    for constellation, spec, bank in chosen:
         result = false_alarm_probability(bank, int(_HOUR_S * spec.rate_hz), max(runs // _ALARM_SHARE, 20), seed, jobs)
         rows.append(
             {
@@ -143,6 +153,7 @@ def alarm_table(runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Confi
                 "reading": spec.reading,
                 "alphas": _weights(spec),
                 "sensors": spec.sensors,
+                "rate_hz": spec.rate_hz,
                 "false_alarm_probability": spec.false_alarm_probability,
                 "horizon_s": float(_HOUR_S),
                 **figures(result),

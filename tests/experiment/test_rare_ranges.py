@@ -88,6 +88,7 @@ def test_every_table_of_rare_events_is_written_for_a_configured_bank(
     for table in tables.values():
         assert {"probability", "relative_error", "variance_reduction", "runs"} <= set(table.columns)
     assert set(tables["missed"]["alphas"]) == {"1, 0.3, 0.1, 0.03"}
+    assert set(tables["missed"]["rate_hz"]) == set(tables["false_alarms"]["rate_hz"]) == {1.0, 10.0}
     assert set(tables["false_alarms"]["false_alarm_probability"]) == {1e-5}
     assert set(tables["pseudorange"]["event"]) == {"missed_detection", "false_alarm"}
     assert set(tables["agreement"]["sensors"]) == {"odometer", "odometer_and_track", "pseudorange"}
