@@ -10,8 +10,9 @@ tells what the data really say about scale and latency; the offset walks with th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +30,7 @@ _WHITE_SHARE = 0.01
 SPEED_SPAN_S = 0.25
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """Scale (true over odometer distance) and latency [s] with their standard deviations."""
 
     scale: float
@@ -39,8 +39,7 @@ class Estimate:
     latency_sigma_s: float
 
 
-@dataclass(frozen=True)
-class FilterState:
+class FilterState(NamedTuple):
     """Mean and covariance of (offset, scale error, latency, e_j...), at a time and from an odometer origin."""
 
     mean: Array
@@ -79,7 +78,7 @@ class ScaleLatencyFilter:
         covariance = fresh.covariance.copy()
         kept = slice(_SCALE, _ERRORS)
         covariance[kept, kept] = state.covariance[kept, kept]
-        return replace(fresh, covariance=covariance)
+        return fresh._replace(covariance=covariance)
 
     def update(
         self, state: FilterState, t_s: float, path_m: float, sigma_m: float, jitter_s: float = 0.0
