@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline import catalogue, storage, store
 from pipeline.campaign_tables import campaign_accuracy, campaign_levels
-from pipeline.hazards.map_errors import map_places
+from pipeline.hazards.map_errors import map_places, map_suspects
 from pipeline.ingest.files import Address
 from pipeline.present import tall
 from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements
@@ -53,6 +53,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         "accuracy": campaign_accuracy(passages, settings),
         "side_by_side": over_all_runs(of_runs),
         "side_by_side_of_runs": by_run(of_runs),
+        "alarms": alarm_causes(alarms),
         "map": map_places(alarms),
     }
     said = [*_reservations(runs), *_slow_receivers(levels), *plain_statements(figures), *_level_statements(detection)]
@@ -113,6 +114,14 @@ def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
         .agg(**counts, receiver_too_slow=(~pl.col("receiver_quick_enough")).sum().cast(pl.Int64))
         .sort("solution", maintain_order=True)
     )
+
+
+def alarm_causes(alarms: pl.DataFrame) -> pl.DataFrame:
+    """Alarms by verdict and suspect, the map held to be at fault where several runs agree on a place."""
+    named = map_suspects(alarms).with_columns(pl.col("verdict", "suspect").cast(pl.String))
+    keys = ("solution", "verdict", "suspect")
+    counts = {"alarms": pl.len().cast(pl.Int64), "runs": pl.col("run_id").n_unique().cast(pl.Int64)}
+    return named.group_by(keys).agg(**counts).sort(keys)
 
 
 def _reservations(runs: pl.DataFrame) -> list[str]:
@@ -182,6 +191,7 @@ def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
         "runs by verdict per service level": tables["levels"],
         "location error of accepted virtual balises": tables["accuracy"].select(_SHORT["accuracy"]),
         "composite and reactive fail-safety side by side": tables["side_by_side"],
+        "alarms by verdict and suspect": tables["alarms"],
         "places where the map is in doubt": tables["map"],
     }
     side = "composite and reactive fail-safety side by side"

@@ -1,0 +1,115 @@
+"""What `balise safety OUT` says of a small result worked by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pipeline.assessment import Assessment, alarm_causes, assess, for_reading
+from pipeline.store import write_run
+from schemas.config import Configuration
+from schemas.run import RunTables
+from schemas.tables import Runs
+from tests.summary.tables import NS, alarms, epochs, hazards, passages, table
+
+ACROSS = {"monitors": [["cross_raw"]], "verdict": "false", "suspect": "unknown", "netelement_id": "A"}
+
+
+def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, **found: Any) -> RunTables:
+    rows: dict[str, Any] = {
+        "solution": list(solutions),
+        "status": "ok",
+        "evidence": "reference",
+        "duration_s": 3600.0,
+        "held_s": 3600.0,
+        "evidence_s": 3600.0,
+        "judged_s": 3600.0,
+        "gnss_rate_hz": 10.0,
+        "false_alarms": 0,
+        "false_alarm_rate_per_h": 0.0,
+        "notes": notes,
+    }
+    points = [20.0 * k for k in range(3)]
+    stand = {"netelement_id": "A", "measure_m": points, "path_m": points, "sigma_along_m": 1.0}
+    tables = {"hazards": hazards(), "alarms": alarms(), "passages": passages()} | found
+    frames = pl.concat(epochs([0, 1, 2], solution=name, **stand) for name in solutions)
+    return RunTables(run_id, epochs=frames, runs=table(Runs, len(solutions), **rows), **tables)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Assessment:
+    out = tmp_path_factory.mktemp("assessed")
+    fault = hazards(
+        1,
+        solution="primary",
+        t_onset=0,
+        t_failure=5 * NS,
+        t_negated=6 * NS,
+        hazardous_s=1.0,
+        time_to_detect_s=5.9,
+        budget_s=1.675,
+    )
+    across = alarms(1, solution="primary", measure_m=500.0, **ACROSS)
+    write_run(run_of("a", notes="faults were injected: ramp", hazards=fault, alarms=across), out, {})
+    write_run(run_of("b", alarms=across.with_columns(measure_m=540.0)), out, {})
+    write_run(run_of("c", ("gps", "primary")), out, {})
+    return assess(out)
+
+
+def test_tables(found: Assessment) -> None:
+    figures = {row["solution"]: row for row in found.tables["figures"].iter_rows(named=True)}
+    assert (figures["primary"]["runs"], figures["gps"]["runs"]) == (3, 1)
+    assert (figures["primary"]["hours_with_truth"], figures["primary"]["failures"]) == (3.0, 1)
+    levels = found.tables["levels"].filter(solution="primary").select("service_level", "kept", "exceeded", "no_failure")
+    assert levels.rows() == [
+        ("npa", 1, 0, 2),
+        ("lpv200", 0, 1, 2),
+        ("egnos_observed", 1, 0, 2),
+        ("horizontal_sis", 1, 0, 2),
+    ]
+    assert found.tables["levels_of_runs"].height == 16
+
+
+def test_only_runs_with_several_solutions_are_compared(found: Assessment) -> None:
+    assert set(found.tables["side_by_side_of_runs"]["run_id"]) == {"c"}
+    assert found.tables["side_by_side"].select("architecture", "solution", "other", "runs").rows() == [
+        ("reactive 1oo1", "gps", None, 1),
+        ("reactive 1oo1", "primary", None, 1),
+        ("composite 2oo2", "gps", "primary", 1),
+        ("composite 2oo2", "primary", "gps", 1),
+        ("reactive 1oo2", "gps", "primary", 1),
+    ]
+
+
+def test_the_map_is_the_suspect_where_runs_agree(found: Assessment) -> None:
+    assert found.tables["alarms"].rows() == [("primary", "false", "map", 2, 2)]
+    assert found.tables["map"].select("from_m", "to_m", "runs").rows() == [(500.0, 540.0, 2)]
+    one = alarms(1, solution="primary", measure_m=500.0, **ACROSS).with_columns(run_id=pl.lit("a"))
+    assert alarm_causes(one)["suspect"].to_list() == ["unknown"]
+
+
+def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
+    said = found.statements
+    assert said[0].startswith("Faults were injected into 1 of 3 runs")
+    assert any(text.startswith("primary: 0 missed detections of 1 position failures") for text in said)
+    assert "lpv200; 95 %: 0.0% to 97.5%" in said[-1]
+
+
+def test_receivers_too_slow_are_named(tmp_path: Path) -> None:
+    slow = run_of("a")
+    write_run(RunTables(**{**vars(slow), "runs": slow.runs.with_columns(gnss_rate_hz=1.0)}), tmp_path, {})
+    said = assess(tmp_path).statements
+    assert "primary: epochs come too slowly for lpv200 in 1 runs" in said[0]
+    assert not any("npa" in text for text in said)
+    quick = assess(tmp_path, Configuration.model_validate({"hazards": {"reaction_s": 0.1}})).statements
+    assert sum("too slowly" in text for text in quick) == 1
+
+
+def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessment) -> None:
+    shown = for_reading(found.tables)
+    assert "places where the map is in doubt" in shown
+    assert all(frame.height for frame in shown.values())
+    assert shown["figures"].columns == ["figure", "gps", "primary"]
