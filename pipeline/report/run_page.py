@@ -12,13 +12,11 @@ import polars as pl
 
 from pipeline.report.architectures import architectures_section
 from pipeline.report.markup import (
-    UNKNOWN,
     Cell,
     badge,
     cell,
     figure,
     link,
-    number,
     page,
     pairs,
     section,
@@ -26,7 +24,8 @@ from pipeline.report.markup import (
 )
 from pipeline.report.packing import Json, script_json
 from pipeline.report.plan_view import plan_data
-from pipeline.report.run_columns import ALARM_COLUMNS, FIGURES, HAZARD_COLUMNS, PASSAGE_COLUMNS, PLOTS
+from pipeline.report.run_columns import ALARM_COLUMNS, HAZARD_COLUMNS, PASSAGE_COLUMNS, PLOTS
+from pipeline.report.run_summary import figures, levels
 from pipeline.report.series import moments_of, reasons, time_data
 from pipeline.report.stanford import stanford_data
 from pipeline.safety.side_by_side import Key, side_by_side_table
@@ -154,7 +153,7 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
     epochs = tables.epochs.filter(pl.col("solution") == name)
     title = f"Figures of {name}" if several else "Figures"
     parts = [
-        section(f"figures-{key}", title, *notes, _figures(row), _levels(key, row)),
+        section(f"figures-{key}", title, *notes, figures(row), levels(key, row)),
         section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
         _drawings(key),
         section(f"passages-{key}", "Passages", _passages(key, passages)),
@@ -168,33 +167,6 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
 def _drawings(key: str) -> str:
     figures = (figure(f"{key}-{plot}", title, note) for plot, title, note in PLOTS)
     return section(f"drawings-{key}", "Drawings", *figures)
-
-
-def _figures(row: Row) -> str:
-    values = []
-    for key, title, unit in FIGURES:
-        value = row[key]
-        text = number(value, 4) if isinstance(value, int | float) else str(value or UNKNOWN)
-        values.append((title, f"{text} {unit}".strip() if value is not None else "not known"))
-    low, high = row["false_alarm_rate_low_per_h"], row["false_alarm_rate_high_per_h"]
-    known = row["false_alarm_rate_per_h"] is not None
-    rate = f"{number(row['false_alarm_rate_per_h'])} /h (95 %: {number(low)} to {number(high)})"
-    shares = ", ".join(
-        f"{state.upper()} " + ("not known" if row[f"share_{state}"] is None else format(row[f"share_{state}"], ".2%"))
-        for state in ("p0", "p1", "p2", "p3")
-    )
-    return pairs([*values, ("false alarm rate", rate if known else "not known"), ("share of time", shares)])
-
-
-def _levels(key: str, run: Row) -> str:
-    """What the run would be worth at each service level (TVB eq. 7)."""
-    columns = ("service_levels", "level_allowed_s", "level_within", "level_verdict")
-    rows = [
-        [cell(level), cell(allowed_s, 4), cell(f"{within} of {run['failures']}"), cell(verdict.replace("_", " "))]
-        for level, allowed_s, within, verdict in zip(*(run[name] or [] for name in columns), strict=True)
-    ]
-    titles = ["service level", "allowed T_D [s]", "failures negated within it", "verdict"]
-    return table(f"table-levels-{key}", "Position failures against the allowed T_D (TVB eq. 7)", titles, rows)
 
 
 def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:

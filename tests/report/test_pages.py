@@ -276,6 +276,16 @@ def test_levels_stand_on_the_page_of_a_run(out: Path) -> None:
     assert {row[3] for row in rows} <= {"kept", "exceeded", "no failure", "unknown"}
 
 
+def test_stanford_counts_stand_beside_the_figures(out: Path, replayed: dict[str, RunTables]) -> None:
+    row = replayed["jump_two"].runs.row(0, named=True)
+    page = text_of(out, "runs/jump_two.html")
+    for bound, prefix in (("confidence", "stanford"), ("HPL", "stanford_hpl")):
+        counts = [row[f"{prefix}_{kind}"] for kind in ("nominal", "misleading", "hazardous", "unavailable")]
+        shown = re.search(rf"<dt>epochs by error and {bound}</dt><dd>(.*?)</dd>", page)
+        assert shown is not None
+        assert [int(text.replace("\u202f", "")) for text in re.findall(r"[\d\u202f]+(?= )", shown[1])] == counts
+
+
 def test_places_where_the_map_is_in_doubt(replayed: dict[str, RunTables], tmp_path: Path) -> None:
     for run_id in ("a", "b"):
         tables = replayed["jump_two"]
