@@ -79,6 +79,7 @@ def test_every_table_of_rare_events_is_written_for_a_configured_bank(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rare_tables, "_RATES_MPS", (1.0,))
+    monkeypatch.setattr(rare_tables, "_HOUR_S", 60)
     monkeypatch.setattr(rare_tables, "_TRANSIENT_RATES_MPS", (1.0,))
     monkeypatch.setattr(rare_range_tables, "_ASKED", ((0.1, 30.0), (0.1, 30.0), (0.1, 30.0)))
     config = Configuration(monitors=MonitorConfig(ewma_alphas=(0.3, 0.1, 0.03), false_alarm_probability=1e-5))
