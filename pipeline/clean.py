@@ -36,7 +36,7 @@ class CleanCounts:
 def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
-    Raises `InputError` where a solution or the odometer has no two different times: nothing can be replayed.
+    Raises `InputError` where no solution or not the odometer has two different times: nothing can be replayed.
     """
     streams: dict[str, pl.DataFrame | None] = {}
     counts: dict[str, StreamCounts] = {}
@@ -49,9 +49,13 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
         solution: _in_order(frame, ["t"])[1]
         for (solution,), frame in run.gnss.group_by("solution", maintain_order=True)
     }
-    _require_two_times(streams["gnss"], run.run_id, "gnss", ["solution"])
-    if streams.get("odometer") is not None:
-        _require_two_times(streams["odometer"], run.run_id, "odometer", [])
+    gnss = streams["gnss"]
+    parts = [] if gnss is None else gnss.partition_by("solution", maintain_order=True)
+    if parts and all(part.height < 2 for part in parts):
+        require_two_times(parts[0], f"{run.run_id}: gnss", f" of solution {parts[0]['solution'][0]!r}")
+    odometer = streams.get("odometer")
+    if odometer is not None:
+        require_two_times(odometer, f"{run.run_id}: odometer")
     return run.with_streams(**streams), CleanCounts(solutions, counts)
 
 
@@ -72,17 +76,13 @@ def _out_of_order(frame: pl.DataFrame, by: list[str]) -> int:
     return int(frame.select(late.sum()).item())
 
 
-def _require_two_times(frame: pl.DataFrame | None, run_id: str, stream: str, by: list[str]) -> None:
-    if frame is None:
-        return
-    groups = frame.group_by(by, maintain_order=True) if by else [((), frame)]
-    for key, part in groups:
-        if part.height < 2:
-            name = f" of solution {key[0]!r}" if key else ""
-            raise InputError(
-                f"only one time in the stream{name}",
-                place=f"{run_id}: {stream}, column t",
-                found=f"{part.height} distinct time",
-                expected="at least two epochs at different times",
-                remedy="Check the recorder's time stamps, or the mapping's time source.",
-            )
+def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
+    """Refuse a cleaned stream with fewer than two times."""
+    if stream.height < 2:
+        raise InputError(
+            f"only one time in the stream{of}",
+            place=f"{place}, column t",
+            found=f"{stream.height} distinct time",
+            expected="at least two epochs at different times",
+            remedy="Check the recorder's time stamps, or the mapping's time source.",
+        )

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.align import align, threshold_factor
 from pipeline.channels import on_path_of
-from pipeline.clean import CleanCounts, clean
+from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes
 from pipeline.hazards import HazardResult, classify, establish_truth
 from pipeline.lds.bank_protocol import LdsLimits
@@ -18,11 +18,12 @@ from pipeline.matching import Match, TravelledPath, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
-from pipeline.summary import Alignment, Provenance, SolutionResults, summarise
+from pipeline.summary import Alignment, Provenance, SolutionResults, failed_row, summarise
 from pipeline.telegrams import place_reads, places_near
 from schemas.config import Configuration, LdsConfig, Vehicle, digest_of
 from schemas.conform import conform, shaped
 from schemas.enums import Evidence
+from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
 from schemas.version import SOFTWARE
@@ -52,21 +53,42 @@ class _Context:
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
     """Replay one recorded run: match, align, monitor, detect balises, classify hazards, summarise.
 
-    `run` as `pipeline.ingest.read_run` yields it, `site` as `read_site` does. Raises `InputError` where the log
-    cannot be replayed at all.
+    `run` as `pipeline.ingest.read_run` yields it, `site` as `read_site` does. A solution that cannot be replayed has
+    a failed row and leaves the others alone; raises `InputError` where none can be.
     """
     config = config or Configuration()
     cleaned, counts = clean(run)
     factor = threshold_factor(config.monitors.false_alarm_probability)
     context = _Context(cleaned, site, vehicle or Vehicle(), config, counts, factor)
-    matches = {name: _match(context, name) for name in cleaned.solutions()}
-    return _tables(run.run_id, [_replay_solution(context, name, matches) for name in matches])
+    matches, errors = _matches(context)
+    parts = [
+        _failed(context, name, errors[name]) if name in errors else _replay_solution(context, name, matches)
+        for name in cleaned.solutions()
+    ]
+    return _tables(run.run_id, parts)
+
+
+def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:
+    """Every solution on the track, and why those that are not could not be."""
+    matches: dict[str, Match] = {}
+    errors: dict[str, InputError] = {}
+    for name in context.run.solutions():
+        try:
+            matches[name] = _match(context, name)
+        except InputError as error:
+            # A receiver that never had a fix must not take the run's other solutions with it.
+            errors[name] = error
+    if not matches:
+        raise next(iter(errors.values()))
+    return matches, errors
 
 
 def _match(context: _Context, solution: str) -> Match:
     run = context.run
+    fixes = run.gnss.filter(pl.col("solution") == solution)
+    require_two_times(fixes, "gnss", f" of solution {solution!r}")
     return match(
-        run.gnss.filter(pl.col("solution") == solution),
+        fixes,
         run.odometer,
         context.site,
         context.vehicle,
@@ -74,6 +96,14 @@ def _match(context: _Context, solution: str) -> Match:
         context.config.fix_sigma,
         run.balise_reads,
     )
+
+
+def _failed(context: _Context, solution: str, error: InputError) -> _Solution:
+    """A solution without content but for the row that says why."""
+    made = provenance(context.run, context.site, context.vehicle, context.config)
+    nothing = {name: table.create_empty() for name, table in TABLES.items()}
+    result = HazardResult(nothing["hazards"], nothing["alarms"], nothing["passages"], nothing["epochs"].select([]))
+    return _Solution(nothing["epochs"], result, failed_row(str(error), made, solution))
 
 
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Solution:

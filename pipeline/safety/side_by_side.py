@@ -21,7 +21,7 @@ from pipeline.safety.composite_alarms import Side, verdicts_of
 from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s, uptime
 from schemas.config import Configuration
-from schemas.enums import Evidence, MonitorState, Verdict
+from schemas.enums import Evidence, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
 
 COMPARISON = "channel"
@@ -77,7 +77,7 @@ def side_by_side(
     are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
     fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right.
     """
-    names = sorted(runs["solution"].to_list())
+    names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
     channels = {name: _reactive(one, config) for name, one in solutions.items()}
     found: dict[Key, Tally] = {}

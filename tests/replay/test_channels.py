@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 
+from pipeline.assessment import assess
 from pipeline.channels import on_path_of
 from pipeline.replay import replay
+from pipeline.report import write_report
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
+from pipeline.store import write_run
 from schemas.config import Configuration
+from schemas.errors import InputError
 from tests.replay.journeys import VEHICLE, journey
 
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
@@ -76,6 +81,32 @@ def test_receivers_that_promise_too_much_raise_false_alarms_in_both_architecture
             assert row["false_alarms"] == row["alarms"] > 0
             assert row["false_alarm_rate_per_h"] == pytest.approx(row["alarms"] / row["judged_h"])
             assert (row["hazards"], row["wrong_in_use_s"]) == (0, 0.0)
+
+
+def without_fix(run):
+    """The log of a receiver that never had a position."""
+    nothing = pl.lit(None, pl.Float64)
+    return run.with_streams(gnss=run.gnss.with_columns(latitude_deg=nothing, longitude_deg=nothing))
+
+
+@pytest.mark.parametrize(
+    ("broken", "reason"),
+    [(without_fix, "no epoch has a position"), (lambda run: run.with_streams(gnss=run.gnss[7:8]), "only one time")],
+)
+def test_a_solution_that_cannot_be_replayed_leaves_the_others_alone(broken, reason, tmp_path):
+    run, site = journey(OFFSET)
+    together = replay(two(run, broken(run)), site, VEHICLE, with_reference("galileo"))
+    alone = replay(run, site, VEHICLE, with_reference("galileo"))
+    assert dict(together.runs.select("solution", "status").iter_rows()) == {"galileo": "failed", "primary": "ok"}
+    assert reason in together.runs.filter(solution="galileo")["error"].item()
+    for name in ("hazards", "passages", "alarms", "epochs"):
+        assert_frame_equal(getattr(together, name), getattr(alone, name), check_exact=True)
+    assert set(rows(together)) == {("primary", REACTIVE)}
+    write_run(together, tmp_path, {})
+    assert write_report(tmp_path)
+    assert assess(tmp_path).tables["figures"]["solution"].to_list() == ["primary"]
+    with pytest.raises(InputError, match=reason):
+        replay(broken(run), site, VEHICLE)
 
 
 def test_slow_drift_of_one_the_comparison_finds_before_it_fails():
