@@ -177,6 +177,7 @@ class _EpochsAfterMonitors(dy.Schema):
     odometer_scale = real("1", "scale in use at this epoch (true over odometer distance)")
     latency_s = real("s", "GNSS latency in use at this epoch")
     hpl_m = real("m", "horizontal protection level of the receiver", min=0)
+    suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
 
 
 def _monitor_columns(monitor: str) -> dict[str, dy.Column]:

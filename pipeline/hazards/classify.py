@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.hazards.alarms import alarms_table
-from pipeline.hazards.arrays import Bools, Floats, linking_gap_s
+from pipeline.hazards.arrays import Bools, Floats, flags, linking_gap_s, times_ns
 from pipeline.hazards.crossings import beacons_by_leg
 from pipeline.hazards.episodes import Draft, find_episodes
 from pipeline.hazards.excursions import faulty_spans
@@ -22,6 +22,7 @@ from pipeline.hazards.passages import (
     positions_at,
     speeds_at,
     suspicious_passages,
+    within_spans,
     wrongly_offered,
 )
 from pipeline.hazards.passing import true_passings
@@ -39,7 +40,7 @@ __all__ = ["HazardResult", "Locate", "classify"]
 @dataclass(frozen=True)
 class HazardResult:
     """`hazards`, `alarms` and `passages` by the contract; `epochs_columns`: `error_along_m,
-    error_cross_m, error_up_m, lds_state`, one row per epoch.
+    error_cross_m, error_up_m, lds_state, suspect_after_the_fact`, one row per epoch.
     """
 
     hazards: pl.DataFrame
@@ -77,7 +78,7 @@ def classify(
     alarms = alarms_table(fails, judged, solution, witnesses, epochs, config.hazards)
     spans = faulty_spans(series, judged, jumps, fails, faults, config.hazards)
     seen = _passages(series, judged, spans, epochs, truth, passages, balises, config)
-    return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, config))
+    return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, spans, config))
 
 
 def _judge(
@@ -136,8 +137,10 @@ def _epochs(
     truth: pl.DataFrame,
     passages: pl.DataFrame,
     errors: dict[str, Floats],
+    spans: list[tuple[int, int]],
     config: Configuration,
 ) -> pl.DataFrame:
     columns = [pl.Series(f"error_{axis}_m", values, nan_to_null=True) for axis, values in errors.items()]
     state = lds_states(epochs, truth, passages, errors["along"], config.hazards, config.lds)
-    return pl.DataFrame([*columns, state])
+    suspicious = pl.Series("suspect_after_the_fact", flags(epochs, "tvb") & within_spans(times_ns(epochs), spans))
+    return pl.DataFrame([*columns, state, suspicious])

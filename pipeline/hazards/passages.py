@@ -143,10 +143,15 @@ def suspicious_passages(passages: pl.DataFrame, spans: list[tuple[int, int]]) ->
     accepted = (passages["status"] == PassageStatus.ACCEPTED.value).to_numpy()
     accepted &= (passages["kind"] == BaliseKind.VIRTUAL.value).to_numpy()
     offered = passages["t_offered"].dt.timestamp("ns").fill_null(-1).to_numpy()
-    inside = np.zeros(passages.height, dtype=np.bool_)
+    return accepted & within_spans(offered, spans)
+
+
+def within_spans(t_ns: Ints, spans: list[tuple[int, int]]) -> Bools:
+    """Instants in `onset <= t < detection` of any fault."""
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
     for onset_ns, until_ns in spans:
-        inside |= (offered >= onset_ns) & (offered < until_ns)
-    return accepted & inside
+        inside |= (t_ns >= onset_ns) & (t_ns < until_ns)
+    return inside
 
 
 def positions_at(epochs: pl.DataFrame, t_true: list[int | None], gap_s: float) -> Bools:

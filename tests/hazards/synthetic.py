@@ -114,6 +114,7 @@ class Journey:
             "alarm": self.within([span for spans in self.fails.values() for span in spans]),
             "negated": self.within(self.negated),
             "diagnosis_faulty": np.zeros(size, dtype=bool),
+            "tvb": ~out & ~self.within(self.negated),
         }
         for name in MONITORS:
             fails = self.within(self.fails.get(name, ()))

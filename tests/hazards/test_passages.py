@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.hazards.synthetic import Journey, judge, seconds
@@ -130,3 +131,14 @@ def test_a_telegram_is_not_suspect_for_a_fault_of_the_position():
     journey = Journey(steps=((31.0, 60.0, 45.0),))
     offers = [{"balise_id": "V3", "t_offered": 35.0}, {"balise_id": "V3", "t_offered": 35.0, "kind": "physical"}]
     assert [row["suspect_after_the_fact"] for row in passages(journey, offers)] == [True, False]
+
+
+def test_tvbs_between_onset_and_detection_are_suspect_too():
+    """1 m/s from 30 s on, beyond 3 sigma from 33 s, found at 52 s: TVBs of the time between, none before or after."""
+    journey = Journey(ramps=((30.0, 60.0, 1.0),), fails={"along_raw": ((52.0, 53.0),)}, negated=((52.0, 90.0),))
+    result = judge(journey)
+    (row,) = result.hazards.to_dicts()
+    marked = np.flatnonzero(result.epochs_columns["suspect_after_the_fact"].to_numpy()) / 10.0
+    assert (marked[0], marked[-1]) == (pytest.approx(seconds(row["t_onset"]), abs=0.06), pytest.approx(51.9))
+    assert marked.size == round((51.9 - marked[0]) * 10.0) + 1
+    assert not judge(Journey()).epochs_columns["suspect_after_the_fact"].any()
