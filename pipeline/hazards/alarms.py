@@ -51,7 +51,8 @@ def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: Ha
     if hazard_id is not None:
         suspect = judged[hazard_id].suspect
     else:
-        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, verdict)
+        healthy_m = config.false_alarm_margin_m
+        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, verdict, healthy_m)
     return {
         "t_start": span.start_ns,
         "t_end": span.end_ns,

@@ -78,12 +78,17 @@ def witnesses_of(
     )
 
 
-def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, ...], verdict: Verdict) -> Suspect:
-    """Who caused the alarm over epochs `first..last`, in the order in which the evidence speaks."""
+def suspect_of_alarm(
+    w: Witnesses, first: int, last: int, monitors: tuple[str, ...], verdict: Verdict, healthy_m: float
+) -> Suspect:
+    """Who caused the alarm over epochs `first..last`, in the order in which the evidence speaks.
+
+    `healthy_m`: an error that a healthy position may have whatever its sigma.
+    """
     if verdict is Verdict.TRUE:
         # The position was wrong at some other time; whoever left the truth when the alarm came made it.
         came = min(int(np.searchsorted(w.t_ns, w.t_ns[first] + round(_COMING_S * NS_PER_S))), last)
-        if by_reference_within_noise(w, first, came) and odometer_left_truth(w, first, came):
+        if by_reference_healthy(w, first, came, healthy_m) and odometer_left_truth(w, first, came):
             return Suspect.ODOMETER
         return suspect_of_error(w, first, last, monitors)
     vote = doppler_vote(w, first, last)
@@ -137,11 +142,11 @@ def suspect_of_error(w: Witnesses, first: int, last: int, monitors: tuple[str, .
     return Suspect.GNSS if any(name.startswith(_ACROSS) for name in monitors) else Suspect.UNKNOWN
 
 
-def by_reference_within_noise(w: Witnesses, first: int, last: int) -> bool:
-    """The reference has the position within 3 sigma along the track all through the epochs `first..last`."""
+def by_reference_healthy(w: Witnesses, first: int, last: int, healthy_m: float) -> bool:
+    """The reference has the position below max(`healthy_m`, 3 sigma) along the track over epochs `first..last`."""
     part = slice(first, last + 1)
     known = np.isfinite(w.error_m[part]) & w.by_reference[part]
-    within: Bools = np.abs(w.error_m[part][known]) < w.noise_m[part][known]
+    within: Bools = np.abs(w.error_m[part][known]) < np.fmax(healthy_m, w.noise_m[part][known])
     return bool(known.any() and within.all())
 
 

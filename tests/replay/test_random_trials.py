@@ -8,7 +8,8 @@ import pytest
 from datasets.random_trials import KINDS, deviations, random_trial
 from pipeline.replay import replay
 
-SEEDS = range(27)
+# Seeds that failed once stay. 620: an odometer's scale fault while the position wanders by 3.2 sigma.
+SEEDS = (*range(27), 620)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
