@@ -88,7 +88,8 @@ def suspect_of_alarm(
     if verdict is Verdict.TRUE:
         # The position was wrong at some other time; whoever left the truth when the alarm came made it.
         came = min(int(np.searchsorted(w.t_ns, w.t_ns[first] + round(_COMING_S * NS_PER_S))), last)
-        if by_reference_healthy(w, first, came, healthy_m) and odometer_left_truth(w, first, came):
+        healthy = by_reference_healthy(w, first, came, healthy_m) or doppler_vote(w, first, came) is Suspect.ODOMETER
+        if healthy and odometer_left_truth(w, first, came):
             return Suspect.ODOMETER
         return suspect_of_error(w, first, last, monitors)
     vote = doppler_vote(w, first, last)
