@@ -85,15 +85,17 @@ def suspect_of_alarm(
 
     `healthy_m`: an error that a healthy position may have whatever its sigma.
     """
+    across = all(name.startswith(_ACROSS) for name in monitors)
     if verdict is Verdict.TRUE:
         # The position was wrong at some other time; whoever left the truth when the alarm came made it.
         came = min(int(np.searchsorted(w.t_ns, w.t_ns[first] + round(_COMING_S * NS_PER_S))), last)
         healthy = by_reference_healthy(w, first, came, healthy_m) or doppler_vote(w, first, came) is Suspect.ODOMETER
-        if healthy and odometer_left_truth(w, first, came):
+        if not across and healthy and odometer_left_truth(w, first, came):
             return Suspect.ODOMETER
         return suspect_of_error(w, first, last, monitors)
-    vote = doppler_vote(w, first, last)
-    if odometer_left_truth(w, first, last) or vote is Suspect.ODOMETER:
+    # What fails across the track or in height has not looked at the odometer.
+    vote = None if across else doppler_vote(w, first, last)
+    if not across and (odometer_left_truth(w, first, last) or vote is Suspect.ODOMETER):
         return Suspect.ODOMETER
     if vote is Suspect.GNSS and verdict is Verdict.UNKNOWN:
         return Suspect.GNSS
@@ -104,7 +106,6 @@ def suspect_of_alarm(
     for axis, error, noise in (cross, up):
         if any(name.startswith(axis) for name in monitors) and _beyond(error, noise, first, last):
             return Suspect.GNSS
-    across = all(name.startswith(_ACROSS) for name in monitors)
     return Suspect.MAP if across and reference_left_map(w, first, last, monitors) else Suspect.UNKNOWN
 
 

@@ -138,3 +138,11 @@ def test_error_across_says_nothing_of_an_alarm_along():
     arguments = (truth_of(epochs_wrong_across), epochs_wrong_across.passages(), epochs_wrong_across.balises(), None)
     result = classify("primary", frame, *arguments, locate, Configuration())
     assert result.alarms["suspect"].to_list() == ["unknown"]
+
+
+def test_an_alarm_across_the_track_is_not_the_odometers_fault():
+    """The odometer slips by 6 m while a height monitor fails by chance: that monitor never saw the odometer."""
+    slipping = Journey(slip=(50.0, 51.0, 6.0))
+    (across,) = alarms(slipping.but(fails={"up_raw": ((50.5, 51.0),)}))
+    (along,) = alarms(slipping.but(fails={"along_raw": ((50.5, 51.0),), "up_raw": ((50.5, 51.0),)}))
+    assert (across["suspect"], along["suspect"]) == ("unknown", "odometer")

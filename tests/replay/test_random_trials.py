@@ -8,8 +8,9 @@ import pytest
 from datasets.random_trials import KINDS, deviations, random_trial
 from pipeline.replay import replay
 
-# Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma.
-SEEDS = (*range(27), 620, 771)
+# Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma;
+# 1192: a monitor of height fails by chance before a slow ramp.
+SEEDS = (*range(27), 620, 771, 1192)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
