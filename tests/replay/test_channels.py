@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
@@ -67,6 +68,36 @@ def test_fault_common_to_both_solutions_only_the_diagnosis_finds():
         assert (found[name, REACTIVE]["detected"], found[name, REACTIVE]["missed"]) == (1, 0)
         composite = found[name, COMPOSITE]
         assert (composite["detected"], composite["missed"], composite["common_missed"]) == (0, 1, 1)
+
+
+def random_fault(seed):
+    """A fault of the position of 25 to 120 m, by step or ramp, somewhere on the way."""
+    generator = np.random.default_rng(seed)
+    size_m = float(generator.choice([-1.0, 1.0]) * generator.uniform(25.0, 120.0))
+    fault = {"start_s": float(generator.uniform(60.0, 200.0)), "duration_s": float(generator.uniform(20.0, 60.0))}
+    if generator.random() < 0.5:
+        return {"kind": "step", "size_m": size_m, **fault}
+    return {"kind": "ramp", "rate_mps": size_m / fault["duration_s"], **fault}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_comparison_never_stands_on_a_fault_of_one_and_never_sees_one_of_both(seed):
+    """7.5 m apart it fails, long before 20 m; what both share by the same size never parts them."""
+    fault = random_fault(seed)
+    faulty, site = journey(fault)
+    sound, _ = journey(seed=9)
+    one = rows(replay(two(faulty, sound), site, VEHICLE))
+    for name in ("primary", "galileo"):
+        assert one[name, COMPOSITE]["wrong_in_use_s"] == 0.0
+        assert one[name, COMPOSITE]["missed"] == 0
+        assert one[name, COMPOSITE]["false_alarms"] == 0
+    also, _ = journey(fault, seed=9)
+    both = rows(replay(two(faulty, also), site, VEHICLE))
+    for name in ("primary", "galileo"):
+        row = both[name, COMPOSITE]
+        assert (row["alarms"], row["detected"]) == (0, 0)
+        assert row["wrong_in_use_s"] > both[name, REACTIVE]["wrong_in_use_s"]
+        assert row["missed"] == row["common_missed"] == row["failures"]
 
 
 def test_receivers_that_promise_too_much_raise_false_alarms_in_both_architectures():
