@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.report.decimate import band, detail_rows, kept_rows
@@ -16,6 +16,8 @@ def test_short_series_stay_whole() -> None:
     assert kept_rows(np.arange(10.0), np.zeros(10, dtype=bool), bins=3).tolist() == list(range(10))
 
 
+# A busy machine draws slowly; that says nothing of the code.
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(
     st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=41, max_size=300),
     st.integers(2, 10),
@@ -71,6 +73,7 @@ def test_pieces_of_a_band() -> None:
     assert pieces.end_ms == 6100
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(st.lists(st.integers(1, 3), min_size=50, max_size=400), st.integers(1, 20))
 def test_the_worst_state_of_a_crowded_band_is_seen(codes: list[int], limit: int) -> None:
     """Wherever an epoch has a state, what is drawn there is at least as bad."""
