@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -12,6 +13,8 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+from distributed import Client
 
 ROOT = Path(__file__).parents[1]
 _START_S = 60.0
@@ -25,6 +28,7 @@ class Cluster:
         self._folder, self._workers = folder, workers
         self.scheduler = self._start_scheduler()
         self.nanny = self.start_workers()
+        self.wait_for_workers()
 
     @property
     def address(self) -> str:
@@ -33,6 +37,13 @@ class Cluster:
     def start_workers(self) -> subprocess.Popen[bytes]:
         arguments = ("--nworkers", str(self._workers), "--nthreads", "1", "--no-dashboard")
         return _dask("worker", "--scheduler-file", str(self._file), "--local-directory", str(self._folder), *arguments)
+
+    def wait_for_workers(self) -> None:
+        """Until all workers have joined: a nanny gives up where one dies before."""
+        if self.nanny.poll() is not None:
+            self.nanny = self.start_workers()
+        with Client(self.address, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+            client.wait_for_workers(self._workers, timeout=_START_S)
 
     def kill_worker(self, chance: random.Random) -> bool:
         """One worker without warning; the nanny lives. Whether there was one."""
@@ -63,11 +74,12 @@ class Cluster:
 
 def workers_of(pid: int) -> list[int]:
     """Worker processes of a process; its tracker of semaphores is a child too, but none that does the work."""
-    try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except (FileNotFoundError, ProcessLookupError):
-        return []
-    return [int(child) for child in children if _is_worker(child)]
+    found: list[str] = []
+    for thread in Path(f"/proc/{pid}/task").glob("*"):
+        # Each thread has the children that it started itself.
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            found += (thread / "children").read_text().split()
+    return sorted(int(child) for child in found if _is_worker(child))
 
 
 def _is_worker(pid: str) -> bool:

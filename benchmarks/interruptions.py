@@ -1,7 +1,8 @@
 """Campaigns killed at random moments, each taken up again: all files equal to those of an undisturbed one.
 
 Killed without warning are, in turn, the campaign itself, one of its workers, a worker of a Dask cluster, and the
-cluster's scheduler, each at a moment drawn from the time that an undisturbed campaign of that kind takes.
+cluster's scheduler: each a random time after a random number of runs was complete, so that slow machines and busy ones
+see kills at the beginning, in the middle and while the campaign's own tables are written.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from benchmarks.cluster import ROOT, Cluster, kill_one, workers_of
+from benchmarks.cluster import ROOT, Cluster, kill_one, wait_for, workers_of
 from benchmarks.results import Figure, stopwatch
 from benchmarks.trials import write_campaign
 from pipeline import store
@@ -28,6 +29,8 @@ TRIALS = 50
 STOP_S = 2.0
 _SEED = 5
 _CAMPAIGN_S = 300.0
+_BETWEEN_RUNS_S = 0.3
+_START_UP_S = 2.0
 
 
 class Victim(StrEnum):
@@ -48,7 +51,7 @@ class Kill:
     """One trial: when, whether somebody was hit before the campaign ended, and what it left."""
 
     victim: Victim
-    moment_s: float
+    after_runs: int
     hit: bool
     complete: int
     half_done: tuple[str, ...]
@@ -74,13 +77,15 @@ class Job:
             stderr=subprocess.DEVNULL,
         )
 
-    def finish(self, out: Path, scheduler: str | None = None) -> float:
-        """Run to the end; seconds that took. Raises where it did not end well."""
-        with stopwatch() as watch:
-            status = self.start(out, scheduler).wait(timeout=_CAMPAIGN_S)
+    def finish(self, out: Path) -> None:
+        """Run to the end. Raises where it did not end well."""
+        status = self.start(out).wait(timeout=_CAMPAIGN_S)
         if status:
             raise RuntimeError(f"the campaign into {out} ended with status {status}")
-        return watch.seconds
+
+    @property
+    def runs(self) -> int:
+        return len(list(self.logs.iterdir()))
 
 
 def measure(folder: Path) -> list[Figure]:
@@ -106,31 +111,25 @@ def disturb(job: Job, victims: Sequence[Victim], trials: int, seed: int) -> list
     chance = random.Random(seed)
     whole = job.folder / "undisturbed"
     shutil.rmtree(whole, ignore_errors=True)
-    local_s = job.finish(whole)
+    job.finish(whole)
     wanted = contents(whole)
     kills = []
     with _clusters(job, any(victim.on_cluster for victim in victims)) as clusters:
-        cluster_s = _timed_on(job, next(clusters)) if clusters is not None else 0.0
         for trial in range(trials):
             victim = victims[trial % len(victims)]
-            moment_s = chance.uniform(0.1, 1.0) * (cluster_s if victim.on_cluster else local_s)
-            cluster = next(clusters) if clusters is not None and victim.on_cluster else None
-            kills.append(_one(job, victim, moment_s, cluster, chance, wanted))
+            cluster = next(clusters) if victim.on_cluster else None
+            kills.append(_one(job, victim, cluster, chance, wanted))
     return kills
 
 
-def _one(
-    job: Job,
-    victim: Victim,
-    moment_s: float,
-    cluster: Cluster | None,
-    chance: random.Random,
-    wanted: dict[str, bytes],
-) -> Kill:
+def _one(job: Job, victim: Victim, cluster: Cluster | None, chance: random.Random, wanted: dict[str, bytes]) -> Kill:
     out = job.folder / "killed"
     shutil.rmtree(out, ignore_errors=True)
+    after_runs = chance.randint(0, job.runs)
     campaign = job.start(out, cluster.address if cluster else None)
-    time.sleep(moment_s)
+    wait_for(lambda: campaign.poll() is not None or len(store.run_ids(out)) >= after_runs, _CAMPAIGN_S)
+    # Without a run to wait for, any moment from the start of the process on.
+    time.sleep(chance.uniform(0.0, _BETWEEN_RUNS_S if after_runs else _START_UP_S))
     hit = _kill(victim, campaign, cluster, chance)
     campaign.wait(timeout=_CAMPAIGN_S)
     complete = store.run_ids(out)
@@ -140,14 +139,17 @@ def _one(
     found = contents(out)
     different = [f"exit status {status}"] if status else []
     different += [name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name)]
-    return Kill(victim, moment_s, hit, len(complete), tuple(half_done), tuple(different))
+    return Kill(victim, after_runs, hit, len(complete), tuple(half_done), tuple(different))
 
 
 def _kill(victim: Victim, campaign: subprocess.Popen[bytes], cluster: Cluster | None, chance: random.Random) -> bool:
     if campaign.poll() is not None:
         return False
+    if victim is Victim.PARENT:
+        return kill_one([campaign.pid], chance)
     if cluster is None:
-        return kill_one([campaign.pid] if victim is Victim.PARENT else workers_of(campaign.pid), chance)
+        wait_for(lambda: campaign.poll() is not None or bool(workers_of(campaign.pid)))
+        return kill_one(workers_of(campaign.pid), chance)
     if victim is Victim.DASK_WORKER:
         return cluster.kill_worker(chance)
     cluster.kill_scheduler()
@@ -155,33 +157,23 @@ def _kill(victim: Victim, campaign: subprocess.Popen[bytes], cluster: Cluster | 
 
 
 @contextmanager
-def _clusters(job: Job, needed: bool) -> Iterator[Iterator[Cluster] | None]:
+def _clusters(job: Job, needed: bool) -> Iterator[Iterator[Cluster]]:
     """A cluster for each trial that wants one: the last one as long as its scheduler lives."""
-    if not needed:
-        yield None
-        return
-    current = [Cluster(job.folder / "cluster", workers=2)]
+    current = [Cluster(job.folder / "cluster", workers=2)] if needed else []
 
     def each() -> Iterator[Cluster]:
         while True:
             if current[0].scheduler.poll() is not None:
                 current[0].stop()
                 current[0] = Cluster(job.folder / "cluster", workers=2)
+            current[0].wait_for_workers()
             yield current[0]
 
     try:
         yield each()
     finally:
-        current[0].stop()
-
-
-def _timed_on(job: Job, cluster: Cluster) -> float:
-    """How long an undisturbed campaign takes on the cluster [s]; the first one also starts its workers."""
-    out = job.folder / "on-cluster"
-    shutil.rmtree(out, ignore_errors=True)
-    job.finish(out, cluster.address)
-    shutil.rmtree(out)
-    return job.finish(out, cluster.address)
+        for cluster in current:
+            cluster.stop()
 
 
 def interrupt_s(job: Job, chance: random.Random) -> float:
@@ -197,9 +189,9 @@ def interrupt_s(job: Job, chance: random.Random) -> float:
 
 
 def contents(out: Path) -> dict[str, bytes]:
-    """Every file of a result but its log, which holds times."""
+    """Every file of a result but its log, which holds times, and its catalogue, which names inodes."""
     files = (path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "replay.log")
-    return {str(path.relative_to(out)): path.read_bytes() for path in files}
+    return {str(path.relative_to(out)): path.read_bytes() for path in files if path.parent.name != ".catalogue"}
 
 
 def _run_of(name: str) -> str:

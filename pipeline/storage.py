@@ -65,12 +65,19 @@ def stage(address: Address, content: bytes) -> tuple[Address, Address]:
     return temporary, final
 
 
+class SweptError(OutputError):
+    """Staged files are gone: another campaign took them for those of one that had ended."""
+
+
 def commit(staged: list[tuple[Address, Address]]) -> None:
-    """Give staged files their names, in order."""
+    """Give staged files their names, in order. Raises `SweptError` where somebody removed one."""
     for temporary, final in staged:
         if temporary != final:
             with as_output_error(final):
-                Path(temporary).replace(final)
+                try:
+                    Path(temporary).replace(final)
+                except FileNotFoundError:
+                    raise SweptError("was removed while it was written", place=str(final)) from None
 
 
 def discard(staged: list[tuple[Address, Address]]) -> None:
@@ -132,25 +139,36 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
     """
     if not is_url(folder):
         return _local_versions(str(folder), name)
-
-    def listed(store: Any, path: str) -> dict[str, Any]:
-        try:
-            return dict(store.find(path, detail=True))
-        except FileNotFoundError:
-            return {}
-
-    found = {
-        place.split("/")[-2]: version_of(info)
-        for place, info in _remote(folder, listed).items()
-        if place.endswith(f"/{name}")
+    infos = {
+        place.split("/")[-2]: info for place, info in _remote(folder, _infos).items() if place.endswith(f"/{name}")
     }
+    found = {part: version_of(info) for part, info in infos.items()}
     return None if None in found.values() else {part: str(version) for part, version in found.items()}
 
 
+def version(address: Address) -> str | None:
+    """What changes with the content of an object, or of the objects in a folder; none where that is not known."""
+    infos = _remote(address, _infos, kind=InputError)
+    found = {place: version_of(info) for place, info in infos.items()}
+    if not found or None in found.values():
+        return None
+    return "\n".join(f"{name_of(place)} {text}" for place, text in sorted(found.items()))
+
+
+def _infos(store: Any, path: str) -> dict[str, Any]:
+    """What a store tells of an object, or of each object in a folder, by its path."""
+    try:
+        return dict(store.find(path, detail=True))
+    except FileNotFoundError:
+        return {}
+
+
 def version_of(info: Mapping[str, Any]) -> str | None:
-    """An object's entity tag and size; weak tags stand for other content too, and are none."""
+    """An object's entity tag, size and time; weak tags stand for other content too, and are none."""
     tag = info.get("ETag") or info.get("etag")
-    return None if not tag or str(tag).startswith("W/") else f"{tag} {info.get('size')}"
+    if not tag or str(tag).startswith("W/"):
+        return None
+    return f"{tag} {info.get('size')} {info.get('LastModified')}"
 
 
 def _local_versions(folder: str, name: str) -> dict[str, str]:

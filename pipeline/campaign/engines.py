@@ -34,6 +34,7 @@ _SINGLE_THREADED = {
 _RUNS_PER_PROCESS = 200
 _CONNECT_S = 10.0
 _COUNT_EVERY_S = 2.0
+_PATIENCE_S = 300.0
 
 
 class Engine(Protocol):
@@ -244,13 +245,25 @@ class DaskEngine:
         self._limit_s = limit_s
         self._threads = 0
         self._counted = -_COUNT_EVERY_S
+        self._seen_s = time.monotonic()
         self._scheduler = scheduler
 
     def capacity(self) -> int:
-        """Twice the cluster's threads, so that no worker waits for the next run."""
+        """Twice the cluster's threads, so that no worker waits for the next run.
+
+        Raises `UsageError` where no worker has been there for minutes: nobody would notice in the night.
+        """
         if time.monotonic() - self._counted > _COUNT_EVERY_S:
             self._threads = sum(self._ask().values())
             self._counted = time.monotonic()
+            if self._threads:
+                self._seen_s = self._counted
+            elif self._counted - self._seen_s > _PATIENCE_S:
+                raise UsageError(
+                    f"has had no worker for {_PATIENCE_S:g} s",
+                    place=self._scheduler,
+                    remedy="Start workers and repeat the command: complete runs are skipped.",
+                )
         return max(1, 2 * self._threads)
 
     def submit(self, job: RunJob) -> Result:

@@ -1,4 +1,8 @@
-"""One campaign at a time per output."""
+"""One campaign at a time per output.
+
+`OUT/.lock` names the campaign that holds it, so that workers of one that has ended (a lost scheduler, a killed
+client) find out before they write. On this machine a lock on the folder itself decides; in a store, the file.
+"""
 
 from __future__ import annotations
 
@@ -15,45 +19,57 @@ from pipeline import storage
 from pipeline.ingest.files import Address, is_url, join
 from schemas.errors import OutputError
 
+_NAME = ".lock"
 _BEAT_S = 2.0
 _SILENCE_S = 8.0
 
 
 @contextlib.contextmanager
-def locked(out: Address) -> Iterator[None]:
-    """Hold the output for this campaign. Raises `OutputError` while another one holds it."""
-    with _locked_remote(str(out)) if is_url(out) else _locked_local(Path(out)):
-        yield
+def locked(out: Address) -> Iterator[str]:
+    """Hold the output for this campaign, under the name that is given. Raises `OutputError` while another holds it."""
+    own = secrets.token_hex(8)
+    with _locked_remote(str(out), own) if is_url(out) else _locked_local(Path(out), own):
+        yield own
+
+
+def check_held(out: Address, own: str) -> None:
+    """Raises `OutputError` unless the campaign of this name still holds the output."""
+    if not _content(join(out, _NAME)).startswith(own):
+        raise OutputError(
+            "is no longer held by this campaign",
+            place=storage.redacted(str(out)),
+            remedy="Repeat the command: complete runs are skipped.",
+        )
 
 
 @contextlib.contextmanager
-def _locked_local(out: Path) -> Iterator[None]:
-    """A lock on the folder itself: it goes with the process, however that ends, and leaves no file."""
+def _locked_local(out: Path, own: str) -> Iterator[None]:
+    """A lock on the folder itself: it goes with the process, however that ends."""
     with storage.as_output_error(out):
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / f".probe-{secrets.token_hex(4)}.tmp"
-        probe.touch()
-        probe.unlink()
         folder = os.open(out, os.O_RDONLY)
     try:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise _busy(out) from None
-        yield
+        storage.write_bytes(out / _NAME, own.encode())
+        try:
+            yield
+        finally:
+            (out / _NAME).unlink(missing_ok=True)
     finally:
         os.close(folder)
 
 
 @contextlib.contextmanager
-def _locked_remote(out: str) -> Iterator[None]:
+def _locked_remote(out: str, own: str) -> Iterator[None]:
     """A lock object that its holder rewrites every few seconds.
 
     One that stays as it is for several beats belongs to a campaign that was killed. No clocks are
     compared, only what is seen to change.
     """
-    place = str(join(out, ".lock"))
-    own = secrets.token_hex(8)
+    place = str(join(out, _NAME))
     _wait_for_silence(place, out)
     storage.write_bytes(place, f"{own} 0".encode())
     time.sleep(_BEAT_S / 4)
@@ -67,7 +83,8 @@ def _locked_remote(out: str) -> Iterator[None]:
     finally:
         ended.set()
         beat.join()
-        storage.remove(place)
+        if _content(place).startswith(own):
+            storage.remove(place)
 
 
 def _wait_for_silence(place: str, out: str) -> None:
@@ -81,15 +98,23 @@ def _wait_for_silence(place: str, out: str) -> None:
         seen = now
 
 
-def _content(place: str) -> str:
-    return storage.read_many([place]).get(place, b"").decode()
+def _content(place: Address) -> str:
+    if is_url(place):
+        return storage.read_many([str(place)]).get(str(place), b"").decode()
+    try:
+        return Path(place).read_text()
+    except FileNotFoundError:
+        return ""
 
 
 def _beat(place: str, own: str, ended: threading.Event) -> None:
+    """Rewrite the lock until the end, or until a campaign that took this one for dead has taken it over."""
     count = 0
     while not ended.wait(_BEAT_S):
         count += 1
         with contextlib.suppress(OutputError):
+            if not _content(place).startswith(own):
+                return
             storage.write_bytes(place, f"{own} {count}".encode())
 
 

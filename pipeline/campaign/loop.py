@@ -18,7 +18,7 @@ from pipeline import store
 from pipeline.campaign.engines import Engine, Result, engine_for
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.lock import locked
-from pipeline.campaign.plan import Plan, RunJob, with_previous
+from pipeline.campaign.plan import Plan, RunJob, held_by, with_previous
 from pipeline.campaign.worker import RunOutcome, fail_run, overdue
 from pipeline.ingest.files import is_url
 from schemas.enums import RunStatus
@@ -110,9 +110,9 @@ def run_campaign(
     any `scheduler` and any order of runs.
     """
     _check_shared(plan, scheduler)
-    with locked(plan.out):
+    with locked(plan.out) as campaign:
         store.sweep(plan.out)
-        plan = plan if force else with_previous(plan)
+        plan = held_by(plan if force else with_previous(plan), campaign)
         store.write_config(plan.out, plan.config)
         state = _State(deque((job, 1) for job in plan.jobs))
         engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
@@ -121,8 +121,17 @@ def run_campaign(
         finally:
             engine.close()
             _tidy(plan, state, scheduler)
-        write_campaign(plan.out, plan.config)
+        _finish(plan, state, summary)
         return summary
+
+
+def _finish(plan: Plan, state: _State, summary: Summary) -> None:
+    """The tables over all runs; they too are given up when somebody asks to stop."""
+    with _listening(state, at_once=True):
+        try:
+            write_campaign(plan.out, plan.config)
+        except Interrupted as interrupted:
+            raise Interrupted(interrupted.signum, summary) from None
 
 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:
@@ -145,7 +154,7 @@ def _watched(plan: Plan, state: _State, engine: Engine, limit_s: float, watches:
     for watch in watches:
         watch.begin(plan)
     stopped: Interrupted | None = None
-    with _listening(state, engine.in_process):
+    with _listening(state, at_once=engine.in_process):
         try:
             _loop(state, engine, limit_s, watches)
         except Interrupted as interrupted:
@@ -224,15 +233,15 @@ def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
 
 
 @contextmanager
-def _listening(state: _State, in_process: bool) -> Iterator[None]:
-    """Answer SIGINT and SIGTERM: at the loop's next look, or at once where the run is in this process."""
+def _listening(state: _State, at_once: bool) -> Iterator[None]:
+    """Answer SIGINT and SIGTERM: at the loop's next look, or at once where the work is in this process."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def answer(signum: int, frame: FrameType | None) -> None:
         state.stop = signum
-        if in_process:
+        if at_once:
             raise Interrupted(signum)
 
     signals = (signal.SIGINT, signal.SIGTERM)

@@ -26,7 +26,8 @@ _DECIDING_LIBRARIES = ("dataframely", "numpy", "polars", "pyarrow", "pyproj", "s
 class RunJob:
     """One run as a worker gets it; everything in it survives the way to another machine.
 
-    `previous` is the metadata of the complete run that an earlier campaign left, if any.
+    `previous` is the metadata of the complete run that an earlier campaign left, if any; `campaign` the name
+    under which its campaign holds the output (`lock.check_held`).
     """
 
     run_id: str
@@ -38,6 +39,7 @@ class RunJob:
     out: str
     software_digest: str
     previous: Mapping[str, str] | None = None
+    campaign: str = ""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,11 @@ def with_previous(plan: Plan) -> Plan:
     """The plan with what earlier campaigns completed in the same output."""
     complete = store.completed_runs(plan.out)
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in plan.jobs))
+
+
+def held_by(plan: Plan, campaign: str) -> Plan:
+    """The plan of the campaign that holds the output under this name."""
+    return replace(plan, jobs=tuple(replace(job, campaign=campaign) for job in plan.jobs))
 
 
 def digests(job: RunJob, files_digest: str) -> dict[str, str]:

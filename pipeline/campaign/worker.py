@@ -8,7 +8,7 @@ import resource
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,8 +17,10 @@ import dataframely as dy
 import polars as pl
 
 from pipeline import storage, store
+from pipeline.campaign import fetched, lock
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
+from pipeline.ingest.files import Address, is_url
 from pipeline.ingest.site import read_site
 from schemas.config import digest_of
 from schemas.enums import RunStatus
@@ -64,21 +66,25 @@ def replay_one(job: RunJob) -> RunOutcome:
     try:
         _same_software(job)
         site = _site(job.site, job.site_digest)
-        with storage.local_copy(job.address) as path, _told_of(job, path):
+        version = _version(job)
+        if (known := fetched.known_digest(job, version)) and _is_done(job, known):
+            return _earlier(job)
+        with _fetched(job, version) as path:
             before, files_digest = _identity(path)
+            fetched.remember(job, version, files_digest)
             if _is_done(job, files_digest):
                 return _earlier(job)
             run = read_run(path, job.config.ingest)
             tables = _replayed(job, run, site)
             if storage.signature(path) != before:
-                raise _ChangedError(f"{path}: changed while it was read. Replay it again when it is complete.")
+                raise _changed(path)
     except (OutputError, SiteError, UsageError):
         raise
     except Exception as error:
         failure = _failure(error, lasting=bool(files_digest))
         return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
     metadata = _metadata(job, files_digest, _worst(tables.runs)) | {"log_digest": run.input_digest}
-    store.write_run(tables, job.out, metadata)
+    _write(job, tables, metadata)
     return _outcome(job, tables.runs, sum(entry[1] for entry in before), time.monotonic() - begun)
 
 
@@ -103,7 +109,7 @@ def fail_run(
     metadata = _metadata(job, files_digest, RunStatus.FAILED)
     if failure is None or not failure.lasting:
         metadata["redo"] = "yes"
-    store.write_run(_failed_tables(job, error), job.out, metadata)
+    _write(job, _failed_tables(job, error), metadata)
     trace = failure.trace if failure else None
     shown = failure.shown if failure else error
     return RunOutcome(job.run_id, RunStatus.FAILED, shown, defect=trace is not None, trace=trace, seconds=seconds)
@@ -116,6 +122,39 @@ def overdue(limit_s: float) -> str:
 
 class _ChangedError(InputError):
     """The log was written to while it was read: trying again may succeed."""
+
+
+def _changed(address: Address) -> _ChangedError:
+    return _ChangedError(f"{address}: changed while it was read. Replay it again when it is complete.")
+
+
+def _version(job: RunJob) -> str | None:
+    """What a store says of the log, before it is fetched."""
+    return storage.version(job.address) if is_url(job.address) else None
+
+
+@contextlib.contextmanager
+def _fetched(job: RunJob, version: str | None) -> Iterator[Path]:
+    """The log on this machine; errors name it by its own address."""
+    with storage.local_copy(job.address) as path, _told_of(job, path):
+        if _version(job) != version:
+            raise _changed(storage.redacted(job.address))
+        yield path
+
+
+def _write(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
+    """Write the run, if its campaign is the one that holds the output still."""
+    try:
+        _write_held(job, tables, metadata)
+    except storage.SweptError:
+        # The marker may be gone already: without a second go a complete run could be left without.
+        _write_held(job, tables, metadata)
+
+
+def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
+    if job.campaign:
+        lock.check_held(job.out, job.campaign)
+    store.write_run(tables, job.out, metadata)
 
 
 @lru_cache(maxsize=2)

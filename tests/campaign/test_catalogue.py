@@ -121,5 +121,5 @@ def test_no_copy_where_a_store_names_no_versions() -> None:
     fsspec.filesystem("memory").pipe_file("/versions/runs/run_id=a/runs.parquet", b"x")
     assert storage.versions("memory://versions/runs", "runs.parquet") is None
     assert storage.versions("memory://versions/none", "runs.parquet") == {}
-    assert storage.version_of({"ETag": '"abc"', "size": 3}) == '"abc" 3'
+    assert storage.version_of({"ETag": "abc", "size": 3, "LastModified": "noon"}) == "abc 3 noon"
     assert storage.version_of({"etag": 'W/"abc"', "size": 3}) is None

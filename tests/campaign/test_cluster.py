@@ -100,3 +100,14 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
     monkeypatch.setattr("pipeline.campaign.engines._CONNECT_S", 1.0)
     with pytest.raises(UsageError, match="Dask scheduler does not answer"):
         run_campaign(plan_of(small_trial, tmp_path), scheduler="tcp://127.0.0.1:9")
+
+
+def test_cluster_that_lost_its_workers(
+    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.campaign.engines._PATIENCE_S", 0.5)
+    monkeypatch.setattr("pipeline.campaign.engines._COUNT_EVERY_S", 0.2)
+    cluster.worker.kill()
+    cluster.worker.wait()
+    with pytest.raises(UsageError, match="has had no worker"):
+        run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import signal
 import subprocess
 import time
@@ -13,8 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import store
-from tests.campaign.compare import campaign_bytes, command, result_bytes, run, start, wait_for
+from benchmarks import interruptions
+from benchmarks.interruptions import STOP_S, Job, Victim, disturb
+from pipeline import storage, store
+from pipeline.campaign import Interrupted, loop, run_campaign
+from pipeline.campaign.lock import locked
+from pipeline.campaign.plan import held_by
+from pipeline.campaign.worker import replay_one
+from pipeline.ingest.files import Address
+from schemas.enums import RunStatus
+from schemas.errors import OutputError
+from tests.campaign.compare import campaign_bytes, command, plan_of, result_bytes, run, start, wait_for
 from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
 
@@ -42,8 +50,10 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     out = tmp_path / "out"
     process = start(command(small_trial, out, "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths]))
     wait_for(lambda: len(store.run_ids(out)) >= 2)
+    asked = time.monotonic()
     os.killpg(process.pid, signum) if signum == signal.SIGINT else process.send_signal(signum)
     stdout, stderr = process.communicate(timeout=30)
+    assert time.monotonic() - asked < STOP_S
     assert process.returncode == status, stderr
     assert "of 5 runs" in stdout
     assert "interrupted" in stderr
@@ -58,16 +68,78 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     assert campaign_bytes(out) == campaign_bytes(undisturbed)
 
 
-def test_sudden_death_of_the_parent(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
-    chance = random.Random(7)
-    for trial in range(2):
-        process = start(command(small_trial, tmp_path, "--jobs", "2", "--force"))
-        time.sleep(chance.uniform(0.5, 4.0))
-        process.kill()
-        process.communicate(timeout=30)
-        again = run(command(small_trial, tmp_path, "--jobs", "2"))
-        assert again.returncode == 0, (trial, again.stderr)
-        assert result_bytes(tmp_path) == result_bytes(undisturbed), trial
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_stop_on_request_at_the_very_end(
+    small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signum: int
+) -> None:
+    """While the campaign's own tables are written: the runs are complete, and the summary says so."""
+
+    def slow(*_: object) -> None:
+        os.kill(os.getpid(), signum)
+        time.sleep(30.0)
+
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    with monkeypatch.context() as patched:
+        patched.setattr(loop, "write_campaign", slow)
+        with pytest.raises(Interrupted) as caught:
+            run_campaign(plan)
+    assert caught.value.signum == signum
+    assert caught.value.summary is not None
+    assert caught.value.summary.count(RunStatus.OK) == 1
+    assert not (tmp_path / "campaign").exists()
+    assert run_campaign(plan).skipped == 1
+    assert (tmp_path / "campaign/runs.parquet").exists()
+
+
+def test_kills_at_random_moments(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """One of each kind; `python -m benchmarks interruptions` does fifty."""
+    job = Job(small_trial.runs, small_trial.site, tmp_path)
+    for kill in disturb(job, list(Victim), trials=4, seed=7):
+        assert (kill.half_done, kill.different) == ((), ()), kill
+
+
+def test_trials_see_what_is_wrong(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result that is not what an undisturbed campaign gives does not pass for one."""
+    monkeypatch.setattr(interruptions, "_kill", lambda *_: _spoil(tmp_path / "killed"))
+    (kill,) = disturb(Job(small_trial.runs, small_trial.site, tmp_path), [Victim.PARENT], trials=1, seed=7)
+    assert kill.different == ("stray.parquet",)
+
+
+def _spoil(out: Path) -> bool:
+    out.mkdir(exist_ok=True)
+    (out / "stray.parquet").touch()
+    return True
+
+
+def test_a_campaign_that_has_ended_writes_no_more(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """The worker of a lost cluster may be at it still when the next campaign has begun, or is over."""
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    run_campaign(plan)
+    before = result_bytes(tmp_path)
+    orphan = held_by(plan, "lost").jobs[0]
+    with pytest.raises(OutputError, match="no longer held by this campaign"):
+        replay_one(orphan)
+    with locked(tmp_path), pytest.raises(OutputError, match="no longer held by this campaign"):
+        replay_one(orphan)
+    assert result_bytes(tmp_path) == before
+
+
+def test_swept_files_are_written_again(
+    small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another campaign cleans up between the writing of the files and their naming."""
+    commit, sweeps = storage.commit, iter([True])
+
+    def swept(staged: list[tuple[Address, Address]]) -> None:
+        if next(sweeps, False):
+            store.sweep(tmp_path)
+        commit(staged)
+
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    monkeypatch.setattr(storage, "commit", swept)
+    replay_one(plan.jobs[0])
+    wanted = {name: data for name, data in result_bytes(undisturbed).items() if "run0" in name}
+    assert result_bytes(tmp_path) == wanted
 
 
 def test_orphaned_workers_go(small_trial: SmallTrial, tmp_path: Path) -> None:

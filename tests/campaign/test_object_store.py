@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +20,7 @@ from pipeline.query import run_sql
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
 from schemas.tables import TABLES
-from tests.campaign.compare import result_bytes
+from tests.campaign.compare import by_run, result_bytes
 from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
 
@@ -34,15 +35,25 @@ class Moody:
     def __init__(self) -> None:
         self.inner = DomainDispatcherApplication(create_backend_app)
         self.refuse_each = 0
+        self.forbidden = ""
+        self.answer_after_s = 0.0
         self.asked = 0
         self.refused = 0
+        self.fetched: list[str] = []
         self.guard = threading.Lock()
 
     def __call__(self, environ: dict[str, Any], respond: Callable[..., Any]) -> Iterable[bytes]:
+        path = environ["PATH_INFO"]
         with self.guard:
             self.asked += 1
             refuse = self.refuse_each > 0 and self.asked % self.refuse_each == 0
             self.refused += refuse
+            if environ["REQUEST_METHOD"] == "GET" and not environ["QUERY_STRING"]:
+                self.fetched.append(path)
+        time.sleep(self.answer_after_s)
+        if self.forbidden and self.forbidden in path:
+            respond("403 Forbidden", [("Content-Type", "application/xml")])
+            return [b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>"]
         if refuse:
             time.sleep(0.05)
             respond("503 Slow Down", [("Content-Type", "application/xml")])
@@ -124,6 +135,65 @@ def test_store_that_refuses_now_and_then(
     assert remote_bytes(f"{bucket}/moody") == result_bytes(undisturbed)
 
 
+def test_store_that_answers_slowly(s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(s3, "answer_after_s", 0.1)
+    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/slow")
+    assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
+    assert remote_bytes(f"{bucket}/slow") == result_bytes(undisturbed)
+
+
+def test_log_that_cannot_be_had_now_is_tried_again(
+    s3: Moody, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(s3, "forbidden", "run2/")
+        first = run_campaign(plan, jobs=2)
+    assert (first.count(RunStatus.OK), first.count(RunStatus.FAILED)) == (3, 1)
+    assert "the store refused" in (by_run(first)["run2"].error or "")
+    again = run_campaign(plan, jobs=2)
+    assert (again.count(RunStatus.OK), again.skipped) == (4, 3)
+
+
+def test_logs_are_not_fetched_again(s3: Moody, bucket: str, tmp_path: Path) -> None:
+    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", tmp_path)
+    run_campaign(plan)
+    assert any("/runs/run1/" in place for place in s3.fetched)
+    s3.fetched.clear()
+    assert run_campaign(plan).skipped == 4
+    assert [place for place in s3.fetched if "/runs/" in place] == []
+    shutil.rmtree(tmp_path / ".catalogue")
+    assert run_campaign(plan).skipped == 4
+    assert any("/runs/run1/" in place for place in s3.fetched)
+
+
+def test_changed_log_in_a_store_is_replayed_again(bucket: str, small_trial: SmallTrial, tmp_path: Path) -> None:
+    """Also where the object has the same size: the tag decides."""
+    import s3fs
+
+    remote = s3fs.S3FileSystem(use_listings_cache=False)
+    remote.put(f"{small_trial.paths[0]}/", "trials/changing/run0/", recursive=True)
+    plan = make_plan([f"{bucket}/changing/run0"], small_trial.site, tmp_path)
+    assert [run_campaign(plan).skipped for _ in range(2)] == [0, 1]
+    place = "trials/changing/run0/odometer.parquet"
+    content = bytearray(remote.cat(place))
+    content[content.index(b"ARROW:schema")] ^= 1
+    remote.pipe(place, bytes(content))
+    assert [run_campaign(plan).skipped for _ in range(2)] == [0, 1]
+
+
+def test_log_that_changes_while_it_is_fetched(
+    bucket: str, small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = iter(["first", "second"])
+    with monkeypatch.context() as patched:
+        patched.setattr(storage, "version", lambda _: next(versions))
+        outcome = run_campaign(make_plan([f"{bucket}/runs/run0"], small_trial.site, tmp_path)).outcomes[0]
+    assert "changed while it was read" in (outcome.error or "")
+    again = run_campaign(make_plan([f"{bucket}/runs/run0"], small_trial.site, tmp_path)).outcomes[0]
+    assert (again.status, again.skipped) == (RunStatus.OK, False)
+
+
 def test_store_that_is_not_there(bucket: str, small_trial: SmallTrial) -> None:
     plan = make_plan([str(small_trial.paths[0])], small_trial.site, "s3://no-such-bucket/out")
     with pytest.raises(OutputError, match="no-such-bucket") as caught:
@@ -144,6 +214,18 @@ def test_one_campaign_at_a_time(bucket: str) -> None:
         pass
     with locked(out):
         pass
+
+
+@pytest.mark.usefixtures("_quick_beat")
+def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
+    place = f"{bucket}/taken/.lock"
+    with locked(f"{bucket}/taken") as own:
+        lock.check_held(f"{bucket}/taken", own)
+        storage.write_bytes(place, b"another 0")
+        with pytest.raises(OutputError, match="no longer held"):
+            lock.check_held(f"{bucket}/taken", own)
+        time.sleep(1.0)
+    assert storage.read_many([place]) == {place: b"another 0"}
 
 
 @pytest.mark.usefixtures("_quick_beat")
