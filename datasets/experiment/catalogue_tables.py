@@ -58,8 +58,8 @@ def _ranking(found: pl.DataFrame) -> list[tuple[str, float]]:
 def monitors_table(runs: pl.DataFrame) -> pl.DataFrame:
     """One row per fault and monitor that saw it in some run.
 
-    `first`: share of runs in which no other failed earlier; `alone`: in which no other failed at all; `lead_s`: median
-    of how much earlier than every other it failed, where it did.
+    `first`: share of runs in which no other failed earlier; `ahead`: in which all others failed later or not at all;
+    `alone`: in which none did; `lead_s`: median of how much earlier than the next it failed, where it did.
     """
     rows = []
     for part in runs.partition_by("fault", maintain_order=True):
@@ -91,6 +91,7 @@ def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> di
         "runs": len(runs),
         **_share("seen", len(own), len(runs)),
         "first": first / len(runs),
+        "ahead": (len(leads) + alone) / len(runs),
         "alone": alone / len(runs),
         "lead_s": pl.Series(leads, dtype=pl.Float64).median(),
         "time_to_detect_median_s": pl.Series(own).median(),
@@ -106,6 +107,7 @@ _MONITORS_SCHEMA = {
     "seen_low": pl.Float64,
     "seen_high": pl.Float64,
     "first": pl.Float64,
+    "ahead": pl.Float64,
     "alone": pl.Float64,
     "lead_s": pl.Float64,
     "time_to_detect_median_s": pl.Float64,

@@ -88,18 +88,18 @@ def _unseen(faults: pl.DataFrame) -> list[str]:
 
 
 def _purpose(monitor: str, monitors: pl.DataFrame) -> str:
-    """Faults that it sees before all others, or alone, in most replays; else where it takes part."""
+    """Faults that it sees before all others, or alone, in most replays; else those that it is among the first for."""
     own = monitors.filter(pl.col("monitor") == monitor)
-    leading = own.filter((pl.col("first") >= 0.5) & ((pl.col("lead_s") > 0.0) | (pl.col("alone") >= 0.5)))
-    if leading.height:
-        told = (
-            f"{row['fault']} ({_percent(row['first'])}"
-            + (f", {_seconds(row['lead_s'])} ahead)" if row["lead_s"] else ")")
-            for row in leading.iter_rows(named=True)
-        )
-        return f"- `{monitor}`: before all others for {'; '.join(told)}"
-    together = own.filter(pl.col("seen") >= 0.5)["fault"].to_list()
-    return f"- `{monitor}`: never before all others in most replays; sees too: {'; '.join(together) or 'nothing'}"
+    ahead = own.filter(pl.col("ahead") >= 0.5)
+    if ahead.height:
+        return f"- `{monitor}`: before all others for {'; '.join(_leads(row) for row in ahead.iter_rows(named=True))}"
+    among = own.filter(pl.col("first") >= 0.5)["fault"].to_list()
+    return f"- `{monitor}`: among the first for {'; '.join(among) or 'nothing'}"
+
+
+def _leads(row: dict[str, object]) -> str:
+    lead = "alone" if row["lead_s"] is None else f"by {_seconds(row['lead_s'])}"
+    return f"{row['fault']} ({_percent(row['ahead'])}, {lead})"
 
 
 def _healthy(row: dict[str, object]) -> str:

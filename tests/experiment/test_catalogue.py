@@ -142,6 +142,7 @@ def test_the_tables_by_hand() -> None:
     assert list(monitors) == ["along_raw", "up_raw", "channel"]
     assert (monitors["along_raw"]["lead_s"], monitors["along_raw"]["first"]) == (5.0, pytest.approx(1 / 3))
     assert (monitors["channel"]["seen"], monitors["channel"]["first"]) == (pytest.approx(2 / 3), pytest.approx(1 / 3))
+    assert [monitors[name]["ahead"] for name in monitors] == [pytest.approx(1 / 3), 0.0, 0.0]
     page = catalogue_page(faults_table(runs_by_hand()), monitors_table(runs_by_hand()))
     assert "| a 1 m | 10 s | along_raw 50%, channel 50% | 8 s | 240 m | 66.7% | 2 of 3 (9.4% to 99.2%) | 2 |" in page
 
@@ -196,6 +197,9 @@ def test_what_no_monitor_sees_is_said(found: pl.DataFrame) -> None:
     assert (row["detected"], row["pmd_at_failure"]) == (0.0, 1.0)
     assert row["runs_with_unsafe"] == 2
     page = catalogue_page(faults, monitors_table(found))
+    assert "- `link_order`: among the first for step along 1200 m" in page
+    assert "- `link_distance`: before all others for outage of 90 s, then off by 300 m (100.0%, alone)" in page
+    assert "range ramp 0.03 m/s (100.0%, by" in page
     unseen = page.split("## What no monitor sees")[1].split("##")[0]
     assert "outage of 90 s, then off by 30 m: unsafe in 2 of 2" in unseen
     assert "physical balise missing 2: nothing unsafe, linking errors tell" in unseen
