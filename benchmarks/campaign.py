@@ -7,22 +7,37 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.results import Figure, best_of, children_peak_mb, stopwatch
+from benchmarks.results import Figure, best_of, children_peak_mb, own_peak_mb, stopwatch
 from benchmarks.trials import write_campaign
+from datasets.demo import demo_scenario
+from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import Summary, make_plan, run_campaign
+from pipeline.campaign.finish import write_campaign as write_tables
 from pipeline.query import run_sql
+from schemas.config import Configuration
 from schemas.enums import RunStatus
+from schemas.tables import TABLES
 
 SPEED_UP = 1.7
 HELP_S = 0.3
 QUERY_S = 2.0
 MEMORY_MB = 600.0
-FORTY, THOUSAND = 40, 1000
+FORTY, THOUSAND, TEN_THOUSAND = 40, 1000, 10_000
+_HAZARDS = "SELECT hazard, COUNT(*) AS n FROM hazards GROUP BY hazard"
+_JOINED = (
+    "SELECT hazard, COUNT(*) AS n, SUM(duration_s) AS seconds FROM hazards "
+    "JOIN runs USING (run_id, solution) WHERE status = 'ok' GROUP BY hazard"
+)
 
 
 def measure(folder: Path) -> list[Figure]:
     """Figures of a campaign of forty runs, of a thousand runs of ten minutes, and of `balise --help`."""
-    return [*_start_up(), *_speed_up(folder / "forty"), *_thousand(folder / "thousand")]
+    return [
+        *_start_up(),
+        *_speed_up(folder / "forty"),
+        *_thousand(folder / "thousand"),
+        *_questions(folder / "ten-thousand"),
+    ]
 
 
 def _start_up() -> list[Figure]:
@@ -54,21 +69,59 @@ def _thousand(folder: Path) -> list[Figure]:
         summary = run_campaign(plan, jobs=2)
     with stopwatch() as again:
         resumed = run_campaign(plan, jobs=2)
-    query = "SELECT hazard, COUNT(*) FROM hazards GROUP BY hazard"
-    query_s = best_of(3, lambda: run_sql(folder / "out", query))
     read = sum(outcome.log_bytes for outcome in summary.outcomes)
     return [
         Figure("a thousand runs of ten minutes", watch.seconds, "s"),
         Figure("runs per second", THOUSAND / watch.seconds, "1/s"),
         Figure("log bytes per second", read / 1e6 / watch.seconds, "MB/s"),
         Figure("peak memory of a worker", _worker_peak_mb(summary), "MB", MEMORY_MB),
-        Figure("peak memory of any process", children_peak_mb(), "MB"),
+        Figure("peak memory of any other process but this", children_peak_mb(), "MB"),
+        Figure("peak memory of the campaign's own process", own_peak_mb(), "MB"),
         Figure("damaged logs not reported", damaged - summary.count(RunStatus.FAILED), "runs", 0),
         Figure("other runs not ok", THOUSAND - damaged - summary.count(RunStatus.OK), "runs", 0),
         Figure("the same again, all complete", again.seconds, "s"),
         Figure("of these replayed again", THOUSAND - resumed.skipped, "runs", 0),
-        Figure("hazard query over a thousand runs", query_s, "s", QUERY_S),
     ]
+
+
+def _questions(folder: Path) -> list[Figure]:
+    """Questions to ten thousand runs: those of the demonstration, with their hazards, under other names."""
+    few, many = folder / "few", folder / "out"
+    if not few.exists():
+        for spec in demo_scenario().runs:
+            write_run_log(build_run(demo_scenario(), spec), folder / "runs")
+        write_site(build_site(demo_scenario()), folder / "site")
+    run_campaign(make_plan([str(folder / "runs")], folder / "site", few), jobs=2)
+    shutil.rmtree(many, ignore_errors=True)
+    _multiply(few, many, TEN_THOUSAND)
+    bare_s = best_of(2, lambda: run_sql(many, _HAZARDS))
+    with stopwatch() as watch:
+        write_tables(many, Configuration())
+    found = run_sql(many, _HAZARDS)["n"].sum()
+    command = [str(Path(sys.executable).parent / "balise"), "sql", str(many), _JOINED]
+    return [
+        Figure("hazards of ten thousand runs", float(found), "hazards", 1.0, "above"),
+        Figure("hazard query over ten thousand runs", best_of(3, lambda: run_sql(many, _HAZARDS)), "s", QUERY_S),
+        Figure("hazards joined with runs", best_of(3, lambda: run_sql(many, _JOINED)), "s", QUERY_S),
+        Figure(
+            "the same as a command",
+            best_of(3, lambda: subprocess.run(command, check=True, capture_output=True)),
+            "s",
+            QUERY_S,
+        ),
+        Figure("hazard query without the catalogue", bare_s, "s"),
+        Figure("tables over ten thousand runs, nothing catalogued", watch.seconds, "s"),
+    ]
+
+
+def _multiply(few: Path, many: Path, count: int) -> None:
+    """The runs of a result under as many other names, by links."""
+    runs = sorted(path.name for path in (few / "runs").iterdir())
+    for table in TABLES:
+        for number in range(count):
+            target = many / table / f"run_id=r{number:05}"
+            target.mkdir(parents=True)
+            (target / f"{table}.parquet").hardlink_to(few / table / runs[number % len(runs)] / f"{table}.parquet")
 
 
 def _worker_peak_mb(summary: Summary) -> float:

@@ -55,3 +55,8 @@ def best_of(times: int, work: Callable[[], object]) -> float:
 def children_peak_mb() -> float:
     """Largest resident memory of any ended child process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
+
+
+def own_peak_mb() -> float:
+    """Largest resident memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
