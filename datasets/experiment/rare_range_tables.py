@@ -27,6 +27,7 @@ _HOUR_S = 3_600.0
 _SEARCH_RUNS = 500
 _HEADING_DEG = 0.0
 _COUNTED_EVENTS = 40
+_COUNTED_MPS = 0.05
 _ALARM_SHARE = 20
 
 
@@ -90,11 +91,11 @@ def range_agreement(runs: int, most_plain_runs: int, seed: int, jobs: int) -> li
     for target in (1e-3, 1e-4, 1e-5):
         plain_runs = min(int(_COUNTED_EVENTS / target), most_plain_runs)
         (epochs,) = first_below(
-            lambda n: missed_by_ranges(system, n, 0.05, _SEARCH_RUNS, seed, jobs).value, (target,), 1_000
+            lambda n: missed_by_ranges(system, n, _COUNTED_MPS, _SEARCH_RUNS, seed, jobs).value, (target,), 1_000
         )
         if epochs is not None:
-            clever = missed_by_ranges(system, epochs, 0.05, runs, seed, jobs)
-            plain = plain_missed_by_ranges(system, epochs, 0.1, plain_runs, seed, jobs)
+            clever = missed_by_ranges(system, epochs, _COUNTED_MPS, runs, seed, jobs)
+            plain = plain_missed_by_ranges(system, epochs, _COUNTED_MPS, plain_runs, seed, jobs)
             rows.append(agreement_row("missed_detection", "pseudorange", epochs, clever, plain))
         tight = range_system(
             RangePlan(default_geometry("gps"), period_s=10.0, false_alarm_probability=target / 50), _HEADING_DEG

@@ -23,7 +23,7 @@ from datasets.experiment.rare_rows import agreement_row, figures, first_below
 from datasets.experiment.tables import write_tables
 from schemas.config import Configuration
 
-RUNS = 10_000
+RUNS = 20_000
 TARGETS: tuple[float, ...] = (1e-4, 1e-9)
 _RATES_MPS = (0.01, 0.03, 0.1, 1.0)
 _TRANSIENT_RATES_MPS = (0.1, 1.0)
@@ -193,12 +193,12 @@ def write_rare(
 ) -> list[Path]:
     """`missed`, `transients`, `false_alarms`, `pseudorange`, `agreement`; `repetitions` are the sampled runs."""
     runs = repetitions or RUNS
-    agreement = agreement_table(runs, 200 * runs, seed, jobs, config)
+    agreement = agreement_table(runs, 100 * runs, seed, jobs, config)
     tables = {
         "missed": missed_table(runs, seed, jobs, config),
         "transients": transient_table(runs, seed, jobs, config),
         "false_alarms": alarm_table(runs, seed, jobs, config),
         "pseudorange": range_table(runs, seed, jobs, config),
-        "agreement": pl.concat([agreement, pl.DataFrame(range_agreement(runs, 200 * runs, seed, jobs))]),
+        "agreement": pl.concat([agreement, pl.DataFrame(range_agreement(runs, 100 * runs, seed, jobs))]),
     }
     return write_tables(out, tables, {"experiment": "rare", "repetitions": runs, "seed": seed})

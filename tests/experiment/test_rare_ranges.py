@@ -93,4 +93,8 @@ def test_every_table_of_rare_events_is_written_for_a_configured_bank(
     assert set(tables["false_alarms"]["false_alarm_probability"]) == {1e-5}
     assert set(tables["pseudorange"]["event"]) == {"missed_detection", "false_alarm"}
     assert set(tables["agreement"]["sensors"]) == {"odometer", "odometer_and_track", "pseudorange"}
+    # Estimate and count are of the same fault: 95 % intervals meet, but for chance.
+    assert tables["agreement"].filter(pl.col("counted_runs") > 5_000)["agrees"].mean() > 0.85  # type: ignore[operator]
+    ranges = tables["agreement"].filter((pl.col("sensors") == "pseudorange") & (pl.col("event") == "missed_detection"))
+    assert ranges["counted"].max() > 0.0  # type: ignore[operator]
     assert set(tables["transients"]["age_s"]) == {0.0, 10.0, 60.0, 300.0, None}
