@@ -127,7 +127,7 @@ def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
 def test_store_that_refuses_now_and_then(
     s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(s3, "refuse_each", 4)
+    monkeypatch.setattr(s3, "refuse_each", 9)
     plan = make_plan([f"{bucket}/runs/run*"], f"{bucket}/site", f"{bucket}/moody")
     assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
     monkeypatch.setattr(s3, "refuse_each", 0)
