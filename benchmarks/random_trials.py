@@ -9,7 +9,7 @@ import argparse
 import sys
 
 from datasets.random_trials import deviations, random_trial
-from pipeline.replay import replay
+from pipeline.stages import replay
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.ingest.run import read_run
 from pipeline.ingest.site import read_site
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
 

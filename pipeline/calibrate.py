@@ -16,7 +16,7 @@ from pipeline.clean import clean
 from pipeline.matching import match
 from pipeline.odometer import odometer_track, polarity
 from pipeline.odometer_filter import error_model
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

@@ -109,4 +109,5 @@ def _kept(out: Address, table: str, wanted: str) -> pl.LazyFrame | None:
 
 
 def _address(out: Address, table: str) -> Address:
-    return join(join(out, _FOLDER), f"{table}.parquet")
+    # Without the ending, so that whoever looks for Parquet files finds those of the result only.
+    return join(join(out, _FOLDER), table)

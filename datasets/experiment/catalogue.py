@@ -20,7 +20,7 @@ from datasets.experiment.diagnostics import SEED
 from datasets.experiment.tables import write_page, write_tables
 from datasets.experiment.workers import mapped
 from datasets.motion import build_motion
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import MONITORS

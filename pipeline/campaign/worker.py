@@ -210,7 +210,7 @@ def _earlier(job: RunJob) -> RunOutcome:
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
     # Imported here because it takes most of a second, and the parent of a campaign never needs it.
-    from pipeline.replay import replay
+    from pipeline.stages import replay
 
     return replay(run, site, job.vehicle, job.config)
 

@@ -77,7 +77,8 @@ def _frame(file: Any, stream: Stream) -> pl.DataFrame:
     groups = [
         pl.DataFrame(pl.from_arrow(file.read_row_group(index, columns=known))) for index in range(file.num_row_groups)
     ]
-    empty = pl.DataFrame(pl.from_arrow(file.schema_arrow.empty_table()))
+    # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
+    empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], file.schema_arrow)))
     frame = pl.concat([empty.select(known), *groups], rechunk=True)
     others = [pl.lit(None).alias(name) for name in names if name not in known]
     return frame.with_columns(others)

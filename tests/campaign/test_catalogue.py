@@ -51,7 +51,7 @@ def test_same_answers_with_and_without(out: Path, query: str) -> None:
 
 def test_it_is_what_answers(out: Path) -> None:
     """Told apart by a catalogue that holds something else under the right digest."""
-    file = out / ".catalogue/passages.parquet"
+    file = out / ".catalogue/passages"
     digest = store.metadata_of(file)["files"]
     file.write_bytes(store.parquet_bytes(pl.read_parquet(file).head(1), {"files": digest}))
     assert run_sql(out, "SELECT COUNT(*) AS n FROM passages")["n"].to_list() == [1]
@@ -94,7 +94,7 @@ def test_tables_of_another_build_are_no_catalogue(out: Path, monkeypatch: pytest
 
 
 def test_damaged_catalogue_is_none(out: Path) -> None:
-    file = out / ".catalogue/runs.parquet"
+    file = out / ".catalogue/runs"
     file.write_bytes(file.read_bytes()[:100])
     assert is_fresh(out) == [False, True, True, True]
     assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [4]

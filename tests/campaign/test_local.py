@@ -177,7 +177,7 @@ def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, m
 
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
     with monkeypatch.context() as patched:
-        patched.setattr(importlib.import_module("pipeline.replay"), "replay", broken)
+        patched.setattr(importlib.import_module("pipeline.stages"), "replay", broken)
         outcome = by_run(run_campaign(plan))["run0"]
     assert outcome.defect
     assert "ZeroDivisionError" in (outcome.trace or "")

@@ -13,7 +13,7 @@ from datasets.inject import inject
 from datasets.samples import comma2k19_run, infrabel_run, infrabel_site
 from pipeline.geodesy import distances_m, earth_centred_m
 from pipeline.matching import match
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

@@ -9,7 +9,7 @@ import polars as pl
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.config import Vehicle
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, RunTables, Site

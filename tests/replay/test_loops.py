@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.inputs import Balises, Gnss, Odometer, Reference
 from schemas.run import RunLog, Site
 from tests.matching import builders

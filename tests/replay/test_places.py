@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.replay import replay
+from pipeline.stages import replay
 from tests.replay.journeys import VEHICLE, journey
 
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}

@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.run import RunLog, Site
 from tests.replay.journeys import PLACES_M, QUIET, VEHICLE, journey, replayed, seconds
 

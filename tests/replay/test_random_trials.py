@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from datasets.random_trials import KINDS, deviations, random_trial
-from pipeline.replay import replay
+from pipeline.stages import replay
 
 # Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma;
 # 1192: a monitor of height fails by chance before a slow ramp.

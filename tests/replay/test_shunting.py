@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.replay import replay
+from pipeline.stages import replay
 from pipeline.telegrams import place_reads
 from schemas.config import Configuration, Vehicle
 from schemas.inputs import Balises, Gnss, Odometer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.replay import replay
+from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from tests.replay.journeys import QUIET, VEHICLE, journey, seconds
 
