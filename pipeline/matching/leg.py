@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import Floats, Ints, Points, points_of
+from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
 from pipeline.matching.segments import (
     SAMPLE_SPACING_M,
     Feet,
@@ -74,15 +74,15 @@ class Leg:
 def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     """A leg over oriented elements, `path_m` beginning at `start_m`.
 
-    Gaps that the site check let pass count as straight track, so that path and odometer agree.
+    Gaps that the site check let pass count as straight track, so that path and odometer agree; a survey that only
+    goes on beside where it ended has no way in between.
     """
     vertex = np.concatenate([_vertices(track, visit) for visit in visits])
     count = np.array([track.first[visit.element + 1] - track.first[visit.element] for visit in visits])
     visit = np.repeat(np.arange(len(visits)), count)
     places = points_of(track.latitude_deg[vertex], track.longitude_deg[vertex])
-    step = np.linalg.norm(np.diff(places.surface, axis=0), axis=1)
     border = visit[1:] != visit[:-1]
-    gap = np.where(border & (step > GAP_COUNTS_M), step, 0.0)
+    gap = _gaps(places.surface, border)
     measure = track.measure_m[vertex]
     grown = np.where(border, gap, np.abs(np.diff(measure)))
     path = start_m + np.concatenate([[0.0], np.cumsum(grown)])
@@ -155,6 +155,21 @@ def _returns(line: Polyline, path_start_m: Floats) -> bool:
     places, path_m = line.start[probes], path_start_m[probes]
     pairs = cKDTree(places).query_pairs(SAME_PLACE_M + 2 * SAMPLE_SPACING_M, output_type="ndarray")
     return bool((np.abs(path_m[pairs[:, 0]] - path_m[pairs[:, 1]]) > HINT_WINDOW_M).any())
+
+
+def _gaps(surface: Floats, border: Bools) -> Floats:
+    """Way along the track that is missing between consecutive vertices [m]; zero but at borders of elements."""
+    gap = np.zeros(border.size)
+    at = np.flatnonzero(border)
+    along = _unit(surface[at] - surface[at - 1]) + _unit(surface[at + 2] - surface[at + 1])
+    missing = np.einsum("ij,ij->i", surface[at + 1] - surface[at], _unit(along))
+    gap[at] = np.where(missing > GAP_COUNTS_M, missing, 0.0)
+    return gap
+
+
+def _unit(vectors: Floats) -> Floats:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
 
 
 def _vertices(track: Track, visit: Visit) -> Ints:

@@ -257,6 +257,15 @@ def test_gaps_between_linked_ends_count_as_track() -> None:
     assert np.allclose(found.epochs["path_m"], x, atol=0.1)
 
 
+def test_a_survey_that_goes_on_beside_where_it_ended_has_no_way_in_between() -> None:
+    elements = {"a": line((0, 0), (500, 0)), "b": line((500, 1.5), (1000, 1.5)), "c": line((503, 1.5), (900, 200))}
+    place = site(elements, [("a", 1, "b", 0, "both"), ("a", 1, "c", 0, "both")])
+    x = np.arange(100.0, 900.0, 10.0)
+    found = matched(run(x, np.where(x < 500.0, 0.0, 1.5)), place, odometer(x))
+    assert found.path.elements() == ["a", "b"]
+    assert np.allclose(found.epochs["path_m"], x, atol=0.1)
+
+
 def test_standstill_beside_a_switch_adds_nothing() -> None:
     """Twenty minutes of noise at the switch between driving in and driving on."""
     rng = np.random.default_rng(3)
