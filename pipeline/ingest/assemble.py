@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import polars as pl
@@ -68,9 +68,7 @@ def _same_receiver(part: Decoded, other: Decoded) -> bool:
 
 def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> pl.DataFrame:
     source = part.source
-    columns = part.frame.select(
-        pl.col(ORDINAL), *(expression.alias(name) for name, expression in source.columns.items())
-    )
+    columns = _columns(part.frame, {ORDINAL: pl.col(ORDINAL), **source.columns})
     try:
         times = [time.instants(part.frame, name) for name, time in source.times.items()]
     except pl.exceptions.PolarsError as error:
@@ -82,6 +80,13 @@ def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> 
     # The calendar of a receiver that does not know the time yet: there is no epoch to be placed anywhere.
     remarks.append(f"{source.channel.topic}: {frame['t'].null_count()} messages without valid time")
     return frame.drop_nulls("t")
+
+
+def _columns(frame: pl.DataFrame, wanted: Mapping[str, pl.Expr]) -> pl.DataFrame:
+    """The columns asked for; those that are only fields under another name need no query."""
+    if all(expression.meta.is_column() for expression in wanted.values()):
+        return pl.DataFrame([frame[expression.meta.output_name()].alias(name) for name, expression in wanted.items()])
+    return frame.select(expression.alias(name) for name, expression in wanted.items())
 
 
 def _named(frame: pl.DataFrame, source: Source) -> pl.DataFrame:

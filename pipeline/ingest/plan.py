@@ -93,6 +93,8 @@ def is_candidate(channel: Channel, config: IngestConfig) -> bool:
 def _fitting(sample: Sample) -> Recipe | None:
     """The first recipe of the schema whose fields are all there, else the first at all."""
     recipes = recipes_for(sample.channel.schema_name, sample.channel.topic)
+    if len(recipes) == 1:
+        return recipes[0]
     whole = (recipe for recipe in recipes if not source_of(sample, (recipe, None)).breaches)
     return next(whole, recipes[0] if recipes else None)
 

@@ -37,7 +37,7 @@ class TimeSource:
 
     def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
         """Times in UTC; null where a part of the stamp is null."""
-        t = frame.select(self._nanoseconds().alias(name)).to_series()
+        t = self._nanoseconds(frame).alias(name)
         if self.epoch == "gps":
             t = t + GPS_EPOCH_NS
         if self.scale == "gps":
@@ -45,14 +45,13 @@ class TimeSource:
             t = utc.set(t.is_null(), None) if t.null_count() else utc
         return t.cast(pl.Datetime("ns", "UTC"))
 
-    def _nanoseconds(self) -> pl.Expr:
-        first = pl.col(self.fields[0])
+    def _nanoseconds(self, frame: pl.DataFrame) -> pl.Series:
+        first = frame[self.fields[0]]
         if len(self.fields) == 2:
-            return first * 1_000_000_000 + pl.col(self.fields[1])
+            return first * 1_000_000_000 + frame[self.fields[1]]
         dtype = self.types.get(self.fields[0], pl.Int64())
         if dtype == pl.String:
-            parsed = first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True)
-            return parsed.to_physical()
+            return first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True).to_physical()
         if dtype == pl.Int64:
             return first * (1 if self.unit_s is None else round(self.unit_s * 1e9))
         return (first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round().cast(pl.Int64)
