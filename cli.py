@@ -200,7 +200,7 @@ def inject(
 
     settings, _ = _settings(config, None)
     faults = load_faults(fault)
-    log = read_run(run, settings.ingest)
+    log = read_run(run, settings.ingest, with_digest=False)
     write_run_as(inject_all(log, faults, None if site is None else read_site(site)), out)
     print(f"{len(faults)} faults injected into {run}: {out}")
 
@@ -243,7 +243,7 @@ def calibrate(
     from schemas.config import to_toml
 
     settings, train = _settings(config, vehicle)
-    logs = [read_run(address, settings.ingest) for address in find_runs(runs).values()]
+    logs = [read_run(address, settings.ingest, with_digest=False) for address in find_runs(runs).values()]
     found = measure(logs, read_site(site), train, settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     if as_json:

@@ -99,11 +99,12 @@ def measure(folder: Path, hours: float = 1.0, repeats: int = 5, long: bool = Fal
 def _case(run: RunLog, case: Case, folder: Path, repeats: int) -> list[Figure]:
     plain = write_case(run, case, folder, chunk_crc=False)
     checked = write_case(run, case, folder, chunk_crc=True)
-    bound, ours, with_crc = _in_turn(
+    bound, ours, with_crc, with_digest = _in_turn(
         repeats,
         lambda: read_and_decompress(plain),
+        lambda: read_run(plain, IngestConfig(), with_digest=False),
+        lambda: read_run(checked, IngestConfig(), with_digest=False),
         lambda: read_run(plain, IngestConfig()),
-        lambda: read_run(checked, IngestConfig()),
     )
     with stopwatch() as stock:
         stock_columns(plain)
@@ -116,6 +117,7 @@ def _case(run: RunLog, case: Case, folder: Path, repeats: int) -> list[Figure]:
         Figure(f"{case}: read and decompress", median(bound) * 1e3, "ms"),
         Figure(f"{case}: log to frames", median(ours) * 1e3, "ms"),
         Figure(f"{case}: against read and decompress", median(ours) / median(bound), "times", most),
+        Figure(f"{case}: the same, with SHA-256 of the log", median(with_digest) / median(bound), "times"),
         Figure(f"{case}: against mcap and its decoder", stock.seconds / median(ours), "times", least, "above"),
         Figure(f"{case}: chunk checksums", crc_ns, "ns/byte", _CRC_NS_PER_BYTE),
         Figure(f"{case}: noise of the bound, (max - min) / median", (max(bound) - min(bound)) / median(bound), "1"),
@@ -140,7 +142,9 @@ def _long(folder: Path, repeats: int, short: list[Figure]) -> list[Figure]:
         path = write_case(run, case, folder, chunk_crc=False)
         name = f"{case}: against read and decompress"
         before = next(figure.value for figure in short if figure.name == name)
-        bound, ours = _in_turn(repeats, partial(read_and_decompress, path), partial(read_run, path, IngestConfig()))
+        bound, ours = _in_turn(
+            repeats, partial(read_and_decompress, path), partial(read_run, path, IngestConfig(), with_digest=False)
+        )
         ratio = median(ours) / median(bound)
         figures += [
             Figure(f"{case}, ten hours: ratio against that of one hour", ratio / before, "times", _LONG_TOLERANCE),

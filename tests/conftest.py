@@ -7,10 +7,17 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from hypothesis import HealthCheck, settings
 
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from schemas.run import RunLog
+
+# The same examples every time, on a slow machine too.
+settings.register_profile(
+    "suite", derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("suite")
 
 _LENGTH_S = 40
 

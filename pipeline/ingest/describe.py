@@ -79,7 +79,7 @@ def describe_log(path: files.Address, config: IngestConfig) -> LogDescription:
     run: RunLog | None = None
     problems: tuple[str, ...] = ()
     try:
-        run = read_run(path, config)
+        run = read_run(path, config, with_digest=False)
     except BaliseError as error:
         problems = (str(error),)
     summaries = tuple(_summaries(run)) if run else ()

@@ -76,15 +76,21 @@ class _Builder:
         while self._next < len(self._tokens) and self._tokens[self._next].lastgroup == "space":
             self._literal()
 
+    def _token(self) -> re.Match[str]:
+        """The token that comes next; a text that ends before it has no pattern."""
+        if self._next >= len(self._tokens):
+            raise NoPatternError
+        return self._tokens[self._next]
+
     def _literal(self) -> re.Match[str]:
-        token = self._tokens[self._next]
+        token = self._token()
         self._next += 1
         self.parts.append(re.escape(token.group()))
         return token
 
     def _mark(self, *expected: str) -> str:
         self._space()
-        if self._next >= len(self._tokens) or self._tokens[self._next].group() not in expected:
+        if self._token().group() not in expected:
             raise NoPatternError
         mark = self._literal().group()
         self._space()
@@ -97,9 +103,7 @@ class _Builder:
 
     def value(self, path: str) -> None:
         self._space()
-        if self._next >= len(self._tokens):
-            raise NoPatternError
-        token = self._tokens[self._next]
+        token = self._token()
         if token.group() == "{":
             self._object(path)
         elif token.group() == "[":
@@ -125,7 +129,7 @@ class _Builder:
     def _object(self, path: str) -> None:
         self._mark("{")
         names: set[str] = set()
-        while self._tokens[self._next].lastgroup == "text":
+        while self._token().lastgroup == "text":
             name = self._literal().group("text")
             if name in names or "." in name or "[" in name:
                 raise NoPatternError
@@ -141,7 +145,7 @@ class _Builder:
     def _array(self, path: str) -> None:
         self._mark("[")
         index = 0
-        while self._tokens[self._next].group() != "]":
+        while self._token().group() != "]":
             self.value(f"{path}[{index}]")
             index += 1
             if self._mark(",", "]") == "]":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import polars as pl
@@ -58,13 +59,19 @@ def sample_of(messages: Messages, channel: Channel) -> Sample:
         raise undecodable(channel, messages, 0, error) from None
 
 
-def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
+def read_mcap(path: files.Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """All streams of a log, read strictly from front to back in pieces."""
-    streams = McapStreams(config)
+    if not with_digest:
+        return _read(path, config, lambda _: None)
     with BackgroundDigest() as digest:
-        walk = walk_log(path, config, streams, digest.update)
-        frames, slow_messages, left_over = _frames(path, config, walk, streams)
-        input_digest = digest.hexdigest()
+        run = _read(path, config, digest.update)
+        return replace(run, input_digest=digest.hexdigest())
+
+
+def _read(path: files.Address, config: IngestConfig, on_bytes: Callable[[memoryview], object]) -> RunLog:
+    streams = McapStreams(config)
+    walk = walk_log(path, config, streams, on_bytes)
+    frames, slow_messages, left_over = _frames(path, config, walk, streams)
     return RunLog(
         run_id=files.stem_of(path),
         notes=IngestNotes(
@@ -74,7 +81,7 @@ def read_mcap(path: files.Address, config: IngestConfig) -> RunLog:
             chunks_without_crc=walk.without_crc,
             skipped_topics=left_over,
         ),
-        input_digest=input_digest,
+        input_digest="",
         **frames,
     )
 

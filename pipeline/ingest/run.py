@@ -10,17 +10,19 @@ from schemas.errors import InputError
 from schemas.run import RunLog
 
 
-def read_run(path: files.Address, config: IngestConfig) -> RunLog:
+def read_run(path: files.Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """One run from `RUN.mcap` or a folder `RUN/` of Parquet files (CONTRACT section 1).
+
+    `with_digest`: also the SHA-256 of its files, which results are stamped with; else `input_digest` is empty.
 
     Every stream has exactly the contract's columns and types; rows stay in recorded order, duplicates
     included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
     damage and says so in `notes`.
     """
     if files.name_of(path).endswith(".mcap"):
-        return read_mcap(path, config)
+        return read_mcap(path, config, with_digest)
     if files.is_dir(path):
-        return read_folder(path)
+        return read_folder(path, with_digest)
     if not files.exists(path):
         raise InputError("does not exist", place=str(path), expected="RUN.mcap or a folder RUN/")
     raise InputError(

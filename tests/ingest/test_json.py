@@ -84,7 +84,11 @@ def test_equal_messages_share_a_pattern():
 
 
 @pytest.mark.parametrize(
-    "content", [b'{"a": NaN}', b'{"a": -Infinity}', b'{"a": 1, "a": 2}', b'{"a": 01}', b'{"a": 1}{}', b"[1", b"\xff"]
+    "content",
+    [
+        *(b'{"a": NaN}', b'{"a": -Infinity}', b'{"a": 1, "a": 2}', b'{"a": 01}', b'{"a": 1}{}', b"[1", b"\xff"),
+        *(b"{", b'{"a"', b'{"a":', b'{"a": 0', b'{"a": 0,', b'{"a": 0, ', b'{"b": [', b'{"b": [1,', b'{"b": {', b"["),
+    ],
 )
 def test_what_is_no_json_is_refused(content):
     with pytest.raises(UndecodableError):
