@@ -323,7 +323,7 @@ class _Learner:
             self._put(history, position)
             series = self._series(position, end, begin)
             result, bank = run_axis(series, self._alphas, bank)
-            beyond = np.abs(result.value) > self._factor * result.sigma
+            beyond = ~(np.abs(result.value) <= self._factor * result.sigma)  # what cannot be compared is no pass
             failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
             if failing.size:
                 alarm = position + int(failing[0])
@@ -381,7 +381,7 @@ class _Learner:
         series = self._series(begin, self._rows.size, begin)
         state = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
         result, _ = run_axis(series, self._alphas, state)
-        beyond = np.abs(result.value[:, :2]) > self._factor * result.sigma[:, :2]
+        beyond = ~(np.abs(result.value[:, :2]) <= self._factor * result.sigma[:, :2])
         fast = beyond.any(axis=1) | (np.arange(rows.size) <= 1)
         last_fail = np.maximum.accumulate(np.where(fast, t_s, -np.inf))
         quiet = t_s - last_fail >= config.lds.recovery_s

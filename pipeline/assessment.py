@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline import catalogue, storage, store
-from pipeline.campaign_tables import campaign_accuracy, campaign_levels
+from pipeline.campaign_tables import campaign_accuracy, campaign_levels, campaign_runs
 from pipeline.hazards.map_errors import map_places, map_suspects
 from pipeline.ingest.files import Address
 from pipeline.present import tall
@@ -43,7 +43,8 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
     runs, hazards, passages, alarms = (_table(out, name) for name in names)
     figures = measured_figures(runs, hazards, settings.safety)
     detection = detection_by_level(hazards, settings.safety)
-    levels = campaign_levels(runs, hazards, settings.safety, settings.hazards.reaction_s)
+    wide = campaign_runs(runs, hazards, settings.safety)
+    levels = campaign_levels(wide, hazards, settings.safety, settings.hazards.reaction_s)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
         "figures": figures,

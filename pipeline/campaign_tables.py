@@ -49,16 +49,16 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
 
 
 def campaign_levels(
-    runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig, reaction_s: float | None = None
+    wide: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig, reaction_s: float | None = None
 ) -> pl.DataFrame:
     """One row per run, solution and service level: would the run have kept this level's allowed T_D (TVB eq. 7)?
 
-    The columns of `campaign_runs` for each level, one below the other. `reaction_s` as in the configuration: the time
-    that negation takes, none for one epoch; with the period of the epochs it is the least that any fault takes.
+    The columns of `wide`, as `campaign_runs` made it, for each level, one below the other. `reaction_s` as in the
+    configuration: the time that negation takes, none for one epoch; with the period of the epochs it is the least that
+    any fault takes.
     """
     period_s = 1.0 / pl.col("gnss_rate_hz")
     needed_s = period_s + (period_s if reaction_s is None else reaction_s)
-    wide = campaign_runs(runs, hazards, safety)
     parts = [
         wide.select(
             *_RUN,

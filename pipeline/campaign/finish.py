@@ -20,13 +20,14 @@ def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFram
     """Derive the tables of `OUT/campaign/` from all complete runs of the result."""
     found = catalogue.gather(out)
     runs, hazards, passages, alarms = (found[name] for name in ("runs", "hazards", "passages", "alarms"))
+    wide = campaign_runs(runs, hazards, config.safety)
     tables = {
-        "runs": campaign_runs(runs, hazards, config.safety),
+        "runs": wide,
         "balises": campaign_balises(passages, config),
         "accuracy": campaign_accuracy(passages, config),
         "figures": measured_figures(runs, hazards, config.safety),
         "detection": detection_by_level(hazards, config.safety),
-        "levels": campaign_levels(runs, hazards, config.safety, config.hazards.reaction_s),
+        "levels": campaign_levels(wide, hazards, config.safety, config.hazards.reaction_s),
         "map": map_places(alarms),
     }
     metadata = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config)}

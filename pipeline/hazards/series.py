@@ -51,9 +51,6 @@ class Series:
     def size(self) -> int:
         return int(self.t_ns.size)
 
-    def seconds_between(self, a: int, b: int) -> float:
-        return float(self.t_ns[b] - self.t_ns[a]) / NS_PER_S
-
 
 def series_of(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Series:
     """Usable epochs of one solution. `linked[i]`: the movement from epoch i-1 to i may be interpolated,

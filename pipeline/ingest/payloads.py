@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import dataframely as dy
 import numpy as np
@@ -176,6 +176,3 @@ def _cdr(
         rows[name] = values
     content = rows.tobytes()
     return (content[start : start + offset] for start in range(0, len(content), offset))
-
-
-Encode = Callable[[pl.DataFrame], Iterator[bytes]]

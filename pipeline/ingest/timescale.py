@@ -23,7 +23,6 @@ _LEAP_GPS_NS = _LEAP_UTC_NS + np.arange(1, len(_LEAPS) + 1, dtype=np.int64) * 1_
 
 # IS-GPS-200, 3.3.4: GPS time starts at 1980-01-06T00:00:00 UTC.
 GPS_EPOCH_NS = int(datetime(1980, 1, 6, tzinfo=UTC).timestamp()) * 1_000_000_000
-WEEK_NS = 604_800 * 1_000_000_000
 
 
 def utc_from_gps(t_ns: Ints) -> Ints:

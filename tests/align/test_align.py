@@ -134,3 +134,14 @@ def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
     found = odometer_at(at, aligned, odometer, CONFIG).to_list()
     assert found[4] is None
     np.testing.assert_allclose(found[:4], expected, atol=2.5)
+
+
+def test_what_cannot_be_compared_freezes_the_learning() -> None:
+    epochs, odometer = run(REAL, 7)
+    unknown = pl.int_range(pl.len()).is_between(3000, 3100)
+    aligned = align(
+        epochs.with_columns(sigma_along_m=pl.when(~unknown).then("sigma_along_m")), odometer, Vehicle(), CONFIG
+    )
+    scale = aligned["odometer_scale"]
+    assert scale.is_finite().all()
+    assert scale[3001:].n_unique() == 1

@@ -188,11 +188,8 @@ class TestAccuracy:
 class TestLevels:
     def test_every_run_against_every_level(self) -> None:
         catalogue = runs(["a", "b", "c"], evidence=["reference", "reference", None])
-        found = campaign_levels(
-            catalogue,
-            faults(["a", "a"], t_failure=[NS, 2 * NS], t_negated=[2 * NS, 3 * NS], hazardous_s=[1.0, 0.2]),
-            CONFIG.safety,
-        )
+        hazards = faults(["a", "a"], t_failure=[NS, 2 * NS], t_negated=[2 * NS, 3 * NS], hazardous_s=[1.0, 0.2])
+        found = campaign_levels(campaign_runs(catalogue, hazards, CONFIG.safety), hazards, CONFIG.safety)
         told = found.select("run_id", "service_level", "failures", "within", "verdict").rows()
         assert told[:4] == [
             ("a", "npa", 2, 2, "kept"),
@@ -205,16 +202,18 @@ class TestLevels:
         assert found["hazardous_max_s"][:5].to_list() == [1.0] * 4 + [None]
 
     def test_a_failure_never_negated_keeps_no_level(self) -> None:
-        found = campaign_levels(runs(["a"]), faults(["a"], t_failure=[NS]), CONFIG.safety)
+        hazards = faults(["a"], t_failure=[NS])
+        found = campaign_levels(campaign_runs(runs(["a"]), hazards, CONFIG.safety), hazards, CONFIG.safety)
         assert set(found["verdict"]) == {"exceeded"}
         assert found["never_negated"].to_list() == [1] * 4
 
     def test_a_receiver_too_slow_for_a_level_is_named(self) -> None:
         """1 Hz and one epoch for negation take 2 s, 10 Hz 0.2 s; LPV-200 allows 0.5025 s, EGNOS as observed 1.675 s."""
         catalogue = runs(["a", "b", "c"], gnss_rate_hz=[1.0, 10.0, None])
-        found = campaign_levels(catalogue, faults([]), CONFIG.safety)
+        wide = campaign_runs(catalogue, faults([]), CONFIG.safety)
+        found = campaign_levels(wide, faults([]), CONFIG.safety)
         told = found.select("run_id", "service_level", "receiver_quick_enough").rows()
         assert [row[2] for row in told] == [True, False, False, True] + [True] * 4 + [None] * 4
         assert found["receiver_needs_s"][0] == 2.0
-        quick = campaign_levels(catalogue, faults([]), CONFIG.safety, reaction_s=0.1)
+        quick = campaign_levels(wide, faults([]), CONFIG.safety, reaction_s=0.1)
         assert quick["receiver_quick_enough"][:4].to_list() == [True, False, True, True]
