@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
 from typing import Any
 
 import pyarrow as pa
 import zstandard
+from isal.isal_zlib import crc32
 
 from pipeline.ingest.mcap_records import ChunkRecord, DamageError
 
@@ -27,7 +27,7 @@ class Decompressor:
             raise DamageError(chunk.offset, f"a chunk cannot be decompressed ({error})") from None
         if size != chunk.size:
             raise DamageError(chunk.offset, f"a chunk holds {size} bytes or more but declares {chunk.size}")
-        if chunk.crc and zlib.crc32(room) != chunk.crc:
+        if chunk.crc and crc32(room) != chunk.crc:
             raise DamageError(chunk.offset, "the checksum of a chunk does not match its content")
 
     def _fill(self, chunk: ChunkRecord, room: memoryview) -> int:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
 import polars as pl
+from isal.isal_zlib import crc32
 
 from pipeline.ingest import files
 from pipeline.ingest.assemble import Decoded, stream_frames
@@ -120,7 +120,7 @@ def _check_data_crc(path: files.Address, walk: McapWalk) -> None:
     crc, left = 0, end
     with files.open_binary(path) as stream:
         while left and (piece := stream.read(min(left, 4 * _MIB))):
-            crc = zlib.crc32(piece, crc)
+            crc = crc32(piece, crc)
             left -= len(piece)
     if crc != expected:
         raise DamageError(end, "the checksum of the data section does not match")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
 from dataclasses import dataclass, field
+
+from isal.isal_zlib import crc32
 
 from pipeline.ingest import mcap_records as records
 from pipeline.ingest.byte_window import ByteWindow
@@ -37,7 +38,7 @@ class Summary:
 
     def add(self, opcode: int, whole: memoryview, position: int) -> None:
         """A record before the footer."""
-        self._crc = zlib.crc32(whole, self._crc)
+        self._crc = crc32(whole, self._crc)
         if opcode == Op.CHUNK_INDEX:
             self._indexed.append(records.parse_chunk_index(whole[HEAD_SIZE:], position))
         elif opcode == Op.STATISTICS:
@@ -67,7 +68,7 @@ class Summary:
         met = self._start if position != self._start else 0
         if start != met:
             raise DamageError(position, f"the footer places the summary at {start}, it is at {met}")
-        if crc and zlib.crc32(footer[:-4], self._crc) != crc:
+        if crc and crc32(footer[:-4], self._crc) != crc:
             raise DamageError(position, "the checksum of the summary does not match")
         cut_at = _check_end(position + len(footer), window)
         self._check_chunk_index(position)
