@@ -60,7 +60,10 @@ class AxisResult:
 
 
 def with_memory(sigma_m: Array, decorrelation: Array) -> dict[str, Array]:
-    """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j."""
+    """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j, best in Fortran order.
+
+    The recursions go along the rows, one source after the other.
+    """
     before = before_steps(sigma_m, decorrelation)
     return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
 
@@ -71,9 +74,14 @@ def along_errors(sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, ta
     `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
     """
     return with_memory(
-        np.column_stack([np.outer(sigma_m, np.sqrt(shares)), np.abs(jitter_m)]),
-        np.column_stack([-np.expm1(-dt_s[:, None] / taus_s), np.ones(dt_s.size)]),
+        np.vstack([np.outer(np.sqrt(shares), sigma_m), np.abs(jitter_m)]).T,
+        np.vstack([decorrelation_of(dt_s, taus_s), np.ones(dt_s.size)]).T,
     )
+
+
+def decorrelation_of(dt_s: Array, taus_s: Array) -> Array:
+    """1 - phi of first-order Gauss-Markov errors over these steps; shape (sources, steps)."""
+    return -np.expm1(-dt_s / taus_s[:, None])
 
 
 def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisResult, AxisState]:
@@ -82,23 +90,27 @@ def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisR
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
     keep = (1.0 - weight) * moving[:, None]
     gain = weight / series.dt_s[:, None]
-    # One channel after the other in memory, as the recursions go along the rows.
-    sigma_m, before_m, decorrelation = (
-        np.asfortranarray(item) for item in (series.sigma_m, series.sigma_before_m, series.decorrelation)
-    )
-    variance, covariance = variance_of_ewma(keep, gain, sigma_m, before_m, decorrelation, series.white_m2, state)
+    errors = series.sigma_m, series.sigma_before_m, series.decorrelation
+    variance, covariance = variance_of_ewma(keep, gain, *errors, series.white_m2, state)
     # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
     # survey's sigma, judges it; inside the EWMAs it would ring for long.
     smooth_rate = np.where(series.border, 0.0, series.rate_mps)
     ewma = linear_recurrence(keep, weight * smooth_rate[:, None], state.ewma)
-    steady = linear_recurrence(keep, weight * series.steady_mps[:, None], state.steady_response)
-    latency = linear_recurrence(keep, weight * series.latency_mps[:, None], state.latency_response)
+    steady = _response(keep, weight, series.steady_mps, state.steady_response)
+    latency = _response(keep, weight, series.latency_mps, state.latency_response)
     raw_variance = _raw_variance(series)
     sigma = np.sqrt(np.column_stack([raw_variance, variance + steady**2 + latency**2]))
     result = AxisResult(np.column_stack([series.rate_mps, ewma]), sigma)
     if series.epoch.size == 0:
         return result, state
     return result, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
+
+
+def _response(keep: Array, weight: Array, rate_mps: Array, before: Array) -> Array:
+    """What one sigma of an error that stays has made of the EWMAs [m/s]; most axes know none."""
+    if not (rate_mps.any() or before.any()):
+        return np.zeros_like(keep)
+    return linear_recurrence(keep, weight * rate_mps[:, None], before)
 
 
 def _raw_variance(series: AxisSeries) -> Array:

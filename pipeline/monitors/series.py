@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.monitors.axis import AxisSeries, Mask, along_errors, with_memory
+from pipeline.monitors.axis import AxisSeries, Mask, along_errors, decorrelation_of, with_memory
 from pipeline.monitors.recursion import Array
 from pipeline.odometer_filter import error_model
 from schemas.config import Configuration
@@ -118,7 +118,7 @@ class _Builder:
         dt, fresh = self._time_steps(rows)
         border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
         survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
-        shares = np.outer(self._sigma(sigma, rows), np.sqrt(self._shares))
+        shares = np.outer(np.sqrt(self._shares), self._sigma(sigma, rows))
         chord, chord_decorrelation = self._chord_error(rows)
         wander, wander_decorrelation = self._wander(rows)
         zero = np.zeros(rows.size)
@@ -129,8 +129,8 @@ class _Builder:
             dt_s=dt,
             rate_mps=_steps(self._column(position, rows)) / dt,
             **with_memory(
-                np.column_stack([shares, chord, wander]),
-                np.column_stack([-np.expm1(-dt[:, None] / self._taus_s), chord_decorrelation, wander_decorrelation]),
+                np.vstack([shares, chord, wander]).T,
+                np.vstack([decorrelation_of(dt, self._taus_s), chord_decorrelation, wander_decorrelation]).T,
             ),
             white_m2=zero,
             border_m2=2.0 * survey**2,
