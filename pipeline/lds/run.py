@@ -57,7 +57,7 @@ def run_lds(
     reads, unknown = reads_of(balise_reads, physical, journey)
     system = LocationSystem(journey, bank, balises_of(balises, BaliseKind.VIRTUAL), physical, reads, config, limits)
     system.run()
-    passages = system.virtual.passages + system.physical.passages
+    passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
         epochs=epoch_columns(epochs["t"], system, journey, config),
         passages=passage_rows(passages, journey, solution),
