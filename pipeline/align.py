@@ -152,8 +152,13 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     at = arrays.t_s - learned.latency_s
     known = track.known_at(at)
     inside = (at >= track.t_s[0]) & (at <= track.t_s[-1])
-    reason = np.where(inside, INTERRUPTED, BEYOND_SPAN).astype(object)
-    reason[known] = None
+    reason = (
+        pl.when(pl.Series(known))
+        .then(None)
+        .when(pl.Series(inside))
+        .then(pl.lit(INTERRUPTED))
+        .otherwise(pl.lit(BEYOND_SPAN))
+    )
     steps = _steps(np.flatnonzero(known), arrays.t_s, track, learned)
     step = np.full(known.size, np.nan)
     step[known] = steps.distance_m
@@ -161,7 +166,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
-        pl.Series("odometer_reason", reason.tolist(), dtype=pl.String),
+        pl.select(reason.alias("odometer_reason")).to_series(),
         pl.Series("odometer_stretch", track.stretch_at(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, arrays.jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, track.white_rate_m2_per_s)),

@@ -10,8 +10,10 @@ tells what the data really say about scale and latency; the offset walks with th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -48,12 +50,9 @@ class FilterState(NamedTuple):
     origin_m: float
 
     def estimate(self) -> Estimate:
-        return Estimate(
-            scale=1.0 + float(self.mean[_SCALE]),
-            scale_sigma=float(np.sqrt(self.covariance[_SCALE, _SCALE])),
-            latency_s=float(self.mean[_LATENCY]),
-            latency_sigma_s=float(np.sqrt(self.covariance[_LATENCY, _LATENCY])),
-        )
+        _, scale_error, latency_s, *_ = self.mean.tolist()
+        _, scale_variance, latency_variance, *_ = self.covariance.diagonal().tolist()
+        return Estimate(1.0 + scale_error, sqrt(scale_variance), latency_s, sqrt(latency_variance))
 
 
 @dataclass(frozen=True)
@@ -93,12 +92,12 @@ class ScaleLatencyFilter:
         speed = (after - before) / (2.0 * SPEED_SPAN_S)
         way_m = distance - state.origin_m
         row = self._loads * sigma_m
-        row[_OFFSET], row[_SCALE], row[_LATENCY] = 1.0, way_m, -(1.0 + scale_error) * speed
+        row[:_ERRORS] = 1.0, way_m, -(1.0 + scale_error) * speed
         # All but the latency, about whose mean the distance was read, and the scale's own way.
-        expected = float(row @ mean) + way_m - float(row[_LATENCY]) * latency_s
-        spread = covariance @ row
+        expected = row.dot(mean).item() + way_m + (1.0 + scale_error) * speed * latency_s
+        spread = covariance.dot(row)
         white = _WHITE_SHARE * sigma_m**2 + (jitter_s * speed) ** 2
-        gain = spread / (row @ spread + white)
+        gain = spread / (row.dot(spread).item() + white)
         mean += gain * (path_m - expected)
         covariance -= gain[:, None] * spread
         return FilterState(mean, covariance, t_s, state.origin_m)
@@ -108,19 +107,24 @@ class ScaleLatencyFilter:
         """By how much of a sigma each state moves the position; zero for offset, scale and latency."""
         return np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
 
-    @cached_property
-    def _decay_rates_per_s(self) -> Array:
-        return np.concatenate([np.zeros(_ERRORS), 1.0 / self.taus_s])
-
     def _predict(self, state: FilterState, t_s: float) -> tuple[Array, Array]:
-        dt = t_s - state.t_s
-        decay = np.exp(-dt * self._decay_rates_per_s)
-        noise = 1.0 - decay * decay
-        noise[_OFFSET] = self.track.white_rate_m2_per_s * dt
-        covariance = state.covariance * decay[:, None]
-        covariance *= decay
-        covariance.reshape(-1)[:: noise.size + 1] += noise
+        decay, decay_of_pairs, noise = self._transition(round((t_s - state.t_s) * 1e9))
+        covariance = state.covariance * decay_of_pairs
+        covariance += noise
         return state.mean * decay, covariance
+
+    @cached_property
+    def _transition(self) -> Callable[[int], tuple[Array, Array, Array]]:
+        """`_transition_over` with a memory: a receiver's epochs are mostly the same time apart."""
+        return lru_cache(maxsize=32)(self._transition_over)
+
+    def _transition_over(self, dt_ns: int) -> tuple[Array, Array, Array]:
+        """Decay of the states, of their covariances, and the noise that comes in over this time."""
+        dt_s = dt_ns * 1e-9
+        decay = np.concatenate([np.ones(_ERRORS), np.exp(-dt_s / self.taus_s)])
+        noise = 1.0 - decay * decay
+        noise[_OFFSET] = self.track.white_rate_m2_per_s * dt_s
+        return decay, np.outer(decay, decay), np.diag(noise)
 
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
