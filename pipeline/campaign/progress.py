@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from pipeline import storage
 from pipeline.campaign.loop import Summary, Watch
+from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
-from pipeline.campaign.worker import RunOutcome
 from pipeline.ingest.files import is_url, join
 from pipeline.present import duration_text
 from schemas.enums import RunStatus

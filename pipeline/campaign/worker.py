@@ -4,55 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import threading
 import time
-import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-import dataframely as dy
-import polars as pl
-
 from pipeline import storage, store
 from pipeline.campaign import fetched, lock
+from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, worst
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
-from pipeline.ingest.files import Address, is_url
+from pipeline.ingest.files import is_url
 from pipeline.ingest.site import read_site
-from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import CONTRACT_VERSION, TABLES, Runs
 from schemas.version import SOFTWARE
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """What became of one run. `defect` is ours, with its `trace`; everything else is the input's."""
-
-    run_id: str
-    status: RunStatus
-    error: str | None = None
-    skipped: bool = False
-    defect: bool = False
-    trace: str | None = None
-    seconds: float = 0.0
-    log_bytes: int = 0
-    hazards: int = 0
-    missed_detections: int = 0
-    peak_memory_bytes: int = 0
-
-
-@dataclass(frozen=True)
-class _Failure:
-    error: str
-    shown: str
-    lasting: bool
-    trace: str | None = None
 
 
 def replay_one(job: RunJob) -> RunOutcome:
@@ -77,15 +45,15 @@ def replay_one(job: RunJob) -> RunOutcome:
             run = read_run(path, job.config.ingest)
             tables = _replayed(job, run, site)
             if storage.signature(path) != before:
-                raise _changed(path)
+                raise changed(path)
     except (OutputError, SiteError, UsageError):
         raise
     except Exception as error:
-        failure = _failure(error, lasting=bool(files_digest))
+        failure = failure_of(error, lasting=bool(files_digest))
         return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
-    metadata = _metadata(job, files_digest, _worst(tables.runs)) | {"log_digest": run.input_digest}
+    metadata = _metadata(job, files_digest, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
-    return _outcome(job, tables.runs, sum(entry[1] for entry in before), time.monotonic() - begun)
+    return outcome_of(job, tables.runs, sum(entry[1] for entry in before), time.monotonic() - begun)
 
 
 def replay_within(job: RunJob, limit_s: float) -> RunOutcome:
@@ -100,7 +68,7 @@ def replay_within(job: RunJob, limit_s: float) -> RunOutcome:
 
 
 def fail_run(
-    job: RunJob, error: str, files_digest: str = "", failure: _Failure | None = None, seconds: float = 0.0
+    job: RunJob, error: str, files_digest: str = "", failure: Failure | None = None, seconds: float = 0.0
 ) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
@@ -109,23 +77,9 @@ def fail_run(
     metadata = _metadata(job, files_digest, RunStatus.FAILED)
     if failure is None or not failure.lasting:
         metadata["redo"] = "yes"
-    _write(job, _failed_tables(job, error), metadata)
+    _write(job, failed_tables(job, error), metadata)
     trace = failure.trace if failure else None
-    shown = failure.shown if failure else error
-    return RunOutcome(job.run_id, RunStatus.FAILED, shown, defect=trace is not None, trace=trace, seconds=seconds)
-
-
-def overdue(limit_s: float) -> str:
-    """The reason of a run that was given up."""
-    return f"took longer than the time limit of {limit_s:g} s"
-
-
-class _ChangedError(InputError):
-    """The log was written to while it was read: trying again may succeed."""
-
-
-def _changed(address: Address) -> _ChangedError:
-    return _ChangedError(f"{address}: changed while it was read. Replay it again when it is complete.")
+    return RunOutcome(job.run_id, RunStatus.FAILED, error, defect=trace is not None, trace=trace, seconds=seconds)
 
 
 def _version(job: RunJob) -> str | None:
@@ -138,7 +92,7 @@ def _fetched(job: RunJob, version: str | None) -> Iterator[Path]:
     """The log on this machine; errors name it by its own address."""
     with storage.local_copy(job.address) as path, _told_of(job, path):
         if _version(job) != version:
-            raise _changed(storage.redacted(job.address))
+            raise changed(storage.redacted(job.address))
         yield path
 
 
@@ -204,7 +158,7 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 def _earlier(job: RunJob) -> RunOutcome:
     """The outcome of a run that is complete already."""
     runs = store.read_table(job.out, "runs", job.run_id).collect()
-    outcome = _outcome(job, runs, 0, 0.0)
+    outcome = outcome_of(job, runs, 0, 0.0)
     return RunOutcome(**{**outcome.__dict__, "skipped": True})
 
 
@@ -215,62 +169,5 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
     return replay(run, site, job.vehicle, job.config)
 
 
-def _failure(error: Exception, lasting: bool) -> _Failure:
-    """How a failure is told, and whether the same input would fail again."""
-    if isinstance(error, BaliseError):
-        shown = storage.redacted(str(error))
-        return _Failure(
-            shown, shown, lasting and isinstance(error, InputError) and not isinstance(error, _ChangedError)
-        )
-    if isinstance(error, MemoryError):
-        return _Failure("not enough memory", "not enough memory", lasting=False)
-    text = f"defect of the program: {type(error).__name__}: {error}"
-    trace = "".join(traceback.format_exception(error))
-    return _Failure(text, text, lasting=False, trace=trace)
-
-
 def _metadata(job: RunJob, files_digest: str, status: RunStatus) -> dict[str, str]:
     return {**digests(job, files_digest), "status": status.value}
-
-
-def _worst(runs: pl.DataFrame) -> RunStatus:
-    found = set(runs["status"].cast(pl.String).to_list())
-    return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in found), RunStatus.OK)
-
-
-def _outcome(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) -> RunOutcome:
-    errors = runs["error"].drop_nulls().to_list()
-    counts = runs.select(pl.sum("hazards_1a", "hazards_1b", "hazards_shift", "missed_detections")).row(0)
-    return RunOutcome(
-        run_id=job.run_id,
-        status=_worst(runs),
-        error=errors[0] if errors else None,
-        seconds=seconds,
-        log_bytes=log_bytes,
-        hazards=sum(counts[:3]),
-        missed_detections=counts[3],
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-    )
-
-
-def _failed_tables(job: RunJob, error: str) -> RunTables:
-    """Tables without content but for the row that says why; no path, so that they are the same anywhere."""
-    folder = job.address.rstrip("/").rpartition("/")[0]
-    known = {
-        "status": RunStatus.FAILED.value,
-        "error": error.replace(f"{storage.redacted(folder)}/", ""),
-        "config_digest": digest_of(job.config, job.vehicle),
-        "software": SOFTWARE,
-        "contract": CONTRACT_VERSION,
-    }
-    columns = {name: [known.get(name, _blank(column))] for name, column in Runs.columns().items()}
-    row = pl.DataFrame(columns, schema=Runs.create_empty().schema)
-    empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
-    return RunTables(run_id=job.run_id, runs=row, **empty)
-
-
-def _blank(column: dy.Column) -> object:
-    """Null where the contract allows it, else nothing counted and nothing named."""
-    if column.nullable:
-        return None
-    return 0 if isinstance(column, dy.Int64) else ""

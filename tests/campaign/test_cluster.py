@@ -97,7 +97,7 @@ def test_killed_worker_and_scheduler(
 
 
 def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.campaign.engines._CONNECT_S", 1.0)
+    monkeypatch.setattr("pipeline.campaign.cluster._CONNECT_S", 1.0)
     with pytest.raises(UsageError, match="Dask scheduler does not answer"):
         run_campaign(plan_of(small_trial, tmp_path), scheduler="tcp://127.0.0.1:9")
 
@@ -105,8 +105,8 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
 def test_cluster_that_lost_its_workers(
     small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.campaign.engines._PATIENCE_S", 0.5)
-    monkeypatch.setattr("pipeline.campaign.engines._COUNT_EVERY_S", 0.2)
+    monkeypatch.setattr("pipeline.campaign.cluster._PATIENCE_S", 0.5)
+    monkeypatch.setattr("pipeline.campaign.cluster._COUNT_EVERY_S", 0.2)
     cluster.worker.kill()
     cluster.worker.wait()
     with pytest.raises(UsageError, match="has had no worker"):

@@ -1,0 +1,121 @@
+"""What became of a run, and how failures are told."""
+
+from __future__ import annotations
+
+import resource
+import traceback
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import dataframely as dy
+import polars as pl
+
+from pipeline import storage
+from pipeline.campaign.plan import RunJob
+from pipeline.ingest.files import Address
+from schemas.config import digest_of
+from schemas.enums import RunStatus
+from schemas.errors import BaliseError, InputError
+from schemas.run import RunTables
+from schemas.tables import CONTRACT_VERSION, TABLES, Runs
+from schemas.version import SOFTWARE
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What became of one run. `defect` is ours, with its `trace`; everything else is the input's."""
+
+    run_id: str
+    status: RunStatus
+    error: str | None = None
+    skipped: bool = False
+    defect: bool = False
+    trace: str | None = None
+    seconds: float = 0.0
+    log_bytes: int = 0
+    hazards: int = 0
+    missed_detections: int = 0
+    peak_memory_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a run failed; a `lasting` reason comes again with the same input, so that the run is not tried again."""
+
+    error: str
+    lasting: bool
+    trace: str | None = None
+
+
+Result = Future[RunOutcome]
+
+
+class ChangedError(InputError):
+    """The log was written to while it was read: trying again may succeed."""
+
+
+def changed(address: Address) -> ChangedError:
+    """The error of a log that somebody writes to."""
+    return ChangedError(f"{address}: changed while it was read. Replay it again when it is complete.")
+
+
+def overdue(limit_s: float) -> str:
+    """The reason of a run that was given up."""
+    return f"took longer than the time limit of {limit_s:g} s"
+
+
+def failure_of(error: Exception, lasting: bool) -> Failure:
+    """How a failure is told, and whether the same input would fail again."""
+    if isinstance(error, BaliseError):
+        again = isinstance(error, InputError) and not isinstance(error, ChangedError)
+        return Failure(storage.redacted(str(error)), lasting and again)
+    if isinstance(error, MemoryError):
+        return Failure("not enough memory", lasting=False)
+    text = f"defect of the program: {type(error).__name__}: {error}"
+    trace = "".join(traceback.format_exception(error))
+    return Failure(text, lasting=False, trace=trace)
+
+
+def worst(runs: pl.DataFrame) -> RunStatus:
+    """The status of a run with several solutions: the worst of theirs."""
+    found = set(runs["status"].cast(pl.String).to_list())
+    return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in found), RunStatus.OK)
+
+
+def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) -> RunOutcome:
+    """The outcome that the rows of a run's `runs` table tell."""
+    errors = runs["error"].drop_nulls().to_list()
+    counts = runs.select(pl.sum("hazards_1a", "hazards_1b", "hazards_shift", "missed_detections")).row(0)
+    return RunOutcome(
+        run_id=job.run_id,
+        status=worst(runs),
+        error=errors[0] if errors else None,
+        seconds=seconds,
+        log_bytes=log_bytes,
+        hazards=sum(counts[:3]),
+        missed_detections=counts[3],
+        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    )
+
+
+def failed_tables(job: RunJob, error: str) -> RunTables:
+    """Tables without content but for the row that says why; no path, so that they are the same anywhere."""
+    folder = job.address.rstrip("/").rpartition("/")[0]
+    known = {
+        "status": RunStatus.FAILED.value,
+        "error": error.replace(f"{storage.redacted(folder)}/", ""),
+        "config_digest": digest_of(job.config, job.vehicle),
+        "software": SOFTWARE,
+        "contract": CONTRACT_VERSION,
+    }
+    columns = {name: [known.get(name, _blank(column))] for name, column in Runs.columns().items()}
+    row = pl.DataFrame(columns, schema=Runs.create_empty().schema)
+    empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
+    return RunTables(run_id=job.run_id, runs=row, **empty)
+
+
+def _blank(column: dy.Column) -> object:
+    """Null where the contract allows it, else nothing counted and nothing named."""
+    if column.nullable:
+        return None
+    return 0 if isinstance(column, dy.Int64) else ""

@@ -1,0 +1,73 @@
+"""Runs in this very process, one after the other."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from types import FrameType
+
+from pipeline.campaign.outcome import Result, overdue
+from pipeline.campaign.plan import RunJob
+from pipeline.campaign.worker import fail_run, replay_one
+
+
+class SerialEngine:
+    """This very process: for a single run, without the seconds that a worker takes to start."""
+
+    in_process = True
+    retries_itself = True
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+
+    def capacity(self) -> int:
+        return 1
+
+    def submit(self, job: RunJob) -> Result:
+        result: Result = Future()
+        try:
+            with _alarm(self._limit_s):
+                result.set_result(replay_one(job))
+        except _Overdue:
+            result.set_result(fail_run(job, overdue(self._limit_s)))
+        except Exception as error:
+            result.set_exception(error)
+        return result
+
+    def has_begun(self, result: Result) -> bool:
+        return True
+
+    def kill(self, result: Result) -> None:
+        return None
+
+    def is_lost_worker(self, error: BaseException) -> bool:
+        return False
+
+    def close(self) -> None:
+        return None
+
+
+class _Overdue(BaseException):
+    """Not an `Exception`, so that nothing on the way takes it for a failure of its own."""
+
+
+@contextlib.contextmanager
+def _alarm(limit_s: float) -> Iterator[None]:
+    """Raise `_Overdue` after a time; only the main thread can be told."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(signum: int, frame: FrameType | None) -> None:
+        raise _Overdue
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
