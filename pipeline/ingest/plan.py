@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -111,10 +112,8 @@ def mapped_recipe(sample: Sample, stream: Stream, mapping: StreamMapping) -> Rec
     columns = dict(base.columns) | {name: pl.col(path) for name, path in fields.items()}
     types = dict(base.types) | {path: recorded_type(contract[name]) for name, path in fields.items()}
     if "fix" in fields and mapping.fix_codes:
-        types[fields["fix"]] = pl.Int64()
-        codes = {int(code): kind.value for code, kind in mapping.fix_codes.items()}
-        columns["fix"] = columns["fix"].replace_strict(codes, default=None, return_dtype=FIX_TYPE)
-    columns |= {name: _constant(contract[name], value) for name, value in mapping.constants.items()}
+        types[fields["fix"]], columns["fix"] = _coded(sample, fields["fix"], mapping)
+    columns |= {name: _constant(stream, mapping, name, contract[name]) for name in mapping.constants}
     columns |= {name: columns[name] * factor for name, factor in mapping.factors.items() if name in columns}
     return replace(base, columns=columns, types=types)
 
@@ -131,8 +130,31 @@ def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Ma
         )
 
 
-def _constant(column: dy.Column, value: str | float | bool) -> pl.Expr:
-    return pl.lit(value, dtype=FIX_TYPE if isinstance(column, dy.Enum) else column.dtype)
+def _coded(sample: Sample, path: str, mapping: StreamMapping) -> tuple[pl.DataType, pl.Expr]:
+    """Kinds of fix by recorded number or text; a code that is not listed stays as it is, and is refused later."""
+    kinds: dict[object, str] = {code: kind.value for code, kind in mapping.fix_codes.items()}
+    dtype: pl.DataType = pl.String()
+    if sample.fields.get(path) != "text" and all(re.fullmatch(r"-?\d+", code) for code in mapping.fix_codes):
+        kinds, dtype = {int(str(code)): kind for code, kind in kinds.items()}, pl.Int64()
+    known = pl.col(path).replace_strict(kinds, default=None, return_dtype=pl.String)
+    return dtype, pl.coalesce(known, pl.format("code {}", pl.col(path)))
+
+
+def _constant(stream: Stream, mapping: StreamMapping, name: str, column: dy.Column) -> pl.Expr:
+    value = mapping.constants[name]
+    words = column.categories if isinstance(column, dy.Enum) else None
+    if isinstance(column, dy.Float64 | dy.Int64):  # to Python, true is a number as well
+        fits = isinstance(value, float) and (value.is_integer() or isinstance(column, dy.Float64))
+    else:
+        fits = isinstance(value, bool if isinstance(column, dy.Bool) else str)
+    if not fits or (words is not None and value not in words):
+        raise ConfigError(
+            "cannot be the constant of this column",
+            place=f"[ingest.{stream}] topic {mapping.topic}: constants.{name}",
+            found=repr(value),
+            expected=", ".join(words) if words is not None else str(column.dtype),
+        )
+    return pl.lit(value, dtype=FIX_TYPE if words is not None else column.dtype)
 
 
 def source_of(sample: Sample, candidate: Candidate) -> Source:

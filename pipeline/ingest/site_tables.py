@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
-import re
 from dataclasses import dataclass
 from enum import StrEnum
 
 import polars as pl
 
+from pipeline.ingest.csv_text import comments_of, epsg_in, read_table
 from schemas.enums import BaliseKind, Navigability, Reaction
 
 EPSG_WGS84 = 4326
@@ -101,12 +101,7 @@ def _parquet(file: str, data: bytes) -> RawTable:
 
 
 def _csv(file: str, data: bytes) -> RawTable:
-    text = data.decode("utf-8-sig")
-    comments = "\n".join(line for line in text.splitlines()[:50] if line.startswith("#"))
-    named = re.search(r"epsg\s*[:=]\s*(?:EPSG:)?(\w+)", comments, re.IGNORECASE)
-    body = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
-    frame = pl.read_csv(io.StringIO(body), infer_schema=False)
-    return _with_epsg(file, frame, named.group(1) if named else None)
+    return _with_epsg(file, read_table(data, infer=False), epsg_in(comments_of(data)))
 
 
 def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:

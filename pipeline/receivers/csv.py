@@ -4,29 +4,35 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
+from pipeline.ingest.breaches import refuse
+from pipeline.ingest.csv_text import read_table
+from pipeline.ingest.mcap_model import Channel
+from pipeline.ingest.plan import Sample, Source, mapped_recipe, mappings_of, source_of
+from pipeline.ingest.stamps import time_source
 from pipeline.ingest.timescale import utc_from_gps
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
-from schemas.inputs import STREAM_SCHEMAS
-from schemas.run import STREAMS
+from schemas.run import STREAMS, Stream
 
-_NS_PER_S = 1_000_000_000
+# Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds.
+_MOST_SECONDS, _LEAST_NANOSECONDS = 10**11, 10**17
 
 
-def read_csv(path: Path, config: IngestConfig) -> dict[str, pl.DataFrame]:
+def read_csv(path: Path, config: IngestConfig) -> dict[Stream, pl.DataFrame]:
     """Streams of a CSV file: each mapping whose `topic` is the file's name, its stem or `*` makes one."""
     try:
-        table = pl.read_csv(path, infer_schema_length=None, try_parse_dates=False)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"is not a CSV file: {error}", place=str(path)) from None
-    streams: dict[str, pl.DataFrame] = {}
+        table = read_table(path.read_bytes(), infer=True)
+    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
+        raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(path)) from None
+    streams: dict[Stream, pl.DataFrame] = {}
     for name in STREAMS:
-        for mapping in getattr(config, name, ()):
+        for mapping in mappings_of(config, name):
             if mapping.topic in (path.name, path.stem, "*"):
                 frame = _mapped(table, mapping, name, path)
-                streams[name] = pl.concat([streams[name], frame]) if name in streams else frame
+                streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
     if not streams:
         raise InputError(
             "no mapping for this file",
@@ -38,48 +44,68 @@ def read_csv(path: Path, config: IngestConfig) -> dict[str, pl.DataFrame]:
     return streams
 
 
-def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: str, path: Path) -> pl.DataFrame:
-    column = mapping.time.removeprefix("field:")
-    wanted = [column, *mapping.fields.values()]
-    missing = [name for name in wanted if name not in table.columns]
-    if missing or not mapping.time.startswith("field:"):
-        raise InputError(
-            "columns are missing" if missing else "a CSV has no log time",
-            place=str(path),
-            found="columns " + ", ".join(table.columns),
-            expected=", ".join(missing) if missing else 'time = "field:COLUMN"',
-        )
-    schema = STREAM_SCHEMAS[stream]  # type: ignore[index]
-    columns = [_times(table[column], mapping, path)]
-    for name, definition in schema.columns().items():
-        if name == "t":
-            continue
-        if name in mapping.fields:
-            columns.append(_values(table[mapping.fields[name]], name, definition.dtype, mapping, path))
-        else:
-            constant = mapping.constants.get(name, mapping.solution if name == "solution" else None)
-            columns.append(pl.Series(name, [constant] * table.height).cast(definition.dtype))
-    return pl.DataFrame(columns)
+def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:
+    if not mapping.time.startswith("field:"):
+        raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
+    kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
+    sample = Sample(Channel(0, path.name, "csv", None, str(path)), kinds)
+    source = source_of(sample, (mapped_recipe(sample, stream, mapping), mapping))
+    refuse(source.breaches)
+    fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
+    columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}
+    if stream in ("gnss", "satellites"):
+        columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns
+    times = _times(table[mapping.time.removeprefix("field:")], mapping, path)
+    return pl.DataFrame({"t": times}).with_columns(fields.select(pl.lit(0).alias("t"), **columns).drop("t"))
 
 
-def _values(recorded: pl.Series, name: str, dtype: pl.DataType, mapping: StreamMapping, path: Path) -> pl.Series:
+def _kind(dtype: pl.DataType) -> str:
+    if dtype.is_integer():
+        return "int"
+    return "float" if dtype.is_float() else "flag" if dtype == pl.Boolean else "text"
+
+
+def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
     try:
-        values = recorded.cast(dtype).alias(name)
+        return recorded.cast(source.types[recorded.name])
     except pl.exceptions.PolarsError as error:
-        raise InputError(f"cannot be {name}: {error}", place=f"{path}: column {recorded.name}") from None
-    factor = mapping.factors.get(name)
-    return values if factor is None else values * factor
+        wanted = ", ".join(name for name in source.columns if recorded.name in source.recipe.fields_of(name))
+        reason = str(error).splitlines()[0]
+        raise InputError(f"cannot be {wanted}: {reason}", place=f"{path}: column {recorded.name}") from None
+
+
+def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
+    """In a text, NaN is how programs write that they have no value."""
+    is_float = fields.lazy().select(expression.alias("value")).collect_schema()["value"].is_float()
+    return expression.fill_nan(None) if is_float else expression
 
 
 def _times(recorded: pl.Series, mapping: StreamMapping, path: Path) -> pl.Series:
-    """ISO 8601 text, or seconds since 1970; without a zone it is taken for UTC, or GPS time if so mapped."""
+    """ISO 8601 text, which without a zone is taken for UTC (or GPS time if so mapped), or a number."""
+    place = f"{path}: column {recorded.name}"
     try:
-        if recorded.dtype == pl.String:
-            stamps = recorded.str.to_datetime(time_unit="ns", strict=True).dt.timestamp("ns")
-        else:
-            stamps = (recorded * _NS_PER_S).round().cast(pl.Int64)
+        if recorded.dtype != pl.String:
+            return _counted(recorded, mapping, place)
+        stamps = recorded.str.to_datetime(time_unit="ns", strict=True).dt.timestamp("ns")
     except pl.exceptions.PolarsError as error:
-        raise InputError(f"holds no times: {error}", place=f"{path}: column {recorded.name}") from None
+        raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place) from None
     if mapping.time_scale == "gps":
-        stamps = pl.Series(utc_from_gps(stamps.to_numpy()))
-    return stamps.cast(pl.Datetime("ns", "UTC")).alias("t")
+        stamps = pl.Series(utc_from_gps(stamps.fill_null(0).to_numpy())).set(stamps.is_null(), None)
+    return stamps.cast(pl.Datetime("ns", "UTC"))
+
+
+def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
+    """Numbers: seconds, whole ones of 18 digits nanoseconds, and of another unit as `factors.t` says."""
+    source = time_source((recorded.name,), {recorded.name: _kind(recorded.dtype)}, mapping)
+    if recorded.dtype.is_integer() and source.unit_s is None:
+        largest = int(np.abs(recorded.drop_nulls().to_numpy()).max(initial=0))
+        if _MOST_SECONDS < largest < _LEAST_NANOSECONDS:
+            raise InputError(
+                "holds times of a unit that nobody said",
+                place=place,
+                found=str(largest),
+                expected="seconds or nanoseconds",
+                remedy="Give the seconds per unit: factors = { t = 1e-3 } for milliseconds.",
+            )
+        recorded = recorded * (1 if largest >= _LEAST_NANOSECONDS else 1_000_000_000)
+    return source.instants(recorded.to_frame(), recorded.name)

@@ -6,14 +6,16 @@ gathered under the receiver's own time key, and turned into rows when the log is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any
 
 import dataframely as dy
 import polars as pl
 
+from schemas.enums import Fix
 from schemas.inputs import Gnss, Satellites
+from schemas.run import Stream
 
 
 @dataclass
@@ -23,6 +25,11 @@ class Epoch:
     t_ns: int | None = None
     gnss: dict[str, Any] = field(default_factory=dict)
     satellites: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def has_fix(self) -> bool:
+        """Whether a message said when the epoch was and what kind of fix it has (also: none)."""
+        return self.t_ns is not None and "fix" in self.gnss
 
 
 @dataclass
@@ -35,18 +42,40 @@ class Gathered:
     def at(self, key: Hashable) -> Epoch:
         return self.epochs.setdefault(key, Epoch())
 
-    def drop(self, reason: str) -> None:
-        self.dropped[reason] = self.dropped.get(reason, 0) + 1
+    def drop(self, reason: str, count: int = 1) -> None:
+        if count:
+            self.dropped[reason] = self.dropped.get(reason, 0) + count
 
-    def frames(self) -> tuple[pl.DataFrame, pl.DataFrame | None]:
+    def settled(self) -> Epochs:
+        """The epochs whose time and kind of fix are known; the others are counted."""
+        told = [epoch for epoch in self.epochs.values() if epoch.gnss or epoch.satellites]
+        known = [epoch for epoch in told if epoch.has_fix]
+        self.drop("epoch without its position message", len(told) - len(known))
+        return Epochs(known)
+
+
+@dataclass(frozen=True)
+class Epochs:
+    """The epochs of a log, put together."""
+
+    epochs: list[Epoch]
+
+    @property
+    def positions(self) -> int:
+        """How many have a position."""
+        return sum(epoch.gnss["fix"] != Fix.NONE for epoch in self.epochs)
+
+    def streams(self) -> dict[Stream, pl.DataFrame]:
         """`gnss`, and `satellites` where any epoch has them."""
-        timed = [epoch for epoch in self.epochs.values() if epoch.t_ns is not None and epoch.gnss]
-        fixes = [{"t": epoch.t_ns, "solution": "primary", **epoch.gnss} for epoch in timed]
-        ranges = [{"t": epoch.t_ns, "solution": "primary", **row} for epoch in timed for row in epoch.satellites]
-        return frame_of(fixes, Gnss), frame_of(ranges, Satellites) if ranges else None
+        fixes = [{"t": epoch.t_ns, "solution": "primary", **_of_fix(epoch.gnss)} for epoch in self.epochs]
+        ranges = [{"t": epoch.t_ns, "solution": "primary", **row} for epoch in self.epochs for row in epoch.satellites]
+        found: dict[Stream, pl.DataFrame] = {"gnss": frame_of(fixes, Gnss)}
+        return found | ({"satellites": frame_of(ranges, Satellites)} if ranges else {})
 
 
-Decoder = Callable[[Gathered, Any, bytes], None]
+def _of_fix(gnss: dict[str, Any]) -> dict[str, Any]:
+    """Without a fix, what other messages of the epoch say of a position is not to be believed."""
+    return gnss if gnss["fix"] != Fix.NONE else {name: gnss.get(name) for name in ("fix", "satellites")}
 
 
 def frame_of(rows: list[dict[str, Any]], schema: type[dy.Schema]) -> pl.DataFrame:

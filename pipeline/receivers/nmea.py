@@ -1,4 +1,4 @@
-"""NMEA 0183: GGA with RMC or ZDA for the date, GST for accuracy, gathered by time of day."""
+"""NMEA 0183: GGA, GNS or RMC, with RMC or ZDA for the date, GST for accuracy, gathered by time of day."""
 
 from __future__ import annotations
 
@@ -20,9 +20,25 @@ _FIXES = {
     5: Fix.RTK_FLOAT,
     6: Fix.ESTIMATED,
 }
+# Mode letters of RMC and GNS, the best first: a solution is as good as its best satellite system.
+_MODES = {
+    "R": Fix.RTK_FIXED,
+    "F": Fix.RTK_FLOAT,
+    "D": Fix.DIFFERENTIAL,
+    "P": Fix.AUTONOMOUS,
+    "A": Fix.AUTONOMOUS,
+    "E": Fix.ESTIMATED,
+}
 # Differential corrections whose station is an SBAS satellite: 120-158 as PRN, 33-64 as NMEA satellite number.
 _SBAS_PRNS, _SBAS_NUMBERS, _NUMBER_TO_PRN = range(120, 159), range(33, 65), 87
 _HALF_DAY_S = 43_200
+
+
+def parse(raw: bytes) -> Any:
+    """The sentence, none if it is of no interest."""
+    from pynmeagps import NMEAReader
+
+    return NMEAReader.parse(raw) if raw[3:6] in _WANTED and raw[6:7] == b"," else None
 
 
 class NmeaDecoder:
@@ -33,22 +49,23 @@ class NmeaDecoder:
         self._latest: time | None = None
 
     def decode(self, gathered: Gathered, message: Any, _raw: bytes) -> None:
-        decoder = {"GGA": _position, "RMC": _motion, "GST": _accuracy, "ZDA": _nothing}.get(message.msgID)
-        if decoder is None or not isinstance(getattr(message, "time", None), time):
+        """Add what this sentence says to its epoch."""
+        if not isinstance(message.time, time):
+            gathered.drop("time not valid")
             return
         self._follow(message)
         epoch = gathered.at((self._day, message.time))
         if self._day is not None:
             moment = datetime.combine(self._day, message.time, tzinfo=UTC)
             epoch.t_ns = int(moment.replace(microsecond=0).timestamp()) * 1_000_000_000 + moment.microsecond * 1000
-        decoder(epoch, message)
+        _DECODERS[message.msgID](epoch, message)
 
     def _follow(self, message: Any) -> None:
         """The day of this sentence: as it says itself, or the last one, past midnight the next."""
         if message.msgID == "RMC" and isinstance(message.date, date):
             self._day = message.date
-        elif message.msgID == "ZDA" and message.year:
-            self._day = date(int(message.year), int(message.month), int(message.day))
+        elif message.msgID == "ZDA" and (day := _date_of(message)):
+            self._day = day
         elif self._day is not None and self._latest is not None:
             back_s = _seconds(self._latest) - _seconds(message.time)
             self._day += timedelta(days=1) if back_s > _HALF_DAY_S else timedelta(0)
@@ -64,23 +81,41 @@ def settle_first_day(gathered: Gathered) -> None:
         if same is None:
             gathered.drop("time without a date")
         else:
-            same.gnss = early.gnss | same.gnss
+            # What GGA and GNS say goes before what an RMC says.
+            same.gnss = same.gnss | early.gnss if "satellites" in early.gnss else early.gnss | same.gnss
 
 
 def _seconds(moment: time) -> int:
     return moment.hour * 3600 + moment.minute * 60 + moment.second
 
 
+def _date_of(m: Any) -> date | None:
+    try:
+        return date(int(m.year), int(m.month), int(m.day))
+    except ValueError:
+        return None
+
+
 def _position(epoch: Epoch, m: Any) -> None:
-    """GGA: height over the ellipsoid is height over the geoid plus the separation."""
-    fix = _FIXES.get(int(m.quality or 0), Fix.NONE)
+    """GGA: kind of fix and position, of which an RMC of the epoch may have said less."""
+    _put(epoch, m, _FIXES.get(int(m.quality or 0), Fix.NONE))
+
+
+def _position_of_systems(epoch: Epoch, m: Any) -> None:
+    """GNS: a letter of `posMode` per satellite system; where a GGA has told its kind of fix, that stands."""
+    if epoch.gnss.get("satellites") is None:
+        _put(epoch, m, next((fix for mode, fix in _MODES.items() if mode in str(m.posMode)), Fix.NONE))
+
+
+def _put(epoch: Epoch, m: Any, fix: Fix) -> None:
+    """What GGA and GNS share; height over the ellipsoid is height over the geoid plus the separation."""
     station = int(m.diffStation) if str(m.diffStation).isdigit() else None
     prn = station + _NUMBER_TO_PRN if station is not None and station in _SBAS_NUMBERS else station
     if fix is Fix.DIFFERENTIAL and prn in _SBAS_PRNS:
         fix = Fix.SBAS
         epoch.gnss |= {"sbas_prn": prn, "sbas_age_s": m.diffAge if isinstance(m.diffAge, float) else None}
     epoch.gnss |= {"fix": fix.value, "satellites": int(m.numSV) if m.numSV != "" else None}
-    if fix is Fix.NONE or m.lat == "":
+    if fix is Fix.NONE or m.lat == "" or m.lon == "":
         return
     epoch.gnss |= {"latitude_deg": m.lat, "longitude_deg": m.lon}
     if isinstance(m.alt, float) and isinstance(m.sep, float):
@@ -88,7 +123,12 @@ def _position(epoch: Epoch, m: Any) -> None:
 
 
 def _motion(epoch: Epoch, m: Any) -> None:
-    if m.status == "A" and isinstance(m.spd, float) and isinstance(m.cog, float):
+    """RMC: velocity; its position and mode count only where neither GGA nor GNS is sent."""
+    valid = m.status == "A"
+    fix = _MODES.get(getattr(m, "posMode", "") or "A", Fix.NONE) if valid else Fix.NONE
+    place = {"latitude_deg": m.lat, "longitude_deg": m.lon} if m.lat != "" and m.lon != "" else {}
+    epoch.gnss = {"fix": fix.value, **place} | epoch.gnss
+    if valid and isinstance(m.spd, float) and isinstance(m.cog, float):
         course, speed = np.radians(m.cog), m.spd * _KNOT_MPS
         epoch.gnss |= {"vel_e_mps": float(speed * np.sin(course)), "vel_n_mps": float(speed * np.cos(course))}
 
@@ -109,3 +149,13 @@ def _correlation(m: Any) -> dict[str, float]:
 
 def _nothing(_epoch: Epoch, _m: Any) -> None:
     """ZDA gives only the date."""
+
+
+_WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
+_DECODERS = {
+    "GGA": _position,
+    "GNS": _position_of_systems,
+    "RMC": _motion,
+    "GST": _accuracy,
+    "ZDA": _nothing,
+}

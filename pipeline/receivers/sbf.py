@@ -33,11 +33,16 @@ _SBAS_PRNS = range(120, 159)
 _NOT_KNOWN_U16 = 65535
 
 
+def parse(raw: bytes) -> Any:
+    """The block, none if it is of no interest."""
+    from pysbf2 import SBFReader
+
+    return SBFReader.parse(raw) if int.from_bytes(raw[4:6], "little") & _BLOCK_NUMBER in _WANTED else None
+
+
 def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
-    """Add what this block says to its epoch; blocks of no interest are passed over."""
-    decoder = _DECODERS.get(message.identity)
-    if decoder is None:
-        return
+    """Add what this block says to its epoch."""
+    decoder = _DECODERS[message.identity]
     tow_ms, week = struct.unpack_from("<IH", raw, 8)
     if tow_ms == _NO_TOW or week == _NO_WEEK:
         gathered.drop("time not valid")
@@ -52,17 +57,17 @@ def _solution(epoch: Epoch, m: Any) -> bool:
     """What both PVT blocks share; true where they hold a position."""
     fix = _FIXES.get(m.Type, Fix.NONE) if m.Error == 0 else Fix.NONE
     epoch.gnss |= {"fix": fix.value, "satellites": m.NrSV if m.NrSV != 255 else None}
-    if m.ReferenceID in _SBAS_PRNS:
+    # Base stations are numbered too: only an SBAS solution refers to a satellite.
+    if fix is Fix.SBAS and m.ReferenceID in _SBAS_PRNS:
         epoch.gnss["sbas_prn"] = m.ReferenceID
-        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if m.MeanCorrAge < _NOT_KNOWN_U16 / 100 else None
+        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if round(m.MeanCorrAge * 100) != _NOT_KNOWN_U16 else None
     return fix is not Fix.NONE
 
 
 def _geodetic(epoch: Epoch, m: Any) -> None:
     if _solution(epoch, m) and m.Latitude != _DO_NOT_USE:
         place = {"latitude_deg": float(np.degrees(m.Latitude)), "longitude_deg": float(np.degrees(m.Longitude))}
-        epoch.gnss |= place | {"height_m": m.Height}
-        epoch.gnss |= _known({"vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu})
+        epoch.gnss |= place | _known({"height_m": m.Height, "vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu})
 
 
 def _cartesian(epoch: Epoch, m: Any) -> None:
@@ -122,6 +127,8 @@ def _east_north_up(latitude_deg: float, longitude_deg: float) -> np.ndarray[Any,
     )
 
 
+_BLOCK_NUMBER = 0x1FFF  # the other bits of the id are the revision
+_WANTED = (4001, 4006, 4007, 5905, 5906)
 _DECODERS = {
     "PVTGeodetic": _geodetic,
     "PVTCartesian": _cartesian,

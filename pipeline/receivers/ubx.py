@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from pipeline.receivers.epochs import Gathered, satellite_name
+from pipeline.receivers.epochs import Epoch, Gathered, satellite_name
 from schemas.enums import Fix
 
 _SYSTEMS = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
@@ -14,25 +14,56 @@ _NO_FIX, _DEAD_RECKONING, _TIME_ONLY = 0, 1, 5
 _RTK_FLOAT, _RTK_FIXED = 1, 2
 
 
-def decode(gathered: Gathered, message: Any, _raw: bytes) -> None:
-    """Add what this message says to its epoch; messages of no interest are passed over."""
-    decoder = _DECODERS.get(message.identity)
-    if decoder is not None:
-        decoder(gathered, message)
+def parse(raw: bytes) -> Any:
+    """The message, none if it is of no interest."""
+    from pyubx2 import UBXReader
+
+    return UBXReader.parse(raw) if raw[2:4] in _WANTED else None
 
 
-def _position(gathered: Gathered, m: Any) -> None:
-    """NAV-PVT and NAV-PVAT: time, position [deg, mm], velocity [mm/s], accuracy [mm], kind of fix."""
+class UbxDecoder:
+    """Keeps count of the weeks while messages go by: most of them only tell the time of the week."""
+
+    def __init__(self) -> None:
+        self._week = 0
+        self._latest_ms = 0
+
+    def decode(self, gathered: Gathered, message: Any, _raw: bytes) -> None:
+        """Add what this message says to its epoch."""
+        if self._latest_ms - message.iTOW > _HALF_WEEK_MS:
+            self._week += 1
+        self._latest_ms = message.iTOW
+        t_ns = _time_ns(message) if message.identity in _POSITIONS else None
+        epoch = gathered.at((self._week, message.iTOW))
+        if epoch.t_ns is not None and t_ns is not None and t_ns != epoch.t_ns:
+            # The same moment of another week: the log was interrupted, or several were joined.
+            self._week += 1
+            epoch = gathered.at((self._week, message.iTOW))
+        if message.identity in _POSITIONS:
+            if t_ns is None:
+                gathered.drop("time not valid")
+                return
+            epoch.t_ns = t_ns
+        _DECODERS[message.identity](gathered, epoch, message)
+
+
+def _time_ns(m: Any) -> int | None:
+    """UTC as the receiver states it, none before it knows [ns since 1970]."""
     if not (m.validDate and m.validTime):
-        gathered.drop("time not valid")
-        return
-    epoch = gathered.at(m.iTOW)
+        return None
+    try:
+        minute = datetime(m.year, m.month, m.day, m.hour, m.min, tzinfo=UTC)
+    except ValueError:
+        return None
     second = m.second if hasattr(m, "second") else m.sec
-    minute = datetime(m.year, m.month, m.day, m.hour, m.min, tzinfo=UTC)
-    epoch.t_ns = (int(minute.timestamp()) + second) * 1_000_000_000 + m.nano
-    fix = _fix(m)
+    return (int(minute.timestamp()) + int(second)) * _NS_PER_S + int(m.nano)
+
+
+def _position(_: Gathered, epoch: Epoch, m: Any) -> None:
+    """NAV-PVT and NAV-PVAT: position [deg, mm], velocity [mm/s], accuracy [mm], kind of fix."""
+    fix = Fix.NONE if getattr(m, "invalidLlh", False) else _fix(m)
     epoch.gnss |= {"fix": fix.value, "satellites": m.numSV}
-    if fix is Fix.NONE or bool(getattr(m, "invalidLlh", False)):
+    if fix is Fix.NONE:
         return
     high_precision = epoch.gnss.get("latitude_deg") is not None
     if not high_precision:
@@ -55,16 +86,15 @@ def _fix(m: Any) -> Fix:
     return Fix.DIFFERENTIAL if m.diffSoln else Fix.AUTONOMOUS
 
 
-def _precise(gathered: Gathered, m: Any) -> None:
+def _precise(_: Gathered, epoch: Epoch, m: Any) -> None:
     if not m.invalidLlh:
-        place = {"latitude_deg": m.lat, "longitude_deg": m.lon, "height_m": m.height / 1e3}
-        gathered.at(m.iTOW).gnss |= place
+        epoch.gnss |= {"latitude_deg": m.lat, "longitude_deg": m.lon, "height_m": m.height / 1e3}
 
 
-def _covariances(gathered: Gathered, m: Any) -> None:
+def _covariances(_: Gathered, epoch: Epoch, m: Any) -> None:
     if m.posCovValid:
         values = (m.posCovEE, m.posCovNE, -m.posCovED, m.posCovNN, -m.posCovND, m.posCovDD)
-        gathered.at(m.iTOW).gnss |= _covariance(*values)
+        epoch.gnss |= _covariance(*values)
 
 
 def _covariance(ee: float, en: float, eu: float, nn: float, nu: float, uu: float) -> dict[str, float]:
@@ -72,20 +102,20 @@ def _covariance(ee: float, en: float, eu: float, nn: float, nu: float, uu: float
     return dict(zip(names, (ee, en, eu, nn, nu, uu), strict=True))
 
 
-def _protection(gathered: Gathered, m: Any) -> None:
+def _protection(gathered: Gathered, epoch: Epoch, m: Any) -> None:
     """NAV-PL: plPos1 and plPos2 are the horizontal axes of the ellipsoid, plPos3 the vertical one [mm]."""
     if not m.plPosValid:
         gathered.drop("protection level not valid")
         return
-    gathered.at(m.iTOW).gnss |= {"hpl_m": max(m.plPos1, m.plPos2) / 1e3, "vpl_m": m.plPos3 / 1e3}
+    epoch.gnss |= {"hpl_m": max(m.plPos1, m.plPos2) / 1e3, "vpl_m": m.plPos3 / 1e3}
 
 
-def _sbas(gathered: Gathered, m: Any) -> None:
+def _sbas(_: Gathered, epoch: Epoch, m: Any) -> None:
     if m.geo and m.mode:
-        gathered.at(m.iTOW).gnss["sbas_prn"] = m.geo
+        epoch.gnss["sbas_prn"] = m.geo
 
 
-def _satellites(gathered: Gathered, m: Any) -> None:
+def _satellites(_: Gathered, epoch: Epoch, m: Any) -> None:
     rows: list[dict[str, Any]] = []
     for index in range(1, m.numSvs + 1):
         value = {name: getattr(m, f"{name}_{index:02d}") for name in _SATELLITE_FIELDS}
@@ -99,10 +129,15 @@ def _satellites(gathered: Gathered, m: Any) -> None:
                 "used": bool(value["svUsed"]),
             }
         )
-    gathered.at(m.iTOW).satellites = [row for row in rows if abs(row["elevation_deg"]) <= _HORIZON_TO_ZENITH_DEG]
+    epoch.satellites = [row for row in rows if abs(row["elevation_deg"]) <= _HORIZON_TO_ZENITH_DEG]
 
 
 _HORIZON_TO_ZENITH_DEG = 90.0
+_HALF_WEEK_MS = 302_400_000
+_NS_PER_S = 1_000_000_000
+_POSITIONS = ("NAV-PVT", "NAV-PVAT")
+# Class and id of the messages below.
+_WANTED = (b"\x01\x07", b"\x01\x17", b"\x01\x14", b"\x01\x36", b"\x01\x62", b"\x01\x32", b"\x01\x35")
 _SATELLITE_FIELDS = ("gnssId", "svId", "azim", "elev", "prRes", "svUsed")
 _DECODERS = {
     "NAV-PVT": _position,

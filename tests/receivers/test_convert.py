@@ -94,16 +94,6 @@ def test_sbf_cartesian_is_turned_into_the_local_frame():
 
 
 @needs_samples
-def test_protection_levels_of_dop_blocks_stand_with_their_epoch(tmp_path):
-    path = tmp_path / "two.sbf"
-    path.write_bytes(
-        (SAMPLES / "pygpsdata_x5_pvtgeod.log").read_bytes() + (SAMPLES / "pygpsdata_x5_pvtextra.log").read_bytes()
-    )
-    fixes = convert([path], "r").run.gnss
-    assert fixes["hpl_m"].drop_nulls().to_list() == pytest.approx([3.88915753364563])
-
-
-@needs_samples
 @pytest.mark.parametrize("name", ["pygpsdata-BADCK2.log", "pygpsdata-MIXED3BADCK.log", "pygpsdata-BADEOF1.log"])
 def test_damaged_logs_give_what_is_whole(name):
     path = SAMPLES / name

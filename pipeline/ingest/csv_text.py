@@ -1,0 +1,54 @@
+"""CSV as programs and spreadsheets write it: byte order marks, other separators than the comma, empty lines."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import re
+
+import polars as pl
+
+_SEPARATORS = (",", ";", "\t")
+_MOST_COMMENTS = 50
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+def read_table(data: bytes, infer: bool) -> pl.DataFrame:
+    """The table, as texts or (`infer`) with types by content; lines that start with # are left out.
+
+    The separator is the one of comma, semicolon and tab that divides the header most. Names and texts lose the
+    blanks around them. Raises ValueError or a polars error where there is no table.
+    """
+    lines = [line for line in text_of(data).splitlines() if not line.startswith("#")]
+    header = next((line for line in lines if line.strip()), "")
+    separator = max(_SEPARATORS, key=header.count)
+    body = io.StringIO("\n".join(lines))
+    length = None if infer else 0
+    frame = pl.read_csv(body, separator=separator, infer_schema=infer, infer_schema_length=length)
+    names = [name.strip() for name in frame.columns]
+    if len(set(names)) < len(names):
+        raise ValueError("a column name stands twice")
+    frame.columns = names
+    frame = frame.with_columns(pl.col(pl.String).str.strip_chars())
+    return frame.filter(~pl.all_horizontal(_is_empty(name, dtype) for name, dtype in frame.schema.items()))
+
+
+def _is_empty(name: str, dtype: pl.DataType) -> pl.Expr:
+    empty = pl.col(name).is_null()
+    return empty | (pl.col(name) == "") if dtype == pl.String else empty
+
+
+def comments_of(data: bytes) -> str:
+    """The comment lines at the top."""
+    return "\n".join(line for line in text_of(data).splitlines()[:_MOST_COMMENTS] if line.startswith("#"))
+
+
+def text_of(data: bytes) -> str:
+    """The text; UTF-8, or UTF-16 where a byte order mark says so."""
+    return data.decode("utf-16") if data.startswith(_UTF16) else data.decode("utf-8-sig")
+
+
+def epsg_in(comments: str) -> str | None:
+    """The EPSG code that a comment names (`# epsg: 31370`)."""
+    named = re.search(r"epsg\s*[:=]\s*(?:EPSG:)?(\w+)", comments, re.IGNORECASE)
+    return named.group(1) if named else None

@@ -1,0 +1,115 @@
+"""Whole messages of a receiver log: UBX, SBF, NMEA and RTCM 3, told by their start, length and checksum.
+
+A start whose message does not prove whole counts as damaged, and the search goes on right behind that start: a
+damaged length hides nothing of what follows it.
+"""
+
+from __future__ import annotations
+
+import re
+from binascii import crc_hqx
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from functools import reduce
+from itertools import accumulate
+from operator import xor
+from typing import NamedTuple
+
+
+class Protocol(StrEnum):
+    UBX = "UBX"
+    SBF = "SBF"
+    NMEA = "NMEA"
+    RTCM = "RTCM"
+
+
+class Frame(NamedTuple):
+    """One whole message, start and checksum included."""
+
+    protocol: Protocol
+    content: bytes
+
+
+_START = re.compile(
+    rb"(?P<UBX>\xb5\x62)|(?P<SBF>\$@)|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),)|(?P<RTCM>\xd3[\x00-\x03])"
+)
+_SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
+_UBX_OVERHEAD, _SBF_HEAD, _RTCM_OVERHEAD = 8, 8, 6
+
+
+def frames(content: bytes, on_damage: Callable[[], None]) -> Iterator[Frame]:
+    """All whole messages in order; `on_damage` is called once for each that is damaged or cut off."""
+    at = 0
+    while start := _START.search(content, at):
+        protocol = Protocol[str(start.lastgroup)]
+        end = _ENDS[protocol](content, start.start())
+        if end is not None:
+            yield Frame(protocol, content[start.start() : end])
+            at = end
+            continue
+        if protocol is not Protocol.RTCM:  # its start is too short to mean anything by itself
+            on_damage()
+        at = start.start() + 1
+
+
+def _ubx_end(content: bytes, start: int) -> int | None:
+    """u-blox interface description, "UBX checksum": 8-bit Fletcher over class, id, length and payload."""
+    end = start + _UBX_OVERHEAD + int.from_bytes(content[start + 4 : start + 6], "little")
+    if end > len(content):
+        return None
+    body = content[start + 2 : end - 2]
+    checksum = bytes((sum(body) & 0xFF, sum(accumulate(body)) & 0xFF))
+    return end if content[end - 2 : end] == checksum else None
+
+
+def _sbf_end(content: bytes, start: int) -> int | None:
+    """SBF reference guide, "block header": CRC-CCITT over id, length and body; the length is a multiple of four."""
+    length = int.from_bytes(content[start + 6 : start + 8], "little")
+    if length < _SBF_HEAD or length % 4 or start + length > len(content):
+        return None
+    crc = int.from_bytes(content[start + 2 : start + 4], "little")
+    return start + length if crc_hqx(content[start + 4 : start + length], 0) == crc else None
+
+
+def _nmea_end(content: bytes, start: int) -> int | None:
+    """NMEA 0183: exclusive or of all characters between `$` and `*`."""
+    sentence = _SENTENCE.match(content, start)
+    if sentence is None or reduce(xor, sentence[1]) != int(sentence[2], 16):
+        return None
+    return sentence.end()
+
+
+def _rtcm_end(content: bytes, start: int) -> int | None:
+    """RTCM 10403, transport layer: length in ten bits, CRC-24Q at the end."""
+    end = start + _RTCM_OVERHEAD + int.from_bytes(content[start + 1 : start + 3], "big")
+    if end > len(content):
+        return None
+    return end if _crc24q(content[start : end - 3]) == int.from_bytes(content[end - 3 : end], "big") else None
+
+
+def _crc24q_table() -> list[int]:
+    table = []
+    for value in range(256):
+        crc = value << 16
+        for _ in range(8):
+            crc = crc << 1 ^ (0x1864CFB if crc & 0x800000 else 0)
+        table.append(crc & 0xFFFFFF)
+    return table
+
+
+_CRC24Q = _crc24q_table()
+
+
+def _crc24q(content: bytes) -> int:
+    crc = 0
+    for byte in content:
+        crc = (crc << 8) & 0xFFFFFF ^ _CRC24Q[crc >> 16 ^ byte]
+    return crc
+
+
+_ENDS: dict[Protocol, Callable[[bytes, int], int | None]] = {
+    Protocol.UBX: _ubx_end,
+    Protocol.SBF: _sbf_end,
+    Protocol.NMEA: _nmea_end,
+    Protocol.RTCM: _rtcm_end,
+}

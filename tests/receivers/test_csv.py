@@ -1,0 +1,102 @@
+"""CSV logs as other programs write them, through a mapping."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.receivers import convert
+from schemas.config import Configuration, settings_from
+from schemas.errors import BaliseError, ConfigError, InputError
+
+PLACE = {"latitude_deg": "lat", "longitude_deg": "lon"}
+
+
+@pytest.fixture
+def converted(tmp_path):
+    def of(text: str | bytes, stream: str = "gnss", **mapping: object):
+        path = tmp_path / "log.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        table = {"topic": "log.csv", "time": "field:t", "fields": PLACE} | mapping
+        config = settings_from({"ingest": {stream: table}}, Configuration, "x")
+        return convert([path], "r", config.ingest).run.gnss
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("time", "expected"),
+    [
+        ("2025-06-01T12:00:00.25", "12:00:00.250"), ("2025-06-01 12:00:00", "12:00:00"),
+        ("2025-06-01T12:00:00.25Z", "12:00:00.250"), ("2025-06-01T14:00:00+02:00", "12:00:00"),
+        ("1748779200", "12:00:00"), ("1748779200250000000", "12:00:00.250"),
+    ],
+)  # fmt: skip
+def test_times_of_a_csv(converted, time, expected):
+    t = converted(f"t,lat,lon\n{time},50.5,4.5\n")["t"]
+    assert t.dt.to_string("%Y-%m-%dT%H:%M:%S%.f").to_list() == [f"2025-06-01T{expected}"]
+
+
+def test_units_and_scales_of_time_are_those_of_the_mapping(converted):
+    with pytest.raises(InputError, match=r"of a unit that nobody said.*1748779200250"):
+        converted("t,lat,lon\n1748779200250,50.5,4.5\n")
+    milliseconds = converted("t,lat,lon\n1748779200250,50.5,4.5\n", factors={"t": 1e-3})
+    assert milliseconds["t"].dt.to_string("%T%.f").to_list() == ["12:00:00.250"]
+    # 1,432,814,418 s after 1980-01-06 on the GPS scale, which is 18 s ahead of UTC.
+    gps = converted("t,lat,lon\n1432814418,50.5,4.5\n", time_scale="gps", time_epoch="gps")
+    assert gps["t"].dt.to_string("%FT%T").to_list() == ["2025-06-01T12:00:00"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"\xef\xbb\xbft;lat;lon\r\n1748779200;50.5;4.5\r\n",
+        "t\tlat\tlon\n1748779200\t50.5\t4.5\n".encode("utf-16"),
+        b"# made by a logger\nt, lat , lon\n1748779200, 50.5, 4.5\n\n,,\n\n",
+        b'"lon","extra","lat","t"\n"4.5","a, b","50.5","1748779200"\n',
+    ],
+)
+def test_separators_byte_order_marks_blanks_and_empty_lines(converted, text):
+    row = converted(text).row(0, named=True)
+    assert (row["latitude_deg"], row["longitude_deg"], row["fix"]) == (50.5, 4.5, "autonomous")
+
+
+def test_nan_and_empty_cells_are_unknown(converted):
+    fixes = converted("t,lat,lon\n1748779200,nan,NaN\n1748779201,,\n1748779202,50.5,4.5\n")
+    assert fixes["latitude_deg"].to_list() == [None, None, 50.5]
+
+
+def test_kinds_of_fix_by_text_number_and_word(converted):
+    fields = PLACE | {"fix": "q"}
+    codes = {"NARROW_INT3": "rtk_fixed", "SINGLE": "autonomous"}
+    texts = converted("t,lat,lon,q\n1,50,4,NARROW_INT3\n2,50,4,SINGLE\n", fields=fields, fix_codes=codes)
+    assert texts["fix"].to_list() == ["rtk_fixed", "autonomous"]
+    numbers = converted("t,lat,lon,q\n1,50,4,4\n", fields=fields, fix_codes={"4": "rtk_fixed"})
+    assert numbers["fix"].to_list() == ["rtk_fixed"]
+    words = converted("t,lat,lon,q\n1,50,4,sbas\n", fields=fields)
+    assert words["fix"].to_list() == ["sbas"]
+    with pytest.raises(InputError, match=r"column fix.*'code 7'"):
+        converted("t,lat,lon,q\n1,50,4,7\n", fields=fields, fix_codes={"4": "rtk_fixed"})
+
+
+@pytest.mark.parametrize(
+    ("text", "mapping", "message"),
+    [
+        ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"heigth_m": "lat"}}, "is no column of this stream.*heigth_m"),
+        ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"height_m": "h"}}, "no field h for column height_m"),
+        ("tt,lat,lon\n1,50,4\n", {}, "no field t for column t"),
+        ("t,lat,lon\n,50,4\n2,50,4\n", {}, "column t: is not complete"),
+        ("t,lat,lon\nabc,50,4\n", {}, "column t: holds no times"),
+        ("t,lat,lon\n1,50,400\n", {}, "longitude_deg: is out of range; found 400"),
+        ("t;lat;lon\n1;50,5;4,5\n", {}, "column lat: cannot be latitude_deg"),
+        ("t,lat,lat\n1,50,4\n", {}, "no field lon|stands twice"),
+        ("", {}, "is not a CSV file"),
+        ("t,lat,lon\n", {}, "no epoch with a time and a position"),
+        ("t,lat,lon\n1,50,4\n", {"time": "auto"}, "has no log time"),
+        ("t,lat,lon\n1,50,4\n", {"constants": {"fix": "bogus"}}, "constants.fix.*found 'bogus'"),
+        ("t,lat,lon\n1,50,4\n", {"constants": {"satellites": 9.5}}, "constants.satellites.*found 9.5"),
+    ],
+)
+def test_what_does_not_fit_is_one_clear_error(converted, text, mapping, message):
+    with pytest.raises(BaliseError, match=message) as caught:
+        converted(text, **mapping)
+    assert isinstance(caught.value, InputError | ConfigError)
