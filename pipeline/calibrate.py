@@ -9,7 +9,6 @@ import numpy as np
 import polars as pl
 import tomli_w
 
-from pipeline.align import threshold_factor
 from pipeline.calibration.sigmas import SigmaFit, regress_sigmas, sigma_table, worst_fit
 from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from pipeline.clean import clean
@@ -17,6 +16,7 @@ from pipeline.matching import match
 from pipeline.odometer import odometer_track, polarity
 from pipeline.odometer_filter import error_model
 from pipeline.stages import replay
+from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

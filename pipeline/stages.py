@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.align import align, threshold_factor
+from pipeline.align import align
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes
@@ -18,6 +18,7 @@ from pipeline.matching import Match, TravelledPath, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
+from pipeline.statistics import threshold_factor
 from pipeline.summary import Alignment, Provenance, SolutionResults, failed_row, summarise
 from pipeline.telegrams import place_reads, places_near
 from schemas.config import Configuration, LdsConfig, Vehicle, digest_of

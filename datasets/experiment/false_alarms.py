@@ -25,8 +25,7 @@ from datasets.experiment.thresholds import (
     two_sided,
 )
 from datasets.experiment.workers import generator, in_blocks, mapped
-from pipeline.align import threshold_factor
-from pipeline.statistics import clopper_pearson, poisson_rate
+from pipeline.statistics import clopper_pearson, poisson_rate, threshold_factor
 from schemas.config import Configuration, LdsConfig
 
 Array = npt.NDArray[np.float64]

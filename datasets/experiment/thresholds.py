@@ -23,8 +23,8 @@ from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
 from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Reading, bank_forms
 from datasets.experiment.sigmas import limit_sigmas
 from datasets.experiment.workers import generator
-from pipeline.align import threshold_factor
 from pipeline.calibration.sigmas import overall_ratio
+from pipeline.statistics import threshold_factor
 
 Array = npt.NDArray[np.float64]
 

@@ -16,6 +16,7 @@ from pipeline.monitors.recursion import (
     linear_recurrence,
     variance_of_ewma,
 )
+from schemas.config import MonitorConfig
 
 Mask = npt.NDArray[np.bool_]
 
@@ -76,6 +77,49 @@ def along_errors(sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, ta
     return with_memory(
         np.vstack([np.outer(np.sqrt(shares), sigma_m), np.abs(jitter_m)]).T,
         np.vstack([decorrelation_of(dt_s, taus_s), np.ones(dt_s.size)]).T,
+    )
+
+
+def calibrated(sigma_m: Array, config: MonitorConfig) -> Array:
+    """Position sigma that the monitors count with [m]: `calibrate` may have fitted a + b sigma."""
+    return config.sigma_intercept_m + config.sigma_slope * sigma_m
+
+
+@dataclass(frozen=True)
+class AlongSteps:
+    """Steps along the track from one usable epoch to the next, shapes (m,), and the errors at their ends.
+
+    `path_m` by GNSS, `odometer_m` and the change of speed `speed_mps` by the corrected odometer; `jitter_s`: how the
+    stamps scatter; `white_m2_per_s`: variance that the odometer's distance gathers in a second.
+    """
+
+    dt_s: Array
+    path_m: Array
+    odometer_m: Array
+    speed_mps: Array
+    sigma_m: Array
+    jitter_s: Array | float
+    white_m2_per_s: Array | float
+    scale_sigma: Array
+    latency_sigma_s: Array
+
+
+def along_axis(
+    epoch: npt.NDArray[np.int64], fresh: Mask, steps: AlongSteps, shares: Array, taus_s: Array
+) -> AxisSeries:
+    """Increments of GNSS minus odometer (DIAG eq. 1-3), with what scale and latency leave uncertain."""
+    dt = steps.dt_s
+    return AxisSeries(
+        epoch=epoch,
+        fresh=fresh,
+        border=np.zeros(dt.size, dtype=np.bool_),
+        dt_s=dt,
+        rate_mps=(steps.path_m - steps.odometer_m) / dt,
+        **along_errors(steps.sigma_m, steps.jitter_s * steps.odometer_m / dt, dt, shares, taus_s),
+        white_m2=steps.white_m2_per_s * dt,
+        border_m2=np.zeros(dt.size),
+        steady_mps=steps.scale_sigma * steps.odometer_m / dt,
+        latency_mps=steps.latency_sigma_s * steps.speed_mps / dt,
     )
 
 

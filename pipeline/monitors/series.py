@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.monitors.axis import AxisSeries, Mask, along_errors, decorrelation_of, with_memory
+from pipeline.monitors.axis import AlongSteps, AxisSeries, Mask, along_axis, calibrated, decorrelation_of, with_memory
 from pipeline.monitors.recursion import Array
 from pipeline.odometer_filter import error_model
 from schemas.config import Configuration
@@ -76,15 +76,15 @@ class _Builder:
         self._survey_default_m = config.matching.survey_sigma_default_m
         self._wander_m, self._wander_length_m = config.monitors.survey_wander_m, config.monitors.survey_wander_length_m
         self._shares, self._taus_s = error_model(config.monitors)
-        self._intercept_m, self._slope = config.monitors.sigma_intercept_m, config.monitors.sigma_slope
+        self._monitors = config.monitors
 
     def _column(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
         values: Array = self._epochs[name].to_numpy().astype(np.float64)[rows]
         return values
 
     def _sigma(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
-        """Position sigma of the axis [m]; `calibrate` may have fitted sigma = a + b sigma_receiver."""
-        return self._intercept_m + self._slope * self._column(name, rows)
+        """Position sigma of the axis [m]."""
+        return calibrated(self._column(name, rows), self._monitors)
 
     def along(self, reasons: pl.Series) -> AxisSeries:
         rows = np.flatnonzero(reasons.is_null().to_numpy())
@@ -93,22 +93,18 @@ class _Builder:
         dt, fresh = self._time_steps(rows)
         stretch = self._epochs["odometer_stretch"].to_numpy()[rows]
         fresh |= _changes(stretch)
-        odometer = _steps(self._column("odometer_m", rows))
-        speed = _steps(self._column("speed_mps", rows))
-        jitter = self._column("stamp_jitter_s", rows) * odometer / dt
-        white = self._column("odometer_white_m2_per_s", rows) * dt
-        return AxisSeries(
-            epoch=rows,
-            fresh=fresh,
-            border=np.zeros(rows.size, dtype=np.bool_),
+        steps = AlongSteps(
             dt_s=dt,
-            rate_mps=(_steps(self._column("along_m", rows)) - odometer) / dt,
-            **along_errors(self._sigma("sigma_along_m", rows), jitter, dt, self._shares, self._taus_s),
-            white_m2=white,
-            border_m2=np.zeros(rows.size),
-            steady_mps=self._column("scale_sigma", rows) * odometer / dt,
-            latency_mps=self._column("latency_sigma_s", rows) * speed / dt,
+            path_m=_steps(self._column("along_m", rows)),
+            odometer_m=_steps(self._column("odometer_m", rows)),
+            speed_mps=_steps(self._column("speed_mps", rows)),
+            sigma_m=self._sigma("sigma_along_m", rows),
+            jitter_s=self._column("stamp_jitter_s", rows),
+            white_m2_per_s=self._column("odometer_white_m2_per_s", rows),
+            scale_sigma=self._column("scale_sigma", rows),
+            latency_sigma_s=self._column("latency_sigma_s", rows),
         )
+        return along_axis(rows, fresh, steps, self._shares, self._taus_s)
 
     def across(self, reasons: pl.Series, position: str, sigma: str) -> AxisSeries:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""

@@ -12,13 +12,13 @@ from itertools import permutations
 
 import polars as pl
 
-from pipeline.align import threshold_factor
 from pipeline.channels import on_path_of
 from pipeline.epoch_clock import trusted
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Side, verdicts_of
 from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
+from pipeline.statistics import threshold_factor
 from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s, uptime
 from schemas.config import Configuration
 from schemas.enums import Evidence, MonitorState, RunStatus, Verdict

@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at, threshold_factor
+from pipeline.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at
 from pipeline.monitors.bank import MonitorBank
+from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 from tests.align.straight import Straight, distance, run, times
 
@@ -145,3 +146,14 @@ def test_what_cannot_be_compared_freezes_the_learning() -> None:
     scale = aligned["odometer_scale"]
     assert scale.is_finite().all()
     assert scale[3001:].n_unique() == 1
+
+
+def test_learning_counts_with_the_calibrated_sigma():
+    epochs, odometer = run(REAL, seed=3)
+    overstated = epochs.with_columns(pl.col("sigma_along_m") * 3.0)
+    calibrated = CONFIG.model_copy(update={"monitors": CONFIG.monitors.model_copy(update={"sigma_slope": 1.0 / 3.0})})
+    stated = align(epochs, odometer, Vehicle(), CONFIG)
+    found = align(overstated, odometer, Vehicle(), calibrated)
+    learned = ["odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"]
+    assert_frame_equal(found.select(learned), stated.select(learned), rel_tol=1e-9)
+    assert stated["scale_sigma"][-1] < align(overstated, odometer, Vehicle(), CONFIG)["scale_sigma"][-1]

@@ -1,0 +1,113 @@
+"""Along-track increments of GNSS minus odometer between epochs, with the scale and latency in use at each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.monitors.axis import AlongSteps, AxisSeries, along_axis
+from pipeline.monitors.recursion import Array
+from pipeline.odometer import OdometerTrack
+from pipeline.odometer_filter import Estimate, error_model
+from schemas.config import Configuration
+
+Index = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+_REGULAR_PERIODS = 3
+
+
+@dataclass(frozen=True)
+class EpochArrays:
+    """What alignment reads of the matched epochs: times [s] on the odometer's scale, positions, usability.
+
+    `jitter_s`: by how much the stamps scatter about the receiver's regular times (see `stamp_jitter_s`).
+    """
+
+    t_s: Array
+    path_m: Array
+    sigma_m: Array
+    usable: Mask
+    jitter_s: float
+
+
+def stamp_jitter_s(t_s: Array) -> float:
+    """Standard deviation of the stamps about a regular clock [s].
+
+    A receiver measures at regular times; a recorder that stamps on receipt scatters them, and at 40 m/s ten
+    milliseconds are 0.4 m from one epoch to the next. Only the stamps are looked at, never a position.
+    """
+    dt = np.diff(t_s)
+    period = float(np.median(dt))
+    periods = np.round(dt / period)
+    regular = (periods >= 1) & (periods <= _REGULAR_PERIODS)
+    away = (dt - periods * period)[regular]
+    return float(np.sqrt(np.mean(away**2) / 2.0)) if away.size else 0.0
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Estimates in use at each epoch; shapes (n,)."""
+
+    scale: Array
+    scale_sigma: Array
+    latency_s: Array
+    latency_sigma_s: Array
+
+    @classmethod
+    def constant(cls, estimate: Estimate, n: int) -> Learned:
+        values = (estimate.scale, estimate.scale_sigma, estimate.latency_s, estimate.latency_sigma_s)
+        return cls(*(np.full(n, value) for value in values))
+
+    def put(self, changes: list[tuple[int, Estimate]]) -> None:
+        """Set estimates: each change holds from its epoch to the next, the last for good."""
+        begins = [epoch for epoch, _ in changes]
+        lengths = np.diff([*begins, self.scale.size])
+        values = np.array([(e.scale, e.scale_sigma, e.latency_s, e.latency_sigma_s) for _, e in changes])
+        columns = (self.scale, self.scale_sigma, self.latency_s, self.latency_sigma_s)
+        for column, value in zip(columns, values.T, strict=True):
+            column[begins[0] :] = np.repeat(value, lengths)
+
+
+@dataclass(frozen=True)
+class OdometerSteps:
+    """Corrected odometer distance and speed change from the row before; the first row has none (zero)."""
+
+    distance_m: Array
+    speed_mps: Array
+
+
+def odometer_steps(rows: Index, t_s: Array, track: OdometerTrack, learned: Learned) -> OdometerSteps:
+    """Steps between consecutive rows, both ends with the estimates in use at the later one."""
+    latency, scale = learned.latency_s[rows], learned.scale[rows]
+    now = t_s[rows] - latency
+    before = np.concatenate([now[:1], t_s[rows][:-1] - latency[1:]])
+    distance = scale * (track.distance_at(now) - track.distance_at(before))
+    speed = scale * (track.speed_at(now) - track.speed_at(before))
+    return OdometerSteps(distance, speed)
+
+
+def along_series(
+    rows: Index, arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration
+) -> AxisSeries:
+    """Increments of GNSS minus odometer between consecutive rows (DIAG eq. 1-3)."""
+    steps = odometer_steps(rows, arrays.t_s, track, learned)
+    t, x = arrays.t_s[rows], arrays.path_m[rows]
+    dt = np.diff(t, prepend=t[0] - 1.0)
+    stretch = track.stretch_at(t - learned.latency_s[rows])
+    fresh = (dt > config.align.gap_reset_s) | (np.diff(stretch, prepend=stretch[0]) != 0)
+    fresh[0] = True
+    along = AlongSteps(
+        dt_s=dt,
+        path_m=np.diff(x, prepend=x[0]),
+        odometer_m=steps.distance_m,
+        speed_mps=steps.speed_mps,
+        sigma_m=arrays.sigma_m[rows],
+        jitter_s=arrays.jitter_s,
+        white_m2_per_s=track.white_rate_m2_per_s,
+        scale_sigma=learned.scale_sigma[rows],
+        latency_sigma_s=learned.latency_sigma_s[rows],
+    )
+    return along_axis(rows, fresh, along, *error_model(config.monitors))
