@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from distributed import Client
@@ -21,11 +21,14 @@ _START_S = 60.0
 
 
 class Cluster:
-    """A scheduler, and workers under a nanny that starts them again; each a process of its own."""
+    """A scheduler, and workers under a nanny that starts them again; each a process of its own.
 
-    def __init__(self, folder: Path, workers: int = 1) -> None:
+    `settings` are Dask's own, as environment variables (`DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES`).
+    """
+
+    def __init__(self, folder: Path, workers: int = 1, settings: Mapping[str, str] | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._workers = folder, workers
+        self._folder, self._workers, self._settings = folder, workers, dict(settings or {})
         self.scheduler = self._start_scheduler()
         self.nanny = self.start_workers()
         self.wait_for_workers()
@@ -36,7 +39,8 @@ class Cluster:
 
     def start_workers(self) -> subprocess.Popen[bytes]:
         arguments = ("--nworkers", str(self._workers), "--nthreads", "1", "--no-dashboard")
-        return _dask("worker", "--scheduler-file", str(self._file), "--local-directory", str(self._folder), *arguments)
+        place = ("--scheduler-file", str(self._file), "--local-directory", str(self._folder))
+        return self._dask("worker", *place, *arguments)
 
     def wait_for_workers(self) -> None:
         """Until all workers have joined: a nanny gives up where one dies before."""
@@ -47,7 +51,18 @@ class Cluster:
 
     def kill_worker(self, chance: random.Random) -> bool:
         """One worker without warning; the nanny lives. Whether there was one."""
-        return kill_one(workers_of(self.nanny.pid), chance)
+        return kill_one(self.worker_pids, chance)
+
+    @property
+    def worker_pids(self) -> list[int]:
+        return workers_of(self.nanny.pid)
+
+    def kill_workers(self) -> None:
+        """All workers and their nanny, without warning."""
+        for pid in [self.nanny.pid, *self.worker_pids]:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.nanny.wait()
 
     def kill_scheduler(self) -> None:
         self.scheduler.kill()
@@ -64,12 +79,21 @@ class Cluster:
 
     def _start_scheduler(self) -> subprocess.Popen[bytes]:
         self._file = self._folder / f"scheduler-{secrets.token_hex(4)}.json"
-        scheduler = _dask(
+        scheduler = self._dask(
             *("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1"),
             *("--scheduler-file", str(self._file)),
         )
         wait_for(lambda: self._file.exists() and self._file.read_text().rstrip().endswith("}"))
         return scheduler
+
+    def _dask(self, *arguments: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "dask", *arguments],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "POLARS_MAX_THREADS": "1", **self._settings},
+        )
 
 
 def workers_of(pid: int) -> list[int]:
@@ -107,13 +131,3 @@ def wait_for(condition: Callable[[], bool], limit_s: float = _START_S) -> None:
         if time.monotonic() > until:
             raise TimeoutError("waited in vain")
         time.sleep(0.02)
-
-
-def _dask(*arguments: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "dask", *arguments],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "POLARS_MAX_THREADS": "1"},
-    )

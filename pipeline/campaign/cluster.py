@@ -1,27 +1,43 @@
-"""Runs on an existing Dask cluster."""
+"""Runs on an existing Dask cluster.
+
+Dask's scheduler hands a task out again when its worker has died, as often as the cluster's own settings say, and also
+counts deaths of workers where the task was only waiting. Whether a run is tried again is the campaign's to decide. So
+each worker first leaves a mark at the scheduler; one that finds it there already gives the run back.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import secrets
+import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
-from pipeline.campaign.outcome import Result
+from pipeline.campaign.outcome import Result, RunOutcome
 from pipeline.campaign.plan import RunJob
-from pipeline.campaign.worker import replay_within
+from pipeline.campaign.worker import replay_one
 from schemas.errors import UsageError
 
 _CONNECT_S = 10.0
 _COUNT_EVERY_S = 2.0
 _PATIENCE_S = 300.0
+_ANSWER_S = 5.0
+_KILL_S = 15.0
+_GRACE_S = 15.0
+_BEGUN = "balise-run-begun"
+
+
+class LostWorkerError(Exception):
+    """The worker that had begun the run is gone."""
 
 
 class DaskEngine:
-    """An existing Dask cluster; Dask's scheduler tries a run elsewhere when a worker dies."""
+    """An existing Dask cluster."""
 
     in_process = False
-    retries_itself = True
 
     def __init__(self, scheduler: str, limit_s: float) -> None:
         self._client = _connect(scheduler)
@@ -31,6 +47,9 @@ class DaskEngine:
         self._counted = -_COUNT_EVERY_S
         self._seen_s = time.monotonic()
         self._scheduler = scheduler
+        self._marks: dict[Result, str] = {}
+        self._workers: dict[str, str] = {}
+        self._client.subscribe_topic(_BEGUN, self._note)
 
     def capacity(self) -> int:
         """Twice the cluster's threads, so that no worker waits for the next run.
@@ -38,7 +57,7 @@ class DaskEngine:
         Raises `UsageError` where no worker has been there for minutes: nobody would notice in the night.
         """
         if time.monotonic() - self._counted > _COUNT_EVERY_S:
-            self._threads = sum(self._ask().values())
+            self._threads = sum(self._count().values())
             self._counted = time.monotonic()
             if self._threads:
                 self._seen_s = self._counted
@@ -51,19 +70,37 @@ class DaskEngine:
         return max(1, 2 * self._threads)
 
     def submit(self, job: RunJob) -> Result:
-        result: Result = self._executor.submit(replay_within, job, self._limit_s)
+        mark = f"balise-{secrets.token_hex(8)}"
+        self._workers[mark] = ""
+        result: Result = self._executor.submit(replay_there, job, mark, self._limit_s + _GRACE_S)
+        self._marks[result] = mark
         return result
 
     def has_begun(self, result: Result) -> bool:
+        """Whether a worker has begun the run; until then it waits for its turn."""
+        mark = self._marks[result]
+        if self._workers[mark] or not result.done():
+            return bool(self._workers[mark])
+        with contextlib.suppress(Exception):
+            return bool(self._ask(self._client.scheduler.event_is_set, name=mark))
         return True
 
     def kill(self, result: Result) -> None:
-        """The worker ends itself at the limit (`replay_within`)."""
+        """End the worker that has the run, through its nanny, without waiting for that."""
+        worker = self._workers[self._marks[result]]
+        threading.Thread(target=self._end, args=(result, worker), daemon=True).start()
 
     def is_lost_worker(self, error: BaseException) -> bool:
         from distributed.scheduler import KilledWorker
 
-        return isinstance(error, KilledWorker)
+        return isinstance(error, LostWorkerError | KilledWorker)
+
+    def collected(self, result: Result) -> None:
+        mark = self._marks.pop(result)
+        del self._workers[mark]
+        if self._client.status == "running":
+            with contextlib.suppress(Exception):
+                self._ask(self._client.scheduler.event_clear, name=mark)
 
     def close(self) -> None:
         with contextlib.suppress(Exception):
@@ -71,7 +108,28 @@ class DaskEngine:
         with contextlib.suppress(Exception):
             self._client.close(timeout=1)
 
-    def _ask(self) -> dict[str, int]:
+    def _note(self, event: tuple[float, dict[str, str]]) -> None:
+        """A worker of this or another campaign has begun a run."""
+        mark = event[1]["mark"]
+        if mark in self._workers:
+            self._workers[mark] = event[1]["worker"]
+
+    def _end(self, result: Result, worker: str) -> None:
+        with contextlib.suppress(Exception):
+            self._client.sync(
+                self._client.scheduler.restart_workers,
+                workers=[worker],
+                timeout=_KILL_S,
+                wait_for_workers=False,
+                on_error="return",
+                stimulus_id=_BEGUN,
+            )
+        result.cancel()
+
+    def _ask(self, question: Any, **arguments: str) -> Any:
+        return self._client.sync(question, callback_timeout=_ANSWER_S, **arguments)
+
+    def _count(self) -> dict[str, int]:
         try:
             if self._client.status != "running":
                 raise OSError("connection lost")
@@ -79,6 +137,39 @@ class DaskEngine:
         except Exception as error:
             raise lost_scheduler(self._scheduler) from error
         return threads
+
+
+def replay_there(job: RunJob, mark: str, limit_s: float) -> RunOutcome:
+    """What a worker does: the run, unless another worker had begun it and was lost.
+
+    The campaign ends the workers of runs that take too long. Where it cannot, because it is gone itself or has no way
+    to, the worker ends itself after `limit_s`.
+    """
+    with _ended_after(limit_s):
+        _begin(mark)
+        return replay_one(job)
+
+
+@contextlib.contextmanager
+def _ended_after(limit_s: float) -> Iterator[None]:
+    timer = threading.Timer(limit_s, os._exit, args=(1,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _begin(mark: str) -> None:
+    from distributed import get_worker
+    from distributed.utils import sync
+
+    worker = get_worker()
+    if sync(worker.loop, worker.scheduler.event_is_set, name=mark):
+        raise LostWorkerError
+    sync(worker.loop, worker.scheduler.event_set, name=mark)
+    worker.log_event(_BEGUN, {"mark": mark, "worker": worker.address})
 
 
 def lost_scheduler(scheduler: str) -> UsageError:

@@ -18,7 +18,6 @@ class Engine(Protocol):
     """What the campaign loop needs to know of where runs are replayed."""
 
     in_process: bool
-    retries_itself: bool
 
     def capacity(self) -> int:
         """How many runs may be under way at once."""
@@ -33,6 +32,9 @@ class Engine(Protocol):
 
     def is_lost_worker(self, error: BaseException) -> bool:
         """Whether the error means that the worker died, not that the run failed."""
+
+    def collected(self, result: Result) -> None:
+        """The campaign has seen the result and is done with it."""
 
     def close(self) -> None:
         """End whatever is still under way, at once."""

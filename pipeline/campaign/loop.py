@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Protocol
@@ -18,7 +18,7 @@ from pipeline import store
 from pipeline.campaign.engines import Engine, engine_for
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.lock import locked
-from pipeline.campaign.outcome import Result, RunOutcome, overdue
+from pipeline.campaign.outcome import Result, RunOutcome, lost, never_begun, overdue
 from pipeline.campaign.plan import Plan, RunJob, held_by, with_previous
 from pipeline.campaign.worker import fail_run
 from pipeline.ingest.files import is_url
@@ -26,7 +26,8 @@ from schemas.enums import RunStatus
 from schemas.errors import UsageError
 
 _LOOK_S = 0.2
-_TRIES = 2
+_ATTEMPTS = 2
+_STARTS = 10
 TIME_LIMIT_S = 3600.0
 
 
@@ -72,15 +73,26 @@ class Watch(Protocol):
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
         """Called several times a second with the runs under way and their age [s]."""
 
+    def lost(self, run_id: str, attempt: int) -> None:
+        """The worker died that was at this attempt of a run; it is tried again."""
+
     def finished(self, outcome: RunOutcome) -> None: ...
 
     def end(self, summary: Summary) -> None: ...
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """One attempt at a run, and how often a worker was to begin it."""
+
+    job: RunJob
+    number: int = 1
+    starts: int = 1
+
+
 @dataclass
 class _UnderWay:
-    job: RunJob
-    attempt: int
+    attempt: _Attempt
     since_s: float
     overdue: bool = False
 
@@ -89,7 +101,7 @@ class _UnderWay:
 class _State:
     """What the loop keeps between two looks."""
 
-    waiting: deque[tuple[RunJob, int]]
+    waiting: deque[_Attempt]
     under_way: dict[Result, _UnderWay] = field(default_factory=dict)
     outcomes: list[RunOutcome] = field(default_factory=list)
     stop: int | None = None
@@ -115,7 +127,7 @@ def run_campaign(
         store.sweep(plan.out)
         plan = held_by(plan if force else with_previous(plan), campaign)
         store.write_config(plan.out, plan.config)
-        state = _State(deque((job, 1) for job in plan.jobs))
+        state = _State(deque(map(_Attempt, plan.jobs)))
         engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
         try:
             summary = _watched(plan, state, engine, time_limit_s, watches)
@@ -147,7 +159,7 @@ def _tidy(plan: Plan, state: _State, scheduler: str | None) -> None:
     """Remove what ended workers left half done; those of a cluster may be at it still."""
     if scheduler is None and not is_url(plan.out):
         for item in state.under_way.values():
-            store.sweep_run(Path(plan.out), item.job.run_id)
+            store.sweep_run(Path(plan.out), item.attempt.job.run_id)
 
 
 def _watched(plan: Plan, state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> Summary:
@@ -180,14 +192,14 @@ def _loop(state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch
         if state.stop is not None:
             raise Interrupted(state.stop)
         for result in done:
-            outcome = _collect(state, engine, result, limit_s)
+            outcome = _collect(state, engine, result, limit_s, watches)
             if outcome is not None:
                 state.outcomes.append(outcome)
                 for watch in watches:
                     watch.finished(outcome)
         _end_overdue(state, engine, limit_s)
         now = time.monotonic()
-        ages = [(item.job.run_id, now - item.since_s) for item in state.under_way.values()]
+        ages = [(item.attempt.job.run_id, now - item.since_s) for item in state.under_way.values()]
         for watch in watches:
             watch.look(ages)
 
@@ -195,32 +207,45 @@ def _loop(state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch
 def _hand_out(state: _State, engine: Engine) -> None:
     capacity = engine.capacity()
     while state.waiting and len(state.under_way) < capacity and state.stop is None:
-        job, attempt = state.waiting.popleft()
-        state.under_way[engine.submit(job)] = _UnderWay(job, attempt, time.monotonic())
+        attempt = state.waiting.popleft()
+        state.under_way[engine.submit(attempt.job)] = _UnderWay(attempt, time.monotonic())
 
 
-def _collect(state: _State, engine: Engine, result: Result, limit_s: float) -> RunOutcome | None:
+def _collect(
+    state: _State, engine: Engine, result: Result, limit_s: float, watches: Sequence[Watch]
+) -> RunOutcome | None:
     """The outcome, or none where the run is tried again."""
     item = state.under_way.pop(result)
-    if result.cancelled():
-        raise UsageError("the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped.")
-    error = result.exception()
-    if error is None:
-        return result.result()
-    if item.overdue:
-        return fail_run(item.job, overdue(limit_s))
-    if isinstance(error, CancelledError):
-        raise UsageError("the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped.")
-    if not engine.is_lost_worker(error):
-        raise error
-    if item.attempt < _TRIES and not engine.retries_itself:
-        state.waiting.appendleft((item.job, item.attempt + 1))
+    attempt = item.attempt
+    try:
+        error = CancelledError() if result.cancelled() else result.exception()
+        if error is None:
+            return replace(result.result(), attempts=attempt.number)
+        if item.overdue:
+            return replace(fail_run(attempt.job, overdue(limit_s)), attempts=attempt.number)
+        if isinstance(error, CancelledError):
+            raise UsageError(
+                "the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped."
+            )
+        if not engine.is_lost_worker(error):
+            raise error
+        return _after_loss(state, attempt, engine.has_begun(result), watches)
+    finally:
+        engine.collected(result)
+
+
+def _after_loss(state: _State, attempt: _Attempt, begun: bool, watches: Sequence[Watch]) -> RunOutcome | None:
+    """A run that was under way when its worker died has one more attempt; one that waited there has lost nothing."""
+    if not begun and attempt.starts < _STARTS:
+        state.waiting.appendleft(replace(attempt, starts=attempt.starts + 1))
         return None
-    return fail_run(
-        item.job,
-        "its worker died each time (killed, out of memory, or over the time limit). "
-        "Give it more memory or fewer --jobs; the next call tries it again.",
-    )
+    if begun and attempt.number < _ATTEMPTS:
+        for watch in watches:
+            watch.lost(attempt.job.run_id, attempt.number)
+        state.waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
+        return None
+    reason = lost(attempt.number) if begun else never_begun(attempt.starts)
+    return replace(fail_run(attempt.job, reason), attempts=attempt.number)
 
 
 def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
@@ -229,7 +254,7 @@ def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
         if not engine.has_begun(result):
             item.since_s = now
         if now - item.since_s > limit_s and not item.overdue:
-            item.overdue = not engine.retries_itself
+            item.overdue = True
             engine.kill(result)
 
 

@@ -23,7 +23,10 @@ from schemas.version import SOFTWARE
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What became of one run. `defect` is ours, with its `trace`; everything else is the input's."""
+    """What became of one run. `defect` is ours, with its `trace`; everything else is the input's.
+
+    `attempts` is more than one where workers were lost over it.
+    """
 
     run_id: str
     status: RunStatus
@@ -36,6 +39,7 @@ class RunOutcome:
     hazards: int = 0
     missed_detections: int = 0
     peak_memory_bytes: int = 0
+    attempts: int = 1
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,19 @@ def changed(address: Address) -> ChangedError:
 def overdue(limit_s: float) -> str:
     """The reason of a run that was given up."""
     return f"took longer than the time limit of {limit_s:g} s"
+
+
+def lost(attempts: int) -> str:
+    """The reason of a run whose workers died over it."""
+    return (
+        f"its worker died {attempts} times (killed, or out of memory). "
+        "Give it more memory or fewer --jobs; the next call tries it again."
+    )
+
+
+def never_begun(workers: int) -> str:
+    """The reason of a run whose workers died before they could begin it."""
+    return f"{workers} workers died before they could begin it. Look at the workers' own logs."
 
 
 def failure_of(error: Exception, lasting: bool) -> Failure:

@@ -29,7 +29,6 @@ class LocalEngine:
     """Processes of this machine, each in an executor of its own, so that the loss of one touches no other."""
 
     in_process = False
-    retries_itself = False
 
     def __init__(self, jobs: int) -> None:
         self._slots = [_Slot() for _ in range(jobs)]
@@ -39,7 +38,6 @@ class LocalEngine:
         return len(self._slots)
 
     def submit(self, job: RunJob) -> Result:
-        self._busy = {result: slot for result, slot in self._busy.items() if not result.done()}
         taken = set(map(id, self._busy.values()))
         slot = next(slot for slot in self._slots if id(slot) not in taken)
         result = slot.submit(job)
@@ -54,6 +52,9 @@ class LocalEngine:
 
     def is_lost_worker(self, error: BaseException) -> bool:
         return isinstance(error, BrokenExecutor)
+
+    def collected(self, result: Result) -> None:
+        del self._busy[result]
 
     def close(self) -> None:
         for slot in self._slots:

@@ -62,7 +62,14 @@ def outcome_line(outcome: RunOutcome) -> str:
         text += f": {outcome.error}"
     elif not outcome.skipped:
         text += f" in {duration_text(outcome.seconds)}"
+    if outcome.attempts > 1:
+        text += f" (attempt {outcome.attempts})"
     return text
+
+
+def loss_line(run_id: str, attempt: int) -> str:
+    """A lost worker in one line."""
+    return f"{run_id}: its worker died at attempt {attempt}; tried again"
 
 
 class LineWatch:
@@ -85,6 +92,9 @@ class LineWatch:
         self._tally.add(outcome)
         if outcome.status is not RunStatus.OK:
             self._say(outcome_line(outcome))
+
+    def lost(self, run_id: str, attempt: int) -> None:
+        self._say(loss_line(run_id, attempt))
 
     def end(self, summary: Summary) -> None:
         self._say(self._tally.line())
@@ -117,6 +127,9 @@ class BarWatch:
         if outcome.status is not RunStatus.OK:
             self._progress.console.print(outcome_line(outcome), markup=False, highlight=False)
 
+    def lost(self, run_id: str, attempt: int) -> None:
+        self._progress.console.print(loss_line(run_id, attempt), markup=False, highlight=False)
+
     def end(self, summary: Summary) -> None:
         self.look(())
         self._progress.stop()
@@ -140,6 +153,9 @@ class LogWatch:
         self._write(outcome_line(outcome))
         if outcome.trace:
             self._write(storage.redacted(outcome.trace))
+
+    def lost(self, run_id: str, attempt: int) -> None:
+        self._write(loss_line(run_id, attempt))
 
     def end(self, summary: Summary) -> None:
         self._write(summary_line(summary))

@@ -18,7 +18,6 @@ class SerialEngine:
     """This very process: for a single run, without the seconds that a worker takes to start."""
 
     in_process = True
-    retries_itself = True
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
@@ -45,6 +44,9 @@ class SerialEngine:
 
     def is_lost_worker(self, error: BaseException) -> bool:
         return False
+
+    def collected(self, result: Result) -> None:
+        return None
 
     def close(self) -> None:
         return None

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
@@ -54,17 +52,6 @@ def replay_one(job: RunJob) -> RunOutcome:
     metadata = _metadata(job, files_digest, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
     return outcome_of(job, tables.runs, sum(entry[1] for entry in before), time.monotonic() - begun)
-
-
-def replay_within(job: RunJob, limit_s: float) -> RunOutcome:
-    """`replay_one` under a time limit that ends the process: for workers that the caller cannot kill."""
-    timer = threading.Timer(limit_s, os._exit, args=(1,))
-    timer.daemon = True
-    timer.start()
-    try:
-        return replay_one(job)
-    finally:
-        timer.cancel()
 
 
 def fail_run(

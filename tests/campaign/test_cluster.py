@@ -2,65 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from benchmarks.cluster import Cluster
+from pipeline import store
 from pipeline.campaign import run_campaign
+from pipeline.campaign.outcome import lost, overdue
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
 from tests.campaign.compare import ROOT, by_run, plan_of, result_bytes, run, wait_for
 from tests.campaign.compare import command as replay_command
-from tests.campaign.test_local import undisturbed
+from tests.campaign.test_local import Spy, undisturbed
 from tests.conftest import SmallTrial
 
 __all__ = ["undisturbed"]
 
-
-class Cluster:
-    """A scheduler and one worker, in processes of their own."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.file = folder / "scheduler.json"
-        common = ["--scheduler-file", str(self.file)]
-        self.scheduler = _dask("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1", *common)
-        wait_for(lambda: self.file.exists() and self.file.read_text().rstrip().endswith("}"))
-        self.worker = self.start_worker()
-
-    def start_worker(self) -> subprocess.Popen[bytes]:
-        arguments = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder))
-        return _dask("worker", "--scheduler-file", str(self.file), *arguments)
-
-    @property
-    def address(self) -> str:
-        import json
-
-        return str(json.loads(self.file.read_text())["address"])
-
-    def stop(self) -> None:
-        for process in (self.worker, self.scheduler):
-            process.terminate()
-            process.wait(timeout=30)
-
-
-def _dask(*arguments: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "dask", *arguments],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "POLARS_MAX_THREADS": "1"},
-    )
+_BEGUN_S = 0.5
 
 
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    (tmp_path / "cluster").mkdir()
     cluster = Cluster(tmp_path / "cluster")
     yield cluster
     cluster.stop()
@@ -84,10 +52,9 @@ def test_killed_worker_and_scheduler(
         replay_command(small_trial, out, "--scheduler", cluster.address), cwd=ROOT, stderr=subprocess.PIPE, text=True
     )
     wait_for(lambda: any((out / "runs").glob("*/runs.parquet")))
-    cluster.worker.kill()
-    cluster.worker.wait()
-    cluster.worker = cluster.start_worker()
-    cluster.scheduler.kill()
+    cluster.kill_workers()
+    cluster.nanny = cluster.start_workers()
+    cluster.kill_scheduler()
     _, said = first.communicate(timeout=90)
     assert "Traceback" not in said
     assert first.returncode in (0, 2)
@@ -107,7 +74,77 @@ def test_cluster_that_lost_its_workers(
 ) -> None:
     monkeypatch.setattr("pipeline.campaign.cluster._PATIENCE_S", 0.5)
     monkeypatch.setattr("pipeline.campaign.cluster._COUNT_EVERY_S", 0.2)
-    cluster.worker.kill()
-    cluster.worker.wait()
+    cluster.kill_workers()
     with pytest.raises(UsageError, match="has had no worker"):
         run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address)
+
+
+@contextlib.contextmanager
+def cluster_that_allows(failures: int, folder: Path) -> Iterator[Cluster]:
+    """One worker; Dask itself would hand a task out again as often as it allows failures."""
+    cluster = Cluster(folder, settings={"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(failures)})
+    try:
+        yield cluster
+    finally:
+        cluster.stop()
+
+
+@pytest.mark.parametrize("failures", [0, 7])
+def test_retries_are_the_campaigns_own(
+    small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, failures: int
+) -> None:
+    """A deadly run costs two workers, and a run that dies once is replayed, whatever Dask's own settings say."""
+    for name in ("deadly", "unlucky"):
+        os.mkfifo(tmp_path / f"{name}.mcap")
+    deaths: dict[str, list[int]] = {"deadly": [], "unlucky": []}
+
+    with cluster_that_allows(failures, tmp_path / "cluster") as cluster:
+
+        def kill(run_id: str, age_s: float) -> None:
+            if run_id not in deaths or age_s < _BEGUN_S:
+                return
+            if len(deaths[run_id]) > [lost for lost, _ in spy.losses].count(run_id):
+                return
+            pids = cluster.worker_pids
+            deaths[run_id].append(pids[0])
+            if run_id == "unlucky":
+                replace_by_copy(tmp_path / "unlucky.mcap", small_trial.paths[0])
+            os.kill(pids[0], signal.SIGKILL)
+
+        named = [tmp_path / "deadly.mcap", tmp_path / "unlucky.mcap", *small_trial.paths[:2]]
+        spy = Spy(kill)
+        outcomes = by_run(
+            run_campaign(plan_of(small_trial, tmp_path / "out", named), scheduler=cluster.address, watches=[spy])
+        )
+    assert {run_id: len(pids) for run_id, pids in deaths.items()} == {"deadly": 2, "unlucky": 1}
+    assert outcomes["deadly"].error == lost(2)
+    assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
+    assert outcomes["unlucky"].attempts == 2
+    assert sorted(spy.losses) == [("deadly", 1), ("unlucky", 1)]
+    assert [outcomes[f"run{number}"].attempts for number in range(2)] == [1] * 2
+    mine = {name: data for name, data in result_bytes(tmp_path / "out").items() if "run_id=run" in name}
+    assert mine == {name: data for name, data in result_bytes(undisturbed).items() if name in mine}
+
+
+def replace_by_copy(place: Path, log: Path) -> None:
+    """What was a pipe that nobody writes to becomes something else: the next worker gets on with it."""
+    place.unlink()
+    place.symlink_to(log, target_is_directory=True)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_hanging_worker_is_given_up(small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, stopped: bool) -> None:
+    """Also one that cannot end itself, since the whole process stands still."""
+    os.mkfifo(tmp_path / "hanging.mcap")
+    seen: list[int] = []
+
+    def stop(run_id: str, age_s: float) -> None:
+        if stopped and run_id == "hanging" and age_s > _BEGUN_S and not seen:
+            seen.extend(cluster.worker_pids)
+            os.kill(seen[0], signal.SIGSTOP)
+
+    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths[:2]])
+    outcomes = by_run(run_campaign(plan, scheduler=cluster.address, time_limit_s=2.0, watches=[Spy(stop)]))
+    assert outcomes["hanging"].error == overdue(2.0)
+    assert outcomes["hanging"].attempts == 1
+    assert [outcomes[f"run{number}"].status for number in range(2)] == [RunStatus.OK] * 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable, Sequence
@@ -15,6 +16,8 @@ import pytest
 
 from pipeline import store
 from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
+from pipeline.campaign.outcome import lost
+from pipeline.campaign.progress import LogWatch
 from pipeline.ingest import read_run
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
@@ -30,6 +33,7 @@ class Spy:
     def __init__(self, act: Callable[[str, float], None]) -> None:
         self.act = act
         self.seen: list[RunOutcome] = []
+        self.losses: list[tuple[str, int]] = []
 
     def begin(self, plan: Plan) -> None:
         self.seen.clear()
@@ -37,6 +41,9 @@ class Spy:
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
         for run_id, age_s in under_way:
             self.act(run_id, age_s)
+
+    def lost(self, run_id: str, attempt: int) -> None:
+        self.losses.append((run_id, attempt))
 
     def finished(self, outcome: RunOutcome) -> None:
         self.seen.append(outcome)
@@ -193,8 +200,15 @@ def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: 
             for pid in killed:
                 os.kill(pid, signal.SIGKILL)
 
-    summary = run_campaign(plan_of(small_trial, tmp_path), jobs=2, watches=[Spy(kill_first)])
+    spy = Spy(kill_first)
+    summary = run_campaign(plan_of(small_trial, tmp_path), jobs=2, watches=[spy, LogWatch()])
     assert killed
+    ((unlucky, attempt),) = spy.losses
+    assert attempt == 1
+    assert {outcome.run_id: outcome.attempts for outcome in summary.outcomes if outcome.attempts > 1} == {unlucky: 2}
+    log = (tmp_path / "replay.log").read_text()
+    assert f" {unlucky}: its worker died at attempt 1; tried again\n" in log
+    assert re.search(f" {unlucky}: ok in .* \\(attempt 2\\)\n", log)
     assert summary.count(RunStatus.OK) == 4
     assert result_bytes(tmp_path) == result_bytes(undisturbed)
 
@@ -212,7 +226,7 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "deadly.mcap", *small_trial.paths[:1]])
     summary = by_run(run_campaign(plan, jobs=1, watches=[Spy(kill_it)]))
     assert summary["deadly"].status is RunStatus.FAILED
-    assert "worker died" in (summary["deadly"].error or "")
+    assert summary["deadly"].error == lost(2)
     assert summary["run0"].status is RunStatus.OK
     assert len(deaths) >= 2
     assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
