@@ -178,6 +178,11 @@ def _notes(run: RunLog, found: Match, lds: LdsResult) -> tuple[str, ...]:
             ).iter_rows()
         ]
         notes.append("ambiguous: " + ", ".join(stretches))
+    if lds.undecided:
+        notes.append(
+            f"after {len(lds.undecided)} breaks of position or odometer nothing could tell whether the position had "
+            "moved meanwhile: what the expectation windows let pass is not seen there"
+        )
     if lds.unknown_reads.height:
         names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
         notes.append("reads of balises that are not on the path: " + ", ".join(names))

@@ -24,6 +24,11 @@ Where the sources leave a choice, this package reads them so:
   `init_s` of consistent epochs); without it the first one may begin the chain at once.
 - The linking distance monitor allows the odometer's 5 m + 5 % and the noise of the two positions at k_T:
   5 m alone would alarm on sound receivers.
+- After a break (no position, no odometer, or an ambiguous match for longer than a crossing is interpolated over; an
+  odometer that lost its distance) the position has to be what it was by the last TVB or accepted VB, within the bounds
+  of a re-link, else the linking distance monitor fails. Where these exceed the failure limit, or the distance of the
+  odometer was lost, nothing can tell: the monitor is `not_evaluated`, the TVB chain begins anew (`init_s`, or a VB
+  inside its window), and linking holds on. A locked-out train after every tunnel would be safe and useless.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """
 

@@ -22,6 +22,7 @@ class Footing:
         self._last_tvb: int | None = None
         self._accepted: Anchor | None = None  # where the last VB was accepted
         self._disputed: Anchor | None = None
+        self._read: Anchor | None = None  # the last physical balise
 
     def validate(self, k: int) -> None:
         """The epoch is a TVB."""
@@ -33,8 +34,9 @@ class Footing:
 
     def read(self, read: Read) -> None:
         """A physical balise read while the position is in use: better to measure from than an earlier position."""
+        self._read = read_anchor(read, self._journey) or self._read
         if self._disputed is not None:
-            self._disputed = read_anchor(read, self._journey) or self._disputed
+            self._disputed = self._read or self._disputed
 
     def negate(self, k: int) -> None:
         """An alarm: what the odometer can no longer tell since the last return does not count."""
@@ -53,6 +55,13 @@ class Footing:
         if accepted is not None and accepted.t_ns > int(self._journey.t_ns[self._last_tvb]):
             return accepted
         return Anchor.at_epoch(self._journey, self._last_tvb)
+
+    def before_break(self) -> Anchor | None:
+        """What was validated last, or a physical balise that was read since."""
+        validated = self.last_validated()
+        if self._read is None or (validated is not None and validated.t_ns > self._read.t_ns):
+            return validated
+        return self._read
 
     def relinks(self, recovery: Recovery, k: int, anchor: Anchor) -> bool:
         """GNSS minus odometer is what it was at the anchor; where no balise was read, also at the last return's."""

@@ -25,7 +25,8 @@ class Journey:
     `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
     count, `None` where it would. `heading`: direction of travel (+1/-1) as known at that epoch;
     `travel`: that of the step from this epoch to the next, put back to where the train turned (for
-    labels only). `travelled_m`: way run, turns included. `blind`: no position for longer than a
+    labels only). `travelled_m`: way run, turns included. `stretch`: odometer readings of one stretch can be
+    compared, between stretches the distance was lost. `blind`: no position for longer than a
     crossing is interpolated over (`gap_ns`).
     """
 
@@ -38,7 +39,10 @@ class Journey:
     sigma_m: Floats
     confidence_m: Floats
     odometer_m: Floats
+    stretch: Integers
+    speed_mps: Floats
     scale_sigma: Floats
+    latency_sigma_s: Floats
     heading: Integers
     travel: Integers
     travelled_m: Floats
@@ -57,6 +61,12 @@ class Journey:
         for k in np.flatnonzero(~self.usable).tolist():
             ambiguous[k] = self.refusal[k] is PassageStatus.REJECTED_AMBIGUOUS
         return ambiguous
+
+    @cached_property
+    def comparable(self) -> Bools:
+        """The position can be held against the odometer."""
+        known: Bools = np.isfinite(self.odometer_m) & np.isfinite(self.sigma_m)
+        return known & self.positioned & ~self.ambiguous
 
     @property
     def has_odometer(self) -> bool:
@@ -82,6 +92,9 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
         sigma_m=_floats(epochs["sigma_along_m"].fill_null(strategy="forward")),
         confidence_m=_floats(epochs["confidence_m"]),
         odometer_m=odometer_m,
+        stretch=epochs["odometer_stretch"].to_numpy().astype(np.int64),
+        speed_mps=np.nan_to_num(_floats(epochs["speed_mps"])),
+        latency_sigma_s=np.nan_to_num(_floats(epochs["latency_sigma_s"])),
         scale_sigma=np.nan_to_num(_floats(epochs["scale_sigma"])),
         heading=heading,
         travel=travel,

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds.bank_protocol import LdsLimits
+from pipeline.lds.breaks import LOST, NEVER, TOO_FAR, Comparison, Verdict
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Bools, Floats, Integers, Journey
 from pipeline.lds.recovery import Anchor
@@ -23,10 +24,9 @@ DISABLED = "disabled by configuration"
 NO_ODOMETER = "no odometer"
 NO_POSITION = "no position"
 AMBIGUOUS = "match ambiguous or off track"
-NO_REFERENCE = "no balise or validated position to measure from"
 NO_SIGMA = "no standard deviation of the position"
 FIRST_EPOCH = "no epoch before"
-_REASONS = (DISABLED, NO_ODOMETER, NO_POSITION, AMBIGUOUS, NO_REFERENCE, NO_SIGMA, FIRST_EPOCH)
+_REASONS = (DISABLED, NO_ODOMETER, NO_POSITION, AMBIGUOUS, NEVER, NO_SIGMA, FIRST_EPOCH, LOST, TOO_FAR)
 _NO_REASON = -1  # a reason is held as its place in the list above
 _STATES = tuple(state.value for state in MonitorState)
 
@@ -68,13 +68,14 @@ class LinkOrder:
 class LinkDistance:
     """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
 
-    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T.
+    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T. After a break it
+    is also the distance since the last validated position, within the bounds of a re-link (see `breaks`).
     """
 
     def __init__(self, journey: Journey, config: LdsConfig, limits: LdsLimits) -> None:
         self._journey, self._config, self._limits = journey, config, limits
         self._reason = _distance_reasons(journey, "link_distance" in limits.disabled)
-        self._possible = self._reason == _NO_REASON
+        self._possible: Bools = self._reason == _NO_REASON
         self._offset_m = journey.path_m - journey.odometer_m
         self._value = np.full(journey.t_ns.size, np.nan)
         self._threshold = np.full(journey.t_ns.size, np.nan)
@@ -85,6 +86,14 @@ class LinkDistance:
     def measure_from(self, anchor: Anchor | None, k: int) -> None:
         """From epoch `k` on the distance counts from this anchor."""
         self._anchor, self._done = anchor, k
+
+    def is_possible(self, k: int) -> bool:
+        """There is a position and an odometer to compare at this epoch."""
+        return bool(self._possible[k])
+
+    def can_measure(self, k: int) -> bool:
+        """What the distance counts from is on the same stretch of the odometer as this epoch."""
+        return self._anchor is not None and self._anchor.stretch == self._journey.stretch[k]
 
     def fails(self, k: int) -> bool:
         if self._anchor is None:
@@ -110,20 +119,33 @@ class LinkDistance:
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         noise_m = self._limits.threshold_factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
-        possible = self._possible[ahead]
-        self._value[ahead] = np.where(possible, self._offset_m[ahead] - anchor.offset_m, np.nan)
-        self._threshold[ahead] = np.where(possible, threshold_m, np.nan)
+        lost = self._possible[ahead] & (self._journey.stretch[ahead] != anchor.stretch)
+        known = self._possible[ahead] & ~lost
+        self._reason[ahead] = np.where(lost, _REASONS.index(LOST), np.where(known, _NO_REASON, self._reason[ahead]))
+        self._value[ahead] = np.where(known, self._offset_m[ahead] - anchor.offset_m, np.nan)
+        self._threshold[ahead] = np.where(known, threshold_m, np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
+
+    def hold_against(self, found: Comparison, k: int) -> None:
+        """The verdict on a position after a break joins that of the bounds at epoch `k`, whose fail remains."""
+        if self.fails(k):
+            return
+        unknown = found.verdict is Verdict.UNKNOWN
+        self._value[k] = np.nan if unknown else found.moved_m
+        self._threshold[k] = np.nan if unknown else found.bound_m
+        self._fails[k] = found.verdict is Verdict.MOVED
+        self._reason[k] = _NO_REASON if found.reason is None else _REASONS.index(found.reason)
 
     def forget(self, k: int) -> None:
         """From epoch `k` on there is nothing to measure from."""
         self.measure_from(None, k)
         self._value[k:] = self._threshold[k:] = np.nan
+        self._reason[k:][self._possible[k:]] = _NO_REASON
 
     def columns(self) -> dict[str, pl.Series]:
         """`link_distance_*` as in the contract of epochs."""
-        unknown = np.isnan(self._value) & self._possible
-        reason = np.where(unknown, _REASONS.index(NO_REFERENCE), self._reason)
+        unknown = np.isnan(self._value) & (self._reason == _NO_REASON)
+        reason = np.where(unknown, _REASONS.index(NEVER), self._reason)
         return _columns("link_distance", self._value, self._threshold, reason)
 
 

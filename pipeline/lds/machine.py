@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.lds.bank_protocol import Bank, LdsLimits
+from pipeline.lds.breaks import Verdict, break_epochs, compare
 from pipeline.lds.crossings import Balise
 from pipeline.lds.detection import BaliseDetection
 from pipeline.lds.footing import Footing
@@ -48,17 +50,20 @@ class LocationSystem:
         self.negations: list[Negation] = []
         self.standings = [Standing(0, None, chain_begun=False)]
         self.accepted_at_ns: dict[int, int] = {}
+        self.undecided: list[int] = []  # epochs after a break at which the odometer could not tell
         size = journey.t_ns.size
         self.tvb, self.alarm, self.negated, self.evaluated = ([False] * size for _ in range(4))
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.heading
-        self._events = self.balises.events
+        self._breaks = break_epochs(journey)
+        self._events = sorted({*self.balises.events, *self._breaks})
         self._refusal = journey.refusal
         self._recovery: Recovery | None = None  # while negated
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
         self._consistent_at_ns = 0
+        self._doubted = False  # after a break: nothing says yet that the position is what it was
         self._footing = Footing(journey, limits)
 
     def run(self) -> None:
@@ -78,7 +83,7 @@ class LocationSystem:
     def _uneventful_until(self, k: int) -> int:
         """The first epoch from `k` on that has to be stepped through; those before it can only be TVBs.
 
-        So it is on linked way where no balise, read, turn, alarm or end of a window is near.
+        So it is on linked way where no balise, read, turn, break, alarm or end of a window is near.
         """
         if self._recovery is not None or self.balises.latched or self._chain_from is None or k <= self._chain_from:
             return k
@@ -102,7 +107,8 @@ class LocationSystem:
         for read in self.balises.read(k):
             self._stand_on(read)
         bank_failed = self._bank.failed(k)
-        distrusted = bank_failed or self._recovery is not None
+        self._test_after_break(k)
+        distrusted = bank_failed or self.distance.fails(k) or self._recovery is not None
         accepted, disordered = self.balises.pass_virtual(k, distrusted, self._chain_from is None)
         for offer in accepted:
             self._accept(offer, k)
@@ -119,6 +125,34 @@ class LocationSystem:
         elif self.evaluated[k] and self._refusal[k] is None:
             self._validate(k)
 
+    def _test_after_break(self, k: int) -> None:
+        """Until something says that the position is what it was before a break, there are no TVBs.
+
+        What the odometer cannot tell, ten consistent seconds may begin anew, or a VB inside its window, as at the
+        start of a mission; linking holds on meanwhile.
+        """
+        if k in self._breaks and self._recovery is None and self._chain_from is not None:
+            self._doubted = True
+        if not (self._doubted and self.distance.is_possible(k)):
+            return
+        found = compare(self._footing.before_break(), k, self._journey, self._limits)
+        self.distance.hold_against(found, k)
+        if found.verdict is Verdict.UNKNOWN:
+            self._interrupt_chain(k)
+        else:
+            self._resume_chain(k)
+
+    def _interrupt_chain(self, k: int) -> None:
+        if self._chain_from is not None:
+            self._chain_from = self._consistent_since_ns = None
+            self.undecided.append(k)
+            self._stand(k)
+
+    def _resume_chain(self, k: int) -> None:
+        self._doubted = False
+        if self._chain_from is None:
+            self._chain_from = k
+
     def _stand_on(self, read: Read) -> None:
         """A physical balise says what GNSS minus odometer should be."""
         if self._recovery is not None:
@@ -128,11 +162,11 @@ class LocationSystem:
 
     def _accept(self, offer: Offer, k: int) -> None:
         self.accepted_at_ns[k] = offer.t_ns
-        if self._chain_from is None:
-            self._chain_from = k
+        self._resume_chain(k)
         if offer.odometer_m is not None:
             offset_m = offer.balise.path_m - offer.odometer_m
-            anchor = Anchor(offset_m, float(self._journey.sigma_m[k]), offer.t_ns, offer.travelled_m)
+            at = Anchor.at_epoch(self._journey, k)
+            anchor = replace(at, offset_m=offset_m, t_ns=offer.t_ns, travelled_m=offer.travelled_m)
             self._footing.accept(anchor)
             self.distance.measure_from(anchor, k)
         self._stand(k)
@@ -153,8 +187,9 @@ class LocationSystem:
         self._consistent_at_ns = t_ns
         if t_ns - self._consistent_since_ns < self._config.init_s * 1e9:
             return False
-        self._chain_from = k
-        self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
+        self._resume_chain(k)
+        if not self.distance.can_measure(k):
+            self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
         self._stand(k)
         return True
 
@@ -164,6 +199,7 @@ class LocationSystem:
         self.negations.append(Negation(k))
         self.negated[k] = True
         self._consistent_since_ns = None
+        self._doubted = False
 
     def _seek_return(self, recovery: Recovery, k: int, disordered: bool) -> None:
         self.negated[k] = True

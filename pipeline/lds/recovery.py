@@ -15,12 +15,21 @@ from schemas.config import LdsConfig
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """A position that the diagnosis stands behind: GNSS minus odometer there, and its sigma [m]."""
+    """A position that the diagnosis stands behind: GNSS minus odometer there, and its sigma [m].
+
+    `scale_sigma`: as known there, since what is learned later does not mend the way run before. `speed_mps`: by how
+    much the latency shifts it, per second; zero for a balise that was read. `slack_m`: location accuracy of such a
+    balise.
+    """
 
     offset_m: float
     sigma_m: float
     t_ns: int
     travelled_m: float
+    stretch: int
+    scale_sigma: float
+    speed_mps: float = 0.0
+    slack_m: float = 0.0
 
     @classmethod
     def at_epoch(cls, journey: Journey, k: int) -> Anchor:
@@ -29,20 +38,36 @@ class Anchor:
             float(journey.sigma_m[k]),
             int(journey.t_ns[k]),
             float(journey.travelled_m[k]),
+            int(journey.stretch[k]),
+            float(journey.scale_sigma[k]),
+            float(journey.speed_mps[k]),
         )
 
 
-def relink_bound_m(anchor: Anchor, k: int, journey: Journey, limits: LdsLimits) -> float | None:
-    """Bound on (GNSS - odometer) minus what it was at the anchor; `None` once nothing can be told.
+def moved_m(anchor: Anchor, k: int, journey: Journey) -> float:
+    """(GNSS - odometer) at epoch `k` minus what it was at the anchor."""
+    return float(journey.path_m[k] - journey.odometer_m[k]) - anchor.offset_m
 
-    k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2), with the sigma of both epochs for
-    2 sigma_x^2. Beyond the failure limit a persisting failure would pass: no re-link then.
+
+def noise_bound_m(anchor: Anchor, k: int, journey: Journey, limits: LdsLimits) -> float:
+    """By how much GNSS minus odometer moves from the anchor to epoch `k` without a fault.
+
+    k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2) (DOMAIN section 4), with the sigma of both epochs for
+    2 sigma_x^2; beside it what an uncertain latency makes of a change of speed (DOMAIN section 3).
     """
     waited_s = (int(journey.t_ns[k]) - anchor.t_ns) * 1e-9
-    scale_m = float(journey.scale_sigma[k]) * (float(journey.travelled_m[k]) - anchor.travelled_m)
+    scale_m = max(anchor.scale_sigma, float(journey.scale_sigma[k])) * (
+        float(journey.travelled_m[k]) - anchor.travelled_m
+    )
     variance_m2 = anchor.sigma_m**2 + float(journey.sigma_m[k]) ** 2
-    variance_m2 += limits.odometer_sigma_mps**2 * waited_s + scale_m**2
-    bound_m = limits.threshold_factor * sqrt(variance_m2)
+    latency_m = float(journey.latency_sigma_s[k]) * (float(journey.speed_mps[k]) - anchor.speed_mps)
+    variance_m2 += limits.odometer_sigma_mps**2 * waited_s + scale_m**2 + latency_m**2
+    return limits.threshold_factor * sqrt(variance_m2)
+
+
+def relink_bound_m(anchor: Anchor, k: int, journey: Journey, limits: LdsLimits) -> float | None:
+    """The bound of the re-link; `None` once it is beyond the failure limit: a persisting failure would pass."""
+    bound_m = noise_bound_m(anchor, k, journey, limits)
     return bound_m if bound_m <= limits.failure_limit_m else None
 
 
@@ -50,8 +75,15 @@ def read_anchor(read: Read, journey: Journey) -> Anchor | None:
     """A physical balise says where the train is, so what GNSS minus odometer should be."""
     if read.odometer_m is None or not isfinite(read.travelled_m):
         return None
-    sigma_m = float(np.nan_to_num(journey.sigma_m[read.epoch]))
-    return Anchor(read.balise.path_m - read.odometer_m, sigma_m, read.t_ns, read.travelled_m)
+    return Anchor(
+        offset_m=read.balise.path_m - read.odometer_m,
+        sigma_m=float(np.nan_to_num(journey.sigma_m[read.epoch])),
+        t_ns=read.t_ns,
+        travelled_m=read.travelled_m,
+        stretch=int(journey.stretch[read.epoch]),
+        scale_sigma=float(journey.scale_sigma[read.epoch]),
+        slack_m=read.balise.accuracy_m,
+    )
 
 
 class Recovery:
@@ -79,9 +111,5 @@ class Recovery:
 
     def relinks(self, k: int, anchor: Anchor) -> bool:
         """GNSS minus odometer is what it was at the anchor."""
-        offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
-        moved_m = abs(offset_m - anchor.offset_m)
-        if moved_m > self._limits.failure_limit_m:
-            return False
         bound_m = relink_bound_m(anchor, k, self._journey, self._limits)
-        return bound_m is not None and moved_m <= bound_m
+        return bound_m is not None and abs(moved_m(anchor, k, self._journey)) <= bound_m

@@ -24,13 +24,15 @@ class LdsResult:
     `epochs`: `t` and the LDS columns, row for row with the input. `passages`: as in the contract,
     in order of time; what needs a truth is null or `none`; beside it `t_reckoned`: when the train
     passes a balise that was not offered, by LRVB and odometer. `restarts`: epochs at which
-    the bank was restarted after the first. `unknown_reads`: telegrams of balises not on the path.
+    the bank was restarted after the first. `undecided`: epochs after a break of the diagnosis at which the odometer
+    could not tell whether the position had moved meanwhile. `unknown_reads`: telegrams of balises not on the path.
     """
 
     epochs: pl.DataFrame
     passages: pl.DataFrame
     restarts: list[int]
     negations: list[Negation]
+    undecided: list[int]
     unknown_reads: pl.DataFrame
 
 
@@ -47,7 +49,8 @@ def run_lds(
 
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, sigma_along_m, confidence_m, odometer_m` (along growing path, cumulative; null
-    where unknown)`, direction` (+1/-1, used where there is no odometer)`, scale_sigma`.
+    where unknown)`, odometer_stretch, speed_mps, direction` (+1/-1, used where there is no odometer)`,
+    scale_sigma, latency_sigma_s`.
     `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, optionally `odometer_m`
     at the read; without it the odometer is interpolated between near epochs. A run without that
     stream has no reader, so its physical balises have no passages.
@@ -63,5 +66,6 @@ def run_lds(
         passages=passage_rows(passages, journey, solution),
         restarts=system.restarts,
         negations=system.negations,
+        undecided=system.undecided,
         unknown_reads=unknown,
     )

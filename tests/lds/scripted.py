@@ -73,6 +73,9 @@ def epochs_of(
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
         scale_sigma=pl.lit(1e-4),
+        odometer_stretch=pl.lit(0, pl.Int64),
+        speed_mps=pl.lit(20.0),
+        latency_sigma_s=pl.lit(0.0),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()

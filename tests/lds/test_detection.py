@@ -255,7 +255,11 @@ def test_jump_over_two_balises_offers_both_in_order() -> None:
     # From 14 to 15 s the position goes from 280 to 420 m, the odometer 20 m: V2 and V3 are early.
     odometer_m = steps(0.0, 20.0, 30)
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(odometer_m)]
-    result = run(epochs_of(path_m, odometer_m), balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0}))
+    balises = balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0})
+    # The linking distance fails at the same epoch, and a failing monitor comes first.
+    seen = run(epochs_of(path_m, odometer_m), balises)
+    assert [row[1] for row in told(seen, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
+    result = run(epochs_of(path_m, odometer_m), balises, limits=replace(LIMITS, disabled=("link_distance",)))
     assert told(result, *STATUS, "odometer_distance_m", "linking_error") == [
         ("V1", "accepted", 5.5, None, "none"),
         ("V2", "rejected_window", 14.5, 180.0, "early"),

@@ -38,9 +38,11 @@ class Chaos:
             self.path_m.append(None if lost else at + offset + dice.gauss(0.0, 1.0))
         if seed % 5 == 0:
             self.odometer_m[300:] = [None] * (size - 300)
+        slips = sorted(dice.sample(range(size), 3)) if seed % 4 == 0 else []
+        self.stretch = [sum(slip <= k for slip in slips) for k in range(size)]
         self.fails = {k for k in range(size) if dice.random() < 0.01}
         blind = {k for k in range(size) if self.path_m[k] is None or self.odometer_m[k] is None}
-        self.blind = blind | {k + 1 for k in blind}
+        self.blind = blind | {k + 1 for k in blind} | set(slips)
         self.places = {f"V{i:02d}": i * dice.choice([60.0, 200.0, 500.0]) + i for i in range(-5, 12)}
         self.places |= {f"P{i:02d}": i * 450.0 + 3.0 for i in range(5)}
         self.kinds = ["physical" if name.startswith("P") else "virtual" for name in self.places]
@@ -49,7 +51,8 @@ class Chaos:
 
     def replayed(self, shift_s: int = 0) -> LdsResult:
         later = pl.col("t") + pl.duration(seconds=shift_s)
-        epochs = epochs_of(self.path_m, self.odometer_m).with_columns(later)
+        stretch = self.stretch[: len(self.path_m)]
+        epochs = epochs_of(self.path_m, self.odometer_m, odometer_stretch=stretch).with_columns(later)
         balises = balises_at(self.places, kind=self.kinds, linked=self.linked)
         reads = reads_at(self.reads).with_columns(later)
         return run(epochs, balises, ScriptedBank(self.fails, blind=self.blind), reads)
@@ -128,6 +131,7 @@ def test_what_comes_later_changes_no_decision_before(seed: int) -> None:
     chaos.reads = [read for read in chaos.reads if read[0] <= cut - 1]
     part = chaos.replayed()
     columns = ["lds_mode", "tvb", "lrvb_id", "negated", "alarm", "exposure_s", "link_order_value"]
+    columns += ["link_distance_value", "link_distance_state", "link_distance_reason"]
     assert part.epochs.select(columns).equals(whole.epochs.head(cut).select(columns))
 
 
