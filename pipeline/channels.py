@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import polars as pl
 
+from pipeline.timeline import NS_PER_S, nominal_period_s
+
 _PLACE = ("netelement_id", "measure_m", "path_m")
+_LEAST_GAP_S = 1.0
+_GAP_IN_PERIODS = 1.5
 
 
 def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
@@ -19,7 +23,7 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
     the beginning: as they will).
     """
     mine, theirs = _with_sense(epochs), _with_sense(other).with_row_index("row")
-    pairs = theirs.join(mine, on="t", how="left", suffix="_mine", maintain_order="left")
+    pairs = theirs.join_asof(mine, on="t_ns", strategy="nearest", tolerance=_gap_ns(epochs), suffix="_mine")
     together = (pl.col("netelement_id") == pl.col("netelement_id_mine")) & (pl.col("sense") * pl.col("sense_mine") != 0)
     turned = pl.col("sense") * pl.col("sense_mine")
     here_m = pl.col("path_m_mine") + pl.col("sense_mine") * (pl.col("measure_m") - pl.col("measure_m_mine"))
@@ -35,10 +39,42 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
     return other.with_columns(placed.sort("row")["path_m"])
 
 
+def paired(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
+    """For each epoch: `row_other`, the last of `other` since the epoch before, and `path_m`, where the train was then.
+
+    Two receivers need not measure at the same times. Where they do, `path_m` is the epoch's own; else it lies between
+    the positions of this epoch and the one before, if both have one and are no more than max(1.5 periods, 1 s) apart.
+    Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `other` with `t`.
+    """
+    stamps = other.select(t_other=_stamp()).with_row_index("row_other")
+    own = epochs.select("path_m", t_ns=_stamp())
+    since = pl.col("t_ns") - pl.col("t_ns").shift(1)
+    early = pl.col("t_ns") - pl.col("t_other")
+    between = (early < since) & (since <= _gap_ns(epochs))
+    way = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
+    return (
+        own.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
+        .with_columns(path_m=pl.when(early == 0).then("path_m").when(between).then(pl.col("path_m") - way))
+        .select("path_m", row_other=pl.when(pl.col("path_m").is_not_null()).then("row_other"))
+    )
+
+
+def _stamp() -> pl.Expr:
+    return pl.col("t").to_physical()
+
+
+def _gap_ns(epochs: pl.DataFrame) -> int:
+    """Longest distance of epochs [ns] over which a position is carried."""
+    period_s = nominal_period_s(epochs["t"].to_physical().to_numpy()) or 0.0
+    return round(max(_GAP_IN_PERIODS * period_s, _LEAST_GAP_S) * NS_PER_S)
+
+
 def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
     """Places with `sense`: +1 where the path runs with the measure of its net element, -1 against it; 0 where a
     visit does not tell.
     """
     own = [pl.col(name) - pl.col(name).mean().over("visit") for name in ("path_m", "measure_m")]
-    placed = epochs.select("t", *_PLACE, visit=pl.col("netelement_id").rle_id()).with_columns(moved=own[0] * own[1])
-    return placed.select("t", *_PLACE, sense=pl.col("moved").sum().over("visit").sign().cast(pl.Int8))
+    placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id()).with_columns(
+        moved=own[0] * own[1]
+    )
+    return placed.select("t_ns", *_PLACE, sense=pl.col("moved").sum().over("visit").sign().cast(pl.Int8))

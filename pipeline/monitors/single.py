@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.channels import paired
 from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
 from schemas.config import Configuration
 from schemas.enums import MonitorState
@@ -98,21 +99,23 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
 def channel_monitor(epochs: pl.DataFrame, other: pl.DataFrame | None, factor: float) -> pl.DataFrame:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
-    `other`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path. Errors that
-    both share (troposphere) make the threshold larger than it need be.
+    `other`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path; at an epoch its
+    last position since the epoch before counts, against this solution's at that time (`paired`). Errors that both share
+    (troposphere) make the threshold larger than it need be.
     """
     if other is None:
         return blind_monitor(epochs.height, NO_OTHER_SOLUTION)
-    usable = other.filter("fix_valid", "on_track").select("t", path_other_m="path_m", sigma_other_m="sigma_along_m")
-    both = epochs.select("t", "path_m", "sigma_along_m", "fix_valid", "on_track").join(
-        usable, on="t", how="left", maintain_order="left"
-    )
-    value = _floats(both["path_m"]) - _floats(both["path_other_m"])
-    threshold = factor * np.hypot(_floats(both["sigma_along_m"]), _floats(both["sigma_other_m"]))
-    reasons = both.select(
+    usable = other.filter("fix_valid", "on_track")
+    placed = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
+    pairs = paired(epochs.select("t", path_m=placed), usable)
+    met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
+    sigma_m, sigma_other_m = epochs["sigma_along_m"], met["sigma_along_m"]
+    value = _floats(pairs["path_m"]) - _floats(met["path_m"])
+    threshold = factor * np.hypot(_floats(sigma_m), _floats(sigma_other_m))
+    reasons = epochs.select(
         pl.when(~pl.col("fix_valid") | ~pl.col("on_track") | pl.col("sigma_along_m").is_null())
         .then(pl.lit(NO_POSITION))
-        .when(pl.col("path_other_m").is_null() | pl.col("sigma_other_m").is_null())
+        .when(met["path_m"].is_null() | sigma_other_m.is_null())
         .then(pl.lit(NO_OTHER_EPOCH))
     ).to_series()
     return judged(value, threshold, reasons)

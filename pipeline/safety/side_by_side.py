@@ -12,7 +12,7 @@ from itertools import permutations
 
 import polars as pl
 
-from pipeline.channels import on_path_of
+from pipeline.channels import on_path_of, paired
 from pipeline.epoch_clock import trusted
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.monitors.single import channel_monitor
@@ -168,9 +168,8 @@ def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally
     compared = channel_monitor(positioned, placed, factor).select(
         pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
     )
-    both = other.epochs.select("t", other_trusted=trusted(config))
-    own = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared)
-    frame = own.join(both, on="t", how="left", maintain_order="left")
+    met = other.epochs.select(other_trusted=trusted(config).gather(paired(one.epochs, other.epochs)["row_other"]))
+    frame = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared).hstack(met)
     trust = pl.col("own_trusted") & pl.col("other_trusted")
     channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
     verdicts = verdicts_of(channel.fails.alarms, (one.side, other.side), config.hazards)

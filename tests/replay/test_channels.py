@@ -8,7 +8,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.assessment import assess
-from pipeline.channels import on_path_of
+from pipeline.channels import on_path_of, paired
 from pipeline.report import write_report
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
 from pipeline.stages import replay
@@ -206,3 +206,37 @@ def test_a_path_from_another_origin_against_the_measure_and_over_a_border():
     assert on_path_of(longer, other)["path_m"].to_list() == [1003.0, 1002.0, 1001.0, 1008.0, 1020.0]
     apart = other.with_columns(netelement_id=pl.lit("C"))
     assert on_path_of(longer, apart)["path_m"].to_list() == [None] * 5
+
+
+def test_pairs_of_epochs_that_were_not_measured_at_one_time():
+    """At 1 Hz the train moves 20 m; the last epoch comes after a gap, and the fourth has no position."""
+    ms = pl.duration(milliseconds=pl.col("ms"), time_unit="ns")
+    start = pl.lit(0).cast(pl.Datetime("ns", "UTC"))
+    mine = pl.DataFrame(
+        {"ms": [0, 1000, 2000, 3000, 4000, 9000], "path_m": [0.0, 20.0, 40.0, None, 80.0, 180.0]}
+    ).with_columns(t=start + ms)
+    other = pl.DataFrame({"ms": [0, 900, 950, 2000, 2500, 3500, 8500]}).with_columns(t=start + ms)
+    found = paired(mine, other)
+    assert found["row_other"].to_list() == [0, 2, 3, None, None, None]
+    assert found["path_m"].to_list() == [0.0, pytest.approx(19.0), 40.0, None, None, None]
+
+
+@pytest.mark.parametrize("behind_ms", [0, 37])
+def test_offset_is_seen_whatever_the_stamps_of_the_other_receiver(behind_ms):
+    faulty, site = journey(OFFSET)
+    sound, _ = journey(seed=9)
+    later = sound.with_streams(gnss=_as_of(sound.gnss, behind_ms))
+    found = rows(replay(two(faulty, later), site, VEHICLE))
+    for name in ("primary", "galileo"):
+        row = found[name, COMPOSITE]
+        assert (row["alarms"], row["false_alarms"]) == (1, 0)
+    assert found["primary", COMPOSITE]["time_to_detect_max_s"] == pytest.approx(0.0, abs=0.21)
+
+
+def _as_of(gnss, behind_ms):
+    """The same journey measured so much later: each position carried on by the velocity between the epochs."""
+    share = behind_ms / 100.0
+    places = ("latitude_deg", "longitude_deg", "height_m")
+    ahead = [pl.col(name) + share * (pl.col(name).shift(-1) - pl.col(name)) for name in places]
+    later = pl.col("t") + pl.duration(milliseconds=behind_ms, time_unit="ns")
+    return gnss.with_columns(*ahead, t=later).drop_nulls("latitude_deg")

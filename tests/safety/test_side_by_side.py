@@ -190,9 +190,19 @@ class TestAvailability:
             assert found[key]["availability"] == pytest.approx(1 - 10 / 199)
         assert found["galileo", REACTIVE]["availability"] == 1.0
 
-    def test_no_common_epoch_no_comparison(self) -> None:
-        late = solution("galileo").with_columns(pl.col("t") + pl.duration(nanoseconds=400_000_000))
+    def test_receivers_that_measure_at_other_times_are_compared_there(self) -> None:
+        late = solution("galileo", off=during(50, 60, 9.0)).with_columns(
+            pl.col("t") + pl.duration(nanoseconds=400_000_000), pl.col("path_m", "measure_m") + 8.0
+        )
         row = compared(solution("gps"), late)["gps", COMPOSITE]
+        # The first epoch has none before it; recovery after the alarm takes 30 s more than the alarm.
+        assert row["judged_h"] == pytest.approx(198 / 3600)
+        assert row["alarms"] == 1
+        assert row["availability"] == pytest.approx(1 - (1 + 11 + 30) / 199)
+
+    def test_no_epoch_of_the_other_no_comparison(self) -> None:
+        later = solution("galileo").with_columns(pl.col("t") + pl.duration(seconds=500, time_unit="ns"))
+        row = compared(solution("gps"), later)["gps", COMPOSITE]
         assert (row["availability"], row["judged_h"], row["false_alarm_rate_per_h"]) == (0.0, 0.0, None)
 
 
