@@ -75,11 +75,35 @@ def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> 
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
     frame = _supplemented(_named(columns.with_columns(times), source), part, supplements)
+    frame = _stamped(frame, source, remarks)
     if source.recipe.time is None or not frame["t"].null_count():
         return frame
     # The calendar of a receiver that does not know the time yet: there is no epoch to be placed anywhere.
     remarks.append(f"{source.channel.topic}: {frame['t'].null_count()} messages without valid time")
     return frame.drop_nulls("t")
+
+
+def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:
+    """Without the messages whose stamp is 0, as of a driver that did not know the time yet."""
+    if source.recipe.own:
+        return frame
+    unset = frame["t"].to_physical() == 0
+    count = int(unset.sum())
+    if count < _STAMPS_NEVER_SET:
+        return frame
+    if count == frame.height:
+        raise InputError(
+            "has no time of validity",
+            place=source.channel.place,
+            found="stamps of 0 in all messages",
+            expected="the time at which the position was valid",
+            remedy='If the log time is near enough, map the topic with time = "log".',
+        )
+    remarks.append(f"{source.channel.topic}: {count} messages with a stamp of 0")
+    return frame.filter(~unset.fill_null(False))
+
+
+_STAMPS_NEVER_SET = 2  # a single 0 may be the start of a clock
 
 
 def _columns(frame: pl.DataFrame, wanted: Mapping[str, pl.Expr]) -> pl.DataFrame:

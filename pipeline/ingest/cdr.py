@@ -41,6 +41,7 @@ _TIME = (Member("sec", "uint32", None), Member("nanosec", "uint32", None))
 def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
     """All messages of a concatenated definition by short name (`pkg/Type`)."""
     found: dict[str, Definition] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
+    text = "\n".join(text.splitlines())  # whatever ends the recorder's lines
     for index, section in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
         title = re.search(r"^MSG:\s+(\S+)\s*$", section, flags=re.MULTILINE)
         if title is None and index > 0:

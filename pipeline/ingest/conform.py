@@ -64,6 +64,8 @@ def _column(frame: pl.DataFrame, name: str, column: dy.Column, place: str, breac
     if name not in frame.columns:
         return pl.Series(name, [DEFAULTS.get(name)], dtype=column.dtype).new_from_index(0, frame.height)
     series = _converted(frame[name], column)
+    if name in DEFAULTS and not isinstance(series, str) and series.null_count():
+        series = series.fill_null(DEFAULTS[name])
     if isinstance(series, str):
         breaches.append(Breach(where, "has the wrong type", found=series, expected=type_name(column), remedy=_RETYPE))
         return None
@@ -92,7 +94,7 @@ def _converted(series: pl.Series, column: dy.Column) -> pl.Series | str:
 
 
 def _to_float(series: pl.Series, target: pl.DataType) -> pl.Series | str:
-    if series.dtype == pl.Float32:
+    if series.dtype in (pl.Float32, pl.Float16) or series.dtype.is_decimal():
         return series.cast(target)
     if series.dtype.is_integer():
         low, high = series.min(), series.max()

@@ -55,7 +55,9 @@ class Summary:
             ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
         ]
         if met.span_ns:
-            pairs.append(("times", (told.start_ns, told.end_ns), met.span_ns))
+            # Some writers take a first time of 0 for none yet, and tell of the earliest after it.
+            start_ns = told.start_ns if met.span_ns[0] else 0
+            pairs.append(("times", (start_ns, told.end_ns), met.span_ns))
         for name, expected, found in pairs:
             if expected != found:
                 raise DamageError(position, f"the statistics speak of {expected} {name}, the file holds {found}")

@@ -51,7 +51,8 @@ class McapWalk:
         self.channels: dict[int, Channel] = {}
         self.met = Met()
         self.data_crc = (0, 0)
-        self._chunks_without_crc = 0
+        self.crc_covers_chunks = True
+        self.without_own_crc: list[tuple[int, int]] = []  # contents of chunks, from and to
         self._loose_blocks = 0
         self.cut_at: int | None = None
         self.unknown_records = 0
@@ -94,7 +95,8 @@ class McapWalk:
     @property
     def without_crc(self) -> int:
         """Blocks of messages whose content no checksum covers."""
-        return 0 if self.data_crc[0] else self._chunks_without_crc + self._loose_blocks
+        loose = 0 if self.data_crc[0] else self._loose_blocks
+        return loose + (0 if self.data_crc[0] and self.crc_covers_chunks else len(self.without_own_crc))
 
     def _first_record(self) -> int | None:
         size = self._window.size
@@ -210,6 +212,9 @@ class McapWalk:
         if chunk.size > self._limit:
             told = f"a chunk declares {chunk.size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
             raise DamageError(position, told)
+        end = position + HEAD_SIZE + len(body)
+        if not chunk.crc:
+            self.without_own_crc.append((end - len(chunk.records), end))
         self._pending.append(Pending(chunk, len(body) + HEAD_SIZE))
         self._pending_size += chunk.size
 
@@ -243,7 +248,6 @@ class McapWalk:
             chunk = waiting.chunk
             placed.append(Placed(placed[-1].end if placed else 0, chunk.size, chunk.offset, waiting.indexes))
             self._unpacker.unpack(chunk, memoryview(data.data)[placed[-1].base : placed[-1].end])
-            self._chunks_without_crc += chunk.crc == 0
             self.met.chunks.append(waiting.summary())
         found = messages_in(data, placed, self._ordinal, self._chunk_record)
         return self._counted(found, placed[0].offset, size)

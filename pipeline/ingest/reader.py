@@ -35,16 +35,18 @@ def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder | 
             from pipeline.ingest.json_columns import JsonDecoder
 
             return JsonDecoder(types)
-        if channel.encoding == "cdr" and channel.schema and channel.schema.encoding == "ros2msg":
+        if channel.encoding == "cdr" and channel.schema and channel.schema.encoding in ("ros2msg", "ros2idl"):
             from pipeline.ingest.cdr import CdrWalk
+            from pipeline.ingest.ros2_idl import as_ros2msg
 
-            return TemplateDecoder(CdrWalk(channel.schema.name, channel.schema.data.decode(), types))
+            schema = as_ros2msg(channel.schema)
+            return TemplateDecoder(CdrWalk(schema.name, schema.data.decode(), types))
         if channel.encoding == "protobuf":
             from pipeline.ingest.generic import protobuf_descriptor
             from pipeline.ingest.protobuf import ProtobufWalk
 
             return TemplateDecoder(ProtobufWalk(protobuf_descriptor(channel), types))
-    except (UnfitError, UnicodeDecodeError):
+    except (UnfitError, ValueError):  # a schema that is not understood: the ordinary decoder says why
         return None
     return None
 

@@ -61,9 +61,12 @@ def unless(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
 
 
 def covariance_enu(known: pl.Expr, path: str = "position_covariance") -> dict[str, pl.Expr]:
-    """Upper triangle of a row-major east-north-up covariance [m2]."""
+    """Upper triangle of a row-major east-north-up covariance [m2]; NaN is how drivers say that one is not known."""
     places = {"ee": 0, "en": 1, "eu": 2, "nn": 4, "nu": 5, "uu": 8}
-    return {f"cov_{axes}_m2": pl.when(known).then(pl.col(f"{path}[{place}]")) for axes, place in places.items()}
+    return {
+        f"cov_{axes}_m2": pl.when(known).then(pl.col(f"{path}[{place}]").fill_nan(None))
+        for axes, place in places.items()
+    }
 
 
 def position_unless_no_fix(path: str, status: pl.Expr) -> pl.Expr:

@@ -38,14 +38,18 @@ def _navsatfix() -> Recipe:
 
 
 def _location_fix() -> Recipe:
-    """foxglove.LocationFix: it has no status, so every position counts as an autonomous fix."""
+    """foxglove.LocationFix: it has no status, so every position counts as an autonomous fix.
+
+    Later versions have a velocity, east, north and up.
+    """
     return Recipe(
         stream="gnss",
         stamps={"t": "timestamp"},
         columns={
             "latitude_deg": pl.col("latitude"),
             "longitude_deg": pl.col("longitude"),
-            "height_m": pl.col("altitude"),
+            "height_m": pl.col("altitude").fill_nan(None),
+            **{f"vel_{axis}_mps": pl.col(f"velocity.{name}") for axis, name in zip("enu", "xyz", strict=True)},
             "fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE),
             **covariance_enu(pl.col("position_covariance_type") > 0),
         },

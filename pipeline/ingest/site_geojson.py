@@ -2,7 +2,8 @@
 
 Read as ERA RINF exports and measurement-train networks write it: an element carries `id` or
 `netelement_id`; a relation carries `netelementA`, `positionOnA`, `netelementB`, `positionOnB` and
-`navigability`. Case and underscores of property names do not matter.
+`navigability`, or in the words of the ERA vocabulary `elementA`, `isOnOriginOfElementA` and so on. Case and
+underscores of property names do not matter.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from schemas.enums import Navigability
 _ID_KEYS = ("netelementid", "id", "elementid", "name")
 _LENGTH_KEYS = ("lengthm", "length")
 _A_KEYS, _B_KEYS = ("netelementa", "elementa"), ("netelementb", "elementb")
-_POSITION_A_KEYS, _POSITION_B_KEYS = ("positionona", "positiona"), ("positiononb", "positionb")
+_POSITIONS_A = (("positionona", "positiona"), "isonoriginofelementa")
+_POSITIONS_B = (("positiononb", "positionb"), "isonoriginofelementb")
 
 
 @dataclass
@@ -38,9 +40,8 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     """Net elements and net relations of a FeatureCollection, or breaches."""
     try:
         document = json.loads(data)
-        features = document["features"]
-        epsg = _epsg(document)
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        features, epsg = list(document["features"]), _epsg(document)
+    except (KeyError, TypeError, ValueError) as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
     points: dict[str, list[Any]] = {name: [] for name in _TRACK_COLUMNS}
@@ -49,19 +50,25 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     ignored = 0
     for number, feature in enumerate(features):
         place = f"{file}: feature {number}"
-        if not isinstance(feature, Mapping):
-            breaches.append(f"{place}: not a feature")
-            continue
+        geometry = _part(feature, "geometry")
         keys = _plain_keys(feature)
-        if any(key in keys for key in _A_KEYS):
+        if geometry is None or keys is None:
+            breaches.append(f"{place}: not a feature with properties and a geometry")
+        elif any(key in keys for key in _A_KEYS):
             _add_relation(place, keys, relations, breaches)
-        elif (feature.get("geometry") or {}).get("type") in ("LineString", "MultiLineString"):
-            _add_element(place, feature["geometry"], keys, points, lengths, breaches)
+        elif geometry.get("type") in ("LineString", "MultiLineString"):
+            _add_element(place, geometry, keys, points, lengths, breaches)
         else:
             ignored += 1
     track = RawTable(file, pl.DataFrame(points, schema=_TRACK_COLUMNS), epsg)
     links = RawTable(file, pl.DataFrame(relations, schema=_LINK_COLUMNS)) if relations["netelement_a"] else None
     return Network(track, links, lengths, ignored)
+
+
+def _part(feature: Any, name: str) -> Mapping[str, Any] | None:
+    """The geometry or properties of a feature, empty where it has none; none where that is no object."""
+    found = (feature.get(name) or {}) if isinstance(feature, Mapping) else None
+    return found if isinstance(found, Mapping) else None
 
 
 _TRACK_COLUMNS = {
@@ -79,9 +86,11 @@ _LINK_COLUMNS = {
 }
 
 
-def _plain_keys(feature: Mapping[str, Any]) -> dict[str, Any]:
+def _plain_keys(feature: Any) -> dict[str, Any] | None:
     """Properties by lower-case name without underscores; the feature's own `id` where they have none."""
-    properties = feature.get("properties") or {}
+    properties = _part(feature, "properties")
+    if properties is None:
+        return None
     keys = {re.sub(r"[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
     if feature.get("id") is not None:
         keys.setdefault("id", feature["id"])
@@ -126,17 +135,30 @@ def _add_element(
 
 
 def _add_relation(place: str, keys: Mapping[str, Any], relations: dict[str, list[Any]], breaches: list[str]) -> None:
-    position_a, position_b = _first(keys, _POSITION_A_KEYS), _first(keys, _POSITION_B_KEYS)
-    word = str(keys.get("navigability")).strip().lower()
+    ends = [_first(keys, _A_KEYS), _first(keys, _B_KEYS)]
+    positions = [_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
+    # Vocabularies give the word as the last part of an address.
+    word = re.split("[/#]", str(keys.get("navigability")).strip().lower())[-1]
     known = {member.value.lower(): member.value for member in Navigability}
     if word not in known:
         breaches.append(f"{place}: navigability {word!r}; expected one of {', '.join(Navigability)}")
-    elif position_a not in (0, 1) or position_b not in (0, 1):
-        breaches.append(f"{place}: positionOnA {position_a!r}, positionOnB {position_b!r}; expected 0 or 1")
+    elif None in positions:
+        found = [_first(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B)]
+        breaches.append(f"{place}: positionOnA {found[0]!r}, positionOnB {found[1]!r}; expected 0 or 1")
+    elif None in ends:
+        breaches.append(f"{place}: netelementA {ends[0]!r}, netelementB {ends[1]!r}; a relation joins two elements")
     else:
-        row = (_first(keys, _A_KEYS), position_a, _first(keys, _B_KEYS), position_b)
-        for column, value in zip(_LINK_COLUMNS, (*row, known[word]), strict=True):
-            relations[column].append(str(value) if column.startswith("netelement") else value)
+        row = (str(ends[0]), positions[0], str(ends[1]), positions[1], known[word])
+        for column, value in zip(_LINK_COLUMNS, row, strict=True):
+            relations[column].append(value)
+
+
+def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> int | None:
+    """End 0 or 1 of an element, or whether it is its origin (ERA vocabulary); none where neither is said."""
+    said, at_origin = _first(keys, names), keys.get(origin)
+    if said is None and isinstance(at_origin, bool):
+        return 0 if at_origin else 1
+    return {"0": 0, "1": 1, "0.0": 0, "1.0": 1}.get(str(said))
 
 
 def _epsg(document: Mapping[str, Any]) -> int:
@@ -144,7 +166,9 @@ def _epsg(document: Mapping[str, Any]) -> int:
     crs = document.get("crs")
     if crs is None:
         return int(document.get("epsg") or EPSG_WGS84)
-    name = str(crs.get("properties", {}).get("name", crs.get("properties", {}).get("code", "")))
+    properties = crs.get("properties") if isinstance(crs, Mapping) else {"name": crs}
+    named = properties if isinstance(properties, Mapping) else {}
+    name = str(named.get("name", named.get("code", "")))
     if name.upper().endswith("CRS84"):
         return EPSG_WGS84
     code = re.search(r"(\d+)$", name)

@@ -206,3 +206,19 @@ def test_addresses_through_fsspec(tmp_path):
     part = content[: len(content) // 2]
     store.pipe("/bucket/cut.mcap", part)
     assert read_run("memory://bucket/cut.mcap", CONFIG).notes.partial_until_ns is not None
+
+
+def test_decimals_and_half_floats_of_other_programs_are_numbers(tmp_path):
+    with_decimals = MINIMAL.with_columns(
+        pl.Series("height_m", ["98.5", "99.25", None]).cast(pl.Decimal(6, 2)),
+        pl.Series("hpl_m", [1.5, 2.5, None], dtype=pl.Float32).cast(pl.Float16),
+    )
+    log = read_run(folder(tmp_path, gnss=with_decimals), CONFIG)
+    assert log.gnss["height_m"].to_list() == [98.5, 99.25, None]
+    assert log.gnss["hpl_m"].to_list() == [1.5, 2.5, None]
+
+
+@pytest.mark.parametrize("names", [[None] * 3, [None, "b", None]])
+def test_a_solution_without_a_name_is_the_default_one(tmp_path, names):
+    log = read_run(folder(tmp_path, gnss=MINIMAL.with_columns(pl.Series("solution", names, dtype=pl.String))), CONFIG)
+    assert log.gnss["solution"].to_list() == [name or "primary" for name in names]
