@@ -166,6 +166,9 @@ def safety(
 @app.command()
 def inspect(
     path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
+    result: Annotated[
+        str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
+    ] = None,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -174,7 +177,7 @@ def inspect(
     from pipeline.present import show_table
 
     settings, _ = _settings(config, None)
-    tables = inspect_path(path, settings.ingest)
+    tables = inspect_path(path, settings.ingest, result)
     if as_json:
         _print_json(tables)
     else:

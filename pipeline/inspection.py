@@ -14,6 +14,7 @@ from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
 from pipeline.matching.describe import describe_site
+from pipeline.matching.survey import survey_findings
 from pipeline.site_windows import window_findings
 from schemas.config import IngestConfig
 from schemas.errors import UsageError
@@ -27,13 +28,17 @@ _RUN_COLUMNS = (
 )
 
 
-def inspect_path(path: Address, config: IngestConfig | None = None) -> dict[str, pl.DataFrame]:
-    """Tables by title, for whatever stands at the path."""
+def inspect_path(
+    path: Address, config: IngestConfig | None = None, result: Address | None = None
+) -> dict[str, pl.DataFrame]:
+    """Tables by title, for whatever stands at the path; `result`: runs over a site, for what they say of its survey."""
     if not files.exists(path):
         raise UsageError("does not exist", place=storage.redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()
     if names & _SITE_FILES:
-        return inspect_site(path)
+        return inspect_site(path, result)
+    if result is not None:
+        raise UsageError("is no site", place=storage.redacted(str(path)), expected="a site, to hold a result against")
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if files.name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
@@ -83,12 +88,22 @@ def _instant(t_ns: int | None) -> datetime | None:
     return None if t_ns is None else datetime.fromtimestamp(t_ns / 1e9, UTC)
 
 
-def inspect_site(path: Address) -> dict[str, pl.DataFrame]:
-    """Figures and findings of a site; among these balises that linking cannot tell apart."""
+def inspect_site(path: Address, result: Address | None = None) -> dict[str, pl.DataFrame]:
+    """Figures and findings of a site; among these balises that linking cannot tell apart.
+
+    With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
+    """
     site = read_site(path)
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
-    return {"Site": _figures(figures), "Findings": _findings((*description.findings, *window_findings(site)))}
+    tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *window_findings(site)))}
+    if result is None:
+        return tables
+    runs = store.run_ids(result)
+    if not runs:
+        raise UsageError("holds no complete run", place=storage.redacted(str(result)))
+    epochs = (store.read_table(result, "epochs", run).collect() for run in runs)
+    return {**tables, "Survey": survey_findings(epochs, site.track)}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:

@@ -42,18 +42,13 @@ def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, 
     return Window(distance_m - half_m, distance_m + half_m)
 
 
-def minimal_next_spacing_m(distance_m: float, accuracy_m: float, config: LdsConfig = DEFAULTS) -> float:
-    """Smallest distance from a balise at `distance_m` to the next whose window does not overlap its own.
-
-    All three balises (reference, expected, next) have the same location accuracy (LOC section III).
-    """
-    return minimal_spacing_m(distance_m, accuracy_m, accuracy_m, accuracy_m, config)
-
-
 def minimal_spacing_m(
     distance_m: float, accuracy_m: float, next_accuracy_m: float, reference_accuracy_m: float, config: LdsConfig
 ) -> float:
-    """The same where each of the balises has a location accuracy of its own."""
+    """Smallest distance from a balise at `distance_m` to the next whose window does not overlap its own.
+
+    The balise, the next and the reference each have their location accuracy (LOC section III: one for all).
+    """
     margin_m = next_accuracy_m + reference_accuracy_m + config.odometer_fixed_m
     close_m = window_m(distance_m, accuracy_m, reference_accuracy_m, config).close_m
     return close_m * (1.0 + config.odometer_share) + margin_m - distance_m

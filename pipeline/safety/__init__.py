@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.safety.architectures import architectures_table, fail_safety_table
-from pipeline.safety.budget import allocation_table, allowed_table, demands_table
+from pipeline.safety.budget import allocation_table, allowed_table, demands_table, tolerable_table
 from pipeline.safety.continuity import continuity_table
 from pipeline.safety.errata import Erratum, errata, errata_table
 from pipeline.safety.markov import markov_table
@@ -27,6 +27,7 @@ def safety_tables(config: SafetyConfig) -> dict[str, pl.DataFrame]:
     return {
         "allocation": allocation_table(config),
         "allowed_time_to_detect": allowed_table(config),
+        "tolerable_gnss_rate": tolerable_table(config),
         "demands": demands_table(config),
         "markov": markov_table(config),
         "architectures": architectures_table(config),

@@ -53,6 +53,24 @@ def tolerable_gnss_rate_per_h(thr_per_h: float, time_to_detect_s: float, demands
     return thr_per_h / (time_to_detect_s / S_PER_H * demands_per_hour)
 
 
+def tolerable_table(
+    config: SafetyConfig, times_s: tuple[float, ...] = (2.0 * RECEIVER_PERIOD_S, 1.0, 10.0, 30.0, 100.0)
+) -> pl.DataFrame:
+    """The other way round: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
+    demands = config.demands_per_hour
+    rows = [
+        (
+            time_s,
+            tolerable_gnss_rate_per_h(config.thr_vb_per_h, time_s),
+            demands,
+            tolerable_gnss_rate_per_h(config.thr_vb_per_h, time_s, demands),
+        )
+        for time_s in times_s
+    ]
+    columns = ["time_to_detect_s", "tolerable_published_per_h", "demands_per_hour", "tolerable_per_h"]
+    return pl.DataFrame(rows, schema=columns, orient="row")
+
+
 def demands_per_hour(speed_kmh: float, spacing_m: float) -> float:
     """Virtual balises passed in an hour: 64 at 160 km/h and 2.5 km, 400 at 400 m."""
     return speed_kmh * 1000.0 / spacing_m

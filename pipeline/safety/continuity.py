@@ -18,11 +18,6 @@ def continuity(t_s: float, mtbf_h: float) -> float:
     return math.exp(-t_s / S_PER_H / mtbf_h)
 
 
-def continuity_linear(t_s: float, mtbf_h: float) -> float:
-    """The same for an MTBF far beyond `t_s` (LOC eq. 9)."""
-    return 1.0 - t_s / S_PER_H / mtbf_h
-
-
 def mtbf_h(continuity_risk: float, t_s: float) -> float:
     """MTBF [h] from a continuity risk per `t_s` (LOC eq. 10): 8e-6 per 15 s are 520.8 h."""
     return t_s / S_PER_H / continuity_risk

@@ -148,6 +148,18 @@ def test_inspect(balise: Balise, small_trial: SmallTrial, result: Path) -> None:
     assert [row["run_id"] for row in runs["Runs"]] == ["run0", "run1"]
 
 
+def test_inspect_a_site_against_the_runs_over_it(balise: Balise, small_trial: SmallTrial, result: Path) -> None:
+    found = json.loads(balise("inspect", small_trial.site, "--result", result, "--json").out)["Survey"]
+    # Both runs are parts of one journey, so only which rows there are is told, not how they come out.
+    assert {row["axis"] for row in found} == {"cross", "vertical"}
+    assert {row["netelement_id"] for row in found} == {"NE1"}
+    assert {row["runs"] for row in found} == {2}
+    wrong = balise("inspect", result, "--result", result)
+    assert (wrong.status, "is no site" in wrong.err) == (2, True)
+    empty = balise("inspect", small_trial.site, "--result", small_trial.site)
+    assert (empty.status, "holds no complete run" in empty.err) == (2, True)
+
+
 def test_inspect_logs(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
     log = json.loads(balise("inspect", small_trial.paths[0], "--json").out)
     assert {row["stream"]: row["rate_hz"] for row in log["Streams"]} == {"gnss": 10.0, "odometer": 25.0}

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.lds.windows import (
-    minimal_next_spacing_m,
+    minimal_spacing_m,
     window_after_turn_m,
     window_m,
 )
@@ -38,8 +38,8 @@ def test_window_is_not_symmetric_about_the_announced_distance(
     [(400.0, 73.7, 103.2), (1000.0, 136.8, 166.3), (2500.0, 294.7, 324.2)],
 )
 def test_minimal_spacing_for_disjoint_windows(distance_m: float, with_5_m: float, with_12_m: float) -> None:
-    assert minimal_next_spacing_m(distance_m, 5.0) == pytest.approx(with_5_m, abs=0.05)
-    assert minimal_next_spacing_m(distance_m, 12.0) == pytest.approx(with_12_m, abs=0.05)
+    assert minimal_spacing_m(distance_m, 5.0, 5.0, 5.0, CONFIG) == pytest.approx(with_5_m, abs=0.05)
+    assert minimal_spacing_m(distance_m, 12.0, 12.0, 12.0, CONFIG) == pytest.approx(with_12_m, abs=0.05)
 
 
 @given(
@@ -58,11 +58,13 @@ def test_window_holds_every_reading_within_the_odometer_s_accuracy(
         assert window.open_m - 1e-9 <= odometer_m <= window.close_m + 1e-9
 
 
-@given(distance_m=st.floats(50, 3000), accuracy_m=st.floats(0, 63))
-def test_minimal_spacing_makes_the_next_window_open_where_this_one_closes(distance_m: float, accuracy_m: float) -> None:
-    spacing_m = minimal_next_spacing_m(distance_m, accuracy_m)
-    close_m = window_m(distance_m, accuracy_m, accuracy_m, CONFIG).close_m
-    next_open_m = window_m(distance_m + spacing_m, accuracy_m, accuracy_m, CONFIG).open_m
+@given(distance_m=st.floats(50, 3000), own_m=st.floats(0, 63), next_m=st.floats(0, 63), reference_m=st.floats(0, 63))
+def test_minimal_spacing_makes_the_next_window_open_where_this_one_closes(
+    distance_m: float, own_m: float, next_m: float, reference_m: float
+) -> None:
+    spacing_m = minimal_spacing_m(distance_m, own_m, next_m, reference_m, CONFIG)
+    close_m = window_m(distance_m, own_m, reference_m, CONFIG).close_m
+    next_open_m = window_m(distance_m + spacing_m, next_m, reference_m, CONFIG).open_m
     assert next_open_m == pytest.approx(close_m, abs=1e-6)
 
 
