@@ -165,14 +165,19 @@ def _nav_sat(stamps: dict[str, str], rows: str, used: pl.Expr, types: dict[str, 
 
 
 # NovAtel OEM7 commands and logs reference manual, "Position or velocity type".
+# Services (OmniSTAR, CDGPS, PPP of any kind) count as differential; a velocity alone (8) is no position.
 _NOVATEL_TYPES = {
-    1: Fix.AUTONOMOUS, 16: Fix.AUTONOMOUS, 17: Fix.DIFFERENTIAL, 18: Fix.SBAS, 19: Fix.ESTIMATED,
-    32: Fix.RTK_FLOAT, 33: Fix.RTK_FLOAT, 34: Fix.RTK_FLOAT, 48: Fix.RTK_FIXED, 49: Fix.RTK_FIXED,
-    50: Fix.RTK_FIXED, 51: Fix.RTK_FIXED, 52: Fix.SBAS, 53: Fix.AUTONOMOUS, 54: Fix.DIFFERENTIAL,
-    55: Fix.RTK_FLOAT, 56: Fix.RTK_FIXED, 68: Fix.DIFFERENTIAL, 69: Fix.DIFFERENTIAL, 70: Fix.AUTONOMOUS,
-    71: Fix.AUTONOMOUS, 72: Fix.AUTONOMOUS, 73: Fix.DIFFERENTIAL, 74: Fix.DIFFERENTIAL, 77: Fix.DIFFERENTIAL,
-    78: Fix.DIFFERENTIAL,
-}  # fmt: skip
+    code: kind
+    for kind, codes in {
+        Fix.AUTONOMOUS: (1, 2, 16, 53, 70, 71, 72),
+        Fix.DIFFERENTIAL: (17, 20, 54, 57, 58, 59, 64, 65, 66, 68, 69, 73, 74, 75, 76, 77, 78, 79, 80),
+        Fix.SBAS: (18, 52),
+        Fix.ESTIMATED: (19, 67),
+        Fix.RTK_FLOAT: (4, 32, 33, 34, 35, 55),
+        Fix.RTK_FIXED: (5, 6, 46, 47, 48, 49, 50, 51, 56),
+    }.items()
+    for code in codes
+}
 
 
 def _bestpos() -> Recipe:

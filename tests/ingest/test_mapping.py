@@ -279,19 +279,37 @@ def test_ublox_calendar(tmp_path):
     assert log.notes.skipped_topics == ("/navpvt: 1 messages without valid time",)
 
 
-def test_novatel_and_gpsfix(tmp_path):
-    bestpos = (
-        "std_msgs/Header header\nSolutionStatus sol_status\nPositionOrVelocityType pos_type\nfloat64 lat\nfloat64 lon\n"
-        "float64 hgt\nfloat32 undulation\nfloat32 lat_stdev\nfloat32 lon_stdev\nfloat32 hgt_stdev\nuint8 num_sol_svs\n"
-        "================\n" + HEADER_TEXT + "================\nMSG: novatel_oem7_msgs/SolutionStatus\nuint32 status\n"
-        "================\nMSG: novatel_oem7_msgs/PositionOrVelocityType\nuint32 type\n"
-    )
-    head = {"header": {"stamp": STAMP, "frame_id": ""}}
-    fixed = head | {
-        "sol_status": {"status": 0}, "pos_type": {"type": 18}, "lat": 50.5, "lon": 4.5, "hgt": 75.0,
+BESTPOS = (
+    "std_msgs/Header header\nSolutionStatus sol_status\nPositionOrVelocityType pos_type\nfloat64 lat\nfloat64 lon\n"
+    "float64 hgt\nfloat32 undulation\nfloat32 lat_stdev\nfloat32 lon_stdev\nfloat32 hgt_stdev\nuint8 num_sol_svs\n"
+    "================\n" + HEADER_TEXT + "================\nMSG: novatel_oem7_msgs/SolutionStatus\nuint32 status\n"
+    "================\nMSG: novatel_oem7_msgs/PositionOrVelocityType\nuint32 type\n"
+)
+
+
+def bestpos(kind: int, status: int = 0) -> dict:
+    return {
+        "header": {"stamp": STAMP, "frame_id": ""},
+        "sol_status": {"status": status}, "pos_type": {"type": kind}, "lat": 50.5, "lon": 4.5, "hgt": 75.0,
         "undulation": 45.5, "lat_stdev": 2.0, "lon_stdev": 1.0, "hgt_stdev": 3.0, "num_sol_svs": 8,
     }  # fmt: skip
-    path = ros_log(tmp_path, ("/novatel/bestpos", "novatel_oem7_msgs/msg/BESTPOS", bestpos, [fixed]))
+
+
+def test_kinds_of_novatel_solutions(tmp_path):
+    # Numbers and names as the vendor's message database has them: SolType, SolStatus.
+    kinds = {
+        "none": (0, 3, 8, 81), "autonomous": (1, 2, 16, 53), "differential": (17, 20, 54, 64, 69, 74, 76, 78, 79, 80),
+        "sbas": (18, 52), "estimated": (19,), "rtk_float": (32, 33, 34, 35, 55), "rtk_fixed": (47, 48, 49, 50, 51, 56),
+    }  # fmt: skip
+    messages = [bestpos(code) for codes in kinds.values() for code in codes] + [bestpos(50, status=1)]
+    path = ros_log(tmp_path, ("/bestpos", "novatel_oem7_msgs/msg/BESTPOS", BESTPOS, messages))
+    found = read_run(path, IngestConfig()).gnss["fix"].to_list()
+    assert found == [kind for kind, codes in kinds.items() for _ in codes] + ["none"]
+
+
+def test_novatel_and_gpsfix(tmp_path):
+    head = {"header": {"stamp": STAMP, "frame_id": ""}}
+    path = ros_log(tmp_path, ("/novatel/bestpos", "novatel_oem7_msgs/msg/BESTPOS", BESTPOS, [bestpos(18)]))
     found = row(path)
     assert (found["height_m"], found["cov_nn_m2"], found["cov_ee_m2"], found["fix"]) == (120.5, 4.0, 1.0, "sbas")
     gps_fix = (
