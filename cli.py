@@ -210,16 +210,24 @@ def inject(
 
 @app.command()
 def convert(
-    logs: Annotated[list[Path], typer.Argument(help="UBX, SBF, NMEA, or CSV with a mapping in --config.")],
+    logs: Annotated[
+        list[Path], typer.Argument(help="UBX, SBF, NMEA, CSV with a mapping in --config, or a public recording.")
+    ],
     to: Annotated[Path, typer.Option("--to", help="The run to write: a folder, or a file *.mcap.")],
     config: ConfigFile = None,
 ) -> None:
     """Make a run of receiver logs."""
+    from datasets.samples import known_recording
     from datasets.trial import write_run_as
+    from pipeline.receivers import Converted
     from pipeline.receivers import convert as convert_logs
 
     settings, _ = _settings(config, None)
-    converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
+    recording = known_recording(logs[0]) if len(logs) == 1 and config is None else None
+    if recording is not None:
+        converted = Converted(recording, {})
+    else:
+        converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
     write_run_as(converted.run, to)
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():

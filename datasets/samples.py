@@ -14,15 +14,19 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+import polars.selectors as cs
 import pyproj
 from dataframely import Schema
 
 from pipeline.geodesy import distances_m
+from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.conform import conform, rows_text
+from pipeline.ingest.csv_text import read_table
 from pipeline.ingest.site import read_site
 from schemas.enums import BaliseKind, Fix, Reaction
 from schemas.errors import InputError
-from schemas.inputs import Balises, Gnss, Links, Odometer, Reference, Track
-from schemas.run import RunLog, Site
+from schemas.inputs import Balises, Links, Track
+from schemas.run import RunLog, Site, Stream
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -37,6 +41,9 @@ _TRACK_STEP_M = 5.0
 _POSE_SIGMA_M = 0.5
 _COMMA_ELEMENT = "road"
 
+_FEWEST_POSES = 2
+
+_INFRABEL_COLUMNS = ("timestamp", "latitude", "longitude", "solution_status", "position_type")
 _INFRABEL_FIX = {
     "NARROW_INT": Fix.RTK_FIXED,
     "NARROW_FLOAT": Fix.RTK_FLOAT,
@@ -46,22 +53,38 @@ _INFRABEL_FIX = {
 }
 
 
+def known_recording(path: Path) -> RunLog | None:
+    """A segment of comma2k19 (a folder) or a log of the Infrabel train (a CSV with its columns); none if neither."""
+    if (path / "processed_log").is_dir():
+        return comma2k19_run(path)[0]
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return None
+    with path.open("rb") as stream:
+        head = stream.readline()
+    return infrabel_run(path) if all(name.encode() in head for name in _INFRABEL_COLUMNS) else None
+
+
 def comma2k19_run(segment: Path, balises_at_m: Sequence[float] = ()) -> tuple[RunLog, Site]:
     """A segment of comma2k19: u-blox fixes, the mean of four wheel speeds, and the pose as reference and as track.
 
     Stamps are the device's clock for all streams (so the latency of the fixes shows), moved to UTC by the one
     offset that the pose gives. The pose was fused with the same satellites: a track, no independent truth.
+    NaN is not known; a segment without wheel speeds has no odometer.
     Virtual balises may be put at measures along the track.
     """
     pose_s, places = _poses(segment)
     offset_s = _utc_offset_s(segment)
-    gnss = _comma_gnss(*_log(segment, "GNSS/live_gnss_ublox"), offset_s)
-    wheels_s, wheels = _log(segment, "CAN/wheel_speed")
-    odometer = _contract(Odometer, t=_stamps(wheels_s + offset_s), speed_mps=wheels.mean(axis=1))
-    reference = _contract(Reference, t=_stamps(pose_s + offset_s), **places, sigma_m=_POSE_SIGMA_M)
-    name = segment.name or "comma2k19"
+    gnss = _comma_gnss(segment, offset_s)
+    reference = pl.DataFrame({"t": _stamps(pose_s + offset_s), **places}).with_columns(sigma_m=_POSE_SIGMA_M)
+    name = segment.resolve().name
     site = _comma_site(places, balises_at_m)
-    return RunLog(name, gnss, odometer=odometer, reference=reference), site
+    run = RunLog(
+        name,
+        _conformed(gnss, "gnss", segment),
+        odometer=_comma_odometer(segment, offset_s),
+        reference=_conformed(reference, "reference", segment),
+    )
+    return run, site
 
 
 def infrabel_run(log: Path) -> RunLog:
@@ -70,8 +93,11 @@ def infrabel_run(log: Path) -> RunLog:
     Its naive local times are taken as UTC, and `NARROW_INT`, `NARROW_FLOAT`, `SINGLE`, `PSRDIFF` and `PROPAGATED`
     (each with any number behind) as kinds of fix; without a computed solution there is none.
     """
-    table = pl.read_csv(log, infer_schema=False)
-    missing = {"timestamp", "latitude", "longitude", "solution_status", "position_type"} - set(table.columns)
+    try:
+        table = read_table(log.read_bytes(), infer=False)
+    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
+        raise InputError(f"is no CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
+    missing = set(_INFRABEL_COLUMNS) - set(table.columns)
     if missing:
         raise InputError("lacks columns of an Infrabel log", place=str(log), found=f"no {', '.join(sorted(missing))}")
     computed = pl.col("solution_status") == "SOL_COMPUTED"
@@ -82,16 +108,33 @@ def infrabel_run(log: Path) -> RunLog:
         raise InputError(
             "a position type is not known",
             place=f"{log}: position_type",
-            found=", ".join(unknown),
+            found=", ".join(str(word) for word in unknown),
             expected=", ".join(_INFRABEL_FIX),
         )
     gnss = table.select(
-        t=pl.col("timestamp").str.to_datetime("%Y-%m-%dT%H:%M:%S%.f", time_unit="ns").dt.replace_time_zone("UTC"),
-        latitude_deg=pl.col("latitude").cast(pl.Float64),
-        longitude_deg=pl.col("longitude").cast(pl.Float64),
+        t=pl.col("timestamp").str.to_datetime(time_unit="ns", strict=False).dt.replace_time_zone("UTC"),
+        latitude_deg=pl.col("latitude").cast(pl.Float64, strict=False),
+        longitude_deg=pl.col("longitude").cast(pl.Float64, strict=False),
         fix=fix,
     )
-    return RunLog(log.stem, _contract(Gnss, **gnss.to_dict()))
+    _refuse_unreadable(table.select("timestamp", "latitude", "longitude"), gnss.select(pl.nth(0, 1, 2)), log)
+    return RunLog(log.stem, _conformed(gnss, "gnss", log))
+
+
+def _refuse_unreadable(texts: pl.DataFrame, values: pl.DataFrame, log: Path) -> None:
+    for text, value in zip(texts, values, strict=True):
+        wrong = value.is_null() & text.is_not_null() & (text != "")
+        if wrong.any():
+            found = f"{text.filter(wrong)[0]!r} in {rows_text(wrong)}"
+            raise InputError("cannot be read", place=f"{log}: column {text.name}", found=found)
+
+
+def _conformed(frame: pl.DataFrame, stream: Stream, place: Path) -> pl.DataFrame:
+    """The stream as the contract has it; NaN is not known."""
+    breaches: list[Breach] = []
+    found = conform(frame.with_columns(cs.float().fill_nan(None)), stream, str(place), breaches)
+    refuse(breaches)
+    return found
 
 
 def infrabel_site(network: Path, path: Path | None = None, balises: Sequence[tuple[str, float]] = ()) -> Site:
@@ -126,20 +169,29 @@ def virtual_balises(places: Sequence[tuple[str, float]]) -> pl.DataFrame:
 
 
 def _contract(schema: type[Schema], **columns: object) -> pl.DataFrame:
-    """A table of the contract: scalars are repeated, columns that are not given are null, solution is `primary`."""
-    given = {"solution": "primary", **columns} if schema is Gnss else columns
-    rows = max(len(value) for value in given.values() if isinstance(value, pl.Series | np.ndarray | list))
+    """A table of the contract: scalars are repeated, columns that are not given are null."""
+    rows = max(len(value) for value in columns.values() if isinstance(value, pl.Series | np.ndarray | list))
     full = {
         name: value if isinstance(value, pl.Series | np.ndarray | list) else [value] * rows
-        for name, value in {**dict.fromkeys(schema.column_names()), **given}.items()
+        for name, value in {**dict.fromkeys(schema.column_names()), **columns}.items()
     }
     table = pl.DataFrame(full, strict=False)
     return schema.validate(table.select(schema.column_names()), cast=True)
 
 
-def _log(segment: Path, name: str) -> tuple[Floats, Floats]:
+def _log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
+    """Times and values of as many columns, without rows of no time."""
     folder = segment / "processed_log" / name
-    return _array(folder / "t"), _array(folder / "value")
+    t_s, value = _array(folder / "t"), _array(folder / "value")
+    if t_s.ndim != 1 or value.ndim != 2 or len(value) != len(t_s) or value.shape[1] < columns:
+        raise InputError(
+            "is not as comma2k19 has it",
+            place=str(folder),
+            found=f"t of shape {t_s.shape}, value of shape {value.shape}",
+            expected=f"one time per row of {columns} values",
+        )
+    timed = np.isfinite(t_s)
+    return t_s[timed], value[timed]
 
 
 def _array(path: Path) -> Floats:
@@ -151,20 +203,31 @@ def _array(path: Path) -> Floats:
 
 
 def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
-    """Times on the device's clock, and positions in WGS 84."""
+    """Times on the device's clock, and positions in WGS 84, of the poses that are known."""
     folder = segment / "global_pose"
+    times_s, places_m = _array(folder / "frame_times"), _array(folder / "frame_positions")
+    if places_m.ndim != 2 or places_m.shape[1] != 3 or len(times_s) != len(places_m):
+        found = f"frame_times of shape {times_s.shape}, frame_positions of shape {places_m.shape}"
+        raise InputError("is not as comma2k19 has it", place=str(folder), found=found)
+    known = np.isfinite(times_s) & np.isfinite(places_m).all(axis=1)
+    if known.sum() < _FEWEST_POSES:
+        raise InputError("holds no poses", place=str(folder), expected="the track that was driven")
     to_wgs84 = pyproj.Transformer.from_crs(4978, 4979, always_xy=True)
-    x_m, y_m, z_m = _array(folder / "frame_positions").T
+    x_m, y_m, z_m = places_m[known].T
     longitude, latitude, height = to_wgs84.transform(x_m, y_m, z_m)
-    places = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
-    return _array(folder / "frame_times"), places
+    return times_s[known], {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
 
 
 def _utc_offset_s(segment: Path) -> float:
-    """What is added to the device's clock: both are known for the first frame."""
-    week, second = _array(segment / "global_pose" / "frame_gps_times")[0]
-    boot_s = float(_array(segment / "global_pose" / "frame_times")[0])
-    return float(_GPS_EPOCH_S + week * _WEEK_S + second - _LEAP_S) - boot_s
+    """What is added to the device's clock: both are known for the first frame that has a GPS time."""
+    folder = segment / "global_pose"
+    gps, boot_s = _array(folder / "frame_gps_times"), _array(folder / "frame_times")
+    count = min(len(gps), len(boot_s))
+    known = np.flatnonzero(np.isfinite(gps[:count]).all(axis=-1) & np.isfinite(boot_s[:count]))
+    if not len(known):
+        raise InputError("holds no GPS time", place=str(folder / "frame_gps_times"), expected="week and second")
+    week, second = gps[known[0]]
+    return float(_GPS_EPOCH_S + week * _WEEK_S + second - _LEAP_S) - float(boot_s[known[0]])
 
 
 def _stamps(seconds: Floats) -> pl.Series:
@@ -172,19 +235,34 @@ def _stamps(seconds: Floats) -> pl.Series:
     return pl.Series(np.round(seconds * 1e6).astype(np.int64) * 1000).cast(pl.Datetime("ns", "UTC"))
 
 
-def _comma_gnss(t_s: Floats, value: Floats, offset_s: float) -> pl.DataFrame:
+def _comma_gnss(segment: Path, offset_s: float) -> pl.DataFrame:
     """`value`: latitude, longitude, speed, UTC, altitude, bearing."""
+    t_s, value = _log(segment, "GNSS/live_gnss_ublox", columns=6)
     bearing = np.radians(value[:, 5])
-    return _contract(
-        Gnss,
-        t=_stamps(t_s + offset_s),
-        latitude_deg=value[:, 0],
-        longitude_deg=value[:, 1],
-        height_m=value[:, 4],
-        vel_e_mps=value[:, 2] * np.sin(bearing),
-        vel_n_mps=value[:, 2] * np.cos(bearing),
-        fix=Fix.AUTONOMOUS.value,
+    known = np.isfinite(value[:, :2]).all(axis=1)
+    return pl.DataFrame(
+        {
+            "t": _stamps(t_s + offset_s),
+            "latitude_deg": value[:, 0],
+            "longitude_deg": value[:, 1],
+            "height_m": value[:, 4],
+            "vel_e_mps": value[:, 2] * np.sin(bearing),
+            "vel_n_mps": value[:, 2] * np.cos(bearing),
+            "fix": np.where(known, Fix.AUTONOMOUS.value, Fix.NONE.value),
+        }
     )
+
+
+def _comma_odometer(segment: Path, offset_s: float) -> pl.DataFrame | None:
+    """The mean of the wheels that are known; none where there are no wheel speeds."""
+    if not (segment / "processed_log" / "CAN" / "wheel_speed").is_dir():
+        return None
+    t_s, wheels_mps = _log(segment, "CAN/wheel_speed", columns=1)
+    known = np.isfinite(wheels_mps).any(axis=1)
+    if not known.any():
+        return None
+    speed = np.nanmean(wheels_mps[known], axis=1)
+    return _conformed(pl.DataFrame({"t": _stamps(t_s[known] + offset_s), "speed_mps": speed}), "odometer", segment)
 
 
 def _comma_site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
