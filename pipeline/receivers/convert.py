@@ -150,10 +150,16 @@ def _decode(frame: Frame, decode: Decode, gathered: Gathered) -> None:
         ) from None
     except Exception:
         # The parsers' own errors share no base class.
-        gathered.drop("message that does not fit its definition")
+        gathered.drop(_UNFIT)
         return
-    if message is not None:
-        decode(gathered, message, frame.content)
+    try:
+        if message is not None:
+            decode(gathered, message, frame.content)
+    except (AttributeError, OverflowError):  # a message that ends before its fields do, a time beyond all calendars
+        gathered.drop(_UNFIT)
+
+
+_UNFIT = "message that does not fit its definition"
 
 
 # By protocol: what makes a message of a frame, and what makes a decoder of its messages. The first wins a tie.

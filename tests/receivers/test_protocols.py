@@ -206,6 +206,16 @@ def test_a_sentence_with_the_right_checksum_and_wrong_content_is_counted(convert
     assert found.dropped == {"message that does not fit its definition": 1, "time not valid": 1}
 
 
+def test_messages_that_end_before_their_fields_do_are_counted(converted):
+    short = [sentence("GPGGA,120001.00,5030.0"), sentence("GPRMC,120001.00,A"), sentence("GPGST,120001.00,1.0")]
+    found = converted(rmc("120000.00"), gga("120000.00"), *short)
+    assert (found.run.gnss.height, found.dropped["message that does not fit its definition"]) == (1, 3)
+    found = converted(nav_pvt(1000), ubx(b"\x01\x07", b""))
+    assert (found.run.gnss.height, found.dropped["message that does not fit its definition"]) == (1, 1)
+    found = converted(pvt_geodetic(0), pvt_geodetic(0, week=65534))
+    assert (found.run.gnss.height, found.dropped["message that does not fit its definition"]) == (1, 1)
+
+
 def test_a_log_without_a_date_says_why(converted):
     with pytest.raises(InputError, match=r"no epoch with a time and a position.*time without a date \(1\)"):
         converted(gga("120000.00"))
