@@ -311,13 +311,21 @@ def sql(
 def report(
     out: Annotated[Path, typer.Argument(help="A result of `balise replay`.")],
     site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Pages at once; 0 takes one per core where there are many.")] = 0,
+    quiet: Quiet = False,
 ) -> None:
-    """Write HTML pages, for the campaign and each run, that open offline."""
+    """Write HTML pages, for the campaign and each run, that open offline.
+
+    Pages of runs that have not changed since the last report are left as they are.
+    """
     from pipeline.ingest.site import read_site
+    from pipeline.present import how_far
     from pipeline.report import write_report
 
-    pages = write_report(out, None if site is None else read_site(site))
-    print(f"{len(pages)} files; begin with {pages[0]}")
+    place = None if site is None else read_site(site)
+    pages = write_report(out, place, jobs, None if quiet else how_far("pages"))
+    if not quiet:
+        print(f"{len(pages)} files; begin with {pages[0]}")
 
 
 @app.command()

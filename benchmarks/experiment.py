@@ -24,7 +24,8 @@ from datasets.experiment.plan import Plan, bank_forms, failure_forms
 from datasets.experiment.ranges import RangePlan, run_ranges
 from datasets.experiment.rare import Probability, missed_detection_probability
 from datasets.experiment.rare_ranges import missed_by_ranges, range_system
-from datasets.experiment.workers import generator, mapped
+from datasets.experiment.workers import generator
+from pipeline.workers import mapped
 
 _NORMALS = 15
 _CHUNK = 256

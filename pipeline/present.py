@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
+from collections.abc import Callable
 from datetime import datetime
 from typing import Any
 
 import polars as pl
 from rich.console import Console
 from rich.table import Table
+
+_SAID_EVERY_S = 5.0
 
 
 def show_table(frame: pl.DataFrame, title: str = "") -> None:
@@ -105,3 +109,16 @@ def _plain(value: Any) -> Any:
             return value
         case _:
             return str(value)
+
+
+def how_far(things: str) -> Callable[[int, int], None]:
+    """Says on standard error every few seconds how many of how many things are done."""
+    said_s = time.monotonic()
+
+    def progress(done: int, total: int) -> None:
+        nonlocal said_s
+        if time.monotonic() - said_s >= _SAID_EVERY_S:
+            said_s = time.monotonic()
+            print(f"{done}/{total} {things}", file=sys.stderr, flush=True)
+
+    return progress

@@ -23,8 +23,9 @@ from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import write_page, write_tables
-from datasets.experiment.workers import generator, mapped
+from datasets.experiment.workers import generator
 from pipeline.statistics import clopper_pearson
+from pipeline.workers import mapped
 from schemas.config import Configuration, MonitorConfig
 
 Array = npt.NDArray[np.float64]

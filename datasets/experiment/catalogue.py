@@ -18,9 +18,9 @@ from datasets.experiment.catalogue_text import catalogue_page
 from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fault
 from datasets.experiment.diagnostics import SEED
 from datasets.experiment.tables import write_page, write_tables
-from datasets.experiment.workers import mapped
 from datasets.motion import build_motion
 from pipeline.stages import replay
+from pipeline.workers import mapped
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import MONITORS

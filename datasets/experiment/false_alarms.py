@@ -24,8 +24,9 @@ from datasets.experiment.thresholds import (
     regression_table,
     two_sided,
 )
-from datasets.experiment.workers import generator, in_blocks, mapped
+from datasets.experiment.workers import generator, in_blocks
 from pipeline.statistics import clopper_pearson, poisson_rate, threshold_factor
+from pipeline.workers import mapped
 from schemas.config import Configuration, LdsConfig
 
 Array = npt.NDArray[np.float64]

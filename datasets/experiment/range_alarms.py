@@ -15,8 +15,9 @@ from scipy.special import chdtrc, chdtri
 
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.ranges import HEADINGS_DEG, RangePlan, Statistic, held_rows, statistic
-from datasets.experiment.workers import generator, in_blocks, mapped
+from datasets.experiment.workers import generator, in_blocks
 from pipeline.statistics import clopper_pearson
+from pipeline.workers import mapped
 
 Array = npt.NDArray[np.float64]
 

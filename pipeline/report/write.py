@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
@@ -9,6 +13,7 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.assessment import over_all_runs
+from pipeline.campaign.plan import software_digest
 from pipeline.hazards.map_errors import map_places
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
@@ -16,36 +21,53 @@ from pipeline.report.run_page import Made, run_page
 from pipeline.safety.side_by_side import Key, side_by_side
 from pipeline.safety.tally import Tally
 from pipeline.store import metadata_of, read_table, run_ids, table_address
+from pipeline.workers import each
 from schemas.config import Configuration, read_toml, settings_from
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import TABLES
 
+_PAGES_PER_PROCESS = 20
 _OWN_ASSETS = ("report.css", "tables.js", "plots.js", "run.js", "campaign.js")
 
 
-def write_report(out: Path, site: Site | None = None) -> list[Path]:
+@dataclass(frozen=True)
+class _Page:
+    """What the page of one run is made from."""
+
+    out: Path
+    run: str
+    path: Path
+    made: Made
+
+
+def write_report(
+    out: Path, site: Site | None = None, jobs: int = 0, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
     """Write `OUT/report`: `index.html`, `runs/RUN.html`, `assets/`; returns the files, the index first.
 
     The pages open from disk and make no request beyond the files beside them. Plans need the site; without it
-    places are drawn along the path. Pages of runs that are no longer in the result are removed.
+    places are drawn along the path. Pages of runs that are no longer in the result are removed; those that were made
+    from these very tables, settings and program are left as they are. `jobs` processes make the others, by
+    default one per core where there are many; `progress` is told how many pages of how many are done.
     """
     runs = run_ids(out)
     if not runs:
         raise UsageError("holds no complete run", place=str(out), expected="a folder that `balise replay` wrote")
     made = _made(out, site)
     names = {run: page_name(run) for run in runs}
-    pages = {out / "report" / "runs" / name: run for run, name in names.items()}
+    pages = [_Page(out, run, out / "report" / "runs" / name, made) for run, name in names.items()]
     written = [*_write_assets(out / "report" / "assets")]
     found: dict[str, dict[Key, Tally]] = {}
-    for path, run in pages.items():
-        metadata = metadata_of(Path(str(table_address(out, "runs", run))))
-        _check_site(site, metadata, run)
-        tables = _tables(out, run)
-        if tables.runs.height > 1:
-            found[run] = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, made.config)
-        written.append(_write(path, run_page(tables, metadata, made, found.get(run)).encode()))
-    for leftover in sorted(set((out / "report" / "runs").glob("*.html")) - set(pages)):
+    for done, (page, tallies) in enumerate(
+        zip(pages, each(_written, pages, jobs or _worth(len(pages))), strict=True), start=1
+    ):
+        written.append(page.path)
+        if tallies:
+            found[page.run] = tallies
+        if progress is not None:
+            progress(done, len(pages))
+    for leftover in sorted(set((out / "report" / "runs").glob("*.html")) - {page.path for page in pages}):
         leftover.unlink()
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
     index = _write(out / "report" / "index.html", campaign_page(_campaign(out, made, hrefs, found), made).encode())
@@ -55,6 +77,39 @@ def write_report(out: Path, site: Site | None = None) -> list[Path]:
 def page_name(run_id: str) -> str:
     """File name of a run's page; what a path cannot hold is percent-encoded."""
     return quote(run_id, safe=" +,()[]@!~") + ".html"
+
+
+def _worth(pages: int) -> int:
+    """Processes that so many pages are worth: starting one takes as long as some pages."""
+    return min(os.cpu_count() or 1, 1 + pages // _PAGES_PER_PROCESS)
+
+
+def _written(page: _Page) -> dict[Key, Tally] | None:
+    """Write the page, unless it is there already; returns the run's solutions side by side where it has several."""
+    metadata = metadata_of(Path(str(table_address(page.out, "runs", page.run))))
+    _check_site(page.made.site, metadata, page.run)
+    mark = f"<!-- {_made_from(page)} -->\n".encode()
+    known_site = page.made.site is None or page.made.site.digest
+    kept = bool(known_site) and page.path.exists() and page.path.read_bytes().endswith(mark)
+    if kept and read_table(page.out, "runs", page.run).select(pl.len()).collect().item() == 1:
+        return None
+    tables = _tables(page.out, page.run)
+    tallies = None
+    if tables.runs.height > 1:
+        tallies = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, page.made.config)
+    if not kept:
+        _write(page.path, run_page(tables, metadata, page.made, tallies).encode() + mark)
+    return tallies
+
+
+def _made_from(page: _Page) -> str:
+    """SHA-256 over the run's tables, the settings, the site and the program: all that its page follows from."""
+    digest = hashlib.sha256(software_digest().encode())
+    for name in TABLES:
+        digest.update(Path(str(table_address(page.out, name, page.run))).read_bytes())
+    site = page.made.site
+    digest.update(f"{page.run}\n{page.made.config_text}\n{None if site is None else site.digest}".encode())
+    return digest.hexdigest()
 
 
 def _made(out: Path, site: Site | None) -> Made:

@@ -205,6 +205,24 @@ def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
     assert not (out / "report" / "runs" / "gone.html").exists()
 
 
+def test_only_pages_of_what_changed_are_made_again(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    for run_id in ("kept", "cut", "changed"):
+        write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": run_id}), tmp_path, {})
+    told: list[tuple[int, int]] = []
+    write_report(tmp_path, jobs=2, progress=lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    pages = {name: tmp_path / "report" / "runs" / f"{name}.html" for name in ("kept", "cut", "changed")}
+    whole = pages["cut"].read_bytes()
+    pages["cut"].write_bytes(whole[:-200])
+    fewer = replayed["jump_two"].alarms.clear()
+    write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": "changed", "alarms": fewer}), tmp_path, {})
+    before = {name: (page.stat().st_mtime_ns, page.read_bytes()) for name, page in pages.items()}
+    write_report(tmp_path)
+    assert pages["kept"].stat().st_mtime_ns == before["kept"][0]
+    assert pages["cut"].read_bytes() == whole
+    assert pages["changed"].read_bytes() != before["changed"][1]
+
+
 def test_ten_hours_at_ten_hertz_stay_small(replayed: dict[str, RunTables], site: Site, tmp_path: Path) -> None:
     one = replayed["jump_two"]
     copies = -(-360_000 // one.epochs.height)

@@ -1,0 +1,45 @@
+"""Independent pieces of work on several processes; results in the order of the tasks, whatever the number."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_THREADS = ("POLARS_MAX_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+
+
+def mapped(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
+    """`function` of every task; `jobs` processes, or this one for a single job or task."""
+    return list(each(function, tasks, jobs))
+
+
+def each(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
+    """As `mapped`, one result after the other as soon as it and those before it are there."""
+    workers = min(jobs, len(tasks))
+    if workers <= 1:
+        yield from map(function, tasks)
+        return
+    with _single_threaded_children(), ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(function, tasks)
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Processes are the parallelism: more threads would only fight for the cores."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
