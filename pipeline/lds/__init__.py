@@ -17,6 +17,8 @@ Where the sources leave a choice, this package reads them so:
   should be.
 - The last TVB before the alarm's onset: an alarm that follows upon a return may be about the same fault, so its
   re-link also has to hold against what that return was measured from (`footing`), while the odometer can tell.
+- The last TVB before the onset of an alarm of which only slow averages know may be any that the odometer still
+  reaches. A return wants room for the same drift once more within the failure limit (`drift`).
 - Linking holds in both directions of travel. Balises in whose window the train turned round may be found
   or not; the 5 % of the odometer then count on the whole way run since the reference.
 - Not announced (`linked` false): rejected while linking is in force, taken like any other before that.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.lds.journey import Journey
+from pipeline.lds.drift import Drift
+from pipeline.lds.journey import Integers, Journey
 from pipeline.lds.reads import Read
 from pipeline.lds.recovery import Anchor, Recovery, read_anchor, relink_bound_m
 
@@ -23,6 +24,7 @@ class Footing:
         self._accepted: Anchor | None = None  # where the last VB was accepted
         self._disputed: Anchor | None = None
         self._read: Anchor | None = None  # the last physical balise
+        self._drift: Drift | None = None  # by the alarm that stands
 
     def validate(self, k: int) -> None:
         """The epoch is a TVB."""
@@ -38,8 +40,12 @@ class Footing:
         if self._disputed is not None:
             self._disputed = self._read or self._disputed
 
-    def negate(self, k: int) -> None:
-        """An alarm: what the odometer can no longer tell since the last return does not count."""
+    def negate(self, k: int, slow_after: Integers | None) -> None:
+        """An alarm; `slow_after`: where only a slow average fails, the TVBs before it, which may carry its fault.
+
+        What the odometer can no longer tell since the last return does not count.
+        """
+        self._drift = None if slow_after is None else Drift.before(slow_after, self._journey, self._limits)
         if self._disputed is not None and relink_bound_m(self._disputed, k, self._journey, self._limits) is None:
             self._disputed = None
 
@@ -65,8 +71,15 @@ class Footing:
 
     def relinks(self, recovery: Recovery, k: int, anchor: Anchor) -> bool:
         """GNSS minus odometer is what it was at the anchor; where no balise was read, also at the last return's."""
-        settled = recovery.read is not None or self._disputed is None or recovery.relinks(k, self._disputed)
+        settled = recovery.read is not None or (self._is_undisputed(k, recovery) and self._leaves_room(k))
         if not (settled and recovery.relinks(k, anchor)):
             return False
         self._disputed = recovery.read or self._disputed or anchor
         return True
+
+    def _is_undisputed(self, k: int, recovery: Recovery) -> bool:
+        return self._disputed is None or recovery.relinks(k, self._disputed)
+
+    def _leaves_room(self, k: int) -> bool:
+        offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
+        return self._drift is None or self._drift.leaves_room(offset_m, self._limits)

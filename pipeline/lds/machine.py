@@ -194,7 +194,8 @@ class LocationSystem:
         return True
 
     def _negate(self, k: int) -> None:
-        self._footing.negate(k)
+        slow = self._bank.failed(k) and not self._bank.fast_failed(k)
+        self._footing.negate(k, np.flatnonzero(self.tvb[:k]) if slow else None)
         self._recovery = Recovery(k, self._journey, self._bank, self._config, self._limits)
         self.negations.append(Negation(k))
         self.negated[k] = True

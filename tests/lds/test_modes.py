@@ -274,6 +274,41 @@ def test_what_the_odometer_can_no_longer_tell_does_not_hold_a_return_back() -> N
         assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(100, 130), (250, end)]
 
 
+@pytest.mark.parametrize(("rate_mps", "returns"), [(0.06, True), (0.08, False), (-0.08, False)])
+def test_a_drift_that_only_a_slow_average_saw_needs_room_to_go_on(rate_mps: float, returns: bool) -> None:
+    """Seen after 100 s, and 30 s later 7.8 or 10.4 m off: twice that is the failure limit of 20 m."""
+    odometer_m = steps(0.0, 20.0, 400)
+    off = [x + rate_mps * max(0, k - 100) for k, x in enumerate(odometer_m)]
+    epochs = epochs_of(off, odometer_m, scale_sigma=[1e-5] * 400)
+    slow = run(epochs, balises_at(V1), ScriptedBank([200], fast=[]))
+    assert [(n.first_epoch, n.end_epoch) for n in slow.negations] == [(200, 230 if returns else None)]
+    # Of what a fast monitor sees the onset is known: GNSS minus odometer is what it was a second before.
+    fast = run(epochs, balises_at(V1), ScriptedBank([200]))
+    assert fast.negations[0].end_epoch == 230
+
+
+def test_a_drift_counts_as_far_back_as_the_odometer_tells() -> None:
+    """Scale known to 0.2 %: 85 s at 20 m/s, back to 114 s. The drift of 12 m began at 120 s, or was over before."""
+    odometer_m = steps(0.0, 20.0, 400)
+    for end_s, returns in ((150, None), (110, 230)):
+        off = [x + min(12.0, max(0.0, 0.4 * (k - end_s + 30))) for k, x in enumerate(odometer_m)]
+        epochs = epochs_of(off, odometer_m, scale_sigma=[0.002] * 400)
+        result = run(epochs, balises_at(V1), ScriptedBank([200], fast=[]))
+        assert result.negations[0].end_epoch == returns
+
+
+def test_a_balise_frees_a_position_that_had_drifted() -> None:
+    odometer_m = steps(0.0, 20.0, 400)
+    off = [x + min(11.0, 0.12 * max(0, k - 100)) for k, x in enumerate(odometer_m)]
+    balises = balises_at({"V1": 110.0, "P1": 4420.0}, kind=["virtual", "physical"])
+    epochs = epochs_of(off, odometer_m, scale_sigma=[1e-5] * 400)
+    for read_at_m, end in ((4420.0, None), (4409.0, 222)):
+        # Eleven metres off by the balise's word, or right by it.
+        reads = reads_at([(221.5, "P1")]).with_columns(odometer_m=pl.lit(read_at_m))
+        result = run(epochs, balises, ScriptedBank([190], fast=[]), reads)
+        assert result.negations[0].end_epoch == end
+
+
 def test_linking_goes_on_while_negated() -> None:
     # V2 and V3 pass under alarm: offered, rejected, missed in their windows, the second brakes.
     places = {"V1": 110.0, "V2": 510.0, "V3": 710.0, "V4": 1310.0}
