@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,13 @@ LATE_S, EARLY_S = 300.0, 50.0
 
 
 def journey(
-    outage_s: float, offset_m: float, rate_hz: float, vehicle: bool, onset_s: float = LATE_S, shunting: bool = False
+    outage_s: float,
+    offset_m: float,
+    rate_hz: float,
+    vehicle: bool,
+    onset_s: float = LATE_S,
+    shunting: bool = False,
+    odometer: Callable[[pl.DataFrame], pl.DataFrame] | None = None,
 ) -> RunTables:
     """30 m/s over a line with curves and virtual balises every 700 m; the offset comes in the middle of the outage."""
     phases: list[dict[str, Any]] = [{"speed_mps": 30.0, "acceleration_mps2": 0.7, "hold_s": onset_s + outage_s + 60.0}]
@@ -30,9 +37,9 @@ def journey(
         # It turns round inside the outage: brakes from 235 s on, stands, and runs back.
         there, back = {"speed_mps": 30.0, "hold_s": 180.0}, {"speed_mps": -20.0, "hold_s": 120.0}
         phases = [{"acceleration_mps2": 0.7} | phase for phase in (there, {"speed_mps": 0.0, "hold_s": 5.0}, back)]
-    faults: list[dict[str, Any]] = [
-        {"kind": "outage", "target": "position", "start_s": onset_s, "duration_s": outage_s}
-    ]
+    faults: list[dict[str, Any]] = []
+    if outage_s:
+        faults = [{"kind": "outage", "target": "position", "start_s": onset_s, "duration_s": outage_s}]
     if offset_m:
         faults.append({"kind": "step", "target": "along", "start_s": onset_s + outage_s / 2, "size_m": offset_m})
     run: dict[str, Any] = {"id": "run", "vehicle": vehicle, "faults": faults}
@@ -59,7 +66,10 @@ def journey(
         }
     )
     spec = scenario.runs[0]
-    return replay(build_run(scenario, spec), build_site(scenario), scenario.vehicle if vehicle else None)
+    log = build_run(scenario, spec)
+    if odometer is not None and log.odometer is not None:
+        log = log.with_streams(odometer=odometer(log.odometer))
+    return replay(log, build_site(scenario), scenario.vehicle if vehicle else None)
 
 
 def unsafe(tables: RunTables) -> int:
@@ -101,6 +111,37 @@ def test_before_the_scale_is_learned_nothing_can_tell_and_the_run_says_so() -> N
         assert "nothing could tell whether the position had moved" in tables.runs["notes"][0]
 
 
+def _seconds() -> pl.Expr:
+    return (pl.col("t") - pl.col("t").min()).dt.total_nanoseconds() * 1e-9
+
+
+def _speed_alone_with_a_pause(odometer: pl.DataFrame) -> pl.DataFrame:
+    """20 s at 30 m/s are lost."""
+    speed = odometer.with_columns(distance_m=pl.lit(None, pl.Float64))
+    return speed.filter(~_seconds().is_between(LATE_S, LATE_S + 20.0))
+
+
+def _slip_that_is_reported(odometer: pl.DataFrame) -> pl.DataFrame:
+    """A wheel turns 40 m too far within 2 s, and says so."""
+    too_far_m = 20.0 * (_seconds() - LATE_S).clip(0.0, 2.0)
+    return odometer.with_columns(
+        distance_m=pl.col("distance_m") + too_far_m, slip=_seconds().is_between(LATE_S, LATE_S + 2.1)
+    )
+
+
+@pytest.mark.parametrize("odometer", [_speed_alone_with_a_pause, _slip_that_is_reported])
+@pytest.mark.parametrize("vehicle", [True, False])
+def test_a_way_that_the_odometer_lost_is_no_alarm(
+    odometer: Callable[[pl.DataFrame], pl.DataFrame], vehicle: bool
+) -> None:
+    tables = journey(0.0, 0.0, 1.0, vehicle, odometer=odometer)
+    assert tables.alarms.is_empty()
+    reasons = tables.epochs["link_distance_reason"]
+    assert (reasons == "odometer distance lost since the last validated position").sum() == 12
+    assert tables.epochs["tvb"].tail(30).all()
+
+
+@pytest.mark.skipif(not SEGMENT.exists(), reason="the public recordings are not beside the project")
 @pytest.mark.parametrize("gap_reset_s", [5.0, 60.0])
 def test_on_the_noise_of_a_real_recording(gap_reset_s: float) -> None:
     """A car for a minute, scale and latency learned on the way; the bank restarts after the outage, or bridges it."""
