@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline import catalogue, storage, store
+from pipeline import catalogue, store
 from pipeline.campaign_tables import campaign_accuracy, campaign_levels, campaign_runs
 from pipeline.hazards.map_errors import map_places, map_suspects
 from pipeline.ingest.files import Address
 from pipeline.present import tall
+from pipeline.remote import redacted
 from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally
@@ -35,7 +36,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
     if not store.run_ids(out):
         raise UsageError(
             "holds no complete run",
-            place=storage.redacted(str(out)),
+            place=redacted(str(out)),
             expected="the output folder of `balise replay`",
         )
     settings = config or store.read_config(out) or Configuration()

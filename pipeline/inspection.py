@@ -8,13 +8,14 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline import storage, store
+from pipeline import store
 from pipeline.ingest import files
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
 from pipeline.matching.describe import describe_site
 from pipeline.matching.survey import survey_findings
+from pipeline.remote import redacted
 from pipeline.site_windows import window_findings
 from schemas.config import IngestConfig
 from schemas.errors import UsageError
@@ -33,19 +34,19 @@ def inspect_path(
 ) -> dict[str, pl.DataFrame]:
     """Tables by title, for whatever stands at the path; `result`: runs over a site, for what they say of its survey."""
     if not files.exists(path):
-        raise UsageError("does not exist", place=storage.redacted(str(path)))
+        raise UsageError("does not exist", place=redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()
     if names & _SITE_FILES:
         return inspect_site(path, result)
     if result is not None:
-        raise UsageError("is no site", place=storage.redacted(str(path)), expected="a site, to hold a result against")
+        raise UsageError("is no site", place=redacted(str(path)), expected="a site, to hold a result against")
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if files.name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
         return inspect_log(path, config or IngestConfig())
     raise UsageError(
         "is neither a log, a site nor a result",
-        place=storage.redacted(str(path)),
+        place=redacted(str(path)),
         expected="RUN.mcap, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
     )
 
@@ -101,7 +102,7 @@ def inspect_site(path: Address, result: Address | None = None) -> dict[str, pl.D
         return tables
     runs = store.run_ids(result)
     if not runs:
-        raise UsageError("holds no complete run", place=storage.redacted(str(result)))
+        raise UsageError("holds no complete run", place=redacted(str(result)))
     epochs = (store.read_table(result, "epochs", run).collect() for run in runs)
     return {**tables, "Survey": survey_findings(epochs, site.track)}
 

@@ -11,8 +11,9 @@ import re
 
 import polars as pl
 
-from pipeline import catalogue, storage, store
+from pipeline import catalogue, store
 from pipeline.ingest.files import Address, exists, is_url, join
+from pipeline.remote import redacted
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES
@@ -44,7 +45,7 @@ def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
     if not runs:
         raise UsageError(
             "holds no complete run",
-            place=storage.redacted(str(out)),
+            place=redacted(str(out)),
             expected="the output folder of `balise replay`",
         )
     # Only what the query may name: ten thousand addresses take their time, remote tables their transfer.

@@ -9,30 +9,18 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import re
 import secrets
 import shutil
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pipeline.ingest.files import Address, is_url, name_of
-from schemas.errors import BaliseError, InputError, OutputError
+from pipeline.remote import arrivals, on_store, opened, redacted
+from schemas.errors import InputError, OutputError
 
-T = TypeVar("T")
-
-_TRIES = 4
-_FIRST_PAUSE_S = 0.25
 _BLOCK_BYTES = 1 << 20
-_SECRETS = re.compile(r"(?<=://)[^/@\s]+@|\?[^\s'\"]*|((?:AKIA|ASIA)[A-Z0-9]{12,})")
-
-
-def redacted(text: str) -> str:
-    """The text without user names, passwords, keys and signatures that addresses may carry."""
-    return _SECRETS.sub("", text)
 
 
 def absolute(address: Address) -> str:
@@ -48,7 +36,7 @@ def write_bytes(address: Address, content: bytes) -> None:
 def stage(address: Address, content: bytes) -> tuple[Address, Address]:
     """Put the content beside its final place (object stores: at it); `commit` gives it its name."""
     if is_url(address):
-        _remote(address, lambda store, path: store.pipe_file(path, content))
+        on_store(address, lambda store, path: store.pipe_file(path, content))
         return address, address
     final = Path(address)
     temporary = final.with_name(f".{final.name}.{secrets.token_hex(6)}.tmp")
@@ -98,7 +86,7 @@ def remove(address: Address) -> None:
         with contextlib.suppress(FileNotFoundError):
             store.rm_file(path)
 
-    _remote(address, delete)
+    on_store(address, delete)
 
 
 def remove_folder(address: Address) -> None:
@@ -111,7 +99,16 @@ def remove_folder(address: Address) -> None:
         with contextlib.suppress(FileNotFoundError):
             store.rm(path, recursive=True)
 
-    _remote(address, delete)
+    on_store(address, delete)
+
+
+def reach(address: Address) -> None:
+    """Raises `InputError` where the store of an address does not answer; local paths answer always.
+
+    For reading through `ingest.files`, whose patience is that of the store's own library: many minutes.
+    """
+    if is_url(address):
+        on_store(address, lambda store, path: store.isdir(path), kind=InputError)
 
 
 def folders_in(address: Address) -> list[str]:
@@ -129,7 +126,7 @@ def folders_in(address: Address) -> list[str]:
             return []
         return sorted(name_of(entry["name"]) for entry in entries if entry["type"] == "directory")
 
-    return _remote(address, names)
+    return on_store(address, names)
 
 
 def versions(folder: Address, name: str) -> dict[str, str] | None:
@@ -140,7 +137,7 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
     if not is_url(folder):
         return _local_versions(str(folder), name)
     infos = {
-        place.split("/")[-2]: info for place, info in _remote(folder, _infos).items() if place.endswith(f"/{name}")
+        place.split("/")[-2]: info for place, info in on_store(folder, _infos).items() if place.endswith(f"/{name}")
     }
     found = {part: version_of(info) for part, info in infos.items()}
     return None if None in found.values() else {part: str(version) for part, version in found.items()}
@@ -148,7 +145,7 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
 
 def version(address: Address) -> str | None:
     """What changes with the content of an object, or of the objects in a folder; none where that is not known."""
-    infos = _remote(address, _infos, kind=InputError)
+    infos = on_store(address, _infos, kind=InputError)
     found = {place: version_of(info) for place, info in infos.items()}
     if not found or None in found.values():
         return None
@@ -185,7 +182,7 @@ def glob_remote(pattern: str) -> list[Address]:
     """Addresses that match a glob in an object store, sorted."""
     return [
         str(found)
-        for found in _remote(
+        for found in on_store(
             pattern, lambda store, path: sorted(store.unstrip_protocol(p) for p in store.glob(path)), kind=InputError
         )
     ]
@@ -195,7 +192,7 @@ def read_many(addresses: list[str]) -> dict[str, bytes]:
     """Contents of those of the remote objects that exist."""
     if not addresses:
         return {}
-    by_path = {_store(address)[1]: address for address in addresses}
+    by_path = {opened(address)[1]: address for address in addresses}
 
     def fetch(store: Any, _: str) -> dict[str, bytes]:
         found: dict[str, bytes | Exception] = store.cat(list(by_path), on_error="return")
@@ -205,7 +202,7 @@ def read_many(addresses: list[str]) -> dict[str, bytes]:
         return {by_path[path]: data for path, data in found.items() if isinstance(data, bytes)}
 
     # With a single path fsspec would return bare bytes where it is not asked for a list.
-    return _remote(addresses[0], fetch)
+    return on_store(addresses[0], fetch)
 
 
 @contextlib.contextmanager
@@ -218,9 +215,9 @@ def local_copy(address: Address) -> Iterator[Path]:
         target = Path(folder) / name_of(address)
 
         def fetch(store: Any, path: str) -> None:
-            store.get(path, str(target), recursive=store.isdir(path))
+            store.get(path, str(target), recursive=store.isdir(path), callback=arrivals(store))
 
-        _remote(address, fetch, kind=InputError)
+        on_store(address, fetch, kind=InputError)
         yield target
 
 
@@ -256,45 +253,3 @@ def as_output_error(address: Address) -> Iterator[None]:
             place=redacted(str(address)),
             remedy="Free space or choose another --out; complete runs stay and are skipped next time.",
         ) from None
-
-
-@lru_cache(maxsize=64)
-def _filesystem(root: str) -> Any:
-    import fsspec
-
-    # Listings must not be remembered: other processes write here too.
-    return fsspec.core.url_to_fs(root, use_listings_cache=False)[0]
-
-
-def _store(address: Address) -> tuple[Any, str]:
-    """The file system of an address and its path there."""
-    protocol, _, rest = str(address).partition("://")
-    try:
-        store = _filesystem(f"{protocol}://{rest.split('/', 1)[0]}")
-        return store, str(store._strip_protocol(str(address)))
-    except (ImportError, ValueError) as error:
-        raise OutputError(
-            f"cannot be opened: {redacted(str(error))}",
-            place=redacted(str(address)),
-            remedy="Install the extra for this kind of address (`balise[s3]`).",
-        ) from None
-
-
-def _remote(address: Address, operation: Callable[[Any, str], T], kind: type[BaliseError] = OutputError) -> T:
-    """Run an operation on an object store, again after a pause where it answers with an error."""
-    store, path = _store(address)
-    for attempt in range(_TRIES):
-        try:
-            return operation(store, path)
-        except BaliseError:
-            raise
-        except Exception as error:
-            # Stores raise their client library's own exceptions, which share no base class.
-            if attempt == _TRIES - 1 or isinstance(error, FileNotFoundError | PermissionError):
-                raise kind(
-                    f"the store refused: {redacted(str(error)) or type(error).__name__}",
-                    place=redacted(str(address)),
-                    remedy="Check address, rights and connection; complete runs stay and are skipped next time.",
-                ) from None
-            time.sleep(_FIRST_PAUSE_S * 2**attempt)
-    raise AssertionError("the last attempt returns or raises")

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from pipeline import storage
 from pipeline.ingest.files import Address, is_url, join
+from pipeline.remote import redacted
 from schemas.errors import OutputError
 
 _NAME = ".lock"
@@ -37,7 +38,7 @@ def check_held(out: Address, own: str) -> None:
     if not _content(join(out, _NAME)).startswith(own):
         raise OutputError(
             "is no longer held by this campaign",
-            place=storage.redacted(str(out)),
+            place=redacted(str(out)),
             remedy="Repeat the command: complete runs are skipped.",
         )
 
@@ -121,6 +122,6 @@ def _beat(place: str, own: str, ended: threading.Event) -> None:
 def _busy(out: Address) -> OutputError:
     return OutputError(
         "another campaign is writing here",
-        place=storage.redacted(str(out)),
+        place=redacted(str(out)),
         remedy="Wait for its end, or choose another --out.",
     )

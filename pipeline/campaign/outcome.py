@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import dataframely as dy
 import polars as pl
 
-from pipeline import storage
 from pipeline.campaign.plan import RunJob
 from pipeline.ingest.files import Address
+from pipeline.remote import redacted
 from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError
@@ -85,7 +85,7 @@ def failure_of(error: Exception, lasting: bool) -> Failure:
     """How a failure is told, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
         again = isinstance(error, InputError) and not isinstance(error, ChangedError)
-        return Failure(storage.redacted(str(error)), lasting and again)
+        return Failure(redacted(str(error)), lasting and again)
     if isinstance(error, MemoryError):
         return Failure("not enough memory", lasting=False)
     text = f"defect of the program: {type(error).__name__}: {error}"
@@ -120,7 +120,7 @@ def failed_tables(job: RunJob, error: str) -> RunTables:
     folder = job.address.rstrip("/").rpartition("/")[0]
     known = {
         "status": RunStatus.FAILED.value,
-        "error": error.replace(f"{storage.redacted(folder)}/", ""),
+        "error": error.replace(f"{redacted(folder)}/", ""),
         "config_digest": digest_of(job.config, job.vehicle),
         "software": SOFTWARE,
         "contract": CONTRACT_VERSION,

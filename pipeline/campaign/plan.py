@@ -14,6 +14,7 @@ from pipeline import storage, store
 from pipeline.ingest import files
 from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
+from pipeline.remote import redacted
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
@@ -62,6 +63,7 @@ def make_plan(
     """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done."""
     config, vehicle = config or Configuration(), vehicle or Vehicle()
     addresses = find_runs(runs)
+    storage.reach(site)
     site_digest = read_site(site).digest
     base = RunJob(
         run_id="",
@@ -108,8 +110,8 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
             other = found.setdefault(run_id, storage.absolute(address))
             if other != storage.absolute(address):
                 raise UsageError(
-                    f"and {storage.redacted(str(address))} have the same run id {run_id!r}",
-                    place=storage.redacted(other),
+                    f"and {redacted(str(address))} have the same run id {run_id!r}",
+                    place=redacted(other),
                     remedy="Rename one of them: results are filed by run id.",
                 )
     return dict(sorted(found.items()))
@@ -119,7 +121,7 @@ def _expand(name: str) -> list[Address]:
     matches = _matches(name)
     if not matches:
         raise UsageError(
-            "no such run", place=storage.redacted(name), expected="RUN.mcap, a run folder, a folder of runs or a glob"
+            "no such run", place=redacted(name), expected="RUN.mcap, a run folder, a folder of runs or a glob"
         )
     runs: list[Address] = []
     for match in matches:
@@ -137,7 +139,10 @@ def _matches(name: str) -> list[Address]:
 
 def _is_run(address: Address) -> bool:
     """A file, or a folder that holds a stream itself; whether it can be read is found out later."""
-    if files.name_of(address).endswith(".mcap") or not files.is_dir(address):
+    if files.name_of(address).endswith(".mcap"):
+        return True
+    storage.reach(address)
+    if not files.is_dir(address):
         return True
     names = files.list_dir(address)
     return any(f"{stream}.parquet" in names for stream in STREAMS)
@@ -148,7 +153,7 @@ def _runs_in(folder: Address) -> list[Address]:
     runs = [child for child in inside if _looks_like_run(child)]
     if not runs:
         raise UsageError(
-            "holds no run", place=storage.redacted(str(folder)), expected="RUN.mcap files or folders with gnss.parquet"
+            "holds no run", place=redacted(str(folder)), expected="RUN.mcap files or folders with gnss.parquet"
         )
     return runs
 

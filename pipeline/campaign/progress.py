@@ -18,6 +18,7 @@ from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
 from pipeline.ingest.files import is_url, join
 from pipeline.present import duration_text
+from pipeline.remote import redacted
 from schemas.enums import RunStatus
 from schemas.version import SOFTWARE
 
@@ -152,7 +153,7 @@ class LogWatch:
     def finished(self, outcome: RunOutcome) -> None:
         self._write(outcome_line(outcome))
         if outcome.trace:
-            self._write(storage.redacted(outcome.trace))
+            self._write(redacted(outcome.trace))
 
     def lost(self, run_id: str, attempt: int) -> None:
         self._write(loss_line(run_id, attempt))

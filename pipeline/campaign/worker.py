@@ -15,6 +15,7 @@ from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
 from pipeline.ingest.files import is_url
 from pipeline.ingest.site import read_site
+from pipeline.remote import redacted
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
@@ -79,7 +80,7 @@ def _fetched(job: RunJob, version: str | None) -> Iterator[Path]:
     """The log on this machine; errors name it by its own address."""
     with storage.local_copy(job.address) as path, _told_of(job, path):
         if _version(job) != version:
-            raise changed(storage.redacted(job.address))
+            raise changed(redacted(job.address))
         yield path
 
 
@@ -101,10 +102,11 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
 @lru_cache(maxsize=2)
 def _site(address: str, digest: str) -> Site:
     """The site, read once per worker."""
+    storage.reach(address)
     site = read_site(address)
     if site.digest != digest:
         raise SiteError(
-            "has changed since the campaign began", place=storage.redacted(address), remedy="Start the campaign again."
+            "has changed since the campaign began", place=redacted(address), remedy="Start the campaign again."
         )
     return site
 
@@ -132,7 +134,7 @@ def _told_of(job: RunJob, path: Path) -> Iterator[None]:
         yield
     except BaliseError as error:
         if error.place and str(path) != job.address:
-            error.place = error.place.replace(str(path), storage.redacted(job.address))
+            error.place = error.place.replace(str(path), redacted(job.address))
         raise
 
 

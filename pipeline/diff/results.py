@@ -13,6 +13,7 @@ from pipeline import storage, store
 from pipeline.diff.hazards import HAZARD_WINDOW_S, HazardChange, compare_hazards
 from pipeline.diff.tables import Difference, compare_tables
 from pipeline.ingest.files import Address, is_url
+from pipeline.remote import redacted
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
@@ -108,7 +109,7 @@ def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
 def _runs(out: Address) -> list[str]:
     runs = store.run_ids(out)
     if not runs:
-        place = storage.redacted(str(out))
+        place = redacted(str(out))
         raise UsageError("holds no complete run", place=place, expected="the output folder of `balise replay`")
     return runs
 
@@ -138,6 +139,6 @@ def _content(out: Address, table: str, run_id: str) -> bytes:
     else:
         content = Path(address).read_bytes() if Path(address).exists() else None
     if content is None:
-        place = storage.redacted(str(address))
+        place = redacted(str(address))
         raise UsageError("is missing from a complete run", place=place, remedy="Replay the run again with --force.")
     return content

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline import storage, store
+from pipeline.remote import redacted
 from schemas.config import Configuration
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunTables
@@ -190,7 +191,7 @@ def test_config_is_written_resolved(tmp_path: Path) -> None:
     ],
 )
 def test_secrets_are_taken_out(text: str, clean: str) -> None:
-    assert storage.redacted(text) == clean
+    assert redacted(text) == clean
 
 
 def test_remote_store_holds_the_same_bytes(tmp_path: Path) -> None:

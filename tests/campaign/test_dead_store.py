@@ -1,0 +1,144 @@
+"""Object stores that never come back: the campaign gives up on what is there, soon, and goes on with the rest."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from pipeline import remote, storage
+from pipeline.campaign import make_plan, run_campaign
+from schemas.enums import RunStatus
+from schemas.errors import InputError, OutputError, UsageError
+from tests.campaign.compare import by_run, plan_of
+from tests.conftest import SmallTrial
+
+_PATIENCE_S = 1.5
+_BLOCKS, _BLOCK = 6, b"x" * (1 << 16)
+_LISTING = b"<ListBucketResult><Name>b</Name><IsTruncated>false</IsTruncated></ListBucketResult>"
+
+
+class Ill(BaseHTTPRequestHandler):
+    """Answers with 503, breaks off, says nothing, or sends an object drop by drop: as its server's `ailment` is."""
+
+    protocol_version = "HTTP/1.1"
+    ailment = ""
+    well = threading.Event()
+
+    def do_GET(self) -> None:
+        if self.ailment == "busy":
+            self._answer(503, b"<Error><Code>ServiceUnavailable</Code><Message>Come back later</Message></Error>")
+        elif self.ailment == "silent":
+            self.well.wait(30.0)
+            self.close_connection = True
+        elif self.ailment == "slow":
+            self._answer(200, _LISTING) if "list-type" in self.path else self._drip()
+        else:
+            self.connection.close()
+            self.close_connection = True
+
+    do_HEAD = do_PUT = do_POST = do_GET  # noqa: N815 - names that the base class looks for
+
+    def log_message(self, *_: object) -> None:
+        """Nothing in the tests' output."""
+
+    def _drip(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", str(_BLOCKS * len(_BLOCK)))
+        self.end_headers()
+        for _ in range(_BLOCKS):
+            time.sleep(_PATIENCE_S / 3)
+            self.wfile.write(_BLOCK)
+
+    def _answer(self, status: int, content: bytes) -> None:
+        self.rfile.read(int(self.headers.get("Content-Length") or 0))
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+
+@pytest.fixture
+def ill(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[str]:
+    """The address of a bucket in a store with this ailment."""
+    handler = type("Ailing", (Ill,), {"ailment": request.param, "well": threading.Event()})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    thread.start()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "somebody")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    monkeypatch.setenv("BALISE_STORE_PATIENCE_S", str(_PATIENCE_S))
+    _forget_stores()
+    yield f"s3://{request.param}"
+    _forget_stores()
+    handler.well.set()  # type: ignore[attr-defined]
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def _forget_stores() -> None:
+    """Connections are kept, and know where the store of the test before was."""
+    import s3fs
+
+    remote._filesystem.cache_clear()
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize("ill", ["busy", "silent", "broken"], indirect=True)
+def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_path: Path) -> None:
+    named = [f"{ill}/far.mcap", str(small_trial.paths[0])]
+    begun_s = time.monotonic()
+    summary = run_campaign(make_plan(named, small_trial.site, tmp_path), jobs=2)
+    assert time.monotonic() - begun_s < 30.0
+    outcomes = by_run(summary)
+    assert outcomes["far"].status is RunStatus.FAILED
+    assert "far.mcap: the store was asked in vain for 1.5 s: " in (outcomes["far"].error or "")
+    assert outcomes["far"].defect is False
+    assert outcomes["run0"].status is RunStatus.OK
+
+
+@pytest.mark.parametrize("ill", ["busy", "silent", "broken"], indirect=True)
+def test_dead_store_ends_the_command_soon(ill: str, small_trial: SmallTrial, tmp_path: Path) -> None:
+    """Site, runs and output are asked for before any work is done."""
+    begun_s = time.monotonic()
+    with pytest.raises(InputError, match="asked in vain"):
+        make_plan([str(small_trial.runs)], f"{ill}/site", tmp_path)
+    with pytest.raises(InputError, match="asked in vain"):
+        make_plan([f"{ill}/runs"], small_trial.site, tmp_path)
+    with pytest.raises(OutputError, match="asked in vain"):
+        run_campaign(plan_of(small_trial, f"{ill}/out", small_trial.paths[:1]))
+    assert time.monotonic() - begun_s < 5 * _PATIENCE_S
+
+
+@pytest.mark.parametrize("ill", ["slow"], indirect=True)
+def test_slow_is_not_dead(ill: str) -> None:
+    """A download may take longer than the patience as long as something arrives."""
+    begun_s = time.monotonic()
+    with storage.local_copy(f"{ill}/far.mcap") as path:
+        assert path.read_bytes() == _BLOCKS * _BLOCK
+    assert time.monotonic() - begun_s > _PATIENCE_S
+
+
+def test_patience_is_under_a_minute_unless_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("BALISE_STORE_PATIENCE_S", raising=False)
+    assert remote.patience_s() < 60.0
+    monkeypatch.setenv("BALISE_STORE_PATIENCE_S", "7.5")
+    assert remote.patience_s() == 7.5
+    for wrong in ("0", "-3", "nan", "soon"):
+        monkeypatch.setenv("BALISE_STORE_PATIENCE_S", wrong)
+        with pytest.raises(UsageError, match="BALISE_STORE_PATIENCE_S"):
+            remote.patience_s()
+
+
+def test_what_is_wrong_for_good_is_not_asked_again() -> None:
+    assert remote._tries(FileNotFoundError()) == remote._tries(PermissionError()) == 1
+    assert remote._tries(ValueError("no credentials")) < remote._tries(OSError(16, "busy"))
