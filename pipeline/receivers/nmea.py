@@ -144,7 +144,9 @@ def _correlation(m: Any) -> dict[str, float]:
     if not all(isinstance(value, float) for value in (m.stdMajor, m.stdMinor, m.orient)):
         return {"cov_en_m2": 0.0}
     angle = np.radians(m.orient)
-    return {"cov_en_m2": float((m.stdMajor**2 - m.stdMinor**2) * np.sin(angle) * np.cos(angle))}
+    shared = float((m.stdMajor**2 - m.stdMinor**2) * np.sin(angle) * np.cos(angle))
+    # Rounding, or an ellipse of something else: the deviations of the axes count.
+    return {"cov_en_m2": shared if abs(shared) <= m.stdLat * m.stdLong else 0.0}
 
 
 def _nothing(_epoch: Epoch, _m: Any) -> None:

@@ -193,6 +193,15 @@ def test_sentences_that_make_no_position_make_no_epoch(converted, tmp_path):
     assert (found.run.gnss.height, found.dropped) == (1, {"epoch without its position message": 1})
 
 
+def test_an_error_ellipse_that_contradicts_its_axes_gives_no_correlation(converted):
+    def covariances(gst: str) -> tuple[float, ...]:
+        fixes = converted(rmc("120000.00"), gga("120000.00"), sentence(f"GPGST,120000.00,1.0,{gst}")).run.gnss
+        return fixes.select("cov_ee_m2", "cov_nn_m2", "cov_en_m2").row(0)
+
+    assert covariances("2.0,1.0,45.0,1.5811,1.5811,3.0") == pytest.approx((2.5, 2.5, 1.5), abs=1e-3)
+    assert covariances("9.0,1.0,45.0,1.0,1.0,3.0") == (1.0, 1.0, 0.0)
+
+
 def test_half_lines_and_stray_signs_are_damage_and_nothing_more(converted):
     whole = [rmc("120000.00"), gga("120000.00")]
     found = converted(whole[1][:30], b"\r\n", *whole, whole[1].replace(b"5030", b"5130"), b"$@GPGGA,junk\r\n")
