@@ -60,7 +60,9 @@ def replay(
     force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
     quiet: Quiet = False,
-    as_json: Json = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
+    ] = False,
 ) -> None:
     """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
@@ -75,7 +77,7 @@ def replay(
             scheduler=scheduler,
             force=force,
             time_limit_s=time_limit,
-            watches=watches(quiet or as_json),
+            watches=watches(quiet, as_json),
         )
     except Interrupted as interrupted:
         if interrupted.summary is not None:
@@ -465,16 +467,16 @@ def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> Non
     elif not quiet:
         shown = rows if rows.height <= _SHOWN_RUNS else rows.filter(rows["status"] != "ok").head(_SHOWN_RUNS)
         if shown.height:
-            show_table(shown)
+            show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))
         print(f"{summary_line(summary)}. Tables are in {out}.")
 
 
 def _summary_rows(summary: Summary) -> Any:
     import polars as pl
 
-    names = ("run_id", "status", "hazards", "missed_detections", "seconds", "skipped", "error")
+    names = ("run_id", "status", "hazards", "missed_detections", "seconds", "skipped", "attempts", "error")
     rows = [tuple(getattr(outcome, name) for name in names) for outcome in summary.outcomes]
-    kinds = (pl.String, pl.String, pl.Int64, pl.Int64, pl.Float64, pl.Boolean, pl.String)
+    kinds = (pl.String, pl.String, pl.Int64, pl.Int64, pl.Float64, pl.Boolean, pl.Int64, pl.String)
     return pl.DataFrame(rows, schema=dict(zip(names, kinds, strict=True)), orient="row")
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
@@ -39,20 +40,44 @@ class Tally:
         self.failed += outcome.status is not RunStatus.OK
         self.skipped += outcome.skipped
 
+    @property
+    def rate_per_s(self) -> float | None:
+        """Runs replayed per second; none before the first."""
+        elapsed_s, replayed = time.monotonic() - self.since_s, self.done - self.skipped
+        return replayed / elapsed_s if replayed and elapsed_s > 0 else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the end at this rate."""
+        rate_per_s = self.rate_per_s
+        return None if rate_per_s is None else (self.total - self.done) / rate_per_s
+
     def line(self, under_way: Sequence[tuple[str, float]] = ()) -> str:
         """One line: done, failed, rate, time left, slow runs."""
-        elapsed = time.monotonic() - self.since_s
-        rate = (self.done - self.skipped) / elapsed if elapsed > 0 else 0.0
         parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed or partial"]
         if self.skipped:
             parts.append(f"{self.skipped} skipped")
-        if rate > 0:
-            left = (self.total - self.done) / rate
-            parts += [f"{rate:.2f} runs/s", f"{duration_text(left)} left"]
-        slow = sorted(under_way, key=lambda item: -item[1])[:_SLOW_SHOWN]
-        if slow:
-            parts.append("longest now: " + ", ".join(f"{run} ({duration_text(age)})" for run, age in slow))
+        if self.rate_per_s is not None and self.left_s is not None:
+            parts += [f"{self.rate_per_s:.2f} runs/s", f"{duration_text(self.left_s)} left"]
+        if slow := slowest(under_way):
+            parts.append("longest now: " + ", ".join(f"{run} ({duration_text(age_s)})" for run, age_s in slow))
         return ", ".join(parts)
+
+    def figures(self, under_way: Sequence[tuple[str, float]] = ()) -> dict[str, object]:
+        """The same for programs."""
+        counts = {"done": self.done, "failed": self.failed, "skipped": self.skipped, "total": self.total}
+        slow = [{"run_id": run, "seconds": round(age_s, 3)} for run, age_s in slowest(under_way)]
+        times = {"rate_per_s": _rounded(self.rate_per_s), "left_s": _rounded(self.left_s)}
+        return {**counts, **times, "slow": slow}
+
+
+def slowest(under_way: Sequence[tuple[str, float]]) -> list[tuple[str, float]]:
+    """The runs that have been under way for longest."""
+    return sorted(under_way, key=lambda item: -item[1])[:_SLOW_SHOWN]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
 
 
 def outcome_line(outcome: RunOutcome) -> str:
@@ -102,6 +127,39 @@ class LineWatch:
 
     def _say(self, text: str) -> None:
         print(text, file=self._stream, flush=True)
+
+
+class JsonWatch:
+    """JSON lines for programs: `run` as each run ends, `lost` with each worker that dies, `progress` in between."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stderr
+        self._said_s = time.monotonic()
+        self._tally = Tally(0)
+
+    def begin(self, plan: Plan) -> None:
+        self._tally = Tally(len(plan.jobs))
+        self._say("progress", self._tally.figures())
+
+    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
+        if time.monotonic() - self._said_s >= _LINE_EVERY_S:
+            self._said_s = time.monotonic()
+            self._say("progress", self._tally.figures(under_way))
+
+    def finished(self, outcome: RunOutcome) -> None:
+        self._tally.add(outcome)
+        names = ("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections")
+        told = {name: getattr(outcome, name) for name in names}
+        self._say("run", {**told, "seconds": round(outcome.seconds, 3), **self._tally.figures()})
+
+    def lost(self, run_id: str, attempt: int) -> None:
+        self._say("lost", {"run_id": run_id, "attempt": attempt})
+
+    def end(self, summary: Summary) -> None:
+        self._say("progress", self._tally.figures())
+
+    def _say(self, event: str, told: Mapping[str, object]) -> None:
+        print(json.dumps({"event": event, **told}), file=self._stream, flush=True)
 
 
 class BarWatch:
@@ -181,8 +239,10 @@ def summary_line(summary: Summary) -> str:
     return f"{text}; {duration_text(summary.seconds)}"
 
 
-def watches(quiet: bool) -> list[Watch]:
+def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
     """What shows a campaign on this terminal or pipe."""
     if quiet:
         return [LogWatch()]
+    if as_json:
+        return [JsonWatch(), LogWatch()]
     return [BarWatch() if sys.stderr.isatty() else LineWatch(), LogWatch()]

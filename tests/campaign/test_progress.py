@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +12,9 @@ import pytest
 from rich.console import Console
 
 from pipeline.campaign import Plan, RunOutcome, Summary, progress
-from pipeline.campaign.progress import BarWatch, LineWatch, LogWatch, Tally, watches
+from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, Tally, watches
 from schemas.enums import RunStatus
-from tests.campaign.compare import plan_of
+from tests.campaign.compare import command, plan_of, run
 from tests.conftest import SmallTrial
 
 OK = RunOutcome("a", RunStatus.OK, seconds=2.0)
@@ -118,3 +119,39 @@ def test_who_watches(
 ) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
     assert [type(watch) for watch in watches(quiet)] == kinds
+
+
+def test_json_lines_for_programs(clock: Clock, plan: Plan) -> None:
+    said = io.StringIO()
+    watch = JsonWatch(said)
+    watch.begin(plan)
+    watch.look([("a", 1.0)])
+    clock.now_s += 5.0
+    watch.look([("a", 5.0), ("b", 2.0), ("c", 3.0)])
+    watch.lost("b", 1)
+    watch.finished(OK)
+    watch.finished(BAD)
+    watch.end(Summary(4, (OK, BAD), 5.0))
+    lines = [json.loads(line) for line in said.getvalue().splitlines()]
+    assert [line["event"] for line in lines] == ["progress", "progress", "lost", "run", "run", "progress"]
+    nothing = {"done": 0, "failed": 0, "skipped": 0, "total": 4, "rate_per_s": None, "left_s": None}
+    assert lines[0] == {"event": "progress", **nothing, "slow": []}
+    slow = [{"run_id": "a", "seconds": 5.0}, {"run_id": "c", "seconds": 3.0}]
+    assert lines[1] == {"event": "progress", **nothing, "slow": slow}
+    assert lines[2] == {"event": "lost", "run_id": "b", "attempt": 1}
+    assert (lines[3]["run_id"], lines[3]["status"], lines[3]["error"]) == ("a", "ok", None)
+    assert (lines[3]["done"], lines[3]["rate_per_s"], lines[3]["left_s"]) == (1, 0.2, 15.0)
+    assert (lines[4]["status"], lines[4]["error"], lines[4]["failed"]) == ("failed", "b.mcap: damaged", 1)
+    assert lines[5]["done"] == 2
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_json_on_both_streams(small_trial: SmallTrial, tmp_path: Path, quiet: bool) -> None:
+    flags = ["--json", "--quiet"] if quiet else ["--json"]
+    ended = run(command(small_trial, tmp_path, *flags, runs=small_trial.paths[:2]))
+    result = json.loads(ended.stdout)
+    assert [row["run_id"] for row in result["runs"]] == ["run0", "run1"]
+    assert [row["attempts"] for row in result["runs"]] == [1, 1]
+    lines = [json.loads(line) for line in ended.stderr.splitlines()]
+    assert sorted(line["run_id"] for line in lines if line["event"] == "run") == ([] if quiet else ["run0", "run1"])
+    assert bool(lines) is not quiet
