@@ -48,6 +48,7 @@ def inspect_path(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
         expected="RUN.mcap, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
+        remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
 
 

@@ -12,6 +12,7 @@ from pipeline.ingest.conform import conform
 from pipeline.ingest.plan import Source, missing_field
 from pipeline.ingest.reader import ORDINAL
 from schemas.errors import InputError
+from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
 
@@ -74,6 +75,7 @@ def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> 
     except pl.exceptions.PolarsError as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
+    columns = _explicit(columns, source)
     frame = _supplemented(_named(columns.with_columns(times), source), part, supplements)
     frame = _stamped(frame, source, remarks)
     if source.recipe.time is None or not frame["t"].null_count():
@@ -81,6 +83,26 @@ def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> 
     # The calendar of a receiver that does not know the time yet: there is no epoch to be placed anywhere.
     remarks.append(f"{source.channel.topic}: {frame['t'].null_count()} messages without valid time")
     return frame.drop_nulls("t")
+
+
+_NEVER_ZERO = ("hpl_m", "vpl_m", "sbas_prn", "sigma_m", "sigma_speed_mps")
+
+
+def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
+    """What a protobuf field without presence holds: a column that is 0 throughout was not recorded."""
+    contract = STREAM_SCHEMAS[source.stream].columns()
+    names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
+    silent = [name for name in names if not (frame[name] != 0).any()]
+    if set(silent) >= {"distance_m", "speed_mps"}:  # a train that stands says so
+        silent.remove("speed_mps")
+    empty = [pl.lit(None, dtype=frame[name].dtype).alias(name) for name in silent]
+    zero = [
+        pl.when(pl.col(name) != 0).then(name).alias(name)
+        for name in names
+        if name in _NEVER_ZERO and name not in silent
+    ]
+    text = [pl.col("solution").replace("", None)] if "solution" in source.implicit else []
+    return frame.with_columns(*empty, *zero, *text)
 
 
 def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:

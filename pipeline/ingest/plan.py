@@ -10,6 +10,7 @@ import dataframely as dy
 import polars as pl
 
 from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.generic import protobuf_descriptor
 from pipeline.ingest.inventory import stamp_parts
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.recipe import FIX_TYPE, Recipe
@@ -37,7 +38,8 @@ class Sample:
 class Source:
     """One channel that feeds a stream: fields to decode, columns and times over them.
 
-    `doubtful` are fields that the first message lacks and some message must have, by column.
+    `doubtful` are fields that the first message lacks and some message must have, by column. `implicit` are
+    nullable columns of this project's protobuf messages whose field cannot be left out: 0 may say that it was.
     """
 
     channel: Channel
@@ -49,6 +51,7 @@ class Source:
     breaches: tuple[Breach, ...] = ()
     mapped: bool = False
     doubtful: Mapping[str, str] = field(default_factory=dict)
+    implicit: tuple[str, ...] = ()
 
     @property
     def dropped(self) -> bool:
@@ -181,8 +184,25 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
         types |= time.types
     solution = mapping.solution if mapping else None
     return Source(
-        sample.channel, recipe, columns, times, types, solution, tuple(breaches), mapping is not None, doubtful
+        sample.channel,
+        recipe,
+        columns,
+        times,
+        types,
+        solution,
+        tuple(breaches),
+        mapping is not None,
+        doubtful,
+        _without_presence(sample.channel, columns) if recipe.own else (),
     )
+
+
+def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ...]:
+    """Columns whose protobuf field has its default where it was not set (proto3 without `optional`)."""
+    if channel.encoding != "protobuf":
+        return ()
+    known = protobuf_descriptor(channel).fields_by_name
+    return tuple(name for name in columns if name in known and not known[name].has_presence)
 
 
 def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:

@@ -163,3 +163,47 @@ def test_a_constant_that_its_column_cannot_hold_is_an_error_of_the_configuration
         read(tmp_path, quality("sbas"), mapped(constants={"height_m": "abc"}))
     with pytest.raises(ConfigError, match=r"constants.solution: .*found True"):
         read(tmp_path, quality("sbas"), mapped(constants={"solution": True}))
+
+
+def implicit_protobuf(stream: str, rows: list[dict[str, object]]) -> bytes:
+    """This project's message by a writer whose fields are not `optional`: what it does not set has its default."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    from pipeline.ingest.proto_schemas import descriptor_set
+
+    name = f"balise.{stream.capitalize()}"
+    files = FileDescriptorSet.FromString(descriptor_set(name))
+    message_type = files.file[-1].message_type[0]
+    del message_type.oneof_decl[:]
+    for field in message_type.field:
+        field.ClearField("oneof_index")
+        field.ClearField("proto3_optional")
+    pool = DescriptorPool()
+    for file in files.file:
+        pool.Add(file)
+    kind = GetMessageClass(pool.FindMessageTypeByName(name))
+    records = b""
+    for number, values in enumerate(rows):
+        written = kind(**values)
+        written.t.seconds = START_NS // SECOND + number
+        records += message(written.SerializeToString(), channel_id=1 if stream == "gnss" else 2)
+    own = 1 if stream == "gnss" else 2
+    return (
+        schema(own, name, "protobuf", files.SerializeToString()) + channel(own, own, f"/{stream}", "protobuf") + records
+    )
+
+
+def test_what_a_writer_without_presence_never_sets_is_not_known(tmp_path):
+    fixes = [
+        {"latitude_deg": 50.0, "longitude_deg": 4.0, "fix": "sbas", "vel_e_mps": v, "hpl_m": v} for v in (0.0, 2.0)
+    ]
+    wheels = [{"distance_m": 1.0}, {"distance_m": 2.0}]
+    run = read(tmp_path, whole(implicit_protobuf("gnss", fixes), implicit_protobuf("odometer", wheels)))
+    known = [name for name in run.gnss.columns if run.gnss[name].null_count() < 2]
+    assert known == ["t", "solution", "latitude_deg", "longitude_deg", "vel_e_mps", "hpl_m", "fix"]
+    assert run.gnss.select("solution", "vel_e_mps", "hpl_m").rows() == [("primary", 0.0, None), ("primary", 2.0, 2.0)]
+    assert run.odometer.select("distance_m", "speed_mps").rows() == [(1.0, None), (2.0, None)]
+    standing = whole(implicit_protobuf("gnss", fixes), implicit_protobuf("odometer", [{}, {}]))
+    assert read(tmp_path, standing).odometer.select("distance_m", "speed_mps").rows() == [(None, 0.0)] * 2
