@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -22,7 +23,7 @@ app = typer.Typer(
     name="balise",
     help="Replays recorded train journeys and says whether satellite positioning could have replaced balises.",
     epilog="Exit status: 0 all runs ok; 1 some run failed or partial; 2 bad usage, configuration or site; "
-    "3 a defect of the program; 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
+    "3 a defect of the program; 129, 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -80,9 +81,11 @@ def replay(
             watches=watches(quiet, as_json),
         )
     except Interrupted as interrupted:
-        if interrupted.summary is not None:
-            _show_summary(interrupted.summary, out, quiet, as_json)
-        print("balise: interrupted; the same command goes on from here", file=sys.stderr)
+        # A terminal that was closed takes no more words.
+        with contextlib.suppress(OSError):
+            if interrupted.summary is not None:
+                _show_summary(interrupted.summary, out, quiet, as_json)
+            print("balise: interrupted; the same command goes on from here", file=sys.stderr)
         raise typer.Exit(128 + interrupted.signum) from None
     _show_summary(summary, out, quiet, as_json)
     raise typer.Exit(_status_of(summary))

@@ -26,6 +26,7 @@ from schemas.enums import RunStatus
 from schemas.errors import UsageError
 
 _LOOK_S = 0.2
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ATTEMPTS = 2
 _STARTS = 10
 TIME_LIMIT_S = 3600.0
@@ -118,7 +119,7 @@ def run_campaign(
 ) -> Summary:
     """Replay every run of the plan whose result is not there already.
 
-    Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT and SIGTERM; either way
+    Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT, SIGTERM and SIGHUP; either way
     what is complete stays, and the same call later does the rest. The tables are the same for any `jobs`,
     any `scheduler` and any order of runs.
     """
@@ -260,7 +261,10 @@ def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
 
 @contextmanager
 def _listening(state: _State, at_once: bool) -> Iterator[None]:
-    """Answer SIGINT and SIGTERM: at the loop's next look, or at once where the work is in this process."""
+    """Answer SIGINT, SIGTERM and SIGHUP: at the loop's next look, or at once where the work is in this process.
+
+    What the caller ignores (`nohup`) is ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -270,7 +274,7 @@ def _listening(state: _State, at_once: bool) -> Iterator[None]:
         if at_once:
             raise Interrupted(signum)
 
-    signals = (signal.SIGINT, signal.SIGTERM)
+    signals = [signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN]
     before = {signum: signal.signal(signum, answer) for signum in signals}
     try:
         yield

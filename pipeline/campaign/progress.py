@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
@@ -98,6 +99,12 @@ def loss_line(run_id: str, attempt: int) -> str:
     return f"{run_id}: its worker died at attempt {attempt}; tried again"
 
 
+def say(text: str, stream: TextIO) -> None:
+    """One line; a reader or a terminal that has gone is no reason to stop a campaign."""
+    with contextlib.suppress(OSError):
+        print(text, file=stream, flush=True)
+
+
 class LineWatch:
     """Plain lines: each run that is not ok, and every few seconds how far the campaign is."""
 
@@ -126,7 +133,7 @@ class LineWatch:
         self._say(self._tally.line())
 
     def _say(self, text: str) -> None:
-        print(text, file=self._stream, flush=True)
+        say(text, self._stream)
 
 
 class JsonWatch:
@@ -159,7 +166,7 @@ class JsonWatch:
         self._say("progress", self._tally.figures())
 
     def _say(self, event: str, told: Mapping[str, object]) -> None:
-        print(json.dumps({"event": event, **told}), file=self._stream, flush=True)
+        say(json.dumps({"event": event, **told}), self._stream)
 
 
 class BarWatch:
@@ -190,8 +197,10 @@ class BarWatch:
         self._progress.console.print(loss_line(run_id, attempt), markup=False, highlight=False)
 
     def end(self, summary: Summary) -> None:
-        self.look(())
-        self._progress.stop()
+        # The terminal may be closed.
+        with contextlib.suppress(OSError):
+            self.look(())
+            self._progress.stop()
 
 
 class LogWatch:

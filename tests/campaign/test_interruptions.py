@@ -22,7 +22,7 @@ from pipeline.campaign.worker import replay_one
 from pipeline.ingest.files import Address
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
-from tests.campaign.compare import campaign_bytes, command, plan_of, result_bytes, run, start, wait_for
+from tests.campaign.compare import ROOT, campaign_bytes, command, plan_of, result_bytes, run, start, wait_for
 from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
 
@@ -44,7 +44,7 @@ def tmpfs(folder: Path, options: str) -> Iterator[Path]:
         subprocess.run(["umount", str(folder)], check=True)
 
 
-@pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, signum: int, status: int) -> None:
     os.mkfifo(tmp_path / "never.mcap")
     out = tmp_path / "out"
@@ -66,6 +66,23 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     assert again.returncode == 0, again.stderr
     assert result_bytes(out) == whole
     assert campaign_bytes(out) == campaign_bytes(undisturbed)
+
+
+def test_progress_that_nobody_reads(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """`2>&1 | head -1` and `nohup` do not end a campaign."""
+    process = subprocess.Popen(
+        ["nohup", *command(small_trial, tmp_path, "--jobs", "2", "--json")],
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stderr is not None
+    process.stderr.readline()
+    process.stderr.close()
+    process.send_signal(signal.SIGHUP)
+    assert process.wait(timeout=60) == 0
+    assert len(store.run_ids(tmp_path)) == 4
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
