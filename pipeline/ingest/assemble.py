@@ -90,6 +90,8 @@ _NEVER_ZERO = ("hpl_m", "vpl_m", "sbas_prn", "sigma_m", "sigma_speed_mps")
 
 def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     """What a protobuf field without presence holds: a column that is 0 throughout was not recorded."""
+    if not source.implicit:
+        return frame
     contract = STREAM_SCHEMAS[source.stream].columns()
     names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
     silent = [name for name in names if not (frame[name] != 0).any()]
