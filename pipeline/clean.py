@@ -36,7 +36,8 @@ class CleanCounts:
 def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
-    Raises `InputError` where no solution or not the odometer has two different times: nothing can be replayed.
+    Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
+    nothing can be replayed.
     """
     streams: dict[str, pl.DataFrame | None] = {}
     counts: dict[str, StreamCounts] = {}
@@ -56,6 +57,7 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
     odometer = streams.get("odometer")
     if odometer is not None:
         require_two_times(odometer, f"{run.run_id}: odometer")
+        _require_common_time(run.run_id, gnss, odometer)
     return run.with_streams(**streams), CleanCounts(solutions, counts)
 
 
@@ -85,4 +87,19 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
             found=f"{stream.height} distinct time",
             expected="at least two epochs at different times",
             remedy="Check the recorder's time stamps, or the mapping's time source.",
+        )
+
+
+def _require_common_time(run_id: str, gnss: pl.DataFrame | None, odometer: pl.DataFrame) -> None:
+    """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
+    if gnss is None or gnss.is_empty():
+        return
+    (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
+    if odometer_begin > end or odometer_end < begin:
+        raise InputError(
+            "has no time in common with the GNSS",
+            place=f"{run_id}: odometer, column t",
+            found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
+            expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
+            remedy="Check date and time scale of the two recorders; leave the odometer out to replay without it.",
         )

@@ -74,6 +74,7 @@ class OdometerTrack:
 def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> OdometerTrack:
     """Distance from the recorded distance where there is one, else from speed (trapezoids).
 
+    Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows.
     A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry; a cumulative distance
     carries over it. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
     1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
@@ -83,11 +84,15 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     t_s = (t_ns - epoch_ns) * _NS
     dt = np.diff(t_s)
     period = float(np.median(dt))
-    recorded = np.diff(odometer["distance_m"].to_numpy().astype(np.float64))
-    speed = odometer["speed_mps"].to_numpy().astype(np.float64)
-    driven = 0.5 * (speed[1:] + speed[:-1]) * dt
+    limit_s = max(gap_s, _GAP_IN_PERIODS * period)
+    distance, speed = (odometer[name].to_numpy().astype(np.float64) for name in ("distance_m", "speed_mps"))
+    recorded, driven = np.diff(distance), _driven(speed, dt)
+    if np.isnan(np.where(np.isnan(recorded), driven, recorded)).any():
+        between = np.diff(_carried(t_s, distance, limit_s))
+        recorded = np.where(np.isnan(recorded) & np.isnan(driven), between, recorded)
+        driven = _driven(_carried(t_s, speed, limit_s), dt)
     step = np.where(np.isnan(recorded), driven, recorded)
-    pause = np.isnan(step) | (dt > max(gap_s, _GAP_IN_PERIODS * period))
+    pause = np.isnan(step) | (dt > limit_s)
     slip = odometer["slip"].fill_null(False).to_numpy()
     lost = (pause & np.isnan(recorded)) | slip[1:]
     step = np.where(np.isnan(step) | (pause & np.isnan(recorded)), 0.0, step)
@@ -101,6 +106,24 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
         pause=pause,
         slip=slip,
         white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
+    )
+
+
+def _driven(speed_mps: Array, dt_s: Array) -> Array:
+    steps: Array = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * dt_s
+    return steps
+
+
+def _carried(t_s: Array, values: Array, limit_s: float) -> Array:
+    """Values between known rows no further apart than the limit by straight lines; NaN elsewhere."""
+    known = np.flatnonzero(np.isfinite(values))
+    if known.size < 2:
+        return values
+    after = np.searchsorted(known, np.arange(values.size)).clip(1, known.size - 1)
+    near = t_s[known[after]] - t_s[known[after - 1]] <= limit_s
+    inside = (t_s >= t_s[known[0]]) & (t_s <= t_s[known[-1]])
+    return np.where(
+        np.isfinite(values), values, np.where(near & inside, np.interp(t_s, t_s[known], values[known]), np.nan)
     )
 
 

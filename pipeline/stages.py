@@ -15,6 +15,7 @@ from pipeline.hazards import HazardResult, classify, establish_truth
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, TravelledPath, match
+from pipeline.matching.fixes import contradictory_covariances
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
@@ -134,7 +135,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         ingest=run.notes,
         ambiguous_stretches=found.ambiguous.height,
         notes=(
-            *_notes(run, found, lds),
+            *_notes(run, fixes, found, lds),
             *evidence_notes(aligned, truth),
             *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
         ),
@@ -160,7 +161,7 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
     return Alignment(*(aligned[name][-1] for name in names))
 
 
-def _notes(run: RunLog, found: Match, lds: LdsResult) -> tuple[str, ...]:
+def _notes(run: RunLog, fixes: pl.DataFrame, found: Match, lds: LdsResult) -> tuple[str, ...]:
     """What the reader of the `runs` row should know beside its figures."""
     notes = []
     if run.faults is not None and run.faults.height:
@@ -169,6 +170,9 @@ def _notes(run: RunLog, found: Match, lds: LdsResult) -> tuple[str, ...]:
         notes.append("the odometer ends before the GNSS")
     if run.odometer is not None and _end_ns(run.odometer) > _end_ns(run.gnss) + 1_000_000_000:
         notes.append("the GNSS ends before the odometer")
+    contradictory = contradictory_covariances(fixes)
+    if contradictory:
+        notes.append(f"cov_en_m2 contradicts its variances at {contradictory} epochs and is not used there")
     if found.ambiguous.height:
         clock = "%H:%M:%S"
         stretches = [

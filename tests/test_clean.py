@@ -51,3 +51,16 @@ def test_times_of_another_unit_are_the_same_instants():
     run = RunLog("r", gnss([1_000_000, 2_000_000, 3_000_000]))
     coarse = run.with_streams(gnss=run.gnss.with_columns(pl.col("t").cast(pl.Datetime("us", "UTC"))))
     assert_frame_equal(clean(coarse)[0].gnss, clean(run)[0].gnss)
+
+
+@pytest.mark.parametrize("shift", [-7, 7])
+def test_an_odometer_of_another_day_is_refused(shift):
+    times = gnss([10, 12, 14])
+    day = times.select("t").with_columns(pl.col("t") + pl.duration(nanoseconds=shift, time_unit="ns"))
+    with pytest.raises(InputError, match="no time in common with the GNSS"):
+        clean(RunLog("r", times, day))
+    assert clean(RunLog("r", times, times.select("t")))[0].odometer is not None
+
+
+def test_an_odometer_that_meets_the_gnss_at_one_time_is_kept():
+    assert clean(RunLog("r", gnss([10, 12]), gnss([12, 20]).select("t")))[0].odometer is not None

@@ -46,7 +46,8 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     """Arrays of a `gnss` stream of one solution.
 
     A receiver's covariance counts where both horizontal variances are positive (zero means not known in
-    many logs); else the configuration's sigma by kind of fix stands in (DOMAIN section 3).
+    many logs); else the configuration's sigma by kind of fix stands in (DOMAIN section 3). A correlation that no
+    covariance can have is not known: the variances stand alone.
     """
     column = {name: _floats(frame, name) for name in _NUMBERS}
     fix = frame["fix"].cast(pl.String)
@@ -56,6 +57,7 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     with np.errstate(invalid="ignore"):
         receiver = valid & (column["cov_ee_m2"] > 0) & (column["cov_nn_m2"] > 0)
         height_known = receiver & (column["cov_uu_m2"] > 0)
+        correlated = receiver & (column["cov_en_m2"] ** 2 < column["cov_ee_m2"] * column["cov_nn_m2"])
     table = np.where(valid, horizontal_m**2, np.nan)
     ee = np.where(receiver, column["cov_ee_m2"], table)
     nn = np.where(receiver, column["cov_nn_m2"], table)
@@ -70,13 +72,19 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
         longitude_deg=longitude,
         height_m=np.where(valid, column["height_m"], np.nan),
         cov_ee_m2=ee,
-        cov_en_m2=np.where(receiver, np.nan_to_num(column["cov_en_m2"]), np.where(valid, 0.0, np.nan)),
+        cov_en_m2=np.where(correlated, column["cov_en_m2"], np.where(valid, 0.0, np.nan)),
         cov_nn_m2=nn,
         cov_uu_m2=up,
         from_receiver=receiver,
         vel_e_mps=column["vel_e_mps"],
         vel_n_mps=column["vel_n_mps"],
     )
+
+
+def contradictory_covariances(frame: pl.DataFrame) -> int:
+    """Epochs of a `gnss` stream whose `cov_en_m2` no covariance with these variances can have."""
+    ee, en, nn = (pl.col(f"cov_{axes}_m2") for axes in ("ee", "en", "nn"))
+    return frame.filter((ee > 0) & (nn > 0) & (en**2 >= ee * nn)).height
 
 
 _NUMBERS = (

@@ -32,6 +32,30 @@ def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
     np.testing.assert_allclose(track.distance_at(np.array([5.0])), 50.0)
 
 
+def test_distance_and_speed_by_turns_are_carried_between_their_own_rows():
+    nan = np.nan
+    t = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    distance = [0.0, nan, 10.0, nan, 22.0, nan, 36.0]
+    speed = [nan, 11.0, nan, 12.0, nan, 13.0, nan]
+    track = odometer_track(odometer_of(t, distance_m=distance, speed_mps=speed), 1.0, 0.05)
+    np.testing.assert_allclose(track.distance_m, [0.0, 5.0, 10.0, 16.0, 22.0, 29.0, 36.0])
+    assert track.known_at(np.array(t)).all()
+
+
+def test_rows_too_far_apart_are_not_carried():
+    nan = np.nan
+    frame = odometer_of(np.arange(5.0), distance_m=[0.0, nan, nan, nan, 40.0], speed_mps=[nan, 10.0, nan, 12.0, nan])
+    track = odometer_track(frame, 1.0, 0.05)
+    assert track.known_at(np.array([0.5, 1.5, 2.5, 3.5])).tolist() == [False, True, True, False]
+    np.testing.assert_allclose(np.diff(track.distance_m)[1:3], [10.5, 11.5])
+
+
+def test_a_missing_distance_beside_a_speed_is_driven():
+    """The counter was set to zero in the second that it does not report: no way was run backwards."""
+    frame = odometer_of([0.0, 0.5, 1.0, 1.5, 2.0], distance_m=[100.0, 105.0, np.nan, 0.0, 5.0], speed_mps=[10.0] * 5)
+    np.testing.assert_allclose(odometer_track(frame, 1.0, 0.05).distance_m, [0.0, 5.0, 10.0, 15.0, 20.0])
+
+
 def test_reported_slip_is_no_distance():
     frame = odometer_of([0.0, 0.5, 1.0, 1.5], distance_m=[0.0, 5.0, 20.0, 25.0], slip=[False, False, True, False])
     track = odometer_track(frame, 1.0, 0.05)

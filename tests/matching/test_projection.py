@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.matching.fixes import contradictory_covariances
 from pipeline.matching.leg import Visit, leg_of
 from pipeline.matching.path import TravelledPath
 from pipeline.track import track_of
@@ -94,6 +95,17 @@ def test_covariance_is_turned_into_the_track_s_frame() -> None:
     assert np.allclose(epochs["sigma_cross_m"], np.sqrt((4 + 2 - 2 * 1) / 2), atol=1e-3)
     assert epochs["sigma_up_m"].to_list() == [3.0, 3.0]
     assert epochs["sigma_source"].cast(str).to_list() == ["receiver"] * 2
+
+
+def test_a_correlation_that_cannot_be_is_not_used() -> None:
+    """With cov_en = 50 the line across would have a negative variance, and the sigma 0 that a clip makes of it."""
+    place = site({"e": line((0, 0), (700, 700))})
+    fixes = run(np.array([10.0, 50.0]), np.array([10.0, 50.0])).with_columns(
+        cov_ee_m2=pl.lit(4.0), cov_nn_m2=pl.lit(2.0), cov_en_m2=pl.Series([50.0, 1.0]), cov_uu_m2=pl.lit(9.0)
+    )
+    epochs = matched(fixes, place).epochs
+    assert np.allclose(epochs["sigma_cross_m"], [np.sqrt(3.0), np.sqrt(2.0)], atol=1e-3)
+    assert contradictory_covariances(fixes) == 1
 
 
 @pytest.mark.parametrize(

@@ -102,3 +102,24 @@ def test_physical_balise_brings_a_position_back():
         for frame in (by_read, blind)
     ]
     assert accepted[0] > accepted[1]
+
+
+def test_distance_and_speed_by_turns_are_an_odometer():
+    """Two sensors in one stream: each row holds the one or the other."""
+    run, site = journey(JUMP)
+    logs = run.with_streams(reference=None, balise_reads=None)
+    odd = pl.int_range(pl.len()) % 2 == 1
+    turns = logs.odometer.with_columns(
+        distance_m=pl.when(~odd).then(pl.col("distance_m")), speed_mps=pl.when(odd).then(pl.col("speed_mps"))
+    )
+    found, whole = (replay(logs.with_streams(odometer=stream), site, VEHICLE) for stream in (turns, logs.odometer))
+    assert rows(found) == rows(whole)
+    assert rows(whole)
+    assert found.alarms["monitors"].to_list() == whole.alarms["monitors"].to_list()
+
+
+def test_a_covariance_that_contradicts_itself_stands_in_the_notes():
+    run, site = journey()
+    ee = pl.col("cov_ee_m2")
+    broken = run.with_streams(gnss=run.gnss.with_columns(cov_en_m2=pl.when(pl.int_range(pl.len()) < 7).then(9.0 * ee)))
+    assert "cov_en_m2 contradicts its variances at 7 epochs" in replay(broken, site, VEHICLE).runs["notes"][0]
