@@ -71,7 +71,7 @@ def test_replay_as_json(balise: Balise, small_trial: SmallTrial, tmp_path: Path)
         *("replay", tmp_path / "bad.mcap", "--site", small_trial.site, "--out", tmp_path / "out", "--json"),
     )
     assert said.status == 1
-    assert said.err == ""
+    assert {json.loads(line)["event"] for line in said.err.splitlines()} == {"progress", "run"}
     found = json.loads(said.out)
     assert found["planned"] == 1
     assert [(run["run_id"], run["status"]) for run in found["runs"]] == [("bad", "failed")]
