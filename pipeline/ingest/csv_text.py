@@ -25,12 +25,20 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
     body = io.StringIO("\n".join(lines))
     length = None if infer else 0
     frame = pl.read_csv(body, separator=separator, infer_schema=infer, infer_schema_length=length)
-    names = [name.strip() for name in frame.columns]
-    if len(set(names)) < len(names):
-        raise ValueError("a column name stands twice")
-    frame.columns = names
+    frame.columns = _names(header, separator, frame.columns)
     frame = frame.with_columns(pl.col(pl.String).str.strip_chars())
     return frame.filter(~pl.all_horizontal(_is_empty(name, dtype) for name, dtype in frame.schema.items()))
+
+
+def _names(header: str, separator: str, given: list[str]) -> list[str]:
+    """Names without blanks around them; polars gives those that stand twice names of their own."""
+    row = pl.read_csv(io.StringIO(header), separator=separator, has_header=False, infer_schema=False).row(0)
+    written = [name.strip() for name in row if name and name.strip()]
+    twice = sorted({name for name in written if written.count(name) > 1})
+    names = [name.strip() for name in given]
+    if twice or len(set(names)) < len(names):
+        raise ValueError(f"a column name stands twice: {', '.join(twice)}")
+    return names
 
 
 def _is_empty(name: str, dtype: pl.DataType) -> pl.Expr:

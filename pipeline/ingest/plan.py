@@ -15,7 +15,7 @@ from pipeline.ingest.inventory import stamp_parts
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.recipe import FIX_TYPE, Recipe
 from pipeline.ingest.recipes import recipes_for, recorded_type
-from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, CivilTime, TimeSource, time_source
+from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, time_source
 from schemas.config import IngestConfig, StreamMapping
 from schemas.enums import Fix
 from schemas.errors import ConfigError
@@ -246,8 +246,13 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
     named = wanted.removeprefix("field:") if wanted != "auto" else mapping.fields.get("t") if mapping else None
     for candidate in (named,) if named else (path, *_USUAL_STAMPS):
         parts = stamp_parts(dict(sample.fields), candidate)
-        if parts:
+        unfit = [sample.fields[part] for part in parts if sample.fields[part] not in TIME_KINDS]
+        if parts and not unfit:
             return time_source(parts, sample.fields, mapping)
+        if unfit and named:
+            place = f"{sample.channel.place}: field {candidate}"
+            breaches.append(Breach(place, "is no time", found=unfit[0], expected="numbers or text"))
+            return log_time
     if named:
         breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
     return log_time

@@ -15,6 +15,8 @@ from schemas.config import StreamMapping
 
 LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
+# How fields are read that may hold a time, by what their first value is.
+TIME_KINDS: Mapping[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
 
 Ints = npt.NDArray[np.int64]
 
@@ -59,9 +61,8 @@ class TimeSource:
 
 def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamMapping | None) -> TimeSource:
     """How the stamp made of these fields is read."""
-    by_kind: dict[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
     records = (LOG_TIME, PUBLISH_TIME)
-    types = {path: by_kind[kinds[path]] for path in parts if path not in records}
+    types = {path: TIME_KINDS[kinds[path]] for path in parts if path not in records}
     if mapping is None:
         return TimeSource(tuple(parts), types)
     return TimeSource(tuple(parts), types, mapping.factors.get("t"), mapping.time_scale, mapping.time_epoch)

@@ -66,8 +66,8 @@ def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
     collected: dict[Stream, list[pl.DataFrame]] = {}
     for log, streams in parts:
         for name, frame in streams.items():
-            whole = conform(frame, name, str(log), breaches) if frame.height else frame
-            collected.setdefault(name, []).append(whole)
+            if frame.height:
+                collected.setdefault(name, []).append(conform(frame, name, str(log), breaches))
     refuse(breaches)
     return {name: pl.concat(frames) for name, frames in collected.items()}
 
@@ -76,7 +76,7 @@ def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
     """Two receivers under one name would be read as one that jumps between their positions."""
     spans: dict[str, list[tuple[Any, Any, Path]]] = {}
     for log, streams in parts:
-        frame = streams.get("gnss", pl.DataFrame({"solution": [], "t": []}))
+        frame = streams.get("gnss", pl.DataFrame({"solution": [], "t": []})).drop_nulls("t")
         for name, start, end in (
             frame.group_by("solution", maintain_order=True)
             .agg(pl.col("t").min().alias("start"), pl.col("t").max().alias("end"))

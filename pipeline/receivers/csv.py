@@ -17,8 +17,9 @@ from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
 from schemas.run import STREAMS, Stream
 
-# Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds.
-_MOST_SECONDS, _LEAST_NANOSECONDS = 10**11, 10**17
+# Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds. More seconds
+# than these do not fit into nanoseconds.
+_MOST_SECONDS, _LEAST_NANOSECONDS = 9 * 10**9, 10**17
 
 
 def read_csv(path: Path, config: IngestConfig) -> dict[Stream, pl.DataFrame]:
@@ -98,7 +99,7 @@ def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Seri
     """Numbers: seconds, whole ones of 18 digits nanoseconds, and of another unit as `factors.t` says."""
     source = time_source((recorded.name,), {recorded.name: _kind(recorded.dtype)}, mapping)
     if recorded.dtype.is_integer() and source.unit_s is None:
-        largest = int(np.abs(recorded.drop_nulls().to_numpy()).max(initial=0))
+        largest = int(np.abs(recorded.drop_nulls().to_numpy().astype(np.float64)).max(initial=0))
         if _MOST_SECONDS < largest < _LEAST_NANOSECONDS:
             raise InputError(
                 "holds times of a unit that nobody said",

@@ -109,6 +109,10 @@ def test_a_segment_without_wheel_speeds_has_no_odometer(segment: Path, change: E
         ("global_pose/frame_positions", lambda values: values * np.nan, "holds no poses"),
         ("global_pose/frame_positions", lambda values: values[:, :2], "is not as comma2k19 has it"),
         ("global_pose/frame_gps_times", lambda values: values * np.nan, "holds no GPS time"),
+        ("global_pose/frame_gps_times", lambda values: values[:, 0], "is not as comma2k19 has it"),
+        ("global_pose/frame_gps_times", lambda values: values[:, :1], "is not as comma2k19 has it"),
+        ("global_pose/frame_times", lambda values: values[0], r"float64 of shape \(\)"),
+        (f"{GNSS}/value", lambda values: values.astype(str), "is not as comma2k19 has it"),
     ],
 )
 def test_a_segment_that_is_not_whole_is_one_error(segment: Path, name: str, change: Edit, message: str) -> None:

@@ -112,6 +112,16 @@ def test_forms_of_stamps(tmp_path, stamp, expected):
     assert row(path, config(gnss={"topic": "/acme", "fields": {**fields, "t": "when"}}))["t"] == expected
 
 
+@pytest.mark.parametrize(("stamp", "kind"), [(True, "flag"), ({"sec": None, "nsec": 7}, "null")])
+def test_what_is_no_stamp_is_no_time(tmp_path, stamp, kind):
+    place = {"lat": 50.5, "lon": 4.5}
+    path = json_log(tmp_path, {"/acme": [{**place, "stamp": stamp}, {**place, "stamp": stamp}]})
+    gnss = {"topic": "/acme", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}}
+    assert row(path, config(gnss=gnss))["t"] == STAMP_NS
+    with pytest.raises(InputError, match=f"/acme: field stamp: is no time; found {kind}"):
+        read_run(path, config(gnss={**gnss, "time": "field:stamp"}))
+
+
 def test_own_topics_without_own_schema(tmp_path):
     message = {"t": {"sec": 5, "nsec": 7}, "latitude_deg": 50, "longitude_deg": 4.0, "fix": "sbas", "solution": "x"}
     path = json_log(tmp_path, {"/gnss": [message], "/odometer": [{"t": 5, "distance_m": 3}]}, schema="whatever")

@@ -88,7 +88,10 @@ def test_kinds_of_fix_by_text_number_and_word(converted):
         ("t,lat,lon\nabc,50,4\n", {}, "column t: holds no times"),
         ("t,lat,lon\n1,50,400\n", {}, "longitude_deg: is out of range; found 400"),
         ("t;lat;lon\n1;50,5;4,5\n", {}, "column lat: cannot be latitude_deg"),
-        ("t,lat,lat\n1,50,4\n", {}, "no field lon|stands twice"),
+        ("t,lat,lon,lat\n1,50,4,51\n", {}, "a column name stands twice: lat"),
+        ("t,lat,lon, lat \n1,50,4,51\n", {}, "a column name stands twice: lat"),
+        ("t,lat,lon\ntrue,50,4\n", {}, "field t: is no time; found flag"),
+        ("t,lat,lon\n20000000000,50,4\n", {}, "of a unit that nobody said"),
         ("", {}, "is not a CSV file"),
         ("t,lat,lon\n", {}, "no epoch with a time and a position"),
         ("t,lat,lon\n1,50,4\n", {"time": "auto"}, "has no log time"),
@@ -100,3 +103,18 @@ def test_what_does_not_fit_is_one_clear_error(converted, text, mapping, message)
     with pytest.raises(BaliseError, match=message) as caught:
         converted(text, **mapping)
     assert isinstance(caught.value, InputError | ConfigError)
+
+
+def test_columns_without_a_name_are_passed_over(converted):
+    assert converted("t,lat,lon,,\n1,50,4,,\n2,50,4,,x\n").height == 2
+
+
+def test_a_log_without_rows_or_times_beside_another_is_told(tmp_path):
+    config = settings_from({"ingest": {"gnss": {"topic": "*", "time": "field:t", "fields": PLACE}}}, Configuration, "x")
+    full, other = tmp_path / "a.csv", tmp_path / "b.csv"
+    full.write_text("t,lat,lon\n1748779200,50,4\n1748779201,50,4\n")
+    other.write_text("t,lat,lon\n")
+    assert convert([other, full], "r", config.ingest).run.gnss.height == 2
+    other.write_text("t,lat,lon\n,50,4\n,50,4\n")
+    with pytest.raises(InputError, match=r"b\.csv: column t: is not complete"):
+        convert([full, other], "r", config.ingest)
