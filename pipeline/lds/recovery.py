@@ -66,7 +66,12 @@ def noise_bound_m(anchor: Anchor, k: int, journey: Journey, limits: LdsLimits) -
 
 
 def relink_bound_m(anchor: Anchor, k: int, journey: Journey, limits: LdsLimits) -> float | None:
-    """The bound of the re-link; `None` once it is beyond the failure limit: a persisting failure would pass."""
+    """The bound of the re-link; `None` once it is beyond the failure limit: a persisting failure would pass.
+
+    Where the odometer lost its distance since the anchor, any would.
+    """
+    if anchor.stretch != journey.stretch[k]:
+        return None
     bound_m = noise_bound_m(anchor, k, journey, limits)
     return bound_m if bound_m <= limits.failure_limit_m else None
 

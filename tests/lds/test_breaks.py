@@ -167,3 +167,23 @@ def test_what_is_learned_of_the_scale_after_a_break_does_not_mend_the_way_before
     result = outage(90.0, 20.0, scale_sigma=scale)
     assert result.negations == []
     assert result.epochs["link_distance_reason"][BEFORE : BEFORE + 11].to_list() == [TOO_FAR] * 11
+
+
+def test_no_relink_through_a_lost_odometer_distance() -> None:
+    # 40 m off since 40 s; at 50 s the odometer loses 40 m of its way, so that the two agree again.
+    true_m = [20.0 * k for k in range(160)]
+    path_m = [x - (40.0 if k >= 40 else 0.0) for k, x in enumerate(true_m)]
+    odometer_m = [x - (40.0 if k >= 50 else 0.0) for k, x in enumerate(true_m)]
+    stretch = [int(k >= 50) for k in range(160)]
+    epochs = epochs_of(path_m, odometer_m, odometer_stretch=stretch)
+    balises = balises_at(V1 | {"V2": 2710.0})
+    result = run(epochs, balises, ScriptedBank(fails=[40]))
+    assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(40, None)]
+    assert told(result, "balise_id", "status") == [("V1", "accepted"), ("V2", "rejected_monitor")]
+    # What is read after the loss says what they should be.
+    balises = balises_at(V1 | {"B": 1400.0, "V2": 2710.0}, kind=["virtual", "physical", "virtual"])
+    for off_m, end in ((40.0, None), (0.0, 70)):
+        path_m = [x - (off_m if k >= 40 else 0.0) for k, x in enumerate(true_m)]
+        epochs = epochs_of(path_m, odometer_m, odometer_stretch=stretch)
+        result = run(epochs, balises, ScriptedBank(fails=[40]), reads_at([(70.0, "B")]))
+        assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(40, end)]
