@@ -117,11 +117,19 @@ class _Watched:
 
     def __getattr__(self, name: str) -> Any:
         ours = getattr(self._store, f"_{name}", None)
+        if name == "cat" and asyncio.iscoroutinefunction(ours):
+            ours = partial(type(self._store)._cat, self)  # which asks for each file through `_cat_file` below
         if not asyncio.iscoroutinefunction(ours):
             return getattr(self._store, name)
         from fsspec.asyn import sync
 
         return partial(sync, self._store.loop, self._within, ours)
+
+    async def _cat_file(self, *args: object, **kwargs: object) -> bytes:
+        """Of many files that are asked for at once, each that comes is a sign of life."""
+        content: bytes = await self._store._cat_file(*args, **kwargs)
+        self.arrived()
+        return content
 
     async def _within(self, operation: Callable[..., Awaitable[T]], *args: object, **kwargs: object) -> T:
         task = asyncio.ensure_future(operation(*args, **kwargs))

@@ -18,7 +18,7 @@ from typing import Any
 
 from pipeline.ingest.files import Address, is_url, name_of
 from pipeline.remote import arrivals, on_store, opened, redacted
-from schemas.errors import InputError, OutputError
+from schemas.errors import BaliseError, InputError, OutputError
 
 _BLOCK_BYTES = 1 << 20
 
@@ -102,13 +102,13 @@ def remove_folder(address: Address) -> None:
     on_store(address, delete)
 
 
-def reach(address: Address) -> None:
-    """Raises `InputError` where the store of an address does not answer; local paths answer always.
+def reach(address: Address, kind: type[BaliseError] = InputError) -> None:
+    """Raises where the store of an address does not answer; local paths answer always.
 
     For reading through `ingest.files`, whose patience is that of the store's own library: many minutes.
     """
     if is_url(address):
-        on_store(address, lambda store, path: store.isdir(path), kind=InputError)
+        on_store(address, lambda store, path: store.isdir(path), kind=kind)
 
 
 def folders_in(address: Address) -> list[str]:

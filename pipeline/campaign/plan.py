@@ -16,7 +16,7 @@ from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
 from pipeline.remote import redacted
 from schemas.config import Configuration, Vehicle, digest_of
-from schemas.errors import InputError, UsageError
+from schemas.errors import InputError, SiteError, UsageError
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
@@ -63,7 +63,7 @@ def make_plan(
     """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done."""
     config, vehicle = config or Configuration(), vehicle or Vehicle()
     addresses = find_runs(runs)
-    storage.reach(site)
+    storage.reach(site, SiteError)
     site_digest = read_site(site).digest
     base = RunJob(
         run_id="",

@@ -13,7 +13,7 @@ import pytest
 from pipeline import remote, storage
 from pipeline.campaign import make_plan, run_campaign
 from schemas.enums import RunStatus
-from schemas.errors import InputError, OutputError, UsageError
+from schemas.errors import InputError, OutputError, SiteError, UsageError
 from tests.campaign.compare import by_run, plan_of
 from tests.conftest import SmallTrial
 
@@ -23,11 +23,12 @@ _LISTING = b"<ListBucketResult><Name>b</Name><IsTruncated>false</IsTruncated></L
 
 
 class Ill(BaseHTTPRequestHandler):
-    """Answers with 503, breaks off, says nothing, or sends an object drop by drop: as its server's `ailment` is."""
+    """Says 503, breaks off, says nothing, sends objects one by one or drop by drop: as its server's `ailment` is."""
 
     protocol_version = "HTTP/1.1"
     ailment = ""
     well = threading.Event()
+    turn = threading.Lock()
 
     def do_GET(self) -> None:
         if self.ailment == "busy":
@@ -35,6 +36,10 @@ class Ill(BaseHTTPRequestHandler):
         elif self.ailment == "silent":
             self.well.wait(30.0)
             self.close_connection = True
+        elif self.ailment == "one by one":
+            with self.turn:
+                time.sleep(_PATIENCE_S / 3)
+            self._answer(200, _BLOCK)
         elif self.ailment == "slow":
             self._answer(200, _LISTING) if "list-type" in self.path else self._drip()
         else:
@@ -110,7 +115,7 @@ def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_
 def test_dead_store_ends_the_command_soon(ill: str, small_trial: SmallTrial, tmp_path: Path) -> None:
     """Site, runs and output are asked for before any work is done."""
     begun_s = time.monotonic()
-    with pytest.raises(InputError, match="asked in vain"):
+    with pytest.raises(SiteError, match="asked in vain"):
         make_plan([str(small_trial.runs)], f"{ill}/site", tmp_path)
     with pytest.raises(InputError, match="asked in vain"):
         make_plan([f"{ill}/runs"], small_trial.site, tmp_path)
@@ -125,6 +130,14 @@ def test_slow_is_not_dead(ill: str) -> None:
     begun_s = time.monotonic()
     with storage.local_copy(f"{ill}/far.mcap") as path:
         assert path.read_bytes() == _BLOCKS * _BLOCK
+    assert time.monotonic() - begun_s > _PATIENCE_S
+
+
+@pytest.mark.parametrize("ill", ["one by one"], indirect=True)
+def test_many_objects_may_take_longer_than_the_patience(ill: str) -> None:
+    begun_s = time.monotonic()
+    addresses = [f"s3://bucket/{name}" for name in range(5)]
+    assert storage.read_many(addresses) == dict.fromkeys(addresses, _BLOCK)
     assert time.monotonic() - begun_s > _PATIENCE_S
 
 
