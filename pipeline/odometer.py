@@ -75,8 +75,9 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     """Distance from the recorded distance where there is one, else from speed (trapezoids).
 
     Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows.
-    A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry; a cumulative distance
-    carries over it. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
+    A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry: the speeds before and after
+    it give the best guess, good for an expectation window, but a new `stretch` begins. A cumulative distance carries
+    over it. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
     1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
     """
     t_ns = odometer["t"].dt.timestamp("ns").to_numpy()
@@ -95,7 +96,7 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     pause = np.isnan(step) | (dt > limit_s)
     slip = odometer["slip"].fill_null(False).to_numpy()
     lost = (pause & np.isnan(recorded)) | slip[1:]
-    step = np.where(np.isnan(step) | (pause & np.isnan(recorded)), 0.0, step)
+    step = np.nan_to_num(step)
     declared = odometer["sigma_speed_mps"].median()
     declared_rate = float(declared) ** 2 * period if isinstance(declared, float) else 0.0
     return OdometerTrack(

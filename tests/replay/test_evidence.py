@@ -123,3 +123,14 @@ def test_a_covariance_that_contradicts_itself_stands_in_the_notes():
     ee = pl.col("cov_ee_m2")
     broken = run.with_streams(gnss=run.gnss.with_columns(cov_en_m2=pl.when(pl.int_range(pl.len()) < 7).then(9.0 * ee)))
     assert "cov_en_m2 contradicts its variances at 7 epochs" in replay(broken, site, VEHICLE).runs["notes"][0]
+
+
+def test_windows_stand_after_a_pause_of_an_odometer_of_speed_alone():
+    """The way of the pause is guessed from the speeds around it; taken as none, the next balise would come early."""
+    run, site = journey()
+    at_s = (pl.col("t") - run.odometer["t"][0]).dt.total_microseconds() / 1e6
+    paused = run.odometer.with_columns(distance_m=pl.lit(None, pl.Float64)).filter(~at_s.is_between(120.0, 128.0))
+    passages = replay(run.with_streams(odometer=paused), site, VEHICLE).passages
+    whole = replay(run, site, VEHICLE).passages
+    assert passages["linking_error"].cast(str).to_list() == ["none"] * whole.height
+    assert passages["status"].to_list() == whole["status"].to_list()
