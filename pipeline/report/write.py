@@ -106,7 +106,8 @@ def _made_from(page: _Page) -> str:
     """SHA-256 over the run's tables, the settings, the site and the program: all that its page follows from."""
     digest = hashlib.sha256(software_digest().encode())
     for name in TABLES:
-        digest.update(Path(str(table_address(page.out, name, page.run))).read_bytes())
+        table = Path(str(table_address(page.out, name, page.run)))
+        digest.update(table.read_bytes() if table.exists() else b"missing")  # which reading the tables tells
     site = page.made.site
     digest.update(f"{page.run}\n{page.made.config_text}\n{None if site is None else site.digest}".encode())
     return digest.hexdigest()

@@ -223,6 +223,14 @@ def test_only_pages_of_what_changed_are_made_again(replayed: dict[str, RunTables
     assert pages["changed"].read_bytes() != before["changed"][1]
 
 
+def test_a_table_that_is_gone_is_an_error_of_the_result(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    write_run(replayed["jump_two"], tmp_path, {})
+    write_report(tmp_path)
+    next(tmp_path.glob("alarms/*/alarms.parquet")).unlink()
+    with pytest.raises(UsageError, match="jump_two"):
+        write_report(tmp_path)
+
+
 def test_ten_hours_at_ten_hertz_stay_small(replayed: dict[str, RunTables], site: Site, tmp_path: Path) -> None:
     one = replayed["jump_two"]
     copies = -(-360_000 // one.epochs.height)
