@@ -95,7 +95,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     contract = STREAM_SCHEMAS[source.stream].columns()
     names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
     silent = [name for name in names if not (frame[name] != 0).any()]
-    if set(silent) >= {"distance_m", "speed_mps"}:  # a train that stands says so
+    if "speed_mps" in silent and not _counted(frame, silent):  # a train that stands says so
         silent.remove("speed_mps")
     empty = [pl.lit(None, dtype=frame[name].dtype).alias(name) for name in silent]
     zero = [
@@ -105,6 +105,11 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     ]
     text = [pl.col("solution").replace("", None)] if "solution" in source.implicit else []
     return frame.with_columns(*empty, *zero, *text)
+
+
+def _counted(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
+    """Whether the odometer gives a distance."""
+    return "distance_m" in frame.columns and "distance_m" not in silent and frame["distance_m"].null_count() < len(frame)
 
 
 def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:

@@ -165,7 +165,7 @@ def test_a_constant_that_its_column_cannot_hold_is_an_error_of_the_configuration
         read(tmp_path, quality("sbas"), mapped(constants={"solution": True}))
 
 
-def implicit_protobuf(stream: str, rows: list[dict[str, object]]) -> bytes:
+def implicit_protobuf(stream: str, rows: list[dict[str, object]], without: str = "") -> bytes:
     """This project's message by a writer whose fields are not `optional`: what it does not set has its default."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool
@@ -177,6 +177,8 @@ def implicit_protobuf(stream: str, rows: list[dict[str, object]]) -> bytes:
     files = FileDescriptorSet.FromString(descriptor_set(name))
     message_type = files.file[-1].message_type[0]
     del message_type.oneof_decl[:]
+    for field in [field for field in message_type.field if field.name == without]:
+        message_type.field.remove(field)
     for field in message_type.field:
         field.ClearField("oneof_index")
         field.ClearField("proto3_optional")
@@ -207,3 +209,10 @@ def test_what_a_writer_without_presence_never_sets_is_not_known(tmp_path):
     assert run.odometer.select("distance_m", "speed_mps").rows() == [(1.0, None), (2.0, None)]
     standing = whole(implicit_protobuf("gnss", fixes), implicit_protobuf("odometer", [{}, {}]))
     assert read(tmp_path, standing).odometer.select("distance_m", "speed_mps").rows() == [(None, 0.0)] * 2
+
+
+@pytest.mark.parametrize("without", ["", "distance_m"])
+def test_a_train_that_stands_all_the_time_has_a_speed(tmp_path, without):
+    fixes = implicit_protobuf("gnss", [{"latitude_deg": 50.0, "longitude_deg": 4.0, "fix": "sbas"}] * 2)
+    run = read(tmp_path, whole(fixes, implicit_protobuf("odometer", [{}, {}], without)))
+    assert run.odometer.select("distance_m", "speed_mps").rows() == [(None, 0.0)] * 2
