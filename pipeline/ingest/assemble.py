@@ -109,7 +109,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
 
 def _counted(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
     """Whether the odometer gives a distance."""
-    return "distance_m" in frame.columns and "distance_m" not in silent and frame["distance_m"].null_count() < len(frame)
+    return "distance_m" in set(frame.columns) - set(silent) and frame["distance_m"].null_count() < frame.height
 
 
 def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:

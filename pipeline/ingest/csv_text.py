@@ -22,23 +22,22 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
     lines = [line for line in text_of(data).splitlines() if not line.startswith("#")]
     header = next((line for line in lines if line.strip()), "")
     separator = max(_SEPARATORS, key=header.count)
-    body = io.StringIO("\n".join(lines))
+    body = "\n".join(lines).lstrip("\n")
     length = None if infer else 0
-    frame = pl.read_csv(body, separator=separator, infer_schema=infer, infer_schema_length=length)
-    frame.columns = _names(header, separator, frame.columns)
+    frame = pl.read_csv(io.StringIO(body), separator=separator, infer_schema=infer, infer_schema_length=length)
+    frame.columns = _names(body, separator, frame.columns)
     frame = frame.with_columns(pl.col(pl.String).str.strip_chars())
     return frame.filter(~pl.all_horizontal(_is_empty(name, dtype) for name, dtype in frame.schema.items()))
 
 
-def _names(header: str, separator: str, given: list[str]) -> list[str]:
+def _names(body: str, separator: str, given: list[str]) -> list[str]:
     """Names without blanks around them; polars gives those that stand twice names of their own."""
-    row = pl.read_csv(io.StringIO(header), separator=separator, has_header=False, infer_schema=False).row(0)
-    written = [name.strip() for name in row if name and name.strip()]
+    first = pl.read_csv(io.StringIO(body), separator=separator, has_header=False, n_rows=1, infer_schema=False)
+    written = [name.strip() for name in first.row(0) if name and name.strip()]
     twice = sorted({name for name in written if written.count(name) > 1})
-    names = [name.strip() for name in given]
-    if twice or len(set(names)) < len(names):
+    if twice:
         raise ValueError(f"a column name stands twice: {', '.join(twice)}")
-    return names
+    return [name.strip() for name in given]
 
 
 def _is_empty(name: str, dtype: pl.DataType) -> pl.Expr:

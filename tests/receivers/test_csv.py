@@ -105,6 +105,10 @@ def test_what_does_not_fit_is_one_clear_error(converted, text, mapping, message)
     assert isinstance(caught.value, InputError | ConfigError)
 
 
+def test_a_name_of_two_lines_is_a_name(converted):
+    assert converted('\n"t","lat\n(deg)",lon\n1,50,4\n', fields=PLACE | {"latitude_deg": "lat\n(deg)"}).height == 1
+
+
 def test_columns_without_a_name_are_passed_over(converted):
     assert converted("t,lat,lon,,\n1,50,4,,\n2,50,4,,x\n").height == 2
 
