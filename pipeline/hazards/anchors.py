@@ -6,26 +6,35 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, linking_gap_s, nominal_period_s
 from pipeline.hazards.travel import Travel
 from schemas.config import LdsConfig
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Instants at which the train was at a known path position, in order of time."""
+    """Instants at which the train was at a known path position, in order of time.
+
+    `odometer_m`: the odometer at that instant, as at the epochs; NaN where only the epochs around can tell it.
+    """
 
     at_ns: Ints
     path_m: Floats
+    odometer_m: Floats
 
     @classmethod
-    def of(cls, at_ns: Ints, path_m: Floats) -> Anchors:
+    def of(cls, at_ns: Ints, path_m: Floats, odometer_m: Floats | None = None) -> Anchors:
+        counted = np.full(at_ns.size, np.nan) if odometer_m is None else odometer_m
         known = np.isfinite(path_m)
         order = np.argsort(at_ns[known], kind="stable")
-        return cls(at_ns[known][order], path_m[known][order])
+        return cls(at_ns[known][order], path_m[known][order], counted[known][order])
 
     def with_others(self, others: Anchors) -> Anchors:
-        return Anchors.of(np.concatenate((self.at_ns, others.at_ns)), np.concatenate((self.path_m, others.path_m)))
+        return Anchors.of(
+            np.concatenate((self.at_ns, others.at_ns)),
+            np.concatenate((self.path_m, others.path_m)),
+            np.concatenate((self.odometer_m, others.odometer_m)),
+        )
 
 
 @dataclass(frozen=True)
@@ -76,12 +85,12 @@ class _AnchorReader:
         stamps = travel.at_ns[known]
         right = np.clip(np.searchsorted(stamps, anchors.at_ns), 0, known.size - 1)
         left = np.where(stamps[right] > anchors.at_ns, np.maximum(right - 1, 0), right)
-        stretch = travel.stretch[known]
-        near = np.minimum(np.abs(stamps[right] - anchors.at_ns), np.abs(stamps[left] - anchors.at_ns)) <= NS_PER_S
-        inside = (stamps[0] <= anchors.at_ns) & (anchors.at_ns <= stamps[-1])
-        usable = (stretch[left] == stretch[right]) & (near | inside)
-        distance = np.interp(anchors.at_ns, stamps, travel.distance_m[known])
-        return cls(anchors.at_ns[usable], anchors.path_m[usable], distance[usable], stretch[right][usable])
+        counted = np.isfinite(anchors.odometer_m)
+        since_m = anchors.odometer_m - travel.odometer_m[known[left]]
+        between_m = np.interp(anchors.at_ns, stamps, travel.distance_m[known])
+        distance = np.where(counted, travel.distance_m[known[left]] + since_m, between_m)
+        usable = counted | _interpolable(anchors.at_ns, stamps, left, right, travel.stretch[known])
+        return cls(anchors.at_ns[usable], anchors.path_m[usable], distance[usable], travel.stretch[known[left]][usable])
 
     def reach(self, index: Ints, travel: Travel, lds: LdsConfig) -> tuple[Floats, Floats, Floats]:
         """Position, its sigma and the odometer's confidence by the anchor `index` of each epoch."""
@@ -95,6 +104,14 @@ class _AnchorReader:
         variance = travel.white_m2_per_s * elapsed_s + (travel.scale_sigma * moved) ** 2
         confidence = lds.odometer_fixed_m + lds.odometer_share * np.abs(moved)
         return self.path_m[safe] + moved, np.sqrt(variance), confidence
+
+
+def _interpolable(at_ns: Ints, stamps: Ints, left: Ints, right: Ints, stretch: Ints) -> Bools:
+    """Between epochs as near as for a crossing: over an outage the train may have braked or started meanwhile."""
+    gap_ns = linking_gap_s(nominal_period_s(stamps)) * NS_PER_S
+    inside = (stamps[left] <= at_ns) & (at_ns <= stamps[right])
+    near: Bools = inside & (stamps[right] - stamps[left] <= gap_ns) & (stretch[left] == stretch[right])
+    return near
 
 
 def _between(

@@ -13,11 +13,13 @@ from pipeline.hazards.arrays import Floats, Ints, floats
 @dataclass(frozen=True)
 class Travel:
     """Per epoch: instant, distance along growing path (NaN = not known), stretch of unbroken counting,
-    sigma of the scale, and variance that the distance gains per second.
+    sigma of the scale, and variance that the distance gains per second. `odometer_m`: the odometer's own
+    distance, which `distance_m` is but for repairs.
     """
 
     at_ns: Ints
     distance_m: Floats
+    odometer_m: Floats
     stretch: Ints
     scale_sigma: Floats
     white_m2_per_s: Floats
@@ -45,6 +47,7 @@ def odometer_travel(epochs: pl.DataFrame, at_ns: Ints) -> Travel:
     return Travel(
         at_ns=at_ns,
         distance_m=floats(epochs, "odometer_m"),
+        odometer_m=floats(epochs, "odometer_m"),
         stretch=epochs["odometer_stretch"].fill_null(-1).cast(pl.Int64).to_numpy(),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         white_m2_per_s=np.nan_to_num(white),

@@ -58,7 +58,8 @@ def establish_truth(
     `epochs`: `t, path_m, fix_valid, direction, latency_s` and the aligned odometer (`odometer_m,
     odometer_stretch, scale_sigma, odometer_white_m2_per_s`, and `velocity_along_mps` where known).
     `reference`: `t, path_m, cross_track_m, vertical_m, sigma_m` on the same path;
-    `balise_reads`: `t, path_m` of physical balises; `passages`: `status, path_m, t_offered` of the
+    `balise_reads`: `t, path_m` of physical balises and, where known, `odometer_m` at the read, which inside an outage
+    the epochs cannot tell; `passages`: `status, path_m, t_offered` of the
     LDS, whose accepted VBs anchor the odometer.
     Yields per epoch `t, evidence, truth_path_m, truth_sigma_m, truth_bound_m, truth_cross_m,
     truth_up_m, truth_travel_m, truth_stretch, truth_smoothed`: `truth_bound_m` is what an error has to exceed before
@@ -75,7 +76,8 @@ def establish_truth(
             return _ladder(epochs["t"], rungs, travel)
     travel = repaired_by_doppler(travel, positions(epochs), floats(epochs, "velocity_along_mps"))
     if balise_reads is not None and balise_reads.height:
-        anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"))
+        counted = floats(balise_reads, "odometer_m") if "odometer_m" in balise_reads.columns else None
+        anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"), counted)
         rungs.append(_balise_rung(carry(anchors, travel, travel.at_ns, lds, both_ways=True), config))
     if config.smoothed_reference:
         rungs.append(_smoothed_rung(epochs, travel, config))

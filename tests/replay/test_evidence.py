@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
+
 import polars as pl
 import pytest
 
@@ -134,3 +136,17 @@ def test_windows_stand_after_a_pause_of_an_odometer_of_speed_alone():
     whole = replay(run, site, VEHICLE).passages
     assert passages["linking_error"].cast(str).to_list() == ["none"] * whole.height
     assert passages["status"].to_list() == whole["status"].to_list()
+
+
+def test_a_balise_read_inside_an_outage_is_placed_by_the_odometer_of_then():
+    # The train stands for 40 s inside the outage; a straight line over it would put the read 150 m away.
+    stops = [{"speed_mps": 30.0}, {"stop_at_m": 3150.0, "hold_s": 40.0}, {"speed_mps": 30.0}, {"stop_at_m": 8000.0}]
+    run, site = journey(motion={"start_m": 200.0, "phases": stops})
+    read = run.balise_reads.filter(balise_id="BG3")
+    at, s = read["t"].item(), timedelta(seconds=1)
+    outage = pl.col("t").is_between(at - 60 * s, at + 5 * s)
+    logs = run.with_streams(reference=None, balise_reads=read, gnss=run.gnss.filter(~outage))
+    tables = replay(logs, site, VEHICLE)
+    assert tables.hazards.height == 0
+    assert tables.runs["share_p1"].item() == 0.0
+    assert tables.epochs["error_along_m"].abs().max() < 6.0
