@@ -77,7 +77,7 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows.
     A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry: the speeds before and after
     it give the best guess, good for an expectation window, but a new `stretch` begins. A cumulative distance carries
-    over it. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
+    over it, also where rows are by turns. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
     1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
     """
     t_ns = odometer["t"].dt.timestamp("ns").to_numpy()
@@ -92,6 +92,7 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
         between = np.diff(_carried(t_s, distance, limit_s))
         recorded = np.where(np.isnan(recorded) & np.isnan(driven), between, recorded)
         driven = _driven(_carried(t_s, speed, limit_s), dt)
+        recorded = _over_pauses(distance, recorded, driven, dt > limit_s)
     step = np.where(np.isnan(recorded), driven, recorded)
     pause = np.isnan(step) | (dt > limit_s)
     slip = odometer["slip"].fill_null(False).to_numpy()
@@ -126,6 +127,24 @@ def _carried(t_s: Array, values: Array, limit_s: float) -> Array:
     return np.where(
         np.isfinite(values), values, np.where(near & inside, np.interp(t_s, t_s[known], values[known]), np.nan)
     )
+
+
+def _over_pauses(distance_m: Array, recorded_m: Array, driven_m: Array, pause: Mask) -> Array:
+    """Recorded steps, and over a pause between rows without a distance what the counter gained around it.
+
+    The counter's last row before the pause and its first after it tell, less the steps to and from the pause. A
+    missing distance beside a speed is no pause: there the counter may have been set to zero.
+    """
+    known = np.flatnonzero(np.isfinite(distance_m))
+    steps = np.where(np.isnan(recorded_m), driven_m, recorded_m)
+    result = recorded_m.copy()
+    for gap in np.flatnonzero(pause & np.isnan(recorded_m)).tolist():
+        after = int(np.searchsorted(known, gap, side="right"))
+        if 0 < after < known.size:
+            begin, end = int(known[after - 1]), int(known[after])
+            beside = np.delete(steps[begin:end], gap - begin)
+            result[gap] = distance_m[end] - distance_m[begin] - beside.sum()
+    return result
 
 
 def polarity(track: OdometerTrack, t_s: Array, path_m: Array, distance_m: float) -> int:

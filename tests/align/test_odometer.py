@@ -42,6 +42,18 @@ def test_distance_and_speed_by_turns_are_carried_between_their_own_rows():
     assert track.known_at(np.array(t)).all()
 
 
+def test_a_distance_by_turns_carries_over_a_pause_between_any_rows():
+    nan = np.nan
+    t = [0.0, 0.5, 1.0, 1.5, 8.0, 8.5, 9.0]
+    distance = [0.0, nan, 10.0, nan, nan, 80.0, nan]
+    speed = [nan, 10.0, nan, 10.0, 12.0, nan, 12.0]
+    track = odometer_track(odometer_of(t, distance_m=distance, speed_mps=speed), 1.0, 0.05)
+    assert track.stretch.tolist() == [0] * 7
+    # A straight line of speeds over the pause would be 71.5 m; the counter gained 59 m.
+    np.testing.assert_allclose(track.distance_m, [0.0, 5.0, 10.0, 15.0, 74.0, 80.0, 86.0])
+    assert track.known_at(np.array([1.5, 4.0, 8.0])).tolist() == [True, False, True]
+
+
 def test_rows_too_far_apart_are_not_carried():
     nan = np.nan
     frame = odometer_of(np.arange(5.0), distance_m=[0.0, nan, nan, nan, 40.0], speed_mps=[nan, 10.0, nan, 12.0, nan])
