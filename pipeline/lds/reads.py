@@ -10,16 +10,23 @@ import polars as pl
 from pipeline.lds.crossings import Balise
 from pipeline.lds.journey import Journey
 
+NO_STRETCH = -1
+
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """A telegram; `epoch`: the first GNSS epoch not before it; distances at the read, where known."""
+    """A telegram; `epoch`: the first GNSS epoch not before it; distances at the read, where known.
+
+    `stretch`: that of the odometer reading, which is the one of the epoch before; `NO_STRETCH` where the distance was
+    lost between the epochs that it was interpolated from.
+    """
 
     balise: Balise
     t_ns: int
     epoch: int
     odometer_m: float | None
     travelled_m: float
+    stretch: int
 
 
 def reads_of(frame: pl.DataFrame | None, balises: list[Balise], journey: Journey) -> tuple[list[Read], pl.DataFrame]:
@@ -49,7 +56,11 @@ def _read(row: dict[str, object], balises: list[Balise], journey: Journey) -> Re
     odometer_m = float(str(given)) if given is not None else _odometer_at(journey, t_ns, epoch)
     since_m = journey.odometer_m[epoch] - (np.nan if odometer_m is None else odometer_m)
     travelled_m = float(journey.travelled_m[epoch] - since_m * journey.travel[max(epoch - 1, 0)])
-    return Read(balise, t_ns, epoch, odometer_m, travelled_m)
+    before = max(int(np.searchsorted(journey.t_ns, t_ns, side="right")) - 1, 0)
+    whole = given is not None or journey.stretch[before] == journey.stretch[epoch]
+    return Read(
+        balise, t_ns, epoch, odometer_m, travelled_m, stretch=int(journey.stretch[before]) if whole else NO_STRETCH
+    )
 
 
 def _odometer_at(journey: Journey, t_ns: int, epoch: int) -> float | None:

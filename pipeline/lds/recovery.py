@@ -85,7 +85,7 @@ def read_anchor(read: Read, journey: Journey) -> Anchor | None:
         sigma_m=float(np.nan_to_num(journey.sigma_m[read.epoch])),
         t_ns=read.t_ns,
         travelled_m=read.travelled_m,
-        stretch=int(journey.stretch[read.epoch]),
+        stretch=read.stretch,
         scale_sigma=float(journey.scale_sigma[read.epoch]),
         slack_m=read.balise.accuracy_m,
     )

@@ -187,3 +187,33 @@ def test_no_relink_through_a_lost_odometer_distance() -> None:
         epochs = epochs_of(path_m, odometer_m, odometer_stretch=stretch)
         result = run(epochs, balises, ScriptedBank(fails=[40]), reads_at([(70.0, "B")]))
         assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(40, end)]
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 40.0])
+def test_a_read_before_the_distance_was_lost_tells_nothing_after_it(offset_m: float) -> None:
+    # P1 is read at 100 s, inside the outage; at 105 s the odometer says that it slipped by 40 m; position at 110 s.
+    t_s = [*map(float, range(BEFORE)), *(110.0 + k for k in range(60))]
+    true_m = [20.0 * t for t in t_s]
+    slipped = [t > 105.0 for t in t_s]
+    odometer_m = [x + 40.0 * late for x, late in zip(true_m, slipped, strict=True)]
+    path_m = [x + offset_m * late for x, late in zip(true_m, slipped, strict=True)]
+    epochs = epochs_of(path_m, odometer_m, t_s, odometer_stretch=[int(late) for late in slipped])
+    balises = balises_at({"V1": 110.0, "P1": 2000.0}, kind=["virtual", "physical"])
+    reads = reads_at([(100.0, "P1")]).with_columns(odometer_m=pl.lit(2000.0))
+    result = run(epochs, balises, ScriptedBank(blind=[BEFORE]), reads)
+    assert not result.epochs["alarm"].any()
+    row = first_after(result)
+    assert (row["link_distance_state"], row["link_distance_reason"]) == ("not_evaluated", LOST)
+
+
+@pytest.mark.parametrize(("stretch", "state"), [(0, "pass"), (1, "not_evaluated")])
+def test_a_read_between_two_epochs_counts_where_the_odometer_held(stretch: int, state: str) -> None:
+    # Read half a second before the position comes back; no odometer is given with it.
+    t_s = [*map(float, range(BEFORE)), 50.0, *(51.0 + k for k in range(60))]
+    path_m = [None if t == 50.0 else 20.0 * t for t in t_s]
+    odometer_m = [20.0 * t for t in t_s]
+    stretches = [stretch * (t >= 51.0) for t in t_s]
+    epochs = epochs_of(path_m, odometer_m, t_s, odometer_stretch=stretches)
+    balises = balises_at({"V1": 110.0, "P1": 1010.0}, kind=["virtual", "physical"])
+    result = run(epochs, balises, ScriptedBank(blind=[BEFORE, BEFORE + 1]), reads_at([(50.5, "P1")]))
+    assert result.epochs["link_distance_state"][BEFORE + 1] == state
