@@ -77,8 +77,8 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows.
     A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry: the speeds before and after
     it give the best guess, good for an expectation window, but a new `stretch` begins. A cumulative distance carries
-    over it, also where rows are by turns. Slip that the odometer itself reports loses the way too. `sigma_mps` is the white noise at
-    1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
+    over it, also where rows are by turns. Slip that the odometer itself reports loses the way too. `sigma_mps` is the
+    white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
     """
     t_ns = odometer["t"].dt.timestamp("ns").to_numpy()
     epoch_ns = int(t_ns[0])
@@ -87,12 +87,7 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     period = float(np.median(dt))
     limit_s = max(gap_s, _GAP_IN_PERIODS * period)
     distance, speed = (odometer[name].to_numpy().astype(np.float64) for name in ("distance_m", "speed_mps"))
-    recorded, driven = np.diff(distance), _driven(speed, dt)
-    if np.isnan(np.where(np.isnan(recorded), driven, recorded)).any():
-        between = np.diff(_carried(t_s, distance, limit_s))
-        recorded = np.where(np.isnan(recorded) & np.isnan(driven), between, recorded)
-        driven = _driven(_carried(t_s, speed, limit_s), dt)
-        recorded = _over_pauses(distance, recorded, driven, dt > limit_s)
+    recorded, driven = _ways(t_s, distance, speed, limit_s)
     step = np.where(np.isnan(recorded), driven, recorded)
     pause = np.isnan(step) | (dt > limit_s)
     slip = odometer["slip"].fill_null(False).to_numpy()
@@ -109,6 +104,18 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
         slip=slip,
         white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
     )
+
+
+def _ways(t_s: Array, distance_m: Array, speed_mps: Array, limit_s: float) -> tuple[Array, Array]:
+    """Way from each row to the next [m], by the recorded distance and by speed; NaN where not known."""
+    dt = np.diff(t_s)
+    recorded, driven = np.diff(distance_m), _driven(speed_mps, dt)
+    if not np.isnan(np.where(np.isnan(recorded), driven, recorded)).any():
+        return recorded, driven
+    between = np.diff(_carried(t_s, distance_m, limit_s))
+    recorded = np.where(np.isnan(recorded) & np.isnan(driven), between, recorded)
+    driven = _driven(_carried(t_s, speed_mps, limit_s), dt)
+    return _over_pauses(distance_m, recorded, driven, dt > limit_s), driven
 
 
 def _driven(speed_mps: Array, dt_s: Array) -> Array:
