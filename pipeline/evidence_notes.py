@@ -7,8 +7,9 @@ import polars as pl
 from schemas.enums import Evidence
 
 _BALISE = (
-    "evidence balise: reads carried on by the odometer; a slip or slide between two reads, or after the last, "
-    "looks like an error of the position unless Doppler velocity sides with it"
+    "evidence balise: reads carried on by the odometer; unless Doppler velocity sides with the position, a slip or "
+    "slide between two reads hides errors up to its own size, and one after the last read looks like an error of the "
+    "position"
 )
 _ODOMETER = (
     "evidence odometer: errors within 5 m + 5 % of the way since the last accepted balise are not seen (here up to "

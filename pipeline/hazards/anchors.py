@@ -10,6 +10,9 @@ from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, linking_gap_s
 from pipeline.hazards.travel import Travel
 from schemas.config import LdsConfig
 
+# Two-sided Gaussian 1e-7, as of the monitors (DOMAIN section 3).
+_FACTOR = 5.3267
+
 
 @dataclass(frozen=True)
 class Anchors:
@@ -42,7 +45,8 @@ class Carried:
     """Position by the nearest anchor and the odometer [m]; NaN where no anchor reaches.
 
     `confidence_m` is the odometer's half-width (SUBSET-041 5.3.1.1), `mismatch_m` by how much two
-    anchors contradict the odometer between them beyond that. `backward`: before the first anchor, so that
+    anchors contradict the odometer between them where that is beyond its noise: it slipped, and nobody knows where,
+    so the place between may be wrong by as much. `backward`: before the first anchor, so that
     nothing but the odometer itself speaks for the way in between.
     """
 
@@ -53,8 +57,10 @@ class Carried:
     backward: Bools
 
 
-def carry(anchors: Anchors, travel: Travel, at_ns: Ints, lds: LdsConfig, *, both_ways: bool) -> Carried:
-    """Carry anchors on to every epoch of their odometer stretch.
+def carry(
+    anchors: Anchors, travel: Travel, at_ns: Ints, lds: LdsConfig, *, both_ways: bool, anchor_sigma_m: float = 0.0
+) -> Carried:
+    """Carry anchors, known to `anchor_sigma_m`, on to every epoch of their odometer stretch.
 
     With `both_ways` an epoch between two anchors takes its place from both, the difference shared out
     by distance, and epochs before the first anchor are reached backwards.
@@ -65,7 +71,7 @@ def carry(anchors: Anchors, travel: Travel, at_ns: Ints, lds: LdsConfig, *, both
     if not both_ways:
         return Carried(*forward, np.zeros(at_ns.size), np.zeros(at_ns.size, dtype=np.bool_))
     backward = reader.reach(before + 1, travel, lds)
-    return _between(forward, backward, reader, before, travel)
+    return _between(forward, backward, reader, before, travel, anchor_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -120,6 +126,7 @@ def _between(
     reader: _AnchorReader,
     before: Ints,
     travel: Travel,
+    anchor_sigma_m: float,
 ) -> Carried:
     ahead, behind = np.isfinite(forward[0]), np.isfinite(backward[0])
     both = ahead & behind
@@ -132,7 +139,8 @@ def _between(
         return np.where(both, np.minimum(a, b), np.where(ahead, a, b))
 
     difference = np.where(both, np.abs(np.nan_to_num(forward[0]) - np.nan_to_num(backward[0])), 0.0)
-    allowed = np.where(both, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]), np.inf)
+    noise = _FACTOR * np.hypot(np.nan_to_num(forward[1]) + np.nan_to_num(backward[1]), np.sqrt(2.0) * anchor_sigma_m)
+    allowed = np.minimum(noise, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]))
     return Carried(
         path_m=blend(forward[0], backward[0]),
         sigma_m=smaller(forward[1], backward[1]),

@@ -78,7 +78,9 @@ def establish_truth(
     if balise_reads is not None and balise_reads.height:
         counted = floats(balise_reads, "odometer_m") if "odometer_m" in balise_reads.columns else None
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"), counted)
-        rungs.append(_balise_rung(carry(anchors, travel, travel.at_ns, lds, both_ways=True), config))
+        sigma_m = config.balise_read_sigma_m
+        carried = carry(anchors, travel, travel.at_ns, lds, both_ways=True, anchor_sigma_m=sigma_m)
+        rungs.append(_balise_rung(carried, config))
     if config.smoothed_reference:
         rungs.append(_smoothed_rung(epochs, travel, config))
     rungs.append(_odometer_rung(epochs, passages, travel, lds))

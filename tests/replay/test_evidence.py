@@ -75,6 +75,17 @@ def test_slip_is_no_hazard_with_any_evidence(kind):
     assert tables.alarms["suspect"].unique().to_list() == ["odometer"]
 
 
+def test_slip_between_two_reads_is_no_hazard_without_doppler_either():
+    # 40 m between two reads 900 m apart: within 5 m + 5 % from both sides, but far beyond the odometer's noise.
+    run, site = journey(SLIP, gnss={"velocity": False})
+    tables = replay(kinds_of(run)["balise"], site, VEHICLE)
+    assert rows(tables) == []
+    assert tables.runs["unsafe_accepted"].item() == 0
+    assert tables.alarms["verdict"].to_list() == ["unknown"]
+    both, _ = journey(SLIP, {**OFFSET, "size_m": 120.0, "start_s": 170.0}, gnss={"velocity": False})
+    assert rows(replay(kinds_of(both)["balise"], site, VEHICLE))
+
+
 def test_without_doppler_the_notes_say_that_nothing_tells_the_two_apart():
     run, site = journey(OFFSET, gnss={"velocity": False})
     tables = replay(kinds_of(run)["balise"], site, VEHICLE)
