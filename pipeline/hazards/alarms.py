@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Ints, runs_of
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
 from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
@@ -78,7 +78,9 @@ def hazard_of(span: AlarmSpan, judged: list[Judged]) -> int | None:
 def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     """False when |e| stayed below max(5 m, 3 sigma) from 300 s before the alarm to its end.
 
-    More than a second of positions without truth, or an error that the evidence cannot resolve, leave it unknown.
+    More than a second of positions without truth, or an error that the evidence cannot resolve, leave it unknown. So
+    does a position that left the odometer by as much over that time where the odometer is the evidence: its error
+    starts anew at each accepted VB.
     """
     since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = slice(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
@@ -90,8 +92,19 @@ def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     if proved.any():
         return Verdict.TRUE
     blind = _longest_s(position & ~np.isfinite(error), w.t_ns[part]) > _BLIND_S
-    unknown = beyond.any() or blind or not np.isfinite(error).any()
+    unknown = beyond.any() or blind or not np.isfinite(error).any() or _left_odometer(w, part, tolerated)
     return Verdict.UNKNOWN if unknown else Verdict.FALSE
+
+
+def _left_odometer(w: Witnesses, part: slice, tolerated_m: Floats) -> bool:
+    """Position minus odometer moved by more than is tolerated within one stretch, the odometer being the evidence."""
+    offset = w.path_m[part] - w.odometer_m[part]
+    known = w.by_odometer[part] & np.isfinite(offset)
+    for stretch in np.unique(w.stretch[part][known]):
+        rows = known & (w.stretch[part] == stretch)
+        if float(np.ptp(offset[rows])) >= float(np.nanmedian(tolerated_m[rows])):
+            return True
+    return False
 
 
 def _longest_s(mask: Bools, t_ns: Ints) -> float:

@@ -42,6 +42,7 @@ class Witnesses:
     white_m2_per_s: Floats
     velocity_mps: Floats
     by_reference: Bools
+    by_odometer: Bools
     doubtful_track: Bools
 
 
@@ -50,6 +51,7 @@ def witnesses_of(
 ) -> Witnesses:
     """Everything that can speak for or against the position."""
     reference = truth["evidence"] == Evidence.REFERENCE.value
+    odometer = truth["evidence"] == Evidence.ODOMETER.value
     truth_sigma = floats(truth, "truth_sigma_m")
     gate = floats(epochs, "gate_probability")
     has_path = np.isfinite(floats(epochs, "path_m"))
@@ -74,6 +76,7 @@ def witnesses_of(
         white_m2_per_s=np.nan_to_num(floats(epochs, "odometer_white_m2_per_s")),
         velocity_mps=floats(epochs, "velocity_along_mps"),
         by_reference=reference.fill_null(False).to_numpy(),
+        by_odometer=odometer.fill_null(False).to_numpy(),
         doubtful_track=doubtful,
     )
 

@@ -43,6 +43,17 @@ def test_slow_drift_that_moves_the_anchors_is_seen_by_balise_reads_but_not_by_th
     assert (row["hazard"], row["timing"], row["evidence"]) == ("VB_SHIFT", "early", "balise")
 
 
+def test_alarm_of_a_drift_that_moves_the_anchors_is_not_called_false_on_the_odometers_word():
+    fails = {"along_raw": ((60.0, 61.0),)}
+    accepted = {f"V{i}": (100.0 + 200.0 * i + 5.0) / 20.5 for i in range(8)}
+    drifting = Journey(ramps=((10.0, 110.0, 0.5),), accepted=accepted, reference=False, fails=fails)
+    sound = drifting.but(ramps=(), accepted={f"V{i}": 5.0 + 10.0 * i for i in range(8)})
+    (row,) = judge(drifting).alarms.to_dicts()
+    assert row["verdict"] == "unknown"
+    (row,) = judge(sound).alarms.to_dicts()
+    assert row["verdict"] == "false"
+
+
 def test_only_what_exceeds_the_odometers_confidence_is_a_hazard():
     # V2 (500 m) accepted at 25 s; 22 m from 55 s on: V6 (1300 m) offered 778 m after it, 5 + 38.9 m cover that.
     journey = Journey(steps=((55.0, 75.0, 19.5),), ramps=((56.0, 75.0, 0.5),), accepted=VBS_ACCEPTED)
