@@ -61,13 +61,11 @@ class Learned:
         values = (estimate.scale, estimate.scale_sigma, estimate.latency_s, estimate.latency_sigma_s)
         return cls(*(np.full(n, value) for value in values))
 
-    def put(self, changes: list[tuple[int, Estimate]]) -> None:
-        """Set estimates: each change holds from its epoch to the next, the last for good."""
-        begins = [epoch for epoch, _ in changes]
-        lengths = np.diff([*begins, self.scale.size])
-        values = np.array([(e.scale, e.scale_sigma, e.latency_s, e.latency_sigma_s) for _, e in changes])
+    def put(self, begins: Index, estimates: Array) -> None:
+        """Set estimates (changes, 4): each change holds from its epoch to the next, the last for good."""
+        lengths = np.diff(begins, append=self.scale.size)
         columns = (self.scale, self.scale_sigma, self.latency_s, self.latency_sigma_s)
-        for column, value in zip(columns, values.T, strict=True):
+        for column, value in zip(columns, estimates.T, strict=True):
             column[begins[0] :] = np.repeat(value, lengths)
 
 

@@ -10,7 +10,15 @@ from pipeline.increments import EpochArrays, Learned, along_series, odometer_ste
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import AxisState
 from pipeline.odometer import OdometerTrack
-from pipeline.odometer_filter import SPEED_SPAN_S, Estimate, FilterState, ScaleLatencyFilter, error_model, prior_of
+from pipeline.odometer_filter import (
+    SPEED_SPAN_S,
+    Estimate,
+    FilterState,
+    ScaleLatencyFilter,
+    error_model,
+    estimates_of,
+    prior_of,
+)
 from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 
@@ -56,7 +64,7 @@ class _Learner:
         self._t_s, self._path_m, self._sigma_m = (
             values[self._rows] for values in (arrays.t_s, arrays.path_m, arrays.sigma_m)
         )
-        # Single times are looked up in lists, which is several times faster than in arrays.
+        # What a single update reads is looked up in lists, which is several times faster than in arrays.
         self._times: list[float] = self._t_s.tolist()
         self._stretches: list[int] = track.stretch_at(self._t_s).tolist()
         self._scale_known = vehicle.odometer_scale is not None
@@ -105,7 +113,7 @@ class _Learner:
             if failing.size:
                 alarm = position + int(failing[0])
                 in_use = [item for effective, item in history if effective <= alarm][-1]
-                self._learned.put([(self._epoch(alarm), in_use.estimate())])
+                self._put([(alarm, in_use)], alarm)
                 return in_use, alarm
             position = end
         return history[-1][1], position
@@ -114,23 +122,22 @@ class _Learner:
         """States of the filter's updates in these positions, each with the position from which it may be used."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
         states: list[tuple[int, FilterState]] = []
+        before = self._next(state.t_s, 0)
         position = self._next(state.t_s + period_s, begin)
         while position < end:
             t_s, path_m, sigma_m = self._observation(position)
-            if self._broken(self._next(state.t_s, 0), position):
+            if self._broken(before, position):
                 state = self._filter.restart(state, t_s, path_m)
             state = self._filter.update(state, t_s, path_m, sigma_m, self._arrays.jitter_s)
             states.append((self._next(t_s + SPEED_SPAN_S, position + 1), state))
-            position = self._next(t_s + period_s, position + 1)
+            before, position = position, self._next(t_s + period_s, position + 1)
         return states
 
     def _put(self, history: list[tuple[int, FilterState]], begin: int) -> None:
         """Fill the estimates in use from position `begin` on, where the first of these is in use."""
-        self._learned.put([(self._epoch(max(effective, begin)), state.estimate()) for effective, state in history])
-
-    def _epoch(self, position: int) -> int:
-        """Index among all epochs; the end for a position past the last."""
-        return int(self._rows[position]) if position < self._rows.size else int(self._learned.scale.size)
+        effective = np.array([position for position, _ in history])
+        epochs = np.append(self._rows, self._learned.scale.size)  # a position past the last is past all epochs
+        self._learned.put(epochs[np.maximum(effective, begin)], estimates_of([state for _, state in history]))
 
     def _broken(self, before: int, now: int) -> bool:
         """Whether the odometer's distance was lost, or too much time passed, between two positions."""

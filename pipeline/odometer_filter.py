@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -42,17 +41,25 @@ class Estimate(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """Mean and covariance of (offset, scale error, latency, e_j...), at a time and from an odometer origin."""
+    """State of (offset, scale error, latency, e_j...) at a time and from an odometer origin.
 
-    mean: Array
-    covariance: Array
+    `joint` holds the covariance and, as its last column, the mean: shape (states, states + 1).
+    """
+
+    joint: Array
     t_s: float
     origin_m: float
 
     def estimate(self) -> Estimate:
-        _, scale_error, latency_s, *_ = self.mean.tolist()
-        _, scale_variance, latency_variance, *_ = self.covariance.diagonal().tolist()
-        return Estimate(1.0 + scale_error, sqrt(scale_variance), latency_s, sqrt(latency_variance))
+        ((scale, scale_sigma, latency_s, latency_sigma_s),) = estimates_of([self]).tolist()
+        return Estimate(scale, scale_sigma, latency_s, latency_sigma_s)
+
+
+def estimates_of(states: list[FilterState]) -> Array:
+    """Scale, its standard deviation, latency and its standard deviation [s] of each state, shape (states, 4)."""
+    joint = np.array([state.joint for state in states])
+    means, deviations = joint[:, :, -1], np.sqrt(np.diagonal(joint, axis1=1, axis2=2))
+    return np.column_stack([1.0 + means[:, _SCALE], deviations[:, _SCALE], means[:, _LATENCY], deviations[:, _LATENCY]])
 
 
 @dataclass(frozen=True)
@@ -69,22 +76,23 @@ class ScaleLatencyFilter:
         origin_m = float(self.track.distance_at(np.array([t_s - prior.latency_s]))[0])
         mean = np.concatenate([[path_m, prior.scale - 1.0, prior.latency_s], np.zeros(errors)])
         variances = [_OFFSET_PRIOR_M2, prior.scale_sigma**2, prior.latency_sigma_s**2]
-        return FilterState(mean, np.diag(np.concatenate([variances, np.ones(errors)])), t_s, origin_m)
+        covariance = np.diag(np.concatenate([variances, np.ones(errors)]))
+        return FilterState(np.column_stack([covariance, mean]), t_s, origin_m)
 
     def restart(self, state: FilterState, t_s: float, path_m: float) -> FilterState:
         """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
         fresh = self.start(state.estimate(), t_s, path_m)
-        covariance = fresh.covariance.copy()
         kept = slice(_SCALE, _ERRORS)
-        covariance[kept, kept] = state.covariance[kept, kept]
-        return fresh._replace(covariance=covariance)
+        fresh.joint[kept, kept] = state.joint[kept, kept]
+        return fresh
 
     def update(
         self, state: FilterState, t_s: float, path_m: float, sigma_m: float, jitter_s: float = 0.0
     ) -> FilterState:
         """The state after the epoch at `t_s` with GNSS path position, its sigma and the stamps' jitter."""
-        mean, covariance = self._predict(state, t_s)
-        _, scale_error, latency_s, *_ = mean.tolist()
+        joint = self._predict(state, t_s)
+        scale = 1.0 + joint.item(_SCALE, -1)
+        latency_s = joint.item(_LATENCY, -1)
         at = t_s - latency_s
         around = (at - SPEED_SPAN_S, at, at + SPEED_SPAN_S)
         before, distance, after = np.interp(around, self.track.t_s, self.track.distance_m).tolist()
@@ -92,39 +100,39 @@ class ScaleLatencyFilter:
         speed = (after - before) / (2.0 * SPEED_SPAN_S)
         way_m = distance - state.origin_m
         row = self._loads * sigma_m
-        row[:_ERRORS] = 1.0, way_m, -(1.0 + scale_error) * speed
-        # All but the latency, about whose mean the distance was read, and the scale's own way.
-        expected = row.dot(mean).item() + way_m + (1.0 + scale_error) * speed * latency_s
-        spread = covariance.dot(row)
+        row[:_ERRORS] = 1.0, way_m, -scale * speed
+        # Covariance of the states with what is observed and, as its last, how far the states alone explain it: all
+        # but the latency, about whose mean the distance was read, and the scale's own way.
+        seen = row.dot(joint)
+        seen[-1] += way_m + scale * speed * latency_s - path_m
+        spread = seen[:-1]
         white = _WHITE_SHARE * sigma_m**2 + (jitter_s * speed) ** 2
-        gain = spread / (row.dot(spread).item() + white)
-        mean += gain * (path_m - expected)
-        covariance -= gain[:, None] * spread
-        return FilterState(mean, covariance, t_s, state.origin_m)
+        joint -= (spread / (row.dot(spread).item() + white))[:, None] * seen
+        return FilterState(joint, t_s, state.origin_m)
 
     @cached_property
     def _loads(self) -> Array:
         """By how much of a sigma each state moves the position; zero for offset, scale and latency."""
         return np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
 
-    def _predict(self, state: FilterState, t_s: float) -> tuple[Array, Array]:
-        decay, decay_of_pairs, noise = self._transition(round((t_s - state.t_s) * 1e9))
-        covariance = state.covariance * decay_of_pairs
-        covariance += noise
-        return state.mean * decay, covariance
+    def _predict(self, state: FilterState, t_s: float) -> Array:
+        decay, noise = self._transition(round((t_s - state.t_s) * 1e9))
+        joint = state.joint * decay
+        joint += noise
+        return joint
 
     @cached_property
-    def _transition(self) -> Callable[[int], tuple[Array, Array, Array]]:
+    def _transition(self) -> Callable[[int], tuple[Array, Array]]:
         """`_transition_over` with a memory: a receiver's epochs are mostly the same time apart."""
         return lru_cache(maxsize=32)(self._transition_over)
 
-    def _transition_over(self, dt_ns: int) -> tuple[Array, Array, Array]:
-        """Decay of the states, of their covariances, and the noise that comes in over this time."""
+    def _transition_over(self, dt_ns: int) -> tuple[Array, Array]:
+        """Decay of the joint state over this time, and the noise that comes in."""
         dt_s = dt_ns * 1e-9
         decay = np.concatenate([np.ones(_ERRORS), np.exp(-dt_s / self.taus_s)])
         noise = 1.0 - decay * decay
         noise[_OFFSET] = self.track.white_rate_m2_per_s * dt_s
-        return decay, np.outer(decay, decay), np.diag(noise)
+        return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
 
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:

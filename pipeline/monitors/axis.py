@@ -135,14 +135,15 @@ def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisR
     keep = (1.0 - weight) * moving[:, None]
     gain = weight / series.dt_s[:, None]
     errors = series.sigma_m, series.sigma_before_m, series.decorrelation
-    variance, covariance = variance_of_ewma(keep, gain, *errors, series.white_m2, state)
+    increment_m2 = increment_variance(*errors) + series.white_m2
+    variance, covariance = variance_of_ewma(keep, gain, *errors, increment_m2, series.white_m2, state)
     # A step between the surveys of two elements is no motion of the GNSS error: only the raw monitor, with the
     # survey's sigma, judges it; inside the EWMAs it would ring for long.
     smooth_rate = np.where(series.border, 0.0, series.rate_mps)
     ewma = linear_recurrence(keep, weight * smooth_rate[:, None], state.ewma)
     steady = _response(keep, weight, series.steady_mps, state.steady_response)
     latency = _response(keep, weight, series.latency_mps, state.latency_response)
-    raw_variance = _raw_variance(series)
+    raw_variance = _raw_variance(series, increment_m2)
     sigma = np.sqrt(np.column_stack([raw_variance, variance + steady**2 + latency**2]))
     result = AxisResult(np.column_stack([series.rate_mps, ewma]), sigma)
     if series.epoch.size == 0:
@@ -157,9 +158,8 @@ def _response(keep: Array, weight: Array, rate_mps: Array, before: Array) -> Arr
     return linear_recurrence(keep, weight * rate_mps[:, None], before)
 
 
-def _raw_variance(series: AxisSeries) -> Array:
+def _raw_variance(series: AxisSeries, increment_m2: Array) -> Array:
     """Variance of the raw rate (DIAG eq. 4-7 with correlated GNSS errors) [m^2/s^2]."""
-    gnss = increment_variance(series.sigma_m, series.sigma_before_m, series.decorrelation)
     border = np.where(series.border, series.border_m2, 0.0)
-    noise: Array = (gnss + series.white_m2 + border) / series.dt_s**2
+    noise: Array = (increment_m2 + border) / series.dt_s**2
     return noise + series.steady_mps**2 + series.latency_mps**2

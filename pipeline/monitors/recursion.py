@@ -25,6 +25,11 @@ def linear_recurrence(decay: Array, drive: Array, initial: Array) -> Array:
     diagonals, which LAPACK solves row by row: term by term the loop that this stands for.
     """
     y = np.array(np.broadcast_to(drive, (len(decay), len(initial))), dtype=np.float64, order="F")
+    return _solved(decay, y, initial)
+
+
+def _solved(decay: Array, y: Array, initial: Array) -> Array:
+    """`linear_recurrence` of the drive `y`, an array in Fortran order that the result takes the place of."""
     if not len(y):
         return y
     y[0] += decay[0] * initial
@@ -62,6 +67,7 @@ def variance_of_ewma(
     sigma_m: Array,
     sigma_before_m: Array,
     decorrelation: Array,
+    increment_m2: Array,
     white_m2: Array,
     state: AxisState,
 ) -> tuple[Array, Array]:
@@ -69,8 +75,9 @@ def variance_of_ewma(
 
     `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
     `sigma_m`, `sigma_before_m` (n, sources): sqrt R_j at the row and at the row before it; `decorrelation`
-    (n, sources): 1 - phi_j, given as such because it is tiny at 10 Hz; `white_m2` (n,): variance of white noise on
-    the increment. Returns the variance (n, alphas) and the last covariances c_j = cov(u, e_j) (alphas, sources).
+    (n, sources): 1 - phi_j, given as such because it is tiny at 10 Hz; `increment_m2` (n,): variance of the increment
+    (`increment_variance` and white noise), of which `white_m2` (n,) is white. Returns the variance (n, alphas) and
+    the last covariances c_j = cov(u, e_j) (alphas, sources).
 
     The recursion of DOMAIN section 3, in which (1-phi)^2 R + R (1-phi^2) = 2 R (1-phi) and phi (phi-1) R +
     R (1-phi^2) = R (1-phi). Where sigma changes by the step (s_p to s_k: a fix lost to dead reckoning), the error
@@ -80,22 +87,29 @@ def variance_of_ewma(
         v <- b^2 v + (alpha g)^2 [s_k^2 + s_p^2 - 2 phi s_k s_p] + 2 alpha g b c (phi r - 1) + (alpha g)^2 white
         c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
-    ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
-    carried = (1.0 - decorrelation) * ratio
-    own = sigma_m * (sigma_m - sigma_before_m + decorrelation * sigma_before_m)
-    change = np.where(ratio == 1.0, -decorrelation, carried - 1.0)
+    carried, own, change = _memory(sigma_m, sigma_before_m, decorrelation)
     coupling, covariances = np.empty_like(gain), np.empty_like(state.covariance)
     for index, before in enumerate(state.covariance):
-        covariance = linear_recurrence(keep[:, index, None] * carried, gain[:, index, None] * own, before)
+        drive = np.asfortranarray(gain[:, index, None] * own)
+        covariance = _solved(keep[:, index, None] * carried, drive, before)
         coupling[1:, index] = (covariance[:-1] * change[1:]).sum(axis=1)
         coupling[:1, index] = (before * change[:1]).sum(axis=1)
         covariances[index] = covariance[-1] if len(gain) else before
-    increment = increment_variance(sigma_m, sigma_before_m, decorrelation) + white_m2
-    fresh = gain**2 * increment[:, None] + 2.0 * gain * keep * coupling
+    fresh = gain**2 * increment_m2[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
     new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
     return np.maximum(variance, gain**2 * new_m2[:, None]), covariances
+
+
+def _memory(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> tuple[Array, Array, Array]:
+    """By which factor the errors' covariances go on, what is new in them, and their share in the increment."""
+    if np.array_equal(sigma_m, sigma_before_m):
+        return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
+    ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
+    carried = (1.0 - decorrelation) * ratio
+    own = sigma_m * (sigma_m - sigma_before_m + decorrelation * sigma_before_m)
+    return carried, own, np.where(ratio == 1.0, -decorrelation, carried - 1.0)
 
 
 def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
@@ -104,7 +118,8 @@ def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
     Until a source's sigma first changes by the step, R_j of the row stands for both ends of the increment, as
     printed; from then on the row before has its own. Sources without memory (phi = 0) know no step.
     """
-    before = np.concatenate([sigma_m[:1], sigma_m[:-1]])
+    before = np.empty_like(sigma_m)
+    before[:1], before[1:] = sigma_m[:1], sigma_m[:-1]
     low, high = np.minimum(sigma_m, before), np.maximum(sigma_m, before)
     steps = (high > STEP_OF_SIGMA * low) & (decorrelation < 1.0)
     if not steps.any():
@@ -114,5 +129,7 @@ def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
 
 def increment_variance(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> Array:
     """Variance of the increments of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
-    summed: Array = ((sigma_m - sigma_before_m) ** 2 + 2.0 * decorrelation * sigma_m * sigma_before_m).sum(axis=1)
-    return summed
+    correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
+    if np.array_equal(sigma_m, sigma_before_m):
+        return np.asarray(correlated.sum(axis=1))
+    return np.asarray(((sigma_m - sigma_before_m) ** 2 + correlated).sum(axis=1))

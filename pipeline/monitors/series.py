@@ -110,13 +110,16 @@ class _Builder:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""
         rows = np.flatnonzero(reasons.is_null().to_numpy())
         if rows.size == 0:
-            return _empty(self._shares.size + 2)
+            return _empty(self._shares.size)
         dt, fresh = self._time_steps(rows)
         border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
         survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
-        shares = np.outer(np.sqrt(self._shares), self._sigma(sigma, rows))
-        chord, chord_decorrelation = self._chord_error(rows)
-        wander, wander_decorrelation = self._wander(rows)
+        sigmas = [*np.outer(np.sqrt(self._shares), self._sigma(sigma, rows))]
+        decorrelations = [*decorrelation_of(dt, self._taus_s)]
+        for error, decorrelation in (self._chord_error(rows), self._wander(rows)):
+            if error.any():  # surveys mostly know at most one of them
+                sigmas.append(error)
+                decorrelations.append(decorrelation)
         zero = np.zeros(rows.size)
         return AxisSeries(
             epoch=rows,
@@ -124,10 +127,7 @@ class _Builder:
             border=border,
             dt_s=dt,
             rate_mps=_steps(self._column(position, rows)) / dt,
-            **with_memory(
-                np.vstack([shares, chord, wander]).T,
-                np.vstack([decorrelation_of(dt, self._taus_s), chord_decorrelation, wander_decorrelation]).T,
-            ),
+            **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T),
             white_m2=zero,
             border_m2=2.0 * survey**2,
             steady_mps=self._turned_mps(rows) if position == "cross_track_m" else zero,

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from pipeline.monitors.recursion import AxisState, before_steps, ewma_weight, linear_recurrence, variance_of_ewma
+from pipeline.monitors.recursion import (
+    AxisState,
+    before_steps,
+    ewma_weight,
+    increment_variance,
+    linear_recurrence,
+    variance_of_ewma,
+)
 
 SHARES = np.array([0.083, 0.014, 0.150, 0.752])
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
@@ -34,13 +41,14 @@ def exact(dt_s, sigma2_m2, odometer_sigma_mps=0.05):
     weight = ewma_weight(ALPHAS, dt_s)
     sigma_m = np.sqrt(np.outer(sigma2_m2, SHARES))
     decorrelation = -np.expm1(-dt_s[:, None] / TAUS_S)
+    errors = sigma_m, before_steps(sigma_m, decorrelation), decorrelation
+    white_m2 = odometer_sigma_mps**2 * dt_s
     variance, _ = variance_of_ewma(
         1.0 - weight,
         weight / dt_s[:, None],
-        sigma_m,
-        before_steps(sigma_m, decorrelation),
-        decorrelation,
-        odometer_sigma_mps**2 * dt_s,
+        *errors,
+        increment_variance(*errors) + white_m2,
+        white_m2,
         AxisState.at_restart(3, 4),
     )
     return variance
@@ -92,12 +100,12 @@ def test_variance_stays_true_where_the_accuracy_jumps():
     sampled = np.column_stack([lfilter([a], [1.0, a - 1.0], rate, axis=1).var(axis=0) for a in ALPHAS])
     weight = ewma_weight(ALPHAS, np.ones(n - 1))
     sources = np.outer(sigma_m, np.sqrt(SHARES))
+    errors = sources[1:], sources[:-1], np.broadcast_to(-np.expm1(-1.0 / TAUS_S), (n - 1, 4))
     found, _ = variance_of_ewma(
         1.0 - weight,
         weight,
-        sources[1:],
-        sources[:-1],
-        np.broadcast_to(-np.expm1(-1.0 / TAUS_S), (n - 1, 4)),
+        *errors,
+        increment_variance(*errors),
         np.zeros(n - 1),
         AxisState.at_restart(3, 4),
     )
