@@ -33,7 +33,7 @@ class Points:
 
     def take(self, rows: Ints) -> Points:
         """Some of the points."""
-        return Points(self.surface[rows], self.east[rows], self.north[rows])
+        return Points(*(vectors.take(rows, axis=0) for vectors in (self.surface, self.east, self.north)))
 
 
 def points_of(latitude_deg: Floats, longitude_deg: Floats) -> Points:

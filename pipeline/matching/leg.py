@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +17,6 @@ from pipeline.matching.segments import (
     held_to_line,
     nearest,
     on_segments,
-    polyline_of,
 )
 from pipeline.track import GAP_COUNTS_M, Track
 
@@ -39,7 +39,6 @@ class Leg:
     """A chain of net elements on which `path_m` is one to one; arrays are per segment, in order.
 
     `turn_start_rad`, `turn_end_rad`: change of heading at the segment's ends, positive to the left.
-    `returns`: the leg comes back to a place where it was.
     """
 
     visits: tuple[Visit, ...]
@@ -55,7 +54,11 @@ class Leg:
     heading_deg: Floats
     turn_start_rad: Floats
     turn_end_rad: Floats
-    returns: bool
+
+    @cached_property
+    def returns(self) -> bool:
+        """Whether the leg comes back to a place where it was: a loop, or an element passed twice."""
+        return _returns(self.line, self.path_start_m)
 
     @property
     def start_m(self) -> float:
@@ -89,11 +92,10 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
     kept = np.flatnonzero(~border | (gap > 0))
     head, tail = kept, kept + 1
     heading, turn = _headings(places, head)
-    line = polyline_of(places.surface[head], places.surface[tail])
     height, sigma = track.height_m[vertex], track.sigma_m[vertex]
     return Leg(
         visits=tuple(visits),
-        line=line,
+        line=Polyline(places.surface.take(head, axis=0), places.surface.take(tail, axis=0)),
         visit=visit[tail],
         path_start_m=path[head],
         path_end_m=path[tail],
@@ -106,7 +108,6 @@ def leg_of(track: Track, visits: Sequence[Visit], start_m: float = 0.0) -> Leg:
         heading_deg=np.degrees(heading) % 360.0,
         turn_start_rad=np.concatenate([[0.0], turn]),
         turn_end_rad=np.concatenate([turn, [0.0]]),
-        returns=_returns(line, path[head]),
     )
 
 
@@ -150,7 +151,6 @@ def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -
 
 
 def _returns(line: Polyline, path_start_m: Floats) -> bool:
-    """Whether the line comes back to where it was: a loop, or an element passed twice."""
     probes = np.unique(np.searchsorted(path_start_m, np.arange(path_start_m[0], path_start_m[-1], SAMPLE_SPACING_M)))
     places, path_m = line.start[probes], path_start_m[probes]
     pairs = cKDTree(places).query_pairs(SAME_PLACE_M + 2 * SAMPLE_SPACING_M, output_type="ndarray")
@@ -179,9 +179,10 @@ def _vertices(track: Track, visit: Visit) -> Ints:
 
 def _headings(places: Points, head: Ints) -> tuple[Floats, Floats]:
     """Heading of each segment, clockwise from north, and the left turn between neighbours [rad]."""
-    along = places.surface[head + 1] - places.surface[head]
-    east = np.einsum("ij,ij->i", along, places.east[head])
-    north = np.einsum("ij,ij->i", along, places.north[head])
+    begin = places.take(head)
+    along = places.surface.take(head + 1, axis=0) - begin.surface
+    east = np.einsum("ij,ij->i", along, begin.east)
+    north = np.einsum("ij,ij->i", along, begin.north)
     heading = np.arctan2(east, north)
     turn = -np.diff(heading)
     return heading, np.asarray((turn + np.pi) % (2.0 * np.pi) - np.pi)

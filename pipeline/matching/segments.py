@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -20,11 +21,21 @@ class Polyline:
 
     start: Floats
     end: Floats
-    tree: cKDTree
-    sample_segment: Ints
 
     def __len__(self) -> int:
         return len(self.start)
+
+    @cached_property
+    def samples(self) -> tuple[cKDTree, Ints]:
+        """A search tree over points at most `SAMPLE_SPACING_M` apart, and the segment of each."""
+        way = self.end - self.start
+        pieces = np.maximum(1, np.ceil(np.linalg.norm(way, axis=1) / SAMPLE_SPACING_M)).astype(np.int64)
+        segment = np.repeat(np.arange(len(self)), pieces)
+        number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        fraction = ((number + 0.5) / pieces[segment])[:, None]
+        places = self.start.take(segment, axis=0) + fraction * way.take(segment, axis=0)
+        # A tree without rebalancing builds faster and answers as fast on lines.
+        return cKDTree(places, balanced_tree=False), segment
 
 
 class HasSegments(Protocol):
@@ -66,25 +77,13 @@ def no_feet(count: int) -> Feet:
     return Feet(np.zeros(count, dtype=np.int64), unknown, unknown.copy(), unknown.copy())
 
 
-def polyline_of(start: Floats, end: Floats) -> Polyline:
-    """Segments with a search tree over points at most `SAMPLE_SPACING_M` apart."""
-    lengths = np.linalg.norm(end - start, axis=1)
-    pieces = np.maximum(1, np.ceil(lengths / SAMPLE_SPACING_M)).astype(np.int64)
-    segment = np.repeat(np.arange(len(start)), pieces)
-    number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    fraction = ((number + 0.5) / pieces[segment])[:, None]
-    samples = start[segment] + fraction * (end - start)[segment]
-    # A tree without rebalancing builds four times faster and answers as fast on lines.
-    tree = cKDTree(samples, balanced_tree=False, compact_nodes=False)
-    return Polyline(start, end, tree, segment)
-
-
 def nearest(points: Points, line: Polyline) -> Feet:
     """The nearest place on the line: nearest sample, then downhill over neighbouring segments."""
     if len(points) == 0:
         return no_feet(0)
-    _, sample = line.tree.query(points.surface)
-    return downhill(points, line, line.sample_segment[sample])
+    tree, segment = line.samples
+    _, sample = tree.query(points.surface)
+    return downhill(points, line, segment[sample])
 
 
 def downhill(points: Points, line: Polyline, segment: Ints) -> Feet:
@@ -106,7 +105,8 @@ def downhill(points: Points, line: Polyline, segment: Ints) -> Feet:
 
 def on_segments(points: Points, line: HasSegments, segment: Ints) -> Feet:
     """Each point on its given segment, in the tangent plane of the point; `fraction` is not limited."""
-    to_start, to_end = line.start[segment] - points.surface, line.end[segment] - points.surface
+    to_start = line.start.take(segment, axis=0) - points.surface
+    to_end = line.end.take(segment, axis=0) - points.surface
     x, y = _dot(to_start, points.east), _dot(to_start, points.north)
     dx, dy = _dot(to_end, points.east) - x, _dot(to_end, points.north) - y
     square = np.maximum(dx * dx + dy * dy, 1e-18)
