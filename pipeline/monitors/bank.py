@@ -17,7 +17,8 @@ from schemas.tables import SCALES
 
 STATES = [state.value for state in MonitorState]
 _PASS, _FAIL, _NOT_EVALUATED = (STATES.index(state) for state in ("pass", "fail", "not_evaluated"))
-_FIRST_BLOCK = 2048
+# Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
+_FIRST_BLOCK, _BLOCK = 2048, 8192
 
 
 class _AxisBank:
@@ -34,7 +35,7 @@ class _AxisBank:
         self.state = np.full((epochs, width), _NOT_EVALUATED, dtype=np.int8, order="F")
         self._series = axis.series
         self._done = 0
-        self._block = max(axis.series.epoch.size, 1)
+        self._block = _BLOCK
         self._carry = self._zero()
 
     def _zero(self) -> AxisState:
@@ -48,7 +49,7 @@ class _AxisBank:
             part = self._series.between(self._done, end)
             result, self._carry = run_axis(part, self._alphas, self._carry)
             self._store(part, result.value, self._factor * result.sigma)
-            self._done, self._block = end, 2 * self._block
+            self._done, self._block = end, min(2 * self._block, _BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Array, threshold: Array) -> None:
@@ -93,7 +94,7 @@ def _state_series(name: str, codes: npt.NDArray[np.int8]) -> pl.Series:
 
 
 def _where_not_evaluated(name: str, codes: npt.NDArray[np.int8], reasons: pl.Series) -> pl.Series:
-    return pl.select(pl.when(pl.Series(codes == _NOT_EVALUATED)).then(reasons).alias(name)).to_series()
+    return reasons.alias(name).zip_with(pl.Series(codes == _NOT_EVALUATED), pl.Series([None], dtype=reasons.dtype))
 
 
 class MonitorBank:

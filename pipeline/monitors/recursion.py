@@ -118,13 +118,15 @@ def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
     Until a source's sigma first changes by the step, R_j of the row stands for both ends of the increment, as
     printed; from then on the row before has its own. Sources without memory (phi = 0) know no step.
     """
-    before = np.empty_like(sigma_m)
-    before[:1], before[1:] = sigma_m[:1], sigma_m[:-1]
-    low, high = np.minimum(sigma_m, before), np.maximum(sigma_m, before)
-    steps = (high > STEP_OF_SIGMA * low) & (decorrelation < 1.0)
-    if not steps.any():
-        return sigma_m
-    return np.where(np.logical_or.accumulate(steps, axis=0), before, sigma_m)
+    before = sigma_m
+    for source, (now, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
+        earlier = np.concatenate([now[:1], now[:-1]])
+        low, high = np.minimum(now, earlier), np.maximum(now, earlier)
+        steps = (high > STEP_OF_SIGMA * low) & (lost < 1.0)
+        if steps.any():
+            before = before.copy(order="F") if before is sigma_m else before
+            before[:, source] = np.where(np.logical_or.accumulate(steps), earlier, now)
+    return before
 
 
 def increment_variance(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> Array:
