@@ -47,7 +47,7 @@ def track_of(frame: pl.DataFrame) -> Track:
     """The track of a site's `track` table; points of an element stay in their order."""
     names = frame["netelement_id"].unique(maintain_order=True)
     index = {name: number for number, name in enumerate(names.to_list())}
-    codes = frame["netelement_id"].replace_strict(names, np.arange(len(names)), return_dtype=pl.Int64).to_numpy()
+    codes = frame["netelement_id"].cast(pl.Enum(names)).to_physical().cast(pl.Int64).to_numpy()
     order = np.argsort(codes, kind="stable")
     first = np.searchsorted(codes[order], np.arange(len(index) + 1))
     columns = {name: _floats(frame, name)[order] for name in _NUMBERS}
@@ -81,7 +81,7 @@ _NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")
 
 def _floats(frame: pl.DataFrame, column: str) -> Floats:
     """A column with null as NaN."""
-    return frame[column].cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
+    return frame[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
 def _all_or_none(height_m: Floats, first: Ints) -> Floats:

@@ -68,7 +68,7 @@ def epoch_frame(
     source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
     columns: dict[str, npt.NDArray[Any] | pl.Series] = {
         "leg": pl.Series(found.leg, dtype=pl.Int32),
-        "netelement_id": _words(path.track.ids, element),
+        "netelement_id": _words(path.track.ids, element, pl.String()),
         "measure_m": measure_m,
         "path_m": path_m,
         "cross_track_m": places.cross_m,
@@ -84,7 +84,7 @@ def epoch_frame(
         "sigma_along_m": sigma_along_m,
         "sigma_cross_m": sigma_cross_m,
         "sigma_up_m": np.sqrt(fixes.cov_uu_m2),
-        "sigma_source": _words(_SOURCES, source).cast(pl.Enum(SigmaSource)),
+        "sigma_source": _words(_SOURCES, source, pl.Enum(SigmaSource)),
         "fix_valid": fixes.valid,
         "velocity_along_mps": velocity_along_mps(fixes, shape),
     }
@@ -138,10 +138,10 @@ def _slope(rise_m: Floats, length_m: Floats) -> Floats:
 _SOURCES = (SigmaSource.RECEIVER.value, SigmaSource.TABLE.value)
 
 
-def _words(words: Sequence[str], number: Ints) -> pl.Series:
+def _words(words: Sequence[str], number: Ints, kind: pl.DataType) -> pl.Series:
     """Words by their number, null for -1."""
     rows = np.where(number < 0, len(words), number)
-    return pl.Series([*words, None], dtype=pl.String).gather(pl.Series(rows))
+    return pl.Series([*words, None], dtype=kind).gather(pl.Series(rows))
 
 
 def _frame(fixes: Fixes, solution: pl.Series, columns: dict[str, npt.NDArray[Any] | pl.Series]) -> pl.DataFrame:

@@ -50,15 +50,15 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     covariance can have is not known: the variances stand alone.
     """
     column = {name: _floats(frame, name) for name in _NUMBERS}
-    fix = frame["fix"].cast(pl.String)
-    horizontal_m = _table_sigma_m(fix, sigma)
+    fix = _kinds(frame["fix"])
+    table_m = np.array([*(sigma.horizontal_m(kind) for kind in Fix), None], dtype=np.float64)
     valid = np.isfinite(column["latitude_deg"]) & np.isfinite(column["longitude_deg"])
-    valid &= (fix != Fix.NONE.value).to_numpy()
+    valid &= fix != _KINDS.index(Fix.NONE.value)
     with np.errstate(invalid="ignore"):
         receiver = valid & (column["cov_ee_m2"] > 0) & (column["cov_nn_m2"] > 0)
         height_known = receiver & (column["cov_uu_m2"] > 0)
         correlated = receiver & (column["cov_en_m2"] ** 2 < column["cov_ee_m2"] * column["cov_nn_m2"])
-    table = np.where(valid, horizontal_m**2, np.nan)
+    table = np.where(valid, (table_m**2)[fix], np.nan)
     ee = np.where(receiver, column["cov_ee_m2"], table)
     nn = np.where(receiver, column["cov_nn_m2"], table)
     up = np.where(height_known, column["cov_uu_m2"], 0.5 * (ee + nn) * sigma.vertical_factor**2)
@@ -87,6 +87,7 @@ def contradictory_covariances(frame: pl.DataFrame) -> int:
     return frame.filter((ee > 0) & (nn > 0) & (en**2 >= ee * nn)).height
 
 
+_KINDS = [kind.value for kind in Fix]
 _NUMBERS = (
     *("latitude_deg", "longitude_deg", "height_m"),
     *("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "cov_uu_m2", "vel_e_mps", "vel_n_mps"),
@@ -101,7 +102,6 @@ def _floats(frame: pl.DataFrame, name: str) -> Floats:
     return values.fill_null(float("nan")).to_numpy() if values.null_count() else values.to_numpy()
 
 
-def _table_sigma_m(fix: pl.Series, sigma: FixSigma) -> Floats:
-    table = {kind.value: sigma.horizontal_m(kind) for kind in Fix}
-    values = fix.replace_strict(table, return_dtype=pl.Float64)
-    return values.fill_null(float("nan")).to_numpy()
+def _kinds(fix: pl.Series) -> Ints:
+    """Kinds of fix by their number; the number after the last is not known."""
+    return fix.cast(pl.Enum(_KINDS)).to_physical().cast(pl.Int64).fill_null(len(_KINDS)).to_numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import polars as pl
@@ -26,12 +27,16 @@ from schemas.run import Site
 
 @dataclass(frozen=True)
 class Match:
-    """Epochs on the path, the path, cross-track biases per element, and stretches of doubt."""
+    """Epochs on the path, the path, and stretches of doubt."""
 
     epochs: pl.DataFrame
     path: TravelledPath
-    biases: pl.DataFrame
     ambiguous: pl.DataFrame
+
+    @cached_property
+    def biases(self) -> pl.DataFrame:
+        """Cross-track biases per element."""
+        return biases(self.epochs)
 
 
 def match(
@@ -53,7 +58,7 @@ def match(
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     path, found, ambiguous = _path(arrays, odometer, site, config, balise_reads)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    return Match(epochs, path, biases(epochs), ambiguous)
+    return Match(epochs, path, ambiguous)
 
 
 def _path(
