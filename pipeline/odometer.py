@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,7 @@ import polars as pl
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+Number = TypeVar("Number", np.float64, np.int64)
 
 _NS = 1e-9
 _GAP_IN_PERIODS = 2.5
@@ -86,36 +88,46 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     dt = np.diff(t_s)
     period = float(np.median(dt))
     limit_s = max(gap_s, _GAP_IN_PERIODS * period)
-    distance, speed = (odometer[name].to_numpy().astype(np.float64) for name in ("distance_m", "speed_mps"))
-    recorded, driven = _ways(t_s, distance, speed, limit_s)
-    step = np.where(np.isnan(recorded), driven, recorded)
-    pause = np.isnan(step) | (dt > limit_s)
+    distance, speed = (odometer[name].cast(pl.Float64).to_numpy() for name in ("distance_m", "speed_mps"))
+    step, counted = _ways(t_s, dt, distance, speed, limit_s)
+    unknown = np.isnan(step)
+    pause = unknown | (dt > limit_s)
     slip = odometer["slip"].fill_null(False).to_numpy()
-    lost = (pause & np.isnan(recorded)) | slip[1:]
-    step = np.nan_to_num(step)
+    lost = (pause & ~counted) | slip[1:]
+    step[unknown] = 0.0
     declared = odometer["sigma_speed_mps"].median()
     declared_rate = float(declared) ** 2 * period if isinstance(declared, float) else 0.0
     return OdometerTrack(
         epoch_ns=epoch_ns,
         t_s=t_s,
-        distance_m=np.concatenate([[0.0], np.cumsum(step)]),
-        stretch=np.concatenate([[0], np.cumsum(lost)]),
+        distance_m=_sums(step),
+        stretch=_sums(lost.astype(np.int64)),
         pause=pause,
         slip=slip,
         white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
     )
 
 
-def _ways(t_s: Array, distance_m: Array, speed_mps: Array, limit_s: float) -> tuple[Array, Array]:
-    """Way from each row to the next [m], by the recorded distance and by speed; NaN where not known."""
-    dt = np.diff(t_s)
-    recorded, driven = np.diff(distance_m), _driven(speed_mps, dt)
-    if not np.isnan(np.where(np.isnan(recorded), driven, recorded)).any():
-        return recorded, driven
-    between = np.diff(_carried(t_s, distance_m, limit_s))
-    recorded = np.where(np.isnan(recorded) & np.isnan(driven), between, recorded)
-    driven = _driven(_carried(t_s, speed_mps, limit_s), dt)
-    return _over_pauses(distance_m, recorded, driven, dt > limit_s), driven
+def _sums(steps: npt.NDArray[Number]) -> npt.NDArray[Number]:
+    """Sums of the steps before each row; 0 at the first."""
+    sums = np.zeros(steps.size + 1, steps.dtype)
+    np.cumsum(steps, out=sums[1:])
+    return sums
+
+
+def _ways(t_s: Array, dt_s: Array, distance_m: Array, speed_mps: Array, limit_s: float) -> tuple[Array, Mask]:
+    """Way from each row to the next [m], NaN where not known, and whether it is by the recorded distance."""
+    recorded, driven = np.diff(distance_m), _driven(speed_mps, dt_s)
+    counted = ~np.isnan(recorded)
+    step = np.where(counted, recorded, driven)
+    unknown = np.isnan(step)
+    if not unknown.any():
+        return step, counted
+    recorded = np.where(unknown, np.diff(_carried(t_s, distance_m, limit_s)), recorded)
+    driven = _driven(_carried(t_s, speed_mps, limit_s), dt_s)
+    recorded = _over_pauses(distance_m, recorded, driven, dt_s > limit_s)
+    counted = ~np.isnan(recorded)
+    return np.where(counted, recorded, driven), counted
 
 
 def _driven(speed_mps: Array, dt_s: Array) -> Array:
