@@ -22,7 +22,8 @@ from pipeline.odometer_filter import (
 from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 
-_BLOCK = 2048
+# Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
+_FIRST_BLOCK, _BLOCK = 2048, 8192
 
 
 def learn(arrays: EpochArrays, track: OdometerTrack, vehicle: Vehicle, config: Configuration) -> Learned:
@@ -100,9 +101,9 @@ class _Learner:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
         bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
         history = [(begin, state)]
-        position = begin
+        position, block = begin, _FIRST_BLOCK
         while position < self._rows.size:
-            end = min(position + _BLOCK, self._rows.size)
+            end = min(position + block, self._rows.size)
             current = max(index for index, (effective, _) in enumerate(history) if effective <= position)
             history = history[current:] + self._updates(history[-1][1], position, end)
             self._put(history, position)
@@ -115,7 +116,7 @@ class _Learner:
                 in_use = [item for effective, item in history if effective <= alarm][-1]
                 self._put([(alarm, in_use)], alarm)
                 return in_use, alarm
-            position = end
+            position, block = end, min(2 * block, _BLOCK)
         return history[-1][1], position
 
     def _updates(self, state: FilterState, begin: int, end: int) -> list[tuple[int, FilterState]]:
