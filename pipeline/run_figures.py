@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import polars as pl
@@ -44,7 +45,7 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
         "availability": availability(clock.t_ns, flags(epochs, pl.col("tvb")), moving, clock.limit_s),
         "outages": len(lost),
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
-        "cross_bias_m": epochs.filter("on_track")["cross_track_m"].median(),
+        "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
         "mtbf_h": mtbf_h,
         "continuity_15s": math.exp(-CONTINUITY_S / 3600.0 / mtbf_h) if mtbf_h else None,
         "trusted_s": trust.up_s if epochs.height else None,
@@ -70,17 +71,23 @@ def accuracy(epochs: pl.DataFrame) -> Row:
 
 
 def balise_counts(passages: pl.DataFrame, failure_limit_m: float) -> Row:
-    virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
-    accepted = virtual.filter(pl.col("status") == PassageStatus.ACCEPTED)
-    return {
-        "balises_on_path": virtual.filter(is_passage()).height,
-        "balises_accepted": accepted.height,
-        "balises_rejected": virtual.filter(pl.col("status").is_in(_REJECTED)).height,
-        "balises_missed": virtual.filter(pl.col("status") == PassageStatus.MISSED).height,
-        "balises_not_available": virtual.filter(pl.col("status") == PassageStatus.NOT_AVAILABLE).height,
-        "unsafe_accepted": accepted.filter(pl.col("location_error_m").abs() > failure_limit_m).height,
-        **_spread(accepted["location_error_m"], "location_error"),
+    virtual, status, error = pl.col("kind") == BaliseKind.VIRTUAL, pl.col("status"), pl.col("location_error_m")
+    accepted = virtual & (status == PassageStatus.ACCEPTED)
+    counts = {
+        "balises_on_path": virtual & is_passage(),
+        "balises_accepted": accepted,
+        "balises_rejected": virtual & status.is_in(_REJECTED),
+        "balises_missed": virtual & (status == PassageStatus.MISSED),
+        "balises_not_available": virtual & (status == PassageStatus.NOT_AVAILABLE),
+        "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
     }
+    known = passages.select(error.filter(accepted)).to_series()
+    return {**_counted(passages, counts), **_spread(known, "location_error")}
+
+
+def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
+    """In how many rows each condition holds."""
+    return frame.select(condition.sum().alias(name) for name, condition in conditions.items()).row(0, named=True)
 
 
 def is_passage() -> pl.Expr:
@@ -99,11 +106,14 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
         Hazard.VB_JUMP_1B: "hazards_1b",
         Hazard.VB_SHIFT: "hazards_shift",
     }
+    counts = {column: pl.col("hazard") == kind for kind, column in classes.items()}
+    counts |= {
+        "hazards_detected": pl.col("detected"),
+        "hazards_within_budget": pl.col("within_budget"),
+        "missed_detections": missed_detection(),
+    }
     return {
-        **{column: hazards.filter(pl.col("hazard") == kind).height for kind, column in classes.items()},
-        "hazards_detected": hazards.filter(pl.col("detected")).height,
-        "hazards_within_budget": hazards.filter(pl.col("within_budget")).height,
-        "missed_detections": hazards.filter(missed_detection()).height,
+        **_counted(hazards, counts),
         "time_to_detect_max_s": hazards["time_to_detect_s"].max(),
         "time_since_failure_max_s": hazards["time_since_failure_s"].max(),
         "hazardous_max_s": hazards["hazardous_s"].max(),
@@ -180,12 +190,10 @@ def state_shares(epochs: pl.DataFrame, clock: Clock) -> Row:
     Where the truth is missing for a while the four do not add up to one; where it is missing
     throughout, P0 and P1 are not known.
     """
-    states = epochs["lds_state"]
-    row: Row = {
-        f"share_{state.value.lower()}": share_of_time(clock.held_s, flags(epochs, pl.col("lds_state") == state))
-        for state in LdsState
-    }
-    if states.is_null().any() and not states.is_in([LdsState.P0.value, LdsState.P1.value]).any():
+    states = {f"share_{state.value.lower()}": pl.col("lds_state") == state for state in LdsState}
+    inside = epochs.select(condition.fill_null(value=False).alias(name) for name, condition in states.items())
+    row: Row = {flag.name: share_of_time(clock.held_s, flag.to_numpy()) for flag in inside}
+    if epochs["lds_state"].null_count() and not (inside["share_p0"].any() or inside["share_p1"].any()):
         row |= {"share_p0": None, "share_p1": None}
     return row
 
