@@ -46,12 +46,10 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
         if frame is None or name == "faults":
             continue
         streams[name], counts[name] = _in_order(frame, _KEYS.get(name, ["t"]))
-    solutions = {
-        solution: _in_order(frame, ["t"])[1]
-        for (solution,), frame in run.gnss.group_by("solution", maintain_order=True)
-    }
+    recorded = run.gnss.select("solution", "t").partition_by("solution", maintain_order=True)
+    solutions = {part["solution"][0]: _in_order(part, ["t"])[1] for part in recorded}
     gnss = streams["gnss"]
-    parts = [] if gnss is None else gnss.partition_by("solution", maintain_order=True)
+    parts = [] if gnss is None else gnss.select("solution").partition_by("solution", maintain_order=True)
     if parts and all(part.height < 2 for part in parts):
         require_two_times(parts[0], f"{run.run_id}: gnss", f" of solution {parts[0]['solution'][0]!r}")
     odometer = streams.get("odometer")

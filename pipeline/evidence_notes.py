@@ -26,16 +26,15 @@ def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame) -> tuple[str, ...]
 
     `epochs`: matched and aligned; `truth`: from `establish_truth`, row by row.
     """
-    positioned = (epochs["fix_valid"] & epochs["path_m"].is_not_null()).fill_null(False)
-    seen = truth.filter(positioned)
+    seen = truth.select("evidence", "truth_bound_m", "truth_smoothed")
+    seen = seen.filter(epochs["fix_valid"] & epochs["path_m"].is_not_null())
     if seen.is_empty():
         return ()
-    kinds = seen["evidence"].cast(pl.String)
     notes = []
-    without = kinds.null_count() / seen.height
+    without = seen["evidence"].null_count() / seen.height
     if without > 0.01:
         notes.append(_NOTHING.format(share=without))
-    weak = seen.filter(kinds.is_in([Evidence.BALISE.value, Evidence.ODOMETER.value]).fill_null(False))
+    weak = seen.filter((seen["evidence"] == Evidence.BALISE.value) | (seen["evidence"] == Evidence.ODOMETER.value))
     if weak.height <= 0.01 * seen.height:
         return tuple(notes)
     notes += _weak_evidence(weak)

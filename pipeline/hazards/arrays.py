@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 import polars as pl
@@ -15,8 +17,12 @@ NS_PER_S = 1_000_000_000
 
 def floats(frame: pl.DataFrame, column: str) -> Floats:
     """A nullable numeric column, null as NaN."""
-    series = frame[column].cast(pl.Float64)
-    return series.fill_null(float("nan")).to_numpy() if series.null_count() else series.to_numpy()
+    return frame[column].cast(pl.Float64).to_numpy()
+
+
+def ints(series: pl.Series, unknown: int = -1) -> Ints:
+    """Whole numbers, null as `unknown`."""
+    return (series.fill_null(unknown) if series.null_count() else series).cast(pl.Int64).to_numpy()
 
 
 def times_ns(frame: pl.DataFrame, column: str = "t") -> Ints:
@@ -26,8 +32,18 @@ def times_ns(frame: pl.DataFrame, column: str = "t") -> Ints:
 
 def flags(frame: pl.DataFrame, column: str) -> Bools:
     """A nullable boolean column, null as false."""
-    series = frame[column]
+    return truths(frame[column])
+
+
+def truths(series: pl.Series) -> Bools:
+    """Booleans, null as false."""
     return (series.fill_null(False) if series.null_count() else series).to_numpy().astype(np.bool_, copy=False)
+
+
+def words(kinds: Sequence[str], codes: Ints) -> pl.Series:
+    """Words of a closed set by their number, null for -1."""
+    rows = np.where(codes < 0, len(kinds), codes)
+    return pl.Series([*kinds, None], dtype=pl.Enum(kinds)).gather(pl.Series(rows))
 
 
 def nominal_period_s(t_ns: Ints) -> float:

@@ -43,8 +43,8 @@ def beacons_by_leg(balises: pl.DataFrame) -> tuple[Beacons, ...]:
     """Virtual balises on the path, by leg."""
     virtual = balises.filter(pl.col("kind") == BaliseKind.VIRTUAL.value).sort("leg", "path_m", "balise_id")
     return tuple(
-        Beacons(int(leg), floats(part, "path_m"), tuple(part["balise_id"].to_list()))
-        for (leg,), part in virtual.group_by("leg", maintain_order=True)
+        Beacons(int(part["leg"][0]), floats(part, "path_m"), tuple(part["balise_id"].to_list()))
+        for part in virtual.partition_by("leg", maintain_order=True)
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Ints, flags, times_ns
+from pipeline.hazards.arrays import NS_PER_S, Bools, Ints, flags, times_ns, truths
 from schemas.enums import MonitorState
 from schemas.tables import MONITORS
 
@@ -79,8 +79,7 @@ def fails_of(epochs: pl.DataFrame, recovery_s: float) -> Fails:
 
 
 def _failing(epochs: pl.DataFrame, monitor: str) -> Bools:
-    failed = epochs[f"{monitor}_state"] == MonitorState.FAIL.value
-    return failed.fill_null(False).to_numpy()
+    return truths(epochs[f"{monitor}_state"] == MonitorState.FAIL.value)
 
 
 def _spans(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, interpolate_known, times_ns
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, interpolate_known, ints, times_ns
 from pipeline.hazards.rows import Judged
 from pipeline.hazards.series import Series, direction_of
 from pipeline.hazards.truth import valid_ns
@@ -93,7 +93,7 @@ def wrongly_offered(
     passages: pl.DataFrame, error: Floats, epochs: pl.DataFrame, truth: pl.DataFrame, config: HazardConfig
 ) -> Bools:
     """Location errors beyond the shift limit that the evidence can resolve."""
-    offered = passages["t_offered"].dt.timestamp("ns").fill_null(0).to_numpy()
+    offered = ints(passages["t_offered"].dt.timestamp("ns"), 0)
     near = np.clip(np.searchsorted(times_ns(epochs), offered), 0, max(epochs.height - 1, 0))
     bound = np.nan_to_num(floats(truth, "truth_bound_m")[near]) if epochs.height else np.zeros(error.size)
     with np.errstate(invalid="ignore"):
@@ -142,7 +142,7 @@ def suspicious_passages(passages: pl.DataFrame, spans: list[tuple[int, int]]) ->
     """VBs accepted in `onset <= t < detection` of a fault; a telegram does not rest on the position."""
     accepted = (passages["status"] == PassageStatus.ACCEPTED.value).to_numpy()
     accepted &= (passages["kind"] == BaliseKind.VIRTUAL.value).to_numpy()
-    offered = passages["t_offered"].dt.timestamp("ns").fill_null(-1).to_numpy()
+    offered = ints(passages["t_offered"].dt.timestamp("ns"))
     return accepted & within_spans(offered, spans)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints
 from pipeline.hazards.truth import valid_ns
 
 # A hole in the epochs over which the train's speed at both ends gives the passage between them.
@@ -78,11 +78,13 @@ def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFra
     if rows.size < 2 or balises.height == 0:
         return TruePassings(found, at_ns, x)
     speed = floats(epochs, "speed_mps")[rows]
-    leg = epochs["leg"].cast(pl.Int64).fill_null(strategy="forward").fill_null(strategy="backward").fill_null(-1)
-    legs = leg.to_numpy()[rows]
-    for (number,), part in balises.sort("path_m").group_by("leg", maintain_order=True):
+    leg = epochs["leg"]
+    if leg.null_count():
+        leg = leg.fill_null(strategy="forward").fill_null(strategy="backward")
+    legs = ints(leg)[rows]
+    for part in balises.sort("path_m").partition_by("leg", maintain_order=True):
         names, places = part["balise_id"].to_list(), floats(part, "path_m")
-        changes = _changes(x, legs == number, places)
+        changes = _changes(x, legs == part["leg"][0], places)
         for index, (balise, beacon_m) in enumerate(zip(names, places.tolist(), strict=True)):
             instants = _instants(at_ns, x, speed, changes.get(index, []), beacon_m)
             found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))

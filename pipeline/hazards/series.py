@@ -14,6 +14,7 @@ from pipeline.hazards.arrays import (
     Ints,
     flags,
     floats,
+    ints,
     linking_gap_s,
     nominal_period_s,
     times_ns,
@@ -68,7 +69,7 @@ def series_of(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Seri
     linked = np.zeros(row.size, dtype=np.bool_)
     gap_ns = linking_gap_s(period_s, lds.crossing_gap_s) * NS_PER_S
     linked[1:] = (np.diff(t) <= gap_ns) & (np.diff(stretch) == 0)
-    leg = epochs["leg"].fill_null(-1).cast(pl.Int64).to_numpy()[row]
+    leg = ints(epochs["leg"])[row]
     return Series(
         row=row,
         t_ns=t,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import Bools, Floats, flags, floats, times_ns
+from pipeline.hazards.arrays import Bools, Floats, flags, floats, times_ns, truths, words
 from pipeline.hazards.series import direction_of
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import BaliseKind, LdsState, PassageStatus
 
-_STATES = pl.Enum([member.value for member in LdsState])
+_STATES = [member.value for member in LdsState]
 
 
 def errors_of(epochs: pl.DataFrame, truth: pl.DataFrame) -> dict[str, Floats]:
@@ -49,9 +49,7 @@ def lds_states(
     faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(epochs, truth, passages, lds)
     state[faulty] = _code(LdsState.P3)
     state[flags(epochs, "negated")] = _code(LdsState.P2)
-    names = pl.Series([member.value for member in LdsState], dtype=_STATES)
-    index = pl.Series("lds_state", state).replace(-1, None)
-    return names.gather(index).alias("lds_state")
+    return words(_STATES, state).alias("lds_state")
 
 
 def _code(state: LdsState) -> int:
@@ -67,12 +65,11 @@ def odometer_beyond_confidence(
     """
     t_ns = times_ns(epochs)
     travelled, place = floats(epochs, "odometer_m"), floats(truth, "truth_path_m")
-    virtual = pl.col("kind") == BaliseKind.VIRTUAL.value
-    accepted = passages.filter(
-        virtual & (pl.col("status") == PassageStatus.ACCEPTED.value) & pl.col("t_offered").is_not_null()
-    ).sort("t_offered")
+    virtual = passages.filter(passages["kind"] == BaliseKind.VIRTUAL.value)
+    accepted = virtual.filter(virtual["status"] == PassageStatus.ACCEPTED.value).drop_nulls("t_offered")
+    accepted = accepted.sort("t_offered")
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
-    known = np.isfinite(travelled) & np.isfinite(place) & (truth["evidence"] != "odometer").fill_null(False).to_numpy()
+    known = np.isfinite(travelled) & np.isfinite(place) & truths(truth["evidence"] != "odometer")
     if accepted.height == 0 or not known.any():
         return beyond
     at_ns = times_ns(accepted, "t_offered")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 from schemas.enums import Evidence, Suspect, Verdict
 
 # How far back an alarm's cause may lie: a raw monitor answers at once, the slowest EWMA after minutes.
@@ -50,8 +50,6 @@ def witnesses_of(
     epochs: pl.DataFrame, truth: pl.DataFrame, errors: dict[str, Floats], ambiguity_probability: float
 ) -> Witnesses:
     """Everything that can speak for or against the position."""
-    reference = truth["evidence"] == Evidence.REFERENCE.value
-    odometer = truth["evidence"] == Evidence.ODOMETER.value
     truth_sigma = floats(truth, "truth_sigma_m")
     gate = floats(epochs, "gate_probability")
     has_path = np.isfinite(floats(epochs, "path_m"))
@@ -71,12 +69,12 @@ def witnesses_of(
         truth_up_m=floats(truth, "truth_up_m"),
         truth_sigma_m=np.nan_to_num(truth_sigma),
         odometer_m=floats(epochs, "odometer_m"),
-        stretch=epochs["odometer_stretch"].fill_null(-1).cast(pl.Int64).to_numpy(),
+        stretch=ints(epochs["odometer_stretch"]),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         white_m2_per_s=np.nan_to_num(floats(epochs, "odometer_white_m2_per_s")),
         velocity_mps=floats(epochs, "velocity_along_mps"),
-        by_reference=reference.fill_null(False).to_numpy(),
-        by_odometer=odometer.fill_null(False).to_numpy(),
+        by_reference=truths(truth["evidence"] == Evidence.REFERENCE.value),
+        by_odometer=truths(truth["evidence"] == Evidence.ODOMETER.value),
         doubtful_track=doubtful,
     )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import Floats, Ints, floats
+from pipeline.hazards.arrays import Floats, Ints, floats, ints
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def odometer_travel(epochs: pl.DataFrame, at_ns: Ints) -> Travel:
         at_ns=at_ns,
         distance_m=floats(epochs, "odometer_m"),
         odometer_m=floats(epochs, "odometer_m"),
-        stretch=epochs["odometer_stretch"].fill_null(-1).cast(pl.Int64).to_numpy(),
+        stretch=ints(epochs["odometer_stretch"]),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         white_m2_per_s=np.nan_to_num(white),
     )

@@ -22,12 +22,13 @@ from pipeline.hazards.arrays import (
     linking_gap_s,
     nominal_period_s,
     times_ns,
+    words,
 )
 from pipeline.hazards.slip import repaired_by_doppler
 from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
-from schemas.enums import Evidence
+from schemas.enums import Evidence, PassageStatus
 
 _NAMES = [member.value for member in Evidence]
 
@@ -148,9 +149,8 @@ def _odometer_rung(epochs: pl.DataFrame, passages: pl.DataFrame | None, travel: 
     at_ns = travel.at_ns
     anchors = _initial_anchors(epochs, travel, at_ns, lds.init_s)
     if passages is not None and passages.height:
-        accepted = passages.filter((pl.col("status") == "accepted") & pl.col("t_offered").is_not_null()).sort(
-            "t_offered"
-        )
+        accepted = passages.filter(passages["status"] == PassageStatus.ACCEPTED.value).drop_nulls("t_offered")
+        accepted = accepted.sort("t_offered")
         offered = times_ns(accepted, "t_offered")
         latency = np.interp(offered, times_ns(epochs), times_ns(epochs) - at_ns)
         path = floats(accepted, "path_m")
@@ -188,13 +188,8 @@ def _ladder(t: pl.Series, rungs: list[Rung], travel: Travel) -> pl.DataFrame:
     by_reference = np.where(evidence == _NAMES.index(Evidence.REFERENCE.value), best["path_m"], np.nan)
     distance_m, stretch = travel.joined_with(by_reference)
     columns = {f"truth_{name}": pl.Series(best[name], nan_to_null=True) for name in names}
-    return pl.DataFrame({"t": t, "evidence": _names_of(evidence), **columns}).with_columns(
+    return pl.DataFrame({"t": t, "evidence": words(_NAMES, evidence), **columns}).with_columns(
         truth_travel_m=pl.Series(distance_m, nan_to_null=True),
         truth_stretch=pl.Series(stretch),
         truth_smoothed=pl.Series(smoothed),
     )
-
-
-def _names_of(codes: Ints) -> pl.Series:
-    """Kinds of evidence by their number; -1 is none."""
-    return pl.Series(_NAMES, dtype=pl.Enum(_NAMES)).gather(pl.Series(codes).replace(-1, None))
