@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,12 @@ class Shape:
     interpolation_error_m: Floats
     survey_sigma_m: Floats
 
+    @cached_property
+    def direction(self) -> tuple[Floats, Floats]:
+        """East and north part of the track's direction."""
+        heading = np.radians(self.heading_deg)
+        return np.sin(heading), np.cos(heading)
+
 
 def epoch_frame(
     fixes: Fixes,
@@ -64,7 +71,7 @@ def epoch_frame(
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
     shape = shape_at(path, found.leg, places.path_m)
     on_track = fixes.valid & (np.nan_to_num(places.distance_m, nan=np.inf) <= config.reach_m)
-    sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape.heading_deg)
+    sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
     source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
     columns: dict[str, npt.NDArray[Any] | pl.Series] = {
         "leg": pl.Series(found.leg, dtype=pl.Int32),
@@ -113,9 +120,9 @@ def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
     return shape
 
 
-def track_sigmas_m(fixes: Fixes, heading_deg: Floats) -> tuple[Floats, Floats]:
+def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
     """The horizontal covariance turned into the track's frame: sigma along and across [m]."""
-    sin, cos = np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))
+    sin, cos = shape.direction
     ee, en, nn = fixes.cov_ee_m2, fixes.cov_en_m2, fixes.cov_nn_m2
     along = sin * sin * ee + 2.0 * sin * cos * en + cos * cos * nn
     cross = cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn
@@ -124,8 +131,8 @@ def track_sigmas_m(fixes: Fixes, heading_deg: Floats) -> tuple[Floats, Floats]:
 
 def velocity_along_mps(fixes: Fixes, shape: Shape) -> Floats:
     """GNSS velocity along growing path, on the slope where the track has one."""
-    heading = np.radians(shape.heading_deg)
-    level = fixes.vel_e_mps * np.sin(heading) + fixes.vel_n_mps * np.cos(heading)
+    east, north = shape.direction
+    level = fixes.vel_e_mps * east + fixes.vel_n_mps * north
     return np.asarray(level * np.sqrt(1.0 + np.nan_to_num(shape.slope) ** 2))
 
 

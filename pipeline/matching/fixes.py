@@ -98,8 +98,7 @@ def _floats(frame: pl.DataFrame, name: str) -> Floats:
     """A column with null as NaN; an optional column that is absent is not known."""
     if name not in frame.columns:
         return np.full(frame.height, np.nan)
-    values = frame[name]
-    return values.fill_null(float("nan")).to_numpy() if values.null_count() else values.to_numpy()
+    return frame[name].cast(pl.Float64).to_numpy()
 
 
 def _kinds(fix: pl.Series) -> Ints:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -135,11 +136,12 @@ class TravelledPath:
         name it).
         """
         rows: dict[tuple[int, str, float], tuple[object, ...]] = {}
-        if balises is not None:
-            groups = balises.partition_by("netelement_id", as_dict=True, maintain_order=True)
-            for number, leg in enumerate(self.legs):
-                for row in _balises_on(self.track, number, leg, groups):
-                    rows.setdefault((number, str(row[1]), round(float(str(row[5])), 3)), row)
+        groups: dict[str, list[dict[str, Any]]] = {}
+        for balise in () if balises is None else balises.iter_rows(named=True):
+            groups.setdefault(balise["netelement_id"], []).append(balise)
+        for number, leg in enumerate(self.legs):
+            for row in _balises_on(self.track, number, leg, groups):
+                rows.setdefault((number, str(row[1]), round(float(str(row[5])), 3)), row)
         frame = pl.DataFrame(list(rows.values()), schema=BALISE_COLUMNS, orient="row")
         return frame.sort("leg", "path_m", "balise_id")
 
@@ -151,18 +153,17 @@ class TravelledPath:
 
 
 def _balises_on(
-    track: Track, number: int, leg: Leg, groups: dict[tuple[object, ...], pl.DataFrame]
+    track: Track, number: int, leg: Leg, groups: dict[str, list[dict[str, Any]]]
 ) -> list[tuple[object, ...]]:
     rows: list[tuple[object, ...]] = []
     for index, visit in enumerate(leg.visits):
         name = track.ids[visit.element]
-        group = groups.get((name,))
-        if group is None:
+        if name not in groups:
             continue
         measures = track.measure_m[track.vertices(visit.element)]
         origin = float(measures[0] if visit.forward else measures[-1])
         start = leg.entry_m(index)
-        for row in group.iter_rows(named=True):
+        for row in groups[name]:
             if not measures[0] - MEASURE_TOLERANCE_M <= row["measure_m"] <= measures[-1] + MEASURE_TOLERANCE_M:
                 continue
             path_m = start + abs(row["measure_m"] - origin)
