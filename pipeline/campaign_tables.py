@@ -24,27 +24,26 @@ _RUN = ["run_id", "solution"]
 
 def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
     """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
+    known_h = pl.col("evidence_s").fill_null(0.0) / 3600.0
+    counted = ("faults", "failures", "missed", *(f"within_{level}" for level in safety.service_levels))
     joined = (
         runs.drop("failures")
         .join(_faults_per_run(hazards, safety), on=_RUN, how="left", maintain_order="left")
         .with_columns(
-            pl.col("faults", "failures", "missed", *(f"within_{level}" for level in safety.service_levels)).fill_null(
-                0
-            ),
+            pl.col(counted).fill_null(0),
             hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
+            hours_seen=pl.when(pl.col("evidence").is_not_null()).then(known_h).otherwise(0.0),
         )
     )
-    known_h = pl.col("evidence_s").fill_null(0.0) / 3600.0
-    seen = pl.when(pl.col("evidence").is_not_null()).then(known_h).otherwise(0.0)
-    table = joined.with_columns(hours_seen=seen).pipe(
-        _with_estimates,
+    table = _with_estimates(
+        joined,
         ("hazard_rate", "_per_h", poisson_rate, "faults", "hours_seen"),
         ("missed_share", "", clopper_pearson, "missed", "failures"),
         ("unsafe_share", "", clopper_pearson, "unsafe_accepted", "balises_accepted"),
         ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
     )
-    for level in safety.service_levels:
-        table = table.with_columns(_verdict(level, safety.allowed_time_to_detect_s(level)))
+    levels = [(level, safety.allowed_time_to_detect_s(level)) for level in safety.service_levels]
+    table = table.with_columns(column for level, allowed_s in levels for column in _verdict(level, allowed_s))
     return conform(table.sort(_RUN), campaign_runs_schema(safety.service_levels))
 
 
@@ -114,8 +113,7 @@ def _with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
     """Columns `name, name_low, name_high` from events and what they are held against, row by row."""
     series = []
     for name, ending, estimate, events, against in estimates:
-        pairs = frame.select(events, against).iter_rows()
-        found = [estimate(*pair) for pair in pairs]
+        found = list(map(estimate, frame[events].to_list(), frame[against].to_list()))
         for part, values in (
             ("", [item.value for item in found]),
             ("_low", [item.low for item in found]),
@@ -196,11 +194,12 @@ def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataF
         & (pl.col("status") == PassageStatus.ACCEPTED)
         & pl.col("location_error_m").is_not_null()
     )
+    values = ("solution", "status", "location_error_m", "location_accuracy_m")
     groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
-    parts = [
-        _accuracy(accepted.with_columns(grouped_by=pl.lit(name), group=group), config) for name, group in groups.items()
-    ]
-    return conform(pl.concat(parts), CampaignAccuracy)
+    grouped = accepted.select(*values, **groups).unpivot(
+        list(groups), index=values, variable_name="grouped_by", value_name="group"
+    )
+    return conform(_accuracy(grouped, config), CampaignAccuracy)
 
 
 def _speed_band() -> pl.Expr:
@@ -212,7 +211,7 @@ def _speed_band() -> pl.Expr:
 
 
 def _accuracy(accepted: pl.DataFrame, config: Configuration) -> pl.DataFrame:
-    keys = ["solution", "grouped_by", "group"]
+    keys = ["grouped_by", "solution", "group"]
     size, own_m, limit_m = pl.col("location_error_m").abs(), pl.col("location_accuracy_m"), config.lds.ci_limit_m
     counted = (
         accepted.group_by(keys, maintain_order=True)
@@ -227,9 +226,8 @@ def _accuracy(accepted: pl.DataFrame, config: Configuration) -> pl.DataFrame:
         )
         .with_columns(ci_limit_m=pl.lit(limit_m))
     )
-    table = _with_estimates(
-        counted,
+    return _with_estimates(
+        counted.sort(keys),
         ("within_location_accuracy_share", "", clopper_pearson, "within_location_accuracy", "accepted_judged"),
         ("within_ci_limit_share", "", clopper_pearson, "within_ci_limit", "accepted_judged"),
     )
-    return table.select(list(CampaignAccuracy.columns())).sort(keys)

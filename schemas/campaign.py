@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 
 import dataframely as dy
 
@@ -40,6 +41,11 @@ def _level_columns(level: str) -> dict[str, dy.Column]:
 
 def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
     """Contract of `campaign/runs.parquet`; the service levels are those of the configuration."""
+    return _campaign_runs_schema(tuple(levels))
+
+
+@lru_cache(maxsize=8)
+def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
     columns |= _estimate("hazard_rate", "faults per hour", "1/h", "_per_h")
     columns |= _estimate("missed_share", "share of failures not negated within the budget")

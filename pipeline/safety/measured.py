@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from typing import Any
+
 import dataframely as dy
 import polars as pl
 
@@ -22,6 +25,8 @@ from schemas.enums import Evidence, RunStatus
 
 Row = dict[str, object]
 
+_SHARES = ("share_p0", "share_p1", "share_p2", "share_p3")
+
 TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
 
 
@@ -38,73 +43,70 @@ def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyCo
     substantiated by hours with a truth only (reference or balises): what the odometer alone lets see
     has to exceed its confidence first.
     """
-    failed = runs.filter(pl.col("status") == RunStatus.FAILED).height
     done = runs.filter(pl.col("status") != RunStatus.FAILED)
     episodes = independent_episodes(hazards)
+    parts = done.partition_by("solution", as_dict=True)
     rows = [
-        {"solution": solution, "runs_failed": failed}
-        | _figures(part, episodes.filter(pl.col("solution") == solution), config.thr_vb_per_h)
-        for (solution,), part in sorted(done.group_by("solution"), key=lambda item: str(item[0][0]))
+        {"solution": solution, "runs_failed": runs.height - done.height}
+        | _figures(parts[(solution,)], episodes.filter(pl.col("solution") == solution), config.thr_vb_per_h)
+        for (solution,) in sorted(parts)
     ]
     return _table(rows, CampaignFigures)
 
 
-def _hours(runs: pl.DataFrame, column: str = "duration_s") -> float:
-    return float(runs[column].fill_null(0.0).sum()) / 3600.0
+def _sums() -> Iterator[pl.Expr]:
+    """What is added up over the runs of one solution; times in seconds."""
+    evidence, evidence_s = pl.col("evidence"), pl.col("evidence_s").fill_null(0.0)
+    judged = pl.col("false_alarm_rate_per_h").is_not_null()
+    yield pl.col("duration_s").fill_null(0.0).sum()
+    yield evidence_s.filter(evidence.is_not_null()).sum().alias("seen_s")
+    yield evidence_s.filter(evidence.is_in(TRUTH)).sum().alias("truth_s")
+    yield pl.col("judged_s").fill_null(0.0).filter(judged).sum()
+    yield pl.col("false_alarms").filter(judged).sum()
+    yield pl.col("balises_accepted", "unsafe_accepted", "outages", "trusted_s", "trusted_losses").sum()
+    for name in _SHARES:
+        known = pl.col(name).is_not_null() & (pl.col("held_s") > 0)
+        yield pl.col("held_s").filter(known).sum().alias(f"{name}_of_s")
+        yield (pl.col(name) * pl.col("held_s")).filter(known).sum().alias(f"{name}_s")
+    yield pl.col(f"stanford_{kind}" for kind in STANFORD).sum()
+    for kind in STANFORD:  # null where no run has a protection level
+        counts = pl.col(f"stanford_hpl_{kind}")
+        yield pl.when(counts.count() > 0).then(counts.sum())
 
 
-def _shares(runs: pl.DataFrame) -> Row:
+def _shares(sums: Mapping[str, Any]) -> Row:
     """Shares of the time in P0 to P3 over the runs; P0 and P1 where the runs know them, P2 and P3 of all."""
-    row: Row = {}
-    for name in ("share_p0", "share_p1", "share_p2", "share_p3"):
-        known = runs.filter(pl.col(name).is_not_null() & (pl.col("held_s") > 0))
-        held_s = float(known["held_s"].sum())
-        row[name] = min(1.0, float((known[name] * known["held_s"]).sum()) / held_s) if held_s else None
-    return row
-
-
-def _stanford(runs: pl.DataFrame) -> Row:
-    """Counts of the along-track Stanford diagram, by confidence and, where there is one, by the receiver's HPL."""
-    row: Row = {f"stanford_{kind}": int(runs[f"stanford_{kind}"].sum()) for kind in STANFORD}
-    for kind in STANFORD:
-        counts = runs[f"stanford_hpl_{kind}"]
-        row[f"stanford_hpl_{kind}"] = int(counts.sum()) if counts.count() else None
-    return row
+    known_s = {name: sums[f"{name}_of_s"] for name in _SHARES}
+    return {name: min(1.0, sums[f"{name}_s"] / held_s) if held_s else None for name, held_s in known_s.items()}
 
 
 def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
-    seen = _hours(runs.filter(pl.col("evidence").is_not_null()), "evidence_s")
-    judged = runs.filter(pl.col("false_alarm_rate_per_h").is_not_null())
-    hours = _hours(runs.filter(pl.col("evidence").is_in(TRUTH)), "evidence_s")
-    hours_judged = _hours(judged, "judged_s")
+    sums = runs.select(_sums()).row(0, named=True)
+    hours, seen, truth, judged = (sums[f"{name}_s"] / 3600.0 for name in ("duration", "seen", "truth", "judged"))
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
-    false_alarms, outages = int(judged["false_alarms"].sum()), int(runs["outages"].sum())
-    losses = int(runs["trusted_losses"].sum())
+    same = ("unsafe_accepted", "outages", "trusted_losses", "false_alarms")
     return {
+        **{name: sums[name] for name in same},
         "runs": runs.height,
-        "hours": _hours(runs),
+        "hours": hours,
         "hours_with_evidence": seen,
-        "hours_with_truth": hours,
+        "hours_with_truth": truth,
         "hazards": episodes.height,
         **columns_of("hazard_rate", poisson_rate(episodes.height, seen), "_per_h"),
         "failures": failures,
         "missed": missed,
         **columns_of("missed_share", clopper_pearson(missed, failures)),
-        "missed_rate_upper_per_h": poisson_rate_upper(missed, hours),
-        "hours_judged": hours_judged,
-        "false_alarms": false_alarms,
-        **columns_of("false_alarm_rate", poisson_rate(false_alarms, hours_judged), "_per_h"),
-        "accepted": int(runs["balises_accepted"].sum()),
-        "unsafe_accepted": int(runs["unsafe_accepted"].sum()),
-        "outages": outages,
-        **columns_of("outage_rate", poisson_rate(outages, _hours(runs)), "_per_h"),
-        "trusted_losses": losses,
-        **continuity_columns(Uptime(float(runs["trusted_s"].sum()), losses)),
-        **_shares(runs),
-        **_stanford(runs),
+        "missed_rate_upper_per_h": poisson_rate_upper(missed, truth),
+        "hours_judged": judged,
+        **columns_of("false_alarm_rate", poisson_rate(sums["false_alarms"], judged), "_per_h"),
+        "accepted": sums["balises_accepted"],
+        **columns_of("outage_rate", poisson_rate(sums["outages"], hours), "_per_h"),
+        **continuity_columns(Uptime(sums["trusted_s"], sums["trusted_losses"])),
+        **_shares(sums),
+        **{name: count for name, count in sums.items() if name.startswith("stanford_")},
         "thr_vb_per_h": thr_vb_per_h,
         "hours_needed": hours_to_substantiate(thr_vb_per_h, missed),
-        "hours_still_needed": hours_still_needed(thr_vb_per_h, missed, hours),
+        "hours_still_needed": hours_still_needed(thr_vb_per_h, missed, truth),
     }
 
 
@@ -115,14 +117,30 @@ def detection_by_level(hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFr
     the quantiles leave out what was never negated or detected, which is counted beside them.
     """
     episodes = independent_episodes(hazards)
-    solutions = sorted(episodes["solution"].unique().to_list())
-    rows = [
-        {"solution": solution, "service_level": level}
-        | _against(episodes.filter(pl.col("solution") == solution), config.allowed_time_to_detect_s(level))
-        for solution in solutions
-        for level in config.service_levels
-    ]
+    parts = episodes.partition_by("solution", as_dict=True)
+    rows = [row for (solution,) in sorted(parts) for row in _by_level(parts[(solution,)], str(solution), config)]
     return _table(rows, CampaignDetection)
+
+
+def _by_level(episodes: pl.DataFrame, solution: str, config: SafetyConfig) -> list[Row]:
+    hazardous_s = episodes["hazardous_s"].filter(episodes["failed"])
+    same = {
+        "solution": solution,
+        "failures": hazardous_s.len(),
+        "never_negated": hazardous_s.null_count(),
+        **_quantiles(hazardous_s, "hazardous"),
+        "detected": episodes["time_to_detect_s"].count(),
+        **_quantiles(episodes["time_to_detect_s"], "time_to_detect"),
+    }
+    return [
+        same | _against(hazardous_s, level, config.allowed_time_to_detect_s(level)) for level in config.service_levels
+    ]
+
+
+def _against(hazardous_s: pl.Series, level: str, allowed_s: float) -> Row:
+    within = int((hazardous_s <= allowed_s).sum())
+    share = columns_of("within_share", clopper_pearson(within, hazardous_s.len()))
+    return {"service_level": level, "allowed_s": allowed_s, "within": within, **share}
 
 
 def _quantiles(values: pl.Series, name: str) -> Row:
@@ -131,21 +149,6 @@ def _quantiles(values: pl.Series, name: str) -> Row:
         f"{name}_median_s": known.median(),
         f"{name}_p95_s": known.quantile(0.95, interpolation="linear"),
         f"{name}_max_s": known.max(),
-    }
-
-
-def _against(episodes: pl.DataFrame, allowed_s: float) -> Row:
-    failures = episodes.filter(pl.col("failed"))
-    within = failures.filter(pl.col("hazardous_s") <= allowed_s).height
-    return {
-        "allowed_s": allowed_s,
-        "failures": failures.height,
-        "within": within,
-        **columns_of("within_share", clopper_pearson(within, failures.height)),
-        "never_negated": failures["hazardous_s"].null_count(),
-        **_quantiles(failures["hazardous_s"], "hazardous"),
-        "detected": episodes["time_to_detect_s"].count(),
-        **_quantiles(episodes["time_to_detect_s"], "time_to_detect"),
     }
 
 
