@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from itertools import pairwise
 
 import numpy as np
 
-from pipeline.increments import EpochArrays, Learned, along_series, odometer_steps
+from pipeline.increments import EpochArrays, Index, Learned, along_series, odometer_steps
 from pipeline.monitors.axis import AxisSeries, run_axis
-from pipeline.monitors.recursion import AxisState
+from pipeline.monitors.recursion import Array, AxisState
 from pipeline.odometer import OdometerTrack
 from pipeline.odometer_filter import (
     SPEED_SPAN_S,
@@ -65,9 +66,9 @@ class _Learner:
         self._t_s, self._path_m, self._sigma_m = (
             values[self._rows] for values in (arrays.t_s, arrays.path_m, arrays.sigma_m)
         )
-        # What a single update reads is looked up in lists, which is several times faster than in arrays.
+        self._stretch = track.stretch_at(self._t_s)
+        # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
-        self._stretches: list[int] = track.stretch_at(self._t_s).tolist()
         self._scale_known = vehicle.odometer_scale is not None
         self._latency_known = vehicle.gnss_latency_s is not None
 
@@ -80,70 +81,76 @@ class _Learner:
             prior.latency_s,
             0.0 if self._latency_known else prior.latency_sigma_s,
         )
-        state, position = self._start(prior), 0
+        state, position = self._filter.start(prior, *self._observation(0)), 0
         while position < self._rows.size:
             state, alarm = self._learn_until_alarm(state, position)
             if alarm >= self._rows.size:
                 break
             position = self._hold(state.estimate(), alarm)
             if position < self._rows.size:
-                state = self._filter.restart(state, *self._observation(position)[:2])
+                state = self._filter.restart(state, *self._observation(position))
 
-    def _observation(self, position: int) -> tuple[float, float, float]:
-        """Time [s], GNSS path position and sigma [m] at a position."""
-        return float(self._t_s[position]), float(self._path_m[position]), float(self._sigma_m[position])
-
-    def _start(self, prior: Estimate) -> FilterState:
-        t_s, path_m, _ = self._observation(0)
-        return self._filter.start(prior, t_s, path_m)
+    def _observation(self, position: int) -> tuple[float, float]:
+        """Time [s] and GNSS path position [m] at a position."""
+        return float(self._t_s[position]), float(self._path_m[position])
 
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
         bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
-        history = [(begin, state)]
+        use_from, joints = np.array([begin]), state.joint[None]
         position, block = begin, _FIRST_BLOCK
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
-            current = max(index for index, (effective, _) in enumerate(history) if effective <= position)
-            history = history[current:] + self._updates(history[-1][1], position, end)
-            self._put(history, position)
+            current = _in_use(use_from, position)
+            state, new_from, new_joints = self._updates(state, position, end)
+            use_from = np.concatenate([use_from[current:], new_from])
+            joints = np.concatenate([joints[current:], new_joints])
+            self._put(np.maximum(use_from, position), joints)
             series = self._series(position, end, begin)
             result, bank = run_axis(series, self._alphas, bank)
             beyond = ~(np.abs(result.value) <= self._factor * result.sigma)  # what cannot be compared is no pass
             failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
             if failing.size:
                 alarm = position + int(failing[0])
-                in_use = [item for effective, item in history if effective <= alarm][-1]
-                self._put([(alarm, in_use)], alarm)
-                return in_use, alarm
+                held = joints[_in_use(use_from, alarm)]
+                self._put(np.array([alarm]), held[None])
+                return state._replace(joint=held), alarm
             position, block = end, min(2 * block, _BLOCK)
-        return history[-1][1], position
+        return state, position
 
-    def _updates(self, state: FilterState, begin: int, end: int) -> list[tuple[int, FilterState]]:
-        """States of the filter's updates in these positions, each with the position from which it may be used."""
+    def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Index, Array]:
+        """The filter's last state in these positions; from where each of its states may be used; the joint states."""
+        due = self._due(state.t_s, begin, end)
+        before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
+        lost = self._stretch[before] != self._stretch[due]
+        broken = lost | (self._t_s[due] - self._t_s[before] > self._config.align.gap_reset_s)
+        joints = np.empty((due.size, *state.joint.shape))
+        for first, last in pairwise((0, *np.flatnonzero(broken).tolist(), due.size)):
+            if first == last:
+                continue
+            if broken[first]:
+                state = self._filter.restart(state, *self._observation(due[first]))
+            part = due[first:last]
+            observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
+            joints[first:last] = self._filter.run(state, *observed, self._arrays.jitter_s)
+            state = state._replace(joint=joints[last - 1], t_s=float(self._t_s[part[-1]]))
+        use_from = np.searchsorted(self._t_s, self._t_s[due] + SPEED_SPAN_S)
+        return state, np.maximum(use_from, due + 1), joints
+
+    def _due(self, last_s: float, begin: int, end: int) -> Index:
+        """Positions of the updates: the first a filter period after the last one, and so on."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
-        states: list[tuple[int, FilterState]] = []
-        before = self._next(state.t_s, 0)
-        position = self._next(state.t_s + period_s, begin)
+        due: list[int] = []
+        position = self._next(last_s + period_s, begin)
         while position < end:
-            t_s, path_m, sigma_m = self._observation(position)
-            if self._broken(before, position):
-                state = self._filter.restart(state, t_s, path_m)
-            state = self._filter.update(state, t_s, path_m, sigma_m, self._arrays.jitter_s)
-            states.append((self._next(t_s + SPEED_SPAN_S, position + 1), state))
-            before, position = position, self._next(t_s + period_s, position + 1)
-        return states
+            due.append(position)
+            position = self._next(self._times[position] + period_s, position + 1)
+        return np.array(due, dtype=np.int64)
 
-    def _put(self, history: list[tuple[int, FilterState]], begin: int) -> None:
-        """Fill the estimates in use from position `begin` on, where the first of these is in use."""
-        effective = np.array([position for position, _ in history])
+    def _put(self, use_from: Index, joints: Array) -> None:
+        """Fill the estimates in use, each from its position on."""
         epochs = np.append(self._rows, self._learned.scale.size)  # a position past the last is past all epochs
-        self._learned.put(epochs[np.maximum(effective, begin)], estimates_of([state for _, state in history]))
-
-    def _broken(self, before: int, now: int) -> bool:
-        """Whether the odometer's distance was lost, or too much time passed, between two positions."""
-        lost = self._stretches[before] != self._stretches[now]
-        return lost or self._times[now] - self._times[before] > self._config.align.gap_reset_s
+        self._learned.put(epochs[use_from], estimates_of(joints))
 
     def _next(self, t_s: float, at_least: int) -> int:
         """First position at or after this time, and not before `at_least`."""
@@ -180,3 +187,8 @@ class _Learner:
         may_return = self._factor * spread <= config.hazards.failure_limit_m
         back = np.flatnonzero(quiet & near & may_return)
         return begin + int(back[0]) if back.size else self._rows.size
+
+
+def _in_use(use_from: Index, position: int) -> int:
+    """Index of the last state that may be used at a position."""
+    return int(np.searchsorted(use_from, position, side="right")) - 1

@@ -51,14 +51,13 @@ class FilterState(NamedTuple):
     origin_m: float
 
     def estimate(self) -> Estimate:
-        ((scale, scale_sigma, latency_s, latency_sigma_s),) = estimates_of([self]).tolist()
+        ((scale, scale_sigma, latency_s, latency_sigma_s),) = estimates_of(self.joint[None]).tolist()
         return Estimate(scale, scale_sigma, latency_s, latency_sigma_s)
 
 
-def estimates_of(states: list[FilterState]) -> Array:
-    """Scale, its standard deviation, latency and its standard deviation [s] of each state, shape (states, 4)."""
-    joint = np.array([state.joint for state in states])
-    means, deviations = joint[:, :, -1], np.sqrt(np.diagonal(joint, axis1=1, axis2=2))
+def estimates_of(joints: Array) -> Array:
+    """Scale, its deviation, latency and its deviation [s] of joint states (k, states, states + 1); shape (k, 4)."""
+    means, deviations = joints[:, :, -1], np.sqrt(np.diagonal(joints, axis1=1, axis2=2))
     return np.column_stack([1.0 + means[:, _SCALE], deviations[:, _SCALE], means[:, _LATENCY], deviations[:, _LATENCY]])
 
 
@@ -86,40 +85,44 @@ class ScaleLatencyFilter:
         fresh.joint[kept, kept] = state.joint[kept, kept]
         return fresh
 
-    def update(
-        self, state: FilterState, t_s: float, path_m: float, sigma_m: float, jitter_s: float = 0.0
-    ) -> FilterState:
-        """The state after the epoch at `t_s` with GNSS path position, its sigma and the stamps' jitter."""
-        joint = self._predict(state, t_s)
-        scale = 1.0 + joint.item(_SCALE, -1)
-        latency_s = joint.item(_LATENCY, -1)
-        at = t_s - latency_s
-        around = (at - SPEED_SPAN_S, at, at + SPEED_SPAN_S)
+    def run(self, state: FilterState, t_s: Array, path_m: Array, sigma_m: Array, jitter_s: float) -> Array:
+        """The joint state after each of these epochs, shape (epochs, states, states + 1).
+
+        Times [s], GNSS path positions and their sigmas, shapes (epochs,); `jitter_s`: how the stamps scatter.
+        """
+        joints = np.empty((t_s.size, *state.joint.shape))
+        steps_ns = np.rint(np.diff(t_s, prepend=state.t_s) * 1e9).astype(np.int64).tolist()
+        # By how much each state moves the position; what follows from the odometer comes in epoch by epoch.
+        rows = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
+        rows[:, _OFFSET] = 1.0
+        white_m2 = (_WHITE_SHARE * sigma_m**2).tolist()
+        before = state.joint
+        epochs = zip(joints, rows, t_s.tolist(), path_m.tolist(), white_m2, steps_ns, strict=True)
+        for joint, row, now_s, place_m, own_m2, step_ns in epochs:
+            decay, noise = self._transition(step_ns)
+            np.multiply(before, decay, out=joint)
+            joint += noise
+            scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
+            way_m, speed_mps = self._odometer_at(now_s - latency_s, state.origin_m)
+            row[_SCALE], row[_LATENCY] = way_m, -scale * speed_mps
+            # Covariance of the states with what is observed and, as its last, how far the states miss it: all but the
+            # latency, about whose mean the distance was read, and the scale's own way.
+            seen = row.dot(joint)
+            seen[-1] += way_m + scale * speed_mps * latency_s - place_m
+            spread = seen[:-1]
+            variance_m2 = row.dot(spread).item() + own_m2 + (jitter_s * speed_mps) ** 2
+            joint -= (spread / variance_m2)[:, None] * seen
+            before = joint
+        return joints
+
+    def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
+        """Way from the origin [m] and speed [m/s].
+
+        The speed is centred: one from the same odometer noise as the innovation would bias the latency upwards.
+        """
+        around = (at_s - SPEED_SPAN_S, at_s, at_s + SPEED_SPAN_S)
         before, distance, after = np.interp(around, self.track.t_s, self.track.distance_m).tolist()
-        # Centred, as a speed from the same odometer noise as the innovation would bias the latency upwards.
-        speed = (after - before) / (2.0 * SPEED_SPAN_S)
-        way_m = distance - state.origin_m
-        row = self._loads * sigma_m
-        row[:_ERRORS] = 1.0, way_m, -scale * speed
-        # Covariance of the states with what is observed and, as its last, how far the states alone explain it: all
-        # but the latency, about whose mean the distance was read, and the scale's own way.
-        seen = row.dot(joint)
-        seen[-1] += way_m + scale * speed * latency_s - path_m
-        spread = seen[:-1]
-        white = _WHITE_SHARE * sigma_m**2 + (jitter_s * speed) ** 2
-        joint -= (spread / (row.dot(spread).item() + white))[:, None] * seen
-        return FilterState(joint, t_s, state.origin_m)
-
-    @cached_property
-    def _loads(self) -> Array:
-        """By how much of a sigma each state moves the position; zero for offset, scale and latency."""
-        return np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
-
-    def _predict(self, state: FilterState, t_s: float) -> Array:
-        decay, noise = self._transition(round((t_s - state.t_s) * 1e9))
-        joint = state.joint * decay
-        joint += noise
-        return joint
+        return distance - origin_m, (after - before) / (2.0 * SPEED_SPAN_S)
 
     @cached_property
     def _transition(self) -> Callable[[int], tuple[Array, Array]]:
