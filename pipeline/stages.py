@@ -11,7 +11,7 @@ from pipeline.align import align
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes
-from pipeline.hazards import HazardResult, classify, establish_truth
+from pipeline.hazards import HazardResult, classify, establish_truth, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, TravelledPath, match
@@ -121,7 +121,8 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     reference = _reference_on_path(context, found.path, aligned)
     reads = None if telegrams is None else telegrams.drop_nulls("path_m")
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
-    result = classify(solution, monitored, truth, lds.passages, balises, run.faults, found.path.locate, config)
+    passages = with_unoffered(lds.passages, monitored, truth, balises, config.lds, solution)
+    result = classify(solution, monitored, truth, passages, balises, run.faults, found.path.locate, config)
     epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
     results = SolutionResults(
         solution=solution,

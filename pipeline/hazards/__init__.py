@@ -2,5 +2,6 @@
 
 from pipeline.hazards.classify import HazardResult, Locate, classify
 from pipeline.hazards.truth import establish_truth
+from pipeline.hazards.unoffered import with_unoffered
 
-__all__ = ["HazardResult", "Locate", "classify", "establish_truth"]
+__all__ = ["HazardResult", "Locate", "classify", "establish_truth", "with_unoffered"]

@@ -91,6 +91,12 @@ def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFra
     return TruePassings(found, at_ns, x)
 
 
+def legs_of(epochs: pl.DataFrame) -> Ints:
+    """Leg of the path at each epoch, held where the position is not known."""
+    leg = epochs["leg"].cast(pl.Int64).fill_null(strategy="forward").fill_null(strategy="backward").fill_null(-1)
+    return leg.to_numpy()
+
+
 def _changes(x: Floats, here: Bools, places: Floats) -> dict[int, list[int]]:
     """By number of the balise the epochs whose movement passes it."""
     passed = np.searchsorted(places, x, side="right")
