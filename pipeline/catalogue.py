@@ -17,6 +17,7 @@ import polars as pl
 
 from pipeline import storage, store
 from pipeline.ingest.files import Address, is_url, join
+from schemas.conform import dtypes
 from schemas.tables import TABLES
 
 # Not `epochs`: it is no small table, and its files are large enough to be read one by one.
@@ -41,7 +42,7 @@ def scan(out: Address, table: str, runs: Iterable[str]) -> pl.LazyFrame:
 
     The contract's columns are expected, not looked for in each file: a file that has others makes the query fail.
     """
-    contract = {name: column.dtype for name, column in TABLES[table].columns().items()}
+    contract = dtypes(TABLES[table])
     paths = [str(store.table_address(out, table, run)) for run in runs]
     frame = pl.scan_parquet(
         paths,
@@ -60,7 +61,7 @@ def digest(out: Address, table: str) -> str | None:
     files = markers if table == _MARKER else storage.versions(join(out, table), f"{table}.parquet")
     if not markers or files is None:
         return None
-    lines = [f"{name} {column.dtype}\n" for name, column in TABLES[table].columns().items()]
+    lines = [f"{name} {dtype}\n" for name, dtype in dtypes(TABLES[table]).items()]
     lines += [f"{run} {marker} {files.get(run)}\n" for run, marker in sorted(markers.items())]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 

@@ -13,7 +13,7 @@ import polars as pl
 from pipeline import storage
 from pipeline.ingest.files import Address, exists, is_url, join, read_bytes
 from schemas.config import Configuration, Settings, settings_from, to_toml
-from schemas.conform import conform
+from schemas.conform import conform, dtypes
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -78,7 +78,7 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     if table not in TABLES:
         raise UsageError("is no table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
-    schema = {"run_id": pl.String(), **_contract(table)}
+    schema = {"run_id": pl.String(), **dtypes(TABLES[table])}
     if not runs:
         return pl.LazyFrame(schema=schema)
     paths = [table_address(out, table, run) for run in runs]
@@ -100,10 +100,6 @@ def check_tables(out: Address, tables: Iterable[str]) -> None:
             _check_columns(table, run, _schema_of(table, run, Path(table_address(out, table, run))))
 
 
-def _contract(table: str) -> dict[str, pl.DataType]:
-    return {name: column.dtype for name, column in TABLES[table].columns().items()}
-
-
 def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]:
     try:
         return pl.read_parquet_schema(file)
@@ -116,7 +112,7 @@ def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]
 
 
 def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) -> None:
-    expected = _contract(table)
+    expected = dtypes(TABLES[table])
     lost = [name for name in expected if name not in found]
     other = [f"{name} as {found[name]}, not {kind}" for name, kind in expected.items() if found.get(name, kind) != kind]
     if lost or other:

@@ -12,7 +12,7 @@ from pipeline import run_figures as figures
 from pipeline.clean import StreamCounts
 from pipeline.epoch_clock import Clock
 from schemas.config import Configuration
-from schemas.conform import conform
+from schemas.conform import conform, dtypes
 from schemas.enums import (
     Evidence,
     RunStatus,
@@ -97,9 +97,9 @@ def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.Dat
 
 
 def _frame(row: Mapping[str, object]) -> pl.DataFrame:
-    dtypes = {name: column.dtype for name, column in Runs.columns().items()}
-    values = {name: [_known(row.get(name))] for name in dtypes}
-    return conform(pl.DataFrame(values, schema=dtypes), Runs)
+    schema = dtypes(Runs)
+    values = {name: [_known(row.get(name))] for name in schema}
+    return conform(pl.DataFrame(values, schema=schema), Runs)
 
 
 def _known(value: object) -> object:

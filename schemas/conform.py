@@ -43,6 +43,11 @@ def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     return pl.DataFrame([_cast(frame[rule.name], rule.dtype) for rule in _rules(schema)])
 
 
+def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:
+    """The contract's columns in their order, with their dtypes."""
+    return {rule.name: rule.dtype for rule in _rules(schema)}
+
+
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
     return series if series.dtype == dtype else series.cast(dtype)
 

@@ -20,7 +20,7 @@ from pipeline.statistics import (
 from pipeline.timeline import Uptime
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
-from schemas.conform import conform
+from schemas.conform import conform, dtypes
 from schemas.enums import Evidence, RunStatus
 
 Row = dict[str, object]
@@ -31,8 +31,7 @@ TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
 
 
 def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
-    dtypes = {name: column.dtype for name, column in contract.columns().items()}
-    return conform(pl.DataFrame(rows, schema=dtypes), contract)
+    return conform(pl.DataFrame(rows, schema=dtypes(contract)), contract)
 
 
 def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
