@@ -14,7 +14,7 @@ from pipeline.evidence_notes import evidence_notes, return_notes
 from pipeline.hazards import HazardResult, classify, establish_truth, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
-from pipeline.matching import Match, TravelledPath, match
+from pipeline.matching import Match, match
 from pipeline.matching.fixes import contradictory_covariances
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
@@ -118,7 +118,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    reference = _reference_on_path(context, found.path, aligned)
+    reference = _reference_on_path(context, found, aligned)
     reads = None if telegrams is None else telegrams.drop_nulls("path_m")
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
     passages = with_unoffered(lds.passages, monitored, truth, balises, config.lds, solution)
@@ -136,7 +136,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         ingest=run.notes,
         ambiguous_stretches=found.ambiguous.height,
         notes=(
-            *_notes(run, fixes, found, lds),
+            *_notes(run, vehicle, fixes, found, lds),
             *evidence_notes(aligned, truth),
             *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
         ),
@@ -162,7 +162,7 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
     return Alignment(*(aligned[name][-1] for name in names))
 
 
-def _notes(run: RunLog, fixes: pl.DataFrame, found: Match, lds: LdsResult) -> tuple[str, ...]:
+def _notes(run: RunLog, vehicle: Vehicle, fixes: pl.DataFrame, found: Match, lds: LdsResult) -> tuple[str, ...]:
     """What the reader of the `runs` row should know beside its figures."""
     notes = []
     if run.faults is not None and run.faults.height:
@@ -171,6 +171,10 @@ def _notes(run: RunLog, fixes: pl.DataFrame, found: Match, lds: LdsResult) -> tu
         notes.append("the odometer ends before the GNSS")
     if run.odometer is not None and _end_ns(run.odometer) > _end_ns(run.gnss) + 1_000_000_000:
         notes.append("the GNSS ends before the odometer")
+    if run.odometer is not None and _begin_ns(run.gnss) > _begin_ns(run.odometer) + 1_000_000_000:
+        notes.append("the GNSS begins after the odometer")
+    if found.antenna_ahead_m * vehicle.gnss_antenna_ahead_m < 0:
+        notes.append("the odometer falls at first, so the train reverses: the GNSS antenna is taken as behind it")
     contradictory = contradictory_covariances(fixes)
     if contradictory:
         notes.append(f"cov_en_m2 contradicts its variances at {contradictory} epochs and is not used there")
@@ -192,6 +196,10 @@ def _notes(run: RunLog, fixes: pl.DataFrame, found: Match, lds: LdsResult) -> tu
         names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
         notes.append("reads of balises that are not on the path: " + ", ".join(names))
     return tuple(notes)
+
+
+def _begin_ns(stream: pl.DataFrame) -> int:
+    return int(stream["t"].dt.timestamp("ns")[0])
 
 
 def _end_ns(stream: pl.DataFrame) -> int:
@@ -219,7 +227,7 @@ def _single_monitors(
     }
 
 
-def _reference_on_path(context: _Context, path: TravelledPath, aligned: pl.DataFrame) -> pl.DataFrame | None:
+def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -> pl.DataFrame | None:
     """The reference stream as path positions of the balise antenna, as the epochs are.
 
     Where the path comes back to a place, the epochs around say which passage of it is meant.
@@ -228,12 +236,12 @@ def _reference_on_path(context: _Context, path: TravelledPath, aligned: pl.DataF
     if reference is None:
         return None
     leg, near_path_m = places_near(reference["t"], aligned) or (None, None)
-    places = path.project(
+    places = found.path.project(
         reference["latitude_deg"], reference["longitude_deg"], reference["height_m"], leg, near_path_m
     )
     return reference.select(
         "t",
-        pl.Series("path_m", places.path_m - context.vehicle.gnss_antenna_ahead_m, nan_to_null=True),
+        pl.Series("path_m", places.path_m - found.antenna_ahead_m, nan_to_null=True),
         pl.Series("cross_track_m", places.cross_m, nan_to_null=True),
         pl.Series("vertical_m", places.vertical_m - context.vehicle.antenna_height_m, nan_to_null=True),
         "sigma_m",

@@ -19,6 +19,8 @@ from pipeline.matching.network import network_of
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.residuals import biases
 from pipeline.matching.route import network_along, visits_of
+from pipeline.matching.steps import ODOMETER_GAP_S
+from pipeline.odometer import odometer_track, polarity
 from pipeline.track import Track, track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
@@ -27,11 +29,15 @@ from schemas.run import Site
 
 @dataclass(frozen=True)
 class Match:
-    """Epochs on the path, the path, and stretches of doubt."""
+    """Epochs on the path, the path, and stretches of doubt.
+
+    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path.
+    """
 
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
+    antenna_ahead_m: float
 
     @cached_property
     def biases(self) -> pl.DataFrame:
@@ -58,7 +64,25 @@ def match(
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     path, found, ambiguous = _path(arrays, odometer, site, config, balise_reads)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    return Match(epochs, path, ambiguous)
+    if vehicle.gnss_antenna_ahead_m and _begins_reversing(arrays, epochs, odometer, config):
+        vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
+        epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
+    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m)
+
+
+def _begins_reversing(
+    fixes: Fixes, epochs: pl.DataFrame, odometer: pl.DataFrame | None, config: MatchingConfig
+) -> bool:
+    """The odometer falls over the first net movement: the leading end faces against growing path.
+
+    `distance_m` falls when reversing (CONTRACT section 1), and the antenna stays where it is on the train.
+    """
+    if odometer is None or odometer.height < 2:
+        return False
+    track = odometer_track(odometer, gap_s=ODOMETER_GAP_S, sigma_mps=1.0)
+    matched = fixes.valid & epochs["on_track"].to_numpy()
+    path_m = np.where(matched, epochs["path_m"].cast(pl.Float64).to_numpy(), np.nan)
+    return polarity(track, track.seconds(fixes.t_ns), path_m, config.orientation_distance_m) < 0
 
 
 def _path(

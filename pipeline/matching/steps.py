@@ -23,7 +23,7 @@ _ODOMETER_SHARE = 0.05
 _JUMP_SIGMAS = 5.0
 _JUMP_MARGIN_M = 10.0
 # A pause in an odometer of speeds alone that is longer loses the way.
-_ODOMETER_GAP_S = 1.0
+ODOMETER_GAP_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def travelled(fixes: Fixes, odometer: pl.DataFrame | None) -> Travelled:
     """The odometer at the epochs' times."""
     if odometer is None or odometer.height < 2:
         return Travelled(np.full(len(fixes), np.nan), np.zeros(len(fixes), dtype=np.int64))
-    track = odometer_track(odometer, gap_s=_ODOMETER_GAP_S, sigma_mps=1.0)
+    track = odometer_track(odometer, gap_s=ODOMETER_GAP_S, sigma_mps=1.0)
     t_s = track.seconds(fixes.t_ns)
     inside = (t_s >= track.t_s[0]) & (t_s <= track.t_s[-1])
     return Travelled(np.where(inside, track.distance_at(t_s), np.nan), track.stretch_at(t_s))

@@ -314,3 +314,15 @@ def test_the_caller_s_frames_stay_as_they_were() -> None:
     matched(fixes, place)
     assert fixes.equals(before)
     assert place.track.equals(track)
+
+
+def test_the_lever_arm_stays_where_it_is_on_a_train_that_begins_by_reversing() -> None:
+    """The odometer falls: the leading end, and the antenna 30 m towards it, is behind the movement."""
+    x = np.arange(300.0, 421.0, 20.0)
+    vehicle = Vehicle(gnss_antenna_ahead_m=30.0)
+    fixes, place = run(x, np.zeros(x.size)), site(EAST)
+    backward = matched(fixes, place, distance=odometer(300.0 - x), vehicle=vehicle)
+    forward = matched(fixes, place, distance=odometer(x - 300.0), vehicle=vehicle)
+    assert np.allclose(backward.epochs["path_m"], x + 30.0, atol=2e-3)
+    assert np.allclose(forward.epochs["path_m"], x - 30.0, atol=2e-3)
+    assert (backward.antenna_ahead_m, forward.antenna_ahead_m) == (-30.0, 30.0)
