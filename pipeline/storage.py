@@ -221,17 +221,24 @@ def local_copy(address: Address) -> Iterator[Path]:
         yield target
 
 
-def content_digest(path: Path) -> str:
-    """SHA-256 over names and contents of a file, or of the files directly in a folder."""
-    files = sorted(entry for entry in path.iterdir() if entry.is_file()) if path.is_dir() else [path]
-    total = hashlib.sha256()
-    for file in files:
-        digest = hashlib.sha256()
-        with file.open("rb") as stream:
-            while block := stream.read(_BLOCK_BYTES):
-                digest.update(block)
-        total.update(f"{file.name} {digest.hexdigest()}\n".encode())
-    return total.hexdigest()
+def content_digest(path: Path, known: str = "") -> str:
+    """SHA-256 over names and contents of a file, or of the files directly in a folder.
+
+    `known`: the SHA-256 of the file, if it has been read already; of no use for a folder.
+    """
+    if path.is_dir():
+        digests = {file.name: _file_digest(file) for file in sorted(path.iterdir()) if file.is_file()}
+    else:
+        digests = {path.name: known or _file_digest(path)}
+    return hashlib.sha256("".join(f"{name} {digest}\n" for name, digest in digests.items()).encode()).hexdigest()
+
+
+def _file_digest(file: Path) -> str:
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def signature(path: Path) -> tuple[tuple[str, int, int, int], ...]:

@@ -37,11 +37,17 @@ def replay_one(job: RunJob) -> RunOutcome:
         if (known := fetched.known_digest(job, version)) and _is_done(job, known):
             return _earlier(job)
         with _fetched(job, version) as path:
-            before, files_digest = _identity(path)
-            fetched.remember(job, version, files_digest)
-            if _is_done(job, files_digest):
-                return _earlier(job)
-            run = read_run(path, job.config.ingest)
+            before = _signature(path)
+            if job.previous is not None:
+                files_digest = _files_digest(job, path, version)
+                if _is_done(job, files_digest):
+                    return _earlier(job)
+            try:
+                run = read_run(path, job.config.ingest)
+            except Exception:
+                files_digest = files_digest or _files_digest(job, path, version)
+                raise
+            files_digest = files_digest or _files_digest(job, path, version, run.input_digest)
             tables = _replayed(job, run, site)
             if storage.signature(path) != before:
                 raise changed(path)
@@ -120,9 +126,23 @@ def _same_software(job: RunJob) -> None:
         )
 
 
-def _identity(path: Path) -> tuple[tuple[tuple[str, int, int, int], ...], str]:
+def _signature(path: Path) -> tuple[tuple[str, int, int, int], ...]:
+    with _as_input_error(path):
+        return storage.signature(path)
+
+
+def _files_digest(job: RunJob, path: Path, version: str | None, known: str = "") -> str:
+    """What the log holds, kept for the next campaign; `known`: the SHA-256 of a log of one file that was read."""
+    with _as_input_error(path):
+        digest = storage.content_digest(path, known)
+    fetched.remember(job, version, digest)
+    return digest
+
+
+@contextlib.contextmanager
+def _as_input_error(path: Path) -> Iterator[None]:
     try:
-        return storage.signature(path), storage.content_digest(path)
+        yield
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", place=str(path)) from None
 

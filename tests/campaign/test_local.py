@@ -14,11 +14,12 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline import store
+from pipeline import storage, store
 from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
 from pipeline.campaign.outcome import lost
 from pipeline.campaign.progress import LogWatch
 from pipeline.ingest import read_run
+from pipeline.ingest.mcap_writer import write_mcap
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError
@@ -81,6 +82,20 @@ def test_campaign_tables_stand_for_all_complete_runs(small_trial: SmallTrial, un
     balises = pl.read_parquet(undisturbed / "campaign/balises.parquet")
     assert balises["accepted"].sum() == passages.filter(pl.col("status") == "accepted").height
     assert set(balises["balise_id"]) == set(passages["balise_id"])
+
+
+def test_a_log_is_known_by_what_its_files_hold(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """However its digest was come by: of its own before the log was read, while it was read, or after that failed."""
+    good, damaged, folder = tmp_path / "good.mcap", tmp_path / "damaged.mcap", small_trial.paths[0]
+    with good.open("wb") as stream:
+        write_mcap(read_run(folder, IngestConfig()), stream)
+    damaged.write_bytes(b"\x89MCAP0\r\n cut")
+    for path in (good, damaged, folder):
+        plan = plan_of(small_trial, tmp_path / "out", [path])
+        run_campaign(plan, force=True)
+        known = store.completed_runs(tmp_path / "out")[path.stem]["files_digest"]
+        assert known == storage.content_digest(path)
+        assert run_campaign(plan).skipped == 1
 
 
 def test_failed_runs_do_not_stop_the_others(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
