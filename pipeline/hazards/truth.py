@@ -30,6 +30,8 @@ from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 
+# Beyond so many of its sigmas a learned latency is no chance of the noise.
+_PROVEN_SIGMAS = 3.0
 _NAMES = [member.value for member in Evidence]
 
 
@@ -81,7 +83,9 @@ def establish_truth(
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"), counted)
         sigma_m = config.balise_read_sigma_m
         carried = carry(anchors, travel, travel.at_ns, lds, both_ways=True, anchor_sigma_m=sigma_m)
-        rungs.append(_balise_rung(carried, config))
+        # Carried to when the odometer counted; how far the train goes from there to the instant of the position.
+        since_m = np.nan_to_num(floats(epochs, "speed_mps")) * (at_ns - travel.at_ns) / NS_PER_S
+        rungs.append(_balise_rung(carried, since_m, config))
     if config.smoothed_reference:
         rungs.append(_smoothed_rung(epochs, travel, config))
     rungs.append(_odometer_rung(epochs, passages, travel, lds))
@@ -92,10 +96,15 @@ def valid_ns(epochs: pl.DataFrame) -> Ints:
     """Instant that each position is of: its stamp less the latency as it is known in the end.
 
     What was learned on the way has its error in the first minutes; at 40 m/s a tenth of a second is 4 m that
-    would be called the position's.
+    would be called the position's. The same holds in the end of a run that hardly changed its speed, which tells
+    nothing of the latency: stamps are times of validity (CONTRACT section 1), less what the vehicle file says, until
+    the run proves them wrong by three sigma.
     """
-    known = epochs["latency_s"].drop_nulls()
-    latency_s = float(known[-1]) if known.len() else 0.0
+    known = epochs.select("latency_s", "latency_sigma_s").drop_nulls()
+    latency_s = 0.0
+    if known.height:
+        said_s, (learned_s, sigma_s) = float(known["latency_s"][0]), known.row(-1)
+        latency_s = learned_s if abs(learned_s - said_s) > _PROVEN_SIGMAS * sigma_s else said_s
     return times_ns(epochs) - round(latency_s * NS_PER_S)
 
 
@@ -125,7 +134,7 @@ def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
     return Rung(Evidence.REFERENCE, path, sigma, np.zeros(path.size), cross, up)
 
 
-def _balise_rung(carried: Carried, config: HazardConfig) -> Rung:
+def _balise_rung(carried: Carried, since_m: Floats, config: HazardConfig) -> Rung:
     """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard.
 
     Reckoned back from the first read, its whole confidence: a slip on the way would look like an error of GNSS.
@@ -134,7 +143,7 @@ def _balise_rung(carried: Carried, config: HazardConfig) -> Rung:
     sigma = np.hypot(config.balise_read_sigma_m, carried.sigma_m)
     smallest = np.where(carried.backward, carried.confidence_m, np.minimum(3.0 * sigma, carried.confidence_m))
     bound = np.maximum(smallest, carried.mismatch_m)
-    return Rung(Evidence.BALISE, carried.path_m, sigma, bound, nothing, nothing)
+    return Rung(Evidence.BALISE, carried.path_m + since_m, sigma, bound, nothing, nothing)
 
 
 def _smoothed_rung(epochs: pl.DataFrame, travel: Travel, config: HazardConfig) -> Rung:

@@ -108,6 +108,7 @@ class Journey:
             "direction": pl.Series([1 if self.speed_mps > 0 else -1] * size, dtype=pl.Int8),
             "scale_sigma": np.full(size, 1e-4),
             "latency_s": np.zeros(size),
+            "latency_sigma_s": np.full(size, 0.01),
             "velocity_along_mps": pl.Series(
                 np.full(size, self.speed_mps if self.doppler else np.nan), nan_to_null=True
             ),

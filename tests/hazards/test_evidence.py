@@ -192,3 +192,19 @@ def test_errors_are_judged_with_the_latency_that_is_known_in_the_end():
     error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
     assert error.abs().max() == pytest.approx(0.0, abs=1e-6)
     assert error.len() > 1000
+
+
+def test_a_latency_that_the_run_cannot_prove_is_noise():
+    """At constant speed the estimate wanders: 0.15 s, one sigma from nothing, would be 3 m of healthy positions."""
+    journey = Journey(reads=(310.0, 1510.0))
+    wandering = {"latency_s": pl.lit(0.15) * (pl.col("t").rank() / 1201.0), "latency_sigma_s": pl.lit(0.14)}
+    shifted = pl.col("odometer_m") - 20.0 * pl.col("latency_s")  # counted at t - latency
+    epochs = journey.epochs().with_columns(**wandering).with_columns(latency_s=pl.col("latency_s") - 0.15 / 1201.0)
+    epochs = epochs.with_columns(odometer_m=shifted)
+    config = Configuration()
+    for reference in (journey.reference_frame(), None):
+        reads = journey.reads_frame().with_columns(odometer_m=pl.Series(journey.reads))
+        truth = establish_truth(epochs, reference, reads, journey.passages(), config.hazards, config.lds)
+        error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
+        assert error.len() > 1000
+        assert error.abs().max() < 0.01
