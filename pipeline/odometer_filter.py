@@ -27,8 +27,10 @@ _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
 # Receivers show a little noise without memory beside the modelled one; it also keeps the update well conditioned.
 _WHITE_SHARE = 0.01
-# An update reads the odometer up to this long after its epoch, so its result may be used only after that.
-SPEED_SPAN_S = 0.25
+# An update reads the odometer so long before and after its epoch, so its result may be used only after that. A speed over
+# less would have noise that the filter takes for changes of speed, which are what tells the latency: at constant speed it
+# would grow sure of any.
+SPEED_SPAN_S = 2.0
 
 
 class Estimate(NamedTuple):
@@ -118,11 +120,13 @@ class ScaleLatencyFilter:
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
         """Way from the origin [m] and speed [m/s].
 
-        The speed is centred: one from the same odometer noise as the innovation would bias the latency upwards.
+        The speed is centred, but at the ends of the odometer: one from the same odometer noise as the innovation would
+        bias the latency upwards.
         """
-        around = (at_s - SPEED_SPAN_S, at_s, at_s + SPEED_SPAN_S)
-        before, distance, after = np.interp(around, self.track.t_s, self.track.distance_m).tolist()
-        return distance - origin_m, (after - before) / (2.0 * SPEED_SPAN_S)
+        times_s = self.track.t_s
+        begin_s, end_s = max(at_s - SPEED_SPAN_S, times_s.item(0)), min(at_s + SPEED_SPAN_S, times_s.item(-1))
+        before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.track.distance_m).tolist()
+        return distance - origin_m, (after - before) / (end_s - begin_s)
 
     @cached_property
     def _transition(self) -> Callable[[int], tuple[Array, Array]]:

@@ -30,8 +30,8 @@ from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 
-# Beyond so many of its sigmas a learned latency is no chance of the noise.
-_PROVEN_SIGMAS = 3.0
+# A learned latency is no chance of the noise beyond so many of its sigmas, or where the run left only so much of the doubt.
+_PROVEN_SIGMAS, _PROVEN_SHARE = 3.0, 0.5
 _NAMES = [member.value for member in Evidence]
 
 
@@ -97,14 +97,15 @@ def valid_ns(epochs: pl.DataFrame) -> Ints:
 
     What was learned on the way has its error in the first minutes; at 40 m/s a tenth of a second is 4 m that
     would be called the position's. The same holds in the end of a run that hardly changed its speed, which tells
-    nothing of the latency: stamps are times of validity (CONTRACT section 1), less what the vehicle file says, until
-    the run proves them wrong by three sigma.
+    little of the latency: stamps are times of validity (CONTRACT section 1), less what the vehicle file says, until
+    the run proves them wrong by three sigma or has at least halved what was unknown of the latency at its start.
     """
     known = epochs.select("latency_s", "latency_sigma_s").drop_nulls()
     latency_s = 0.0
     if known.height:
-        said_s, (learned_s, sigma_s) = float(known["latency_s"][0]), known.row(-1)
-        latency_s = learned_s if abs(learned_s - said_s) > _PROVEN_SIGMAS * sigma_s else said_s
+        (said_s, unknown_s), (learned_s, sigma_s) = known.row(0), known.row(-1)
+        proven = abs(learned_s - said_s) > _PROVEN_SIGMAS * sigma_s or sigma_s <= _PROVEN_SHARE * unknown_s
+        latency_s = learned_s if proven else said_s
     return times_ns(epochs) - round(latency_s * NS_PER_S)
 
 

@@ -14,7 +14,10 @@ TAUS_S = (360.0, 1800.0, 3600.0, 100.0)
 
 @dataclass(frozen=True)
 class Straight:
-    """A train that starts at 10 s, reaches 40 m/s, slows down once and speeds up again."""
+    """A train that starts at 10 s, reaches 40 m/s, slows down once and speeds up again.
+
+    With `cruise_s` it is under way at 60 m/s when the recording begins, and brakes after that time.
+    """
 
     duration_s: float = 720.0
     period_s: float = 0.1
@@ -24,6 +27,7 @@ class Straight:
     sigma_m: float = 1.0
     odometer_sigma_mps: float = 0.05
     polarity: int = 1
+    cruise_s: float | None = None
 
 
 def gauss_markov(rng, n, period_s, sigma_m):
@@ -36,10 +40,12 @@ def gauss_markov(rng, n, period_s, sigma_m):
     return error
 
 
-def distance(t_s):
+def distance(t_s, cruise_s=None):
     fine = np.arange(0.0, t_s[-1] + 1.0, 0.01)
     speed = np.minimum(0.7 * np.maximum(fine - 10.0, 0.0), 40.0)
     speed -= 8.0 * np.clip((fine - 300.0) / 20.0, 0, 1) - 8.0 * np.clip((fine - 400.0) / 20.0, 0, 1)
+    if cruise_s is not None:
+        speed = np.maximum(60.0 - 0.8 * np.maximum(fine - cruise_s, 0.0), 5.0)
     way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * 0.01)])
     return np.interp(t_s, fine, way)
 
@@ -53,10 +59,10 @@ def run(plan: Straight, seed: int, fault=None):
     rng = np.random.default_rng(seed)
     t_odometer = np.arange(0.0, plan.duration_s + 1.0, plan.odometer_period_s)
     walk = np.cumsum(rng.standard_normal(t_odometer.size)) * plan.odometer_sigma_mps * np.sqrt(plan.odometer_period_s)
-    read = plan.polarity * (distance(t_odometer) / plan.scale + walk)
+    read = plan.polarity * (distance(t_odometer, plan.cruise_s) / plan.scale + walk)
     t_gnss = np.arange(1.0, plan.duration_s, plan.period_s)
     error = gauss_markov(rng, t_gnss.size, plan.period_s, plan.sigma_m)
-    path_m = distance(t_gnss - plan.latency_s) + error
+    path_m = distance(t_gnss - plan.latency_s, plan.cruise_s) + error
     if fault is not None:
         path_m = path_m + fault(t_gnss)
     return epochs_of(t_gnss, path_m, plan.sigma_m), odometer_of(t_odometer, read)

@@ -43,6 +43,21 @@ def test_a_clean_run_without_vehicle_file_raises_no_alarm_and_finds_the_scale(se
     assert abs(latency_s - 0.08) < 4 * latency_sigma_s
 
 
+def test_constant_speed_tells_no_latency_and_the_filter_knows_it():
+    cruising = Straight(duration_s=900.0, latency_s=0.1, cruise_s=2000.0)
+    found = pl.concat(
+        align(*run(cruising, seed), Vehicle(), CONFIG).select("latency_s", "latency_sigma_s")[-1] for seed in range(12)
+    )
+    away = (found["latency_s"] - 0.1) / found["latency_sigma_s"]
+    assert float((away**2).mean() ** 0.5) < 1.5
+    assert found["latency_sigma_s"].min() > 0.5 * CONFIG.align.latency_prior_sigma_s
+
+
+def test_braking_after_a_long_cruise_raises_no_alarm():
+    plan = Straight(duration_s=1900.0, period_s=1.0, latency_s=0.25, cruise_s=1800.0)
+    assert [seed for seed in range(10) if alarms(align(*run(plan, seed), Vehicle(), CONFIG))] == []
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("rate_mps", [0.5, -0.5])
 def test_a_drift_after_five_kilometres_is_detected_before_the_position_failure(seed, rate_mps):

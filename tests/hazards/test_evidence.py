@@ -208,3 +208,19 @@ def test_a_latency_that_the_run_cannot_prove_is_noise():
         error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
         assert error.len() > 1000
         assert error.abs().max() < 0.01
+
+
+@pytest.mark.parametrize(("sigma_s", "error_m"), [(0.06, 0.0), (0.14, 1.6)])
+def test_a_learned_latency_counts_where_the_run_halved_the_doubt(sigma_s, error_m):
+    # Positions are 0.08 s old at 20 m/s, and the run says so with this sigma; 0.2 s were unknown at its start.
+    journey = Journey()
+    known = journey.t_s() > 0.0
+    epochs = journey.epochs().with_columns(
+        path_m=pl.Series(journey.truth_m() - 1.6),
+        latency_s=pl.Series(np.where(known, 0.08, 0.0)),
+        latency_sigma_s=pl.Series(np.where(known, sigma_s, 0.2)),
+    )
+    config = Configuration()
+    truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config.hazards, config.lds)
+    error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
+    assert error.median() == pytest.approx(-error_m, abs=1e-6)
