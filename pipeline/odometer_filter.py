@@ -27,9 +27,9 @@ _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
 # Receivers show a little noise without memory beside the modelled one; it also keeps the update well conditioned.
 _WHITE_SHARE = 0.01
-# An update reads the odometer so long before and after its epoch, so its result may be used only after that. A speed over
-# less would have noise that the filter takes for changes of speed, which are what tells the latency: at constant speed it
-# would grow sure of any.
+# An update reads the odometer so long before and after its epoch, so its result may be used only after that. Changes of
+# speed tell the latency. A speed over less time has noise that would pass for such changes: at constant speed the
+# filter would grow sure of any latency.
 SPEED_SPAN_S = 2.0
 
 

@@ -30,7 +30,7 @@ from pipeline.hazards.travel import Travel, odometer_travel
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 
-# A learned latency is no chance of the noise beyond so many of its sigmas, or where the run left only so much of the doubt.
+# A learned latency is no chance of the noise beyond so many of its sigmas, or where so little of the doubt is left.
 _PROVEN_SIGMAS, _PROVEN_SHARE = 3.0, 0.5
 _NAMES = [member.value for member in Evidence]
 
