@@ -16,6 +16,8 @@ from pipeline.hazards.travel import Travel
 _WINDOWS_S = (2.0, 10.0, 60.0)
 _DOPPLER_SIGMA_MPS = 0.1
 _LEAST_M = 2.0
+# Positions may stray from Doppler's way within a window by as much (DOMAIN section 5: below this they are healthy).
+STRAY_M = 5.0
 # Two-sided Gaussian 1e-7, as of the monitors (DOMAIN section 3).
 _FACTOR = 5.3267
 # Longest step between epochs over which the mean of two velocities stands for the way.
@@ -55,7 +57,21 @@ def _odometer_alone(travel: Travel, position_m: Floats, apart: Floats, window_s:
         found = (np.abs(slipped) > np.maximum(_LEAST_M, _FACTOR * noise)) & (
             np.abs(follows - slipped) < 0.5 * np.abs(slipped)
         )
-    return _covered(begin[found], np.flatnonzero(found), apart.size)
+    ends = np.flatnonzero(found)
+    ends = ends[_keeps_to(position_m - travel.distance_m - total, begin[ends], ends, 0.5 * np.abs(slipped[ends]))]
+    return _covered(begin[ends], ends, apart.size)
+
+
+def _keeps_to(strayed_m: Floats, begins: Ints, ends: Ints, limit_m: Floats) -> Bools:
+    """Windows in which position minus Doppler's way stays together.
+
+    A position that leaps to where the track heads elsewhere is not followed by Doppler along that track, but the sum
+    of the leap and of the wrong velocity comes by any value.
+    """
+    spans = (strayed_m[begin : end + 1] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True))
+    ranges = np.array([np.nanmax(span) - np.nanmin(span) for span in spans])
+    kept: Bools = ranges <= np.maximum(STRAY_M, limit_m)
+    return kept
 
 
 def _covered(begins: Ints, ends: Ints, size: int) -> Bools:

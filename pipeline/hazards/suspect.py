@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
+from pipeline.hazards.slip import STRAY_M
 from schemas.enums import Evidence, Suspect, Verdict
 
 # How far back an alarm's cause may lie: a raw monitor answers at once, the slowest EWMA after minutes.
@@ -203,7 +204,11 @@ def doppler_vote(w: Witnesses, first: int, last: int) -> Suspect | None:
 
 
 def _vote(w: Witnesses, rows: Ints) -> Suspect | None:
-    """The epoch of the largest difference between position and odometer decides."""
+    """The epoch of the largest difference between position and odometer decides.
+
+    A position that left Doppler's way before it by as much was not with Doppler: the velocity along a track that heads
+    elsewhere comes by any sum (see `slip`).
+    """
     dt_s = np.diff(w.t_ns[rows]) / NS_PER_S
     velocity = w.velocity_mps[rows]
     by_doppler = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * dt_s)))
@@ -217,7 +222,8 @@ def _vote(w: Witnesses, rows: Ints) -> Suspect | None:
         return None
     to_position, to_odometer = abs(by_doppler[at] - by_position[at]), abs(by_doppler[at] - by_odometer[at])
     if to_position < 0.5 * apart and to_odometer > to_position:
-        return Suspect.ODOMETER
+        strayed_m = float(np.ptp((by_position - by_doppler)[: at + 1]))
+        return Suspect.ODOMETER if strayed_m <= max(STRAY_M, 0.5 * apart) else Suspect.GNSS
     return Suspect.GNSS if to_odometer < 0.5 * apart else None
 
 

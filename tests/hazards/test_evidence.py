@@ -224,3 +224,23 @@ def test_a_learned_latency_counts_where_the_run_halved_the_doubt(sigma_s, error_
     truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config.hazards, config.lds)
     error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
     assert error.median() == pytest.approx(-error_m, abs=1e-6)
+
+
+def test_doppler_along_a_track_that_heads_elsewhere_hides_no_jump():
+    """700 m back for 70 s, to where the track turns the other way: along it, the velocity says -3 m/s.
+
+    30 s later Doppler's sum has lost 700 m against the odometer too, and by the sum alone it sides with the position.
+    """
+    reads = (150.0, 2350.0)
+    journey = Journey(steps=((31.0, 101.0, -700.0),), doppler=True, accepted=VBS_ACCEPTED, duration_s=130.0)
+    elsewhere = pl.Series("velocity_along_mps", np.where(journey.within(((31.0, 100.9),)), -3.0, 20.0))
+    epochs = journey.epochs().with_columns(elsewhere)
+    config = Configuration()
+    for given in (None, journey.but(reads=reads).reads_frame()):
+        truth = establish_truth(epochs, None, given, journey.passages(), config.hazards, config.lds)
+        error = (epochs["path_m"] - truth["truth_path_m"]).to_numpy()
+        assert np.abs(error - journey.error_m()).max() < 1.0
+        found = classify("primary", epochs, truth, journey.passages(), journey.balises(), None, locate, config).hazards
+        first = found.row(0, named=True)
+        assert (seconds(first["t_hazard"]), first["suspect"]) == (31.0, "gnss")
+        assert first["size_m"] == pytest.approx(-700.0, abs=1.0)
