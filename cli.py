@@ -267,6 +267,8 @@ def calibrate(
         return
     show_table(found.runs, "Scale and latency")
     show_table(found.sigmas, "Sigma of the monitors")
+    if found.vehicle.gnss_latency_s is None:
+        print("\nNo latency in the vehicle file: the runs hardly change their speed, which alone tells it.")
     print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
 
 

@@ -26,6 +26,8 @@ from schemas.run import RunLog, Site
 class Calibration:
     """`vehicle`: the vehicle file; `runs`: scale and latency run by run; `sigmas`: regression by monitor.
 
+    The vehicle has no latency where the runs tell none.
+
     `sigma_intercept_m`, `sigma_slope`: for `[monitors]` of the configuration, from the loudest monitor; None
     where no monitor was evaluated.
     """
@@ -67,7 +69,7 @@ def calibrate(
             expected=f"GNSS of solution `{solution}` on the track, and an odometer, while the speed changes",
             remedy="Calibrate on longer runs that stop and start.",
         )
-    fitted = _vehicle(base, found)
+    fitted = _vehicle(base, found, config.align.latency_prior_sigma_s)
     fits = _monitor_fits(logs, site, fitted, config, solution)
     worst = worst_fit(fits)
     return Calibration(
@@ -107,17 +109,18 @@ def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, 
     return estimate_run(Observations(t_s, path_m, sigma_m), track.oriented(sign), shares, taus_s)
 
 
-def _vehicle(base: Vehicle, found: Sequence[RunEstimate]) -> Vehicle:
+def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
+    """The vehicle with what was measured.
+
+    A latency that the runs leave more uncertain than `latency_unknown_s`, as a replay without vehicle file assumes it,
+    is no measurement: at constant speed nothing tells it. What `base` says of it stays.
+    """
     scale = pooled(np.array([one.scale for one in found]), np.array([one.scale_sigma for one in found]))
     latency = pooled(np.array([one.latency_s for one in found]), np.array([one.latency_sigma_s for one in found]))
-    return base.model_copy(
-        update={
-            "odometer_scale": scale.value,
-            "odometer_scale_sigma": scale.sigma,
-            "gnss_latency_s": latency.value,
-            "gnss_latency_sigma_s": latency.sigma,
-        }
-    )
+    measured = {"odometer_scale": scale.value, "odometer_scale_sigma": scale.sigma}
+    if latency.sigma < latency_unknown_s:
+        measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
+    return base.model_copy(update=measured)
 
 
 def _monitor_fits(

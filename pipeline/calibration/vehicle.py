@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.odometer import OdometerTrack
-from pipeline.odometer_filter import SPEED_SPAN_S
 
 Array = npt.NDArray[np.float64]
 
@@ -29,6 +28,9 @@ _LEAST_POINTS = 20
 # Keeps the covariance well conditioned where epochs repeat.
 _WHITE_SHARE = 0.001
 _ITERATIONS = 4
+# Time before and after an epoch over which its speed is taken. Changes of speed tell the latency; over less time the
+# odometer's noise would pass for such changes, and at constant speed any latency be found, and be sure.
+_SPEED_SPAN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,8 @@ def estimate_run(
 
 def _blocks(seen: Observations, track: OdometerTrack) -> list[Observations]:
     """Thinned observations in pieces of unbroken odometry, each with an offset of its own."""
-    known = track.known_at(seen.t_s) & track.known_at(seen.t_s - 1.0) & track.known_at(seen.t_s - SPEED_SPAN_S)
-    known &= track.known_at(np.minimum(seen.t_s + SPEED_SPAN_S, track.t_s[-1]))
+    begin_s, end_s = _span(seen.t_s, track)
+    known = track.known_at(seen.t_s) & track.known_at(seen.t_s - 1.0) & track.known_at(begin_s) & track.known_at(end_s)
     rows = np.flatnonzero(known & np.isfinite(seen.path_m) & np.isfinite(seen.sigma_m) & (seen.sigma_m > 0))
     rows = rows[_thinned(seen.t_s[rows])]
     pieces: list[Observations] = []
@@ -139,8 +141,14 @@ def _linearised(block: Observations, track: OdometerTrack, estimate: Array) -> t
     at = block.t_s - latency_s
     distance = track.distance_at(at)
     # Centred, as a speed from the odometer noise of the same second would bias the latency.
-    speed = (track.distance_at(at + SPEED_SPAN_S) - track.distance_at(at - SPEED_SPAN_S)) / (2.0 * SPEED_SPAN_S)
+    begin_s, end_s = _span(at, track)
+    speed = (track.distance_at(end_s) - track.distance_at(begin_s)) / (end_s - begin_s)
     return np.column_stack([distance - distance[0], -scale * speed]), block.path_m - scale * distance
+
+
+def _span(t_s: Array, track: OdometerTrack) -> tuple[Array, Array]:
+    """Begin and end of the time over which the speed is taken, within what the odometer recorded."""
+    return np.maximum(t_s - _SPEED_SPAN_S, track.t_s[0]), np.minimum(t_s + _SPEED_SPAN_S, track.t_s[-1])
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,14 @@ def test_truth_lies_within_the_stated_uncertainty() -> None:
     assert all(one.latency_sigma_s < 0.05 and one.scale_sigma < 3e-4 for one in found)
 
 
+def test_constant_speed_tells_no_latency() -> None:
+    for seed in range(6):
+        one = estimate_run(*simulated_run(seed, moving=False), SHARES, TAUS_S)
+        assert one is not None
+        assert one.latency_sigma_s > 0.2
+        assert abs(one.scale - SCALE) < 4.0 * one.scale_sigma
+
+
 def test_start_of_the_search_does_not_matter() -> None:
     seen, track = simulated_run(3)
     one = estimate_run(seen, track, SHARES, TAUS_S)
