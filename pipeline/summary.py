@@ -138,8 +138,8 @@ def _ingest_remarks(ingest: IngestNotes) -> list[str]:
 
 def _extent(epochs: pl.DataFrame, clock: Clock) -> Row:
     return {
-        "t_start": epochs["t"].first(),
-        "t_end": epochs["t"].last(),
+        "t_start": epochs["t"].dt.timestamp("ns").first(),
+        "t_end": epochs["t"].dt.timestamp("ns").last(),
         "duration_s": clock.duration_s,
         "distance_m": _distance_m(epochs),
         "epochs": epochs.height,

@@ -376,6 +376,12 @@ def test_exposure() -> None:
     assert (found["exposure_max_s"], found["exposure_p99_s"]) == (100.0, 99.0)
 
 
+def test_begin_and_end_are_the_epochs_to_the_nanosecond() -> None:
+    frame = epochs(seconds(3)).with_columns(pl.col("t") + pl.duration(nanoseconds=123))
+    found = summarise(results(frame), CONFIG, PROVENANCE)
+    assert found.select("t_start", "t_end").cast(pl.Int64).row(0) == tuple(frame["t"].cast(pl.Int64).gather([0, 2]))
+
+
 @settings(deadline=None, max_examples=30)
 @given(shift=st.integers(-(10**9), 10**9))
 def test_shifting_all_times_changes_nothing_else(shift: int) -> None:
