@@ -174,22 +174,41 @@ def active(fault: FaultSpec, t_s: Floats) -> Bools:
 
 
 def odometer_increments(faults: Sequence[FaultSpec], t_s: Floats, increments_m: Floats) -> Floats:
-    """Odometer increments under slip, slide and scale faults; increment k ends at `t_s[k]`."""
-    step_s = np.diff(t_s, prepend=t_s[0])
+    """Odometer increments under slip, slide and scale faults; increment k ends at `t_s[k]`.
+
+    An increment changes with the share of its time that lies within the fault.
+    """
+    begins_s = np.concatenate([t_s[:1], t_s[:-1]])
+    step_s = t_s - begins_s
     result = increments_m.copy()
     for fault in faults:
         if not fault.hits_odometer or fault.kind not in _ON_ODOMETER:
             continue
-        now = active(fault, t_s)
-        change = (fault.rate_mps or 0.0) * step_s
-        sense = np.where(result < 0.0, -1.0, 1.0)
-        if fault.kind is FaultKind.SCALE:
-            result[now] *= fault.scale or 1.0
-        elif fault.kind is FaultKind.SLIP:
-            result[now] += (sense * change)[now]
-        else:
-            result[now] = (sense * np.maximum(np.abs(result) - change, 0.0))[now]
+        end_s = np.inf if fault.duration_s is None else fault.begins_s() + fault.duration_s
+        within_s = np.maximum(np.minimum(t_s, end_s) - np.maximum(begins_s, fault.begins_s()), 0.0)
+        share = np.divide(within_s, step_s, out=np.zeros_like(step_s), where=step_s > 0.0)
+        result = result * (1.0 - share) + _turned(fault, result * share, within_s)
     return result
+
+
+def odometer_speeds(faults: Sequence[FaultSpec], t_s: Floats, speed_mps: Floats) -> Floats:
+    """Odometer speeds under slip, slide and scale faults."""
+    result = speed_mps.copy()
+    for fault in faults:
+        if fault.hits_odometer and fault.kind in _ON_ODOMETER:
+            result = np.where(active(fault, t_s), _turned(fault, result, np.ones(t_s.size)), result)
+    return result
+
+
+def _turned(fault: FaultSpec, moved: Floats, time_s: Floats) -> Floats:
+    """What the odometer counts where it should count `moved` within these times."""
+    sense = np.where(moved < 0.0, -1.0, 1.0)
+    change = (fault.rate_mps or 0.0) * time_s
+    if fault.kind is FaultKind.SCALE:
+        return moved * (fault.scale or 1.0)
+    if fault.kind is FaultKind.SLIP:
+        return moved + sense * change
+    return sense * np.maximum(np.abs(moved) - change, 0.0)
 
 
 def faults_table(faults: Sequence[FaultSpec], first_ns: int, last_ns: int) -> pl.DataFrame:

@@ -18,6 +18,7 @@ from datasets.faults import (
     active,
     faults_table,
     odometer_increments,
+    odometer_speeds,
     offset_m,
 )
 from datasets.inject_ranges import inject_ranges
@@ -32,8 +33,9 @@ Ints = npt.NDArray[np.int64]
 
 _PLACE = ("latitude_deg", "longitude_deg", "height_m")
 _LATE = (*_PLACE, "vel_e_mps", "vel_n_mps", "vel_u_mps")
-# Positions further apart are not joined by a straight line when a late position is read between them.
-_JOINED_S = 1.5
+# Positions further apart, in seconds and in periods of the log, are not joined by a straight line when a late position
+# is read between them.
+_JOINED = 1.5
 
 
 class FaultFile(Settings):
@@ -156,7 +158,8 @@ def _late(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
     known_s = np.sort(known_s, kind="stable")
     wanted = t_s - (fault.latency_s or 0.0)
     right = np.searchsorted(known_s, wanted, side="left").clip(1, max(known_s.size - 1, 1))
-    lost = now & ((wanted < known_s[0]) | (known_s[right] - known_s[right - 1] > _JOINED_S))
+    joined_s = _JOINED * max(1.0, float(np.median(np.diff(known_s)))) if known_s.size > 1 else _JOINED
+    lost = now & ((wanted < known_s[0]) | (known_s[right] - known_s[right - 1] > joined_s))
     columns = {
         name: np.where(
             now, np.interp(wanted, known_s, known[name].to_numpy().astype(np.float64)), part[name].to_numpy()
@@ -179,18 +182,7 @@ def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
     if rows.size:
         steps = np.diff(distance[rows], prepend=distance[rows[0]])
         distance[rows] = distance[rows[0]] + np.cumsum(odometer_increments([fault], t_s[rows], steps))
-    step_s = np.diff(t_s, prepend=2.0 * t_s[0] - t_s[1] if t_s.size > 1 else 0.0)
-    timed = np.flatnonzero(np.isfinite(speed) & (step_s > 0.0))
-    if timed.size:
-        speed[timed] = _speed_under(fault, t_s[timed], speed[timed])
+    speed = odometer_speeds([fault], t_s, speed)
     return odometer.with_columns(
         distance_m=pl.Series(distance, nan_to_null=True), speed_mps=pl.Series(speed, nan_to_null=True)
     )
-
-
-def _speed_under(fault: FaultSpec, t_s: Floats, speed_mps: Floats) -> Floats:
-    """Speed as increments over one second each, so that slip, slide and scale act on it alike."""
-    seconds = np.arange(t_s.size, dtype=np.float64)
-    now = active(fault, t_s)
-    whole = fault.model_copy(update={"start_s": 0.0, "duration_s": None})
-    return np.where(now, odometer_increments([whole], seconds, speed_mps), speed_mps)

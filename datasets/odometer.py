@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, odometer_increments
+from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, odometer_increments, odometer_speeds
 from datasets.motion import Motion
 from datasets.scenario import OdometerSpec
 from schemas.inputs import Odometer
@@ -55,12 +55,7 @@ def _speed(
 ) -> Floats:
     true = motion.speed_mps(t_s)
     noise = np.where(true != 0.0, spec.speed_sigma_mps * rng.standard_normal(t_s.size), 0.0)
-    step_s = 1.0 / spec.rate_hz
-    steps = (true / spec.scale) * step_s
-    steps[0] = 0.0
-    turned = odometer_increments(faults, t_s, steps) / step_s
-    turned[0] = true[0] / spec.scale
-    return turned + noise
+    return odometer_speeds(faults, t_s, true / spec.scale) + noise
 
 
 def _table(spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, speed_mps: Floats) -> pl.DataFrame:

@@ -10,6 +10,7 @@ from datasets.faults import (
     faults_table,
     in_sector,
     odometer_increments,
+    odometer_speeds,
     offset_m,
     position_effect,
 )
@@ -70,10 +71,10 @@ def test_position_faults_add_up_on_their_axes() -> None:
     ("values", "expected"),
     [
         # 10 m per step of 1 s; slip adds 3 m, slide takes off 4 m, at most all; scale multiplies.
-        ({"kind": "slip", "rate_mps": 3.0, "duration_s": 2.0}, [0, 10, 13, 13, 10, 10, 10, 10]),
-        ({"kind": "slide", "rate_mps": 4.0, "duration_s": 2.0}, [0, 10, 6, 6, 10, 10, 10, 10]),
-        ({"kind": "slide", "rate_mps": 40.0, "duration_s": 2.0}, [0, 10, 0, 0, 10, 10, 10, 10]),
-        ({"kind": "scale", "scale": 1.5, "duration_s": 2.0}, [0, 10, 15, 15, 10, 10, 10, 10]),
+        ({"kind": "slip", "rate_mps": 3.0, "duration_s": 2.0}, [0, 10, 10, 13, 13, 10, 10, 10]),
+        ({"kind": "slide", "rate_mps": 4.0, "duration_s": 2.0}, [0, 10, 10, 6, 6, 10, 10, 10]),
+        ({"kind": "slide", "rate_mps": 40.0, "duration_s": 2.0}, [0, 10, 10, 0, 0, 10, 10, 10]),
+        ({"kind": "scale", "scale": 1.5, "duration_s": 2.0}, [0, 10, 10, 15, 15, 10, 10, 10]),
     ],
 )
 def test_odometer_faults(values: dict[str, object], expected: list[float]) -> None:
@@ -82,6 +83,17 @@ def test_odometer_faults(values: dict[str, object], expected: list[float]) -> No
     backwards = odometer_increments([fault(**values)], SECONDS, -steps)
     assert np.abs(backwards).tolist() == expected
     assert (backwards <= 0.0).all()
+
+
+def test_odometer_faults_between_its_rows() -> None:
+    steps = np.array([0.0, 10, 10, 10, 10, 10, 10, 10])
+    slip = fault(kind="slip", start_s=2.25, duration_s=1.5, rate_mps=4.0)
+    assert odometer_increments([slip], SECONDS, steps).tolist() == [0, 10, 10, 13, 13, 10, 10, 10]
+    scale = fault(kind="scale", start_s=2.25, duration_s=1.5, scale=1.4)
+    assert odometer_increments([scale], SECONDS, steps) == pytest.approx([0, 10, 10, 13, 13, 10, 10, 10])
+    speeds = odometer_speeds([slip], SECONDS, np.full(8, 10.0))
+    assert speeds.tolist() == [10, 10, 10, 14, 10, 10, 10, 10]
+    assert odometer_speeds([slip], SECONDS, np.full(8, -10.0)).tolist() == (-speeds).tolist()
 
 
 def test_sectors_wrap_around_north() -> None:

@@ -162,3 +162,25 @@ def test_fault_files(tmp_path: Path) -> None:
     path.write_text('[[faults]]\nkind = "ramp"\n')
     with pytest.raises(ConfigError, match=r"faults\.0"):
         load_faults(path)
+
+
+def test_late_positions_of_a_slow_log_stay(clean: RunLog) -> None:
+    slow = clean.with_streams(gnss=clean.gnss.filter(pl.col("t").dt.epoch("s") % 2 == 0).unique("t", keep="first"))
+    slow = slow.with_streams(gnss=slow.gnss.filter(pl.col("t").dt.truncate("2s") == pl.col("t")).sort("t"))
+    assert slow.gnss["t"].diff().drop_nulls().dt.total_milliseconds().unique().to_list() == [2000]
+    late = inject(slow, fault(kind="latency", start_s=60.0, duration_s=20.0, latency_s=1.0)).gnss
+    assert late["t"].equals(slow.gnss["t"])
+    assert (late["latitude_deg"] != slow.gnss["latitude_deg"]).sum() == 10
+
+
+def test_slip_counts_from_its_start(clean: RunLog) -> None:
+    assert clean.odometer is not None
+    seconds = clean.odometer.filter(pl.col("t").dt.truncate("1s") == pl.col("t"))
+    run = clean.with_streams(odometer=seconds)
+    first = clean.gnss["t"].min()
+    slipped = inject(run, fault(kind="slip", start_s=60.5, duration_s=2.0, rate_mps=3.0)).odometer
+    assert slipped is not None
+    more = pl.DataFrame(
+        {"s": (seconds["t"] - first).dt.total_seconds(), "m": slipped["distance_m"] - seconds["distance_m"]}
+    )
+    assert more.filter(pl.col("s").is_between(60, 64))["m"].to_list() == pytest.approx([0.0, 1.5, 4.5, 6.0, 6.0])
