@@ -112,13 +112,13 @@ def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, 
 def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
     """The vehicle with what was measured.
 
-    A latency that the runs leave more uncertain than `latency_unknown_s`, as a replay without vehicle file assumes it,
-    is no measurement: at constant speed nothing tells it. What `base` says of it stays.
+    A latency that the runs leave more than half as uncertain as `latency_unknown_s`, with which a replay without a
+    vehicle file begins to learn it, is no measurement: at constant speed nothing tells it. What `base` says stays.
     """
     scale = pooled(np.array([one.scale for one in found]), np.array([one.scale_sigma for one in found]))
     latency = pooled(np.array([one.latency_s for one in found]), np.array([one.latency_sigma_s for one in found]))
     measured = {"odometer_scale": scale.value, "odometer_scale_sigma": scale.sigma}
-    if latency.sigma < latency_unknown_s:
+    if latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
     return base.model_copy(update=measured)
 

@@ -31,6 +31,8 @@ _ITERATIONS = 4
 # Time before and after an epoch over which its speed is taken. Changes of speed tell the latency; over less time the
 # odometer's noise would pass for such changes, and at constant speed any latency be found, and be sure.
 _SPEED_SPAN_S = 2.0
+# Of what a run seems to tell of the latency, at least so much counts: a sigma stays finite.
+_LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def estimate_run(
     if not blocks:
         return None
     covariances = [_covariance(block, track, shares, taus_s) for block in blocks]
+    by_chance = sum(_chance_information(block, c, track) for block, c in zip(blocks, covariances, strict=True))
     estimate = np.array([1.0, latency_s])
     for _ in range(_ITERATIONS):
         normal, right, left_over, freedom = _accumulate(blocks, covariances, track, estimate)
@@ -76,6 +79,7 @@ def estimate_run(
         estimate = estimate + np.linalg.solve(normal, right)
     misfit = float(np.sqrt(max(left_over, 0.0) / max(freedom, 1)))
     sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * max(1.0, misfit)
+    sigma[1] = _widened(float(sigma[1]), estimate[0] ** 2 * by_chance)
     points = sum(block.t_s.size for block in blocks)
     return RunEstimate(float(estimate[0]), float(sigma[0]), float(estimate[1]), float(sigma[1]), misfit, points)
 
@@ -133,6 +137,25 @@ def _accumulate(
     if np.linalg.matrix_rank(normal) == normal.shape[0]:
         left_over -= float(right @ np.linalg.solve(normal, right))
     return normal, right, left_over, freedom
+
+
+def _chance_information(block: Observations, covariance: Array, track: OdometerTrack) -> float:
+    """What the odometer's noise alone, taken for changes of speed, seems to tell of the latency [1/s^2], on average.
+
+    The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second.
+    """
+    span_s = 2.0 * _SPEED_SPAN_S
+    lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
+    noise = track.white_rate_m2_per_s * np.maximum(span_s - lag, 0.0) / span_s**2
+    solved = np.linalg.solve(covariance, np.column_stack([noise, np.ones(block.t_s.size)]))
+    inverse_ones = solved[:, -1]
+    return float(np.trace(solved[:, :-1]) - inverse_ones @ noise @ inverse_ones / inverse_ones.sum())
+
+
+def _widened(sigma_s: float, by_chance: float) -> float:
+    """Sigma of the latency without what chance tells of it; twice its mean, as chance also tells more than that."""
+    told = 1.0 / sigma_s**2
+    return float(1.0 / np.sqrt(max(told - 2.0 * by_chance, _LEAST_SHARE * told)))
 
 
 def _linearised(block: Observations, track: OdometerTrack, estimate: Array) -> tuple[Array, Array]:
