@@ -8,8 +8,12 @@ from schemas.enums import Evidence
 
 _BALISE = (
     "evidence balise: reads carried on by the odometer; unless Doppler velocity sides with the position, a slip or "
-    "slide between two reads hides errors up to its own size, and one after the last read looks like an error of the "
-    "position"
+    "slide between two reads hides errors up to its own size, and one before the first or after the last read looks "
+    "like an error of the position"
+)
+_CONTRADICTED = (
+    "balise reads contradict the odometer between them by up to {slip_m:.0f} m: there, for {share:.0%} of the "
+    "positions, errors and jumps up to that size are neither seen nor excluded"
 )
 _ODOMETER = (
     "evidence odometer: errors within 5 m + 5 % of the way since the last accepted balise are not seen (here up to "
@@ -21,12 +25,12 @@ _DRIFT = "a slow drift of the position and a change of the odometer's scale look
 _NO_DOPPLER = "without GNSS velocity nothing tells a fault of the position from one of the odometer"
 
 
-def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame) -> tuple[str, ...]:
+def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame, failure_limit_m: float) -> tuple[str, ...]:
     """Notes on what stands behind the errors of one solution; none where the reference covers all positions.
 
     `epochs`: matched and aligned; `truth`: from `establish_truth`, row by row.
     """
-    seen = truth.select("evidence", "truth_bound_m", "truth_smoothed")
+    seen = truth.select("evidence", "truth_bound_m", "truth_slip_m", "truth_smoothed")
     seen = seen.filter(epochs["fix_valid"] & epochs["path_m"].is_not_null())
     if seen.is_empty():
         return ()
@@ -37,17 +41,21 @@ def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame) -> tuple[str, ...]
     weak = seen.filter((seen["evidence"] == Evidence.BALISE.value) | (seen["evidence"] == Evidence.ODOMETER.value))
     if weak.height <= 0.01 * seen.height:
         return tuple(notes)
-    notes += _weak_evidence(weak)
+    notes += _weak_evidence(weak, failure_limit_m)
     notes.append(_DRIFT)
     if not epochs["velocity_along_mps"].is_not_null().any():
         notes.append(_NO_DOPPLER)
     return tuple(notes)
 
 
-def _weak_evidence(weak: pl.DataFrame) -> list[str]:
+def _weak_evidence(weak: pl.DataFrame, failure_limit_m: float) -> list[str]:
     by_odometer = weak.filter(pl.col("evidence") == Evidence.ODOMETER.value)
     plain = by_odometer.filter(~pl.col("truth_smoothed"))
     notes = [_BALISE] if (weak["evidence"] == Evidence.BALISE.value).any() else []
+    slips = weak["truth_slip_m"].abs()
+    hiding = slips > failure_limit_m
+    if hiding.any():
+        notes.append(_CONTRADICTED.format(slip_m=slips.max(), share=hiding.mean()))
     if plain.height:
         bound_m = plain.select(pl.col("truth_bound_m").max()).item()
         notes.append(_ODOMETER.format(bound_m=bound_m or 0.0))

@@ -137,7 +137,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         ambiguous_stretches=found.ambiguous.height,
         notes=(
             *_notes(run, vehicle, fixes, found, lds),
-            *evidence_notes(aligned, truth),
+            *evidence_notes(aligned, truth, config.hazards.failure_limit_m),
             *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
         ),
     )

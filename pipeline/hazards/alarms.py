@@ -89,10 +89,11 @@ def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     with np.errstate(invalid="ignore"):
         beyond: Bools = error >= tolerated
         proved = beyond & (error > w.bound_m[part])
+        hidden = (w.slip_m[part] > 0.0) & (error + w.slip_m[part] >= tolerated)
     if proved.any():
         return Verdict.TRUE
     blind = _longest_s(position & ~np.isfinite(error), w.t_ns[part]) > _BLIND_S
-    unknown = beyond.any() or blind or not np.isfinite(error).any() or _left_odometer(w, part, tolerated)
+    unknown = (beyond | hidden).any() or blind or not np.isfinite(error).any() or _left_odometer(w, part, tolerated)
     return Verdict.UNKNOWN if unknown else Verdict.FALSE
 
 

@@ -12,6 +12,8 @@ from schemas.config import LdsConfig
 
 # Two-sided Gaussian 1e-7, as of the monitors (DOMAIN section 3).
 _FACTOR = 5.3267
+# Sigmas of its own noise by which a slip between two anchors may be larger than it shows.
+_WIDENED = 3.0
 
 
 @dataclass(frozen=True)
@@ -44,16 +46,16 @@ class Anchors:
 class Carried:
     """Position by the nearest anchor and the odometer [m]; NaN where no anchor reaches.
 
-    `confidence_m` is the odometer's half-width (SUBSET-041 5.3.1.1), `mismatch_m` by how much two
-    anchors contradict the odometer between them where that is beyond its noise: it slipped, and nobody knows where,
-    so the place between may be wrong by as much. `backward`: before the first anchor, so that
-    nothing but the odometer itself speaks for the way in between.
+    `confidence_m` is the odometer's half-width (SUBSET-041 5.3.1.1), `slip_m` by how much at most it counted too far
+    along growing path between two anchors, 0 where that is within its white noise: nobody knows where it slipped, or
+    whether its scale is wrong, so the place between may be wrong by as much. `backward`: before the first anchor, so
+    that nothing but the odometer itself speaks for the way in between.
     """
 
     path_m: Floats
     sigma_m: Floats
     confidence_m: Floats
-    mismatch_m: Floats
+    slip_m: Floats
     backward: Bools
 
 
@@ -138,16 +140,26 @@ def _between(
     def smaller(a: Floats, b: Floats) -> Floats:
         return np.where(both, np.minimum(a, b), np.where(ahead, a, b))
 
-    difference = np.where(both, np.abs(np.nan_to_num(forward[0]) - np.nan_to_num(backward[0])), 0.0)
-    noise = _FACTOR * np.hypot(np.nan_to_num(forward[1]) + np.nan_to_num(backward[1]), np.sqrt(2.0) * anchor_sigma_m)
-    allowed = np.minimum(noise, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]))
+    difference = np.where(both, np.nan_to_num(forward[0]) - np.nan_to_num(backward[0]), 0.0)
+    noise = np.hypot(np.sqrt(_white_m2(reader, before, travel)), np.sqrt(2.0) * anchor_sigma_m)
+    allowed = np.minimum(_FACTOR * noise, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]))
+    widened = difference + np.sign(difference) * _WIDENED * noise
     return Carried(
         path_m=blend(forward[0], backward[0]),
         sigma_m=smaller(forward[1], backward[1]),
         confidence_m=smaller(forward[2], backward[2]),
-        mismatch_m=np.where(difference > allowed, difference, 0.0),
+        slip_m=np.where(np.abs(difference) > allowed, widened, 0.0),
         backward=behind & ~ahead,
     )
+
+
+def _white_m2(reader: _AnchorReader, before: Ints, travel: Travel) -> Floats:
+    """Variance that the odometer gains from the anchor before each epoch to the one behind [m2]."""
+    if reader.at_ns.size < 2:
+        return np.zeros(before.size)
+    a = np.clip(before, 0, reader.at_ns.size - 2)
+    white: Floats = travel.white_m2_per_s * (reader.at_ns[a + 1] - reader.at_ns[a]) / NS_PER_S
+    return white
 
 
 def _share_of_way(reader: _AnchorReader, before: Ints, travel: Travel) -> Floats:

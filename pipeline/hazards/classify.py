@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from pipeline.hazards.alarms import alarms_table
@@ -28,7 +29,7 @@ from pipeline.hazards.passages import (
 from pipeline.hazards.passing import true_passings
 from pipeline.hazards.rows import Judged, Locate, hazards_table
 from pipeline.hazards.series import Series, series_of
-from pipeline.hazards.states import errors_of, lds_states
+from pipeline.hazards.states import contradicted, errors_of, lds_states
 from pipeline.hazards.suspect import Witnesses, suspect_of_error, witnesses_of
 from pipeline.hazards.timing import Timing, time_hazard
 from schemas.config import Configuration
@@ -126,7 +127,7 @@ def _passages(
     suspicious: Bools = suspicious_passages(passages, spans)
     gap_s = linking_gap_s(series.period_s, config.lds.crossing_gap_s)
     positioned = positions_at(epochs, t_true, gap_s)
-    error = location_errors(passages, epochs, truth, gap_s)
+    error = location_errors(passages, epochs, truth, gap_s, config.hazards.failure_limit_m)
     wrong = wrongly_offered(passages, error, epochs, truth, config.hazards)
     speed = speeds_at(passages, t_true, epochs, gap_s)
     return judge_passages(passages, error, wrong, t_true, links, suspicious, positioned, speed)
@@ -140,7 +141,9 @@ def _epochs(
     spans: list[tuple[int, int]],
     config: Configuration,
 ) -> pl.DataFrame:
-    columns = [pl.Series(f"error_{axis}_m", values, nan_to_null=True) for axis, values in errors.items()]
+    hidden = contradicted(errors["along"], truth, config.hazards.failure_limit_m)
+    told = errors | {"along": np.where(hidden, np.nan, errors["along"])}
+    columns = [pl.Series(f"error_{axis}_m", values, nan_to_null=True) for axis, values in told.items()]
     state = lds_states(epochs, truth, passages, errors["along"], config.hazards, config.lds)
     suspicious = pl.Series("suspect_after_the_fact", flags(epochs, "tvb") & within_spans(times_ns(epochs), spans))
     return pl.DataFrame([*columns, state, suspicious])

@@ -33,13 +33,16 @@ class Jump:
 
 
 def find_jumps(series: Series, beacons: tuple[Beacons, ...], config: HazardConfig) -> list[Jump]:
-    """All jumps in order of time, whether they cross a VB or not."""
+    """All jumps in order of time, whether they cross a VB or not.
+
+    What the reads around prove to be a slip of the odometer (`_slipped`) is none.
+    """
     largest = _largest_step(series, config)
     jumps: list[Jump] = []
     for sign in (1.0, -1.0):
         begins, ends = runs_of(largest * sign > config.jump_limit_m)
         spans = [_span(series, begin, end, sign, config) for begin, end in zip(begins, ends, strict=True)]
-        jumps += [_jump(series, beacons, first, last) for first, last in spans]
+        jumps += [_jump(series, beacons, first, last) for first, last in spans if not _slipped(series, first, last)]
     return sorted(jumps, key=lambda jump: (jump.first, jump.last))
 
 
@@ -75,6 +78,17 @@ def _span(series: Series, begin: int, end: int, sign: float, config: HazardConfi
     increments[~series.linked[start : end + 1]] = 0.0
     part_of_it: Ints = np.flatnonzero(increments >= _SHARE_OF_LARGEST * increments.max())
     return start + int(part_of_it[0]), start + int(part_of_it[-1])
+
+
+def _slipped(series: Series, first: int, last: int) -> bool:
+    """A step that the slip between two reads accounts for: of its direction, and within noise no larger.
+
+    Where the odometer counts too far, GNSS minus odometer falls. A slip that lasts over a read is one of each side.
+    """
+    step = float(series.excess_m[last] - series.excess_m[first - 1])
+    slips = np.unique(series.slip_m[first - 1 : last + 1])
+    proved = float(np.abs(slips[slips * step < 0.0]).sum())
+    return proved > 0.0 and abs(step) <= proved + float(series.noise_m[first - 1 : last + 1].max())
 
 
 def _jump(series: Series, beacons: tuple[Beacons, ...], first: int, last: int) -> Jump:

@@ -10,6 +10,7 @@ import polars as pl
 from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, interpolate_known, ints, times_ns
 from pipeline.hazards.rows import Judged
 from pipeline.hazards.series import Series, direction_of
+from pipeline.hazards.states import contradicted
 from pipeline.hazards.truth import valid_ns
 from schemas.config import HazardConfig
 from schemas.enums import BaliseKind, Cause, FailureMode, PassageStatus
@@ -55,10 +56,13 @@ def judge_passages(
     return filled.select(Passages.column_names())
 
 
-def location_errors(passages: pl.DataFrame, epochs: pl.DataFrame, truth: pl.DataFrame, gap_s: float) -> Floats:
+def location_errors(
+    passages: pl.DataFrame, epochs: pl.DataFrame, truth: pl.DataFrame, gap_s: float, limit_m: float
+) -> Floats:
     """How far the train was from the balise at its offer [m], + = offered early; NaN without offer or truth.
 
-    A VB is offered by a position as old as the GNSS latency, a telegram at the instant of its read.
+    A VB is offered by a position as old as the GNSS latency, a telegram at the instant of its read. NaN too where
+    reads contradict the odometer so that nobody knows whether a VB's error is beyond `limit_m`.
     """
     offered = passages["t_offered"].dt.timestamp("ns")
     error = np.full(passages.height, np.nan)
@@ -73,7 +77,9 @@ def location_errors(passages: pl.DataFrame, epochs: pl.DataFrame, truth: pl.Data
         x, at = (stamps - stamps[0]) / NS_PER_S, (at_ns[mine] - stamps[0]) / NS_PER_S
         train = interpolate_known(at, x, place, gap_s)
         near = np.clip(np.searchsorted(x, at), 0, x.size - 1)
-        error[rows[mine]] = (balise[mine] - train) * direction[near]
+        told = (balise[mine] - train) * direction[near]
+        hidden = contradicted(told, truth[near], limit_m) & virtual[mine]
+        error[rows[mine]] = np.where(hidden, np.nan, told)
     return error
 
 

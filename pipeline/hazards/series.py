@@ -28,7 +28,8 @@ class Series:
 
     `error_m` is position by GNSS minus truth in the direction of travel; `excess_m` is GNSS minus true
     travel, whose steps are the jumps (oriented along growing path); `noise_m` is 3 sigma of position and
-    truth together, `quiet_m` the larger of that and what the evidence cannot resolve.
+    truth together, `quiet_m` the larger of that and what the evidence cannot resolve; `slip_m` what the odometer
+    counted too far between two reads around the epoch (`truth_slip_m`).
     """
 
     row: Ints
@@ -39,6 +40,7 @@ class Series:
     error_m: Floats
     noise_m: Floats
     bound_m: Floats
+    slip_m: Floats
     direction: Floats
     leg: Ints
     linked: Bools
@@ -79,6 +81,7 @@ def series_of(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Seri
         error_m=(x - p) * direction,
         noise_m=3.0 * sigma,
         bound_m=np.nan_to_num(floats(truth, "truth_bound_m")[row]),
+        slip_m=np.nan_to_num(floats(truth, "truth_slip_m")[row]),
         direction=direction,
         leg=leg,
         linked=linked,

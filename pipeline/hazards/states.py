@@ -28,6 +28,14 @@ def errors_of(epochs: pl.DataFrame, truth: pl.DataFrame) -> dict[str, Floats]:
     }
 
 
+def contradicted(error_along_m: Floats, truth: pl.DataFrame, limit_m: float) -> Bools:
+    """Errors that may lie on either side of the limit because two reads contradict the odometer around them."""
+    size, slip = np.abs(error_along_m), np.abs(floats(truth, "truth_slip_m"))
+    with np.errstate(invalid="ignore"):
+        hidden: Bools = (slip > 0.0) & (size + slip > limit_m) & (size <= floats(truth, "truth_bound_m"))
+    return hidden
+
+
 def lds_states(
     epochs: pl.DataFrame,
     truth: pl.DataFrame,
@@ -38,12 +46,13 @@ def lds_states(
 ) -> pl.Series:
     """P2 negated; P3 diagnosis faulty; P1 error beyond the failure limit; P0.
 
-    Null without a truth, and where an error beyond the limit is less than the evidence can resolve.
+    Null without a truth, and where an error beyond the limit is less than the evidence can resolve, or one within it
+    may be beyond it (`contradicted`).
     """
     size, bound = np.abs(error_along_m), floats(truth, "truth_bound_m")
     with np.errstate(invalid="ignore"):
         failed = size > config.failure_limit_m
-        unresolved = failed & (size <= bound)
+        unresolved = (failed & (size <= bound)) | contradicted(error_along_m, truth, config.failure_limit_m)
     state = np.where(failed, _code(LdsState.P1), _code(LdsState.P0))
     state[unresolved | ~np.isfinite(size)] = -1
     faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(epochs, truth, passages, lds)

@@ -22,13 +22,17 @@ _MAP_ERROR_M = 0.5
 
 @dataclass(frozen=True)
 class Witnesses:
-    """Per epoch, all epochs: truth, position, odometer and GNSS velocity, NaN where not known."""
+    """Per epoch, all epochs: truth, position, odometer and GNSS velocity, NaN where not known.
+
+    `slip_m`: size of what two reads around say that the odometer counted wrong.
+    """
 
     t_ns: Ints
     path_m: Floats
     error_m: Floats
     noise_m: Floats
     bound_m: Floats
+    slip_m: Floats
     error_cross_m: Floats
     noise_cross_m: Floats
     error_up_m: Floats
@@ -61,6 +65,7 @@ def witnesses_of(
         error_m=errors["along"],
         noise_m=3.0 * np.hypot(floats(epochs, "sigma_along_m"), truth_sigma),
         bound_m=floats(truth, "truth_bound_m"),
+        slip_m=np.abs(floats(truth, "truth_slip_m")),
         error_cross_m=errors["cross"],
         noise_cross_m=3.0 * np.hypot(floats(epochs, "sigma_cross_m"), truth_sigma),
         error_up_m=errors["up"],

@@ -37,12 +37,16 @@ _NAMES = [member.value for member in Evidence]
 
 @dataclass(frozen=True)
 class Rung:
-    """One kind of evidence per epoch; NaN where it does not reach. `bound_m` must be exceeded by a hazard."""
+    """One kind of evidence per epoch; NaN where it does not reach. `bound_m` must be exceeded by a hazard.
+
+    `slip_m`: as of `Carried`.
+    """
 
     evidence: Evidence
     path_m: Floats
     sigma_m: Floats
     bound_m: Floats
+    slip_m: Floats
     cross_m: Floats
     up_m: Floats
     smoothed: bool = False
@@ -64,11 +68,13 @@ def establish_truth(
     `balise_reads`: `t, path_m` of physical balises and, where known, `odometer_m` at the read, which inside an outage
     the epochs cannot tell; `passages`: `status, path_m, t_offered` of the
     LDS, whose accepted VBs anchor the odometer.
-    Yields per epoch `t, evidence, truth_path_m, truth_sigma_m, truth_bound_m, truth_cross_m,
+    Yields per epoch `t, evidence, truth_path_m, truth_sigma_m, truth_bound_m, truth_slip_m, truth_cross_m,
     truth_up_m, truth_travel_m, truth_stretch, truth_smoothed`: `truth_bound_m` is what an error has to exceed before
-    it is called a hazard, differences of `truth_travel_m` within one `truth_stretch` are true
-    movements free of the steps that a new anchor makes; `truth_smoothed` marks the post-processed truth
-    of `config.smoothed_reference`, which steps in where there is neither reference nor balise read.
+    it is called a hazard, `truth_slip_m` by how much two balise reads around the epoch say that the odometer counted
+    too far along growing path between them (0: no contradiction), differences of `truth_travel_m` within one
+    `truth_stretch` are true movements free of the steps that a new anchor makes; `truth_smoothed` marks the
+    post-processed truth of `config.smoothed_reference`, which steps in where there is neither reference nor balise
+    read.
     """
     at_ns = valid_ns(epochs)
     travel = odometer_travel(epochs, counted_ns(epochs))
@@ -132,27 +138,28 @@ def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
     path = column("path_m")
     sigma = np.nan_to_num(column("sigma_m"))
     cross, up = column("cross_track_m"), column("vertical_m")
-    return Rung(Evidence.REFERENCE, path, sigma, np.zeros(path.size), cross, up)
+    nothing = np.zeros(path.size)
+    return Rung(Evidence.REFERENCE, path, sigma, nothing, nothing, cross, up)
 
 
 def _balise_rung(carried: Carried, since_m: Floats, config: HazardConfig) -> Rung:
-    """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard.
+    """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard, and so does its slip.
 
     Reckoned back from the first read, its whole confidence: a slip on the way would look like an error of GNSS.
     """
     nothing = np.full(carried.path_m.size, np.nan)
     sigma = np.hypot(config.balise_read_sigma_m, carried.sigma_m)
     smallest = np.where(carried.backward, carried.confidence_m, np.minimum(3.0 * sigma, carried.confidence_m))
-    bound = np.maximum(smallest, carried.mismatch_m)
-    return Rung(Evidence.BALISE, carried.path_m + since_m, sigma, bound, nothing, nothing)
+    bound = np.maximum(smallest, np.abs(carried.slip_m))
+    return Rung(Evidence.BALISE, carried.path_m + since_m, sigma, bound, carried.slip_m, nothing, nothing)
 
 
 def _smoothed_rung(epochs: pl.DataFrame, travel: Travel, config: HazardConfig) -> Rung:
     """Smoothed from the position itself, so no more than odometer evidence, and marked (`truth_smoothed`)."""
     smoothed = smoothed_truth(epochs, travel, positions(epochs), config.alarm_lead_s)
-    nothing = np.full(smoothed.path_m.size, np.nan)
+    nothing, no_slip = np.full(smoothed.path_m.size, np.nan), np.zeros(smoothed.path_m.size)
     bound = 3.0 * smoothed.sigma_m
-    return Rung(Evidence.ODOMETER, smoothed.path_m, smoothed.sigma_m, bound, nothing, nothing, smoothed=True)
+    return Rung(Evidence.ODOMETER, smoothed.path_m, smoothed.sigma_m, bound, no_slip, nothing, nothing, smoothed=True)
 
 
 def _odometer_rung(epochs: pl.DataFrame, passages: pl.DataFrame | None, travel: Travel, lds: LdsConfig) -> Rung:
@@ -167,7 +174,8 @@ def _odometer_rung(epochs: pl.DataFrame, passages: pl.DataFrame | None, travel: 
         anchors = anchors.with_others(Anchors.of((offered - latency).astype(np.int64), path))
     carried = carry(anchors, travel, at_ns, lds, both_ways=False)
     nothing = np.full(carried.path_m.size, np.nan)
-    return Rung(Evidence.ODOMETER, carried.path_m, carried.sigma_m, carried.confidence_m, nothing, nothing)
+    bound = carried.confidence_m
+    return Rung(Evidence.ODOMETER, carried.path_m, carried.sigma_m, bound, carried.slip_m, nothing, nothing)
 
 
 def _initial_anchors(epochs: pl.DataFrame, travel: Travel, at_ns: Ints, init_s: float) -> Anchors:
@@ -185,7 +193,7 @@ def _initial_anchors(epochs: pl.DataFrame, travel: Travel, at_ns: Ints, init_s: 
 
 
 def _ladder(t: pl.Series, rungs: list[Rung], travel: Travel) -> pl.DataFrame:
-    names = ("path_m", "sigma_m", "bound_m", "cross_m", "up_m")
+    names = ("path_m", "sigma_m", "bound_m", "slip_m", "cross_m", "up_m")
     best = {name: np.full(t.len(), np.nan) for name in names}
     evidence = np.full(t.len(), -1)
     smoothed = np.zeros(t.len(), dtype=np.bool_)

@@ -86,6 +86,37 @@ def test_slip_between_two_reads_is_no_hazard_without_doppler_either():
     assert rows(replay(kinds_of(both)["balise"], site, VEHICLE))
 
 
+SLIDE = {"kind": "slip", "rate_mps": -30.0, "start_s": 150.0, "duration_s": 4.0}
+
+
+def test_slide_as_quick_as_a_jump_between_two_reads_leaves_errors_unknown():
+    run, site = journey(SLIDE, gnss={"velocity": False})
+    tables = replay(kinds_of(run)["balise"], site, VEHICLE)
+    assert rows(tables) == []
+    assert tables.runs["unsafe_accepted"].item() == 0
+    assert tables.alarms["verdict"].to_list() == ["unknown"]
+    assert "contradict the odometer between them by up to 12" in tables.runs["notes"].item()
+    unknown = tables.passages.filter(pl.col("location_error_m").is_null() & pl.col("t_offered").is_not_null())
+    assert unknown.height
+    between = tables.epochs.filter(pl.col("t").is_between(unknown["t_offered"][0], unknown["t_offered"][-1]))
+    assert between["error_along_m"].null_count() == between.height
+    assert not between["lds_state"].is_in(["P0", "P1"]).any()
+
+
+@pytest.mark.parametrize(("size_m", "seen"), [(300.0, True), (-300.0, True), (60.0, True), (-60.0, False)])
+def test_jump_beside_a_slip_is_seen_where_the_slip_cannot_account_for_it(size_m, seen):
+    # The odometer slips by 120 m between two reads, so GNSS minus odometer falls: a leap ahead cannot be the slip.
+    step = {"kind": "step", "size_m": size_m, "at_m": 4260.0 if size_m > 0 else 4330.0, "duration_s": 10.0}
+    slip = {"kind": "slip", "rate_mps": 30.0, "start_s": 188.0, "duration_s": 4.0}
+    run, site = journey(slip, step, gnss={"velocity": False})
+    by_reference = replay(run, site, VEHICLE)
+    tables = replay(kinds_of(run)["balise"], site, VEHICLE)
+    assert rows(by_reference)
+    assert bool(rows(tables)) is seen
+    if not seen:
+        assert tables.passages.filter(balise_id="VB4")["location_error_m"].null_count()
+
+
 def test_without_doppler_the_notes_say_that_nothing_tells_the_two_apart():
     run, site = journey(OFFSET, gnss={"velocity": False})
     tables = replay(kinds_of(run)["balise"], site, VEHICLE)
