@@ -78,7 +78,7 @@ class Hazards(dy.Schema):
     time_to_detect_s = real("s", "T_D = t_detected - t_onset")
     time_since_failure_s = real("s", "T_dsf = t_detected - t_failure; negative = in time")
     hazardous_s = real("s", "max(0, t_negated - t_failure)", min=0)
-    size_m = real("m", "largest error along the track, signed, + = ahead of the train")
+    size_m = real("m", "largest error along the track, signed, + = ahead of the train; of a jump back, its step")
     rate_mps = real("m/s", "slope of the error from onset to failure; null for a step")
     balise_ids = texts("VBs hit, in order")
     accepted_ids = texts("VBs of those that the LDS accepted all the same")

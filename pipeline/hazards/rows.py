@@ -16,7 +16,7 @@ from pipeline.hazards.crossings import Crossing
 from pipeline.hazards.episodes import Draft
 from pipeline.hazards.series import Series
 from pipeline.hazards.timing import Timing
-from schemas.enums import FailureMode, Hazard, Suspect
+from schemas.enums import Evidence, FailureMode, Hazard, Suspect
 from schemas.enums import Timing as Early
 from schemas.tables import Hazards
 
@@ -125,11 +125,16 @@ def _size(item: Judged, series: Series) -> dict[str, Any]:
     """Largest error with its sign, and its slope from onset to failure.
 
     A jump back leaves no error: its size is the step itself. The offers count too: where the odometer since the
-    LRVB is the evidence, the error starts anew at the VB that was offered wrong and accepted.
+    LRVB is the evidence, the error starts anew at the VB that was offered wrong and accepted. So does a jump's step
+    there, and where the evidence cannot resolve its errors: by how much the position was wrong before is not known.
     """
     draft, timing = item.draft, item.timing
-    lasting = series.error_m[timing.onset_epoch : max(draft.end, draft.first_epoch + 1)]
-    errors = np.concatenate((lasting, [hit.error_m for hit in draft.hits]))
+    lasting = slice(timing.onset_epoch, max(draft.end, draft.first_epoch + 1))
+    epochs = np.concatenate((np.arange(series.size)[lasting], [hit.epoch for hit in draft.hits])).astype(np.int64)
+    errors = np.concatenate((series.error_m[lasting], [hit.error_m for hit in draft.hits]))
+    resolved = item.evidence != Evidence.ODOMETER.value and (np.abs(errors) > series.bound_m[epochs]).any()
+    if draft.jump is not None and not resolved:
+        errors = np.append(errors, draft.jump.step_m)
     size = float(errors[int(np.argmax(np.abs(errors)))])
     if draft.caused_by is not None and draft.jump is not None:
         size = draft.jump.step_m

@@ -136,6 +136,15 @@ def test_doppler_names_the_position_where_it_left_alone():
     assert row["suspect"] == "unknown"
 
 
+@pytest.mark.parametrize("accepted", [{}, {"V5": (1100.0 - 34.0) / 20.0}])
+def test_lone_jump_back_is_as_large_as_its_step(accepted):
+    # 45 m crept in within 5 m + 5 % of the way, then V7 (1500 m) is crossed by the jump back.
+    journey = Journey(ramps=((13.0, 73.0, 0.75),), reference=False, accepted=accepted)
+    (row,) = judge(journey).hazards.to_dicts()
+    assert (row["hazard"], row["balise_ids"]) == ("VB_JUMP_1B", ["V7"])
+    assert row["size_m"] == pytest.approx(-45.0, abs=0.1)
+
+
 def test_without_reference_and_odometer_there_is_no_truth():
     journey = Journey(reference=False)
     nothing = pl.lit(None, pl.Float64)
