@@ -205,9 +205,12 @@ def inject(
     from datasets.trial import write_run_as
     from pipeline.ingest import read_run
     from pipeline.ingest.site import read_site
+    from schemas.errors import UsageError
 
     settings, _ = _settings(config, None)
     faults = load_faults(fault)
+    if out.resolve() == Path(run).resolve():
+        raise UsageError("is the recording itself", place=str(out), remedy="Name another place with --out.")
     log = read_run(run, settings.ingest, with_digest=False)
     write_run_as(inject_all(log, faults, None if site is None else read_site(site)), out)
     print(f"{len(faults)} faults injected into {run}: {out}")

@@ -132,9 +132,13 @@ def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
         return
     path.mkdir(exist_ok=True)
     for name in STREAMS:
-        table = run.stream(name)
+        file, table = path / f"{name}.parquet", run.stream(name)
         if table is not None:
-            table.write_parquet(path / f"{name}.parquet")
+            table.write_parquet(file)
+        else:
+            file.unlink(
+                missing_ok=True
+            )  # what an earlier run at this place left would be taken for a stream of this one
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

@@ -208,6 +208,10 @@ def test_inject(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None
     said = balise("inject", small_trial.paths[0], "--fault", tmp_path / "fault.toml", "--out", tmp_path / "faulty")
     assert said.status == 0
     assert pl.read_parquet(tmp_path / "faulty/faults.parquet")["kind"].cast(pl.String).to_list() == ["outage"]
+    onto_itself = balise(
+        "inject", tmp_path / "faulty", "--fault", tmp_path / "fault.toml", "--out", tmp_path / "faulty"
+    )
+    assert (onto_itself.status, "is the recording itself" in onto_itself.err) == (2, True)
 
 
 def test_dictionary(balise: Balise) -> None:

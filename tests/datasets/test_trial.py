@@ -11,7 +11,7 @@ import pytest
 from datasets.line import build_line
 from datasets.motion import build_motion
 from datasets.scenario import Scenario, load_scenario
-from datasets.trial import build_run, build_trial, write_trial
+from datasets.trial import build_run, build_trial, write_run_as, write_trial
 from pipeline.geodesy import earth_centred_m
 from pipeline.ingest.run import read_run
 from pipeline.ingest.site import read_site
@@ -201,3 +201,12 @@ def test_an_unwritable_place_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         write_trial(scenario({}), tmp_path / "file")
+
+
+def test_a_run_replaces_the_one_before_it(tmp_path: Path) -> None:
+    spec = scenario({})
+    run = build_run(spec, spec.runs[0])
+    assert run.reference is not None
+    write_run_as(run, tmp_path / "run")
+    write_run_as(run.with_streams(reference=None), tmp_path / "run")
+    assert read_run(tmp_path / "run", IngestConfig()).reference is None
