@@ -126,6 +126,13 @@ def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
 def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
     """One run at a path: `*.mcap` (JSON unless said otherwise, which keeps everything), else a folder of Parquet."""
     log = log or ("json" if path.suffix == ".mcap" else "parquet")
+    try:
+        _write(run, path, log)
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(error.filename or path)) from None
+
+
+def _write(run: RunLog, path: Path, log: LogKind) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if log != "parquet":
         write_mcap(run, path, encoding=log)
@@ -136,9 +143,8 @@ def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
         if table is not None:
             table.write_parquet(file)
         else:
-            file.unlink(
-                missing_ok=True
-            )  # what an earlier run at this place left would be taken for a stream of this one
+            # What an earlier run left here would be taken for a stream of this one.
+            file.unlink(missing_ok=True)
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

@@ -212,6 +212,9 @@ def test_inject(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None
         "inject", tmp_path / "faulty", "--fault", tmp_path / "fault.toml", "--out", tmp_path / "faulty"
     )
     assert (onto_itself.status, "is the recording itself" in onto_itself.err) == (2, True)
+    a_file = tmp_path / "fault.toml"
+    nowhere = balise("inject", small_trial.paths[0], "--fault", a_file, "--out", a_file / "run")
+    assert (nowhere.status, "fault.toml: cannot be written" in nowhere.err) == (2, True)
 
 
 def test_dictionary(balise: Balise) -> None:
