@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.align import align
+from pipeline.align import align, odometer_at
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes
-from pipeline.hazards import HazardResult, classify, establish_truth, with_unoffered
+from pipeline.hazards import HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
@@ -121,8 +121,9 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     reference = _reference_on_path(context, found, aligned)
     reads = None if telegrams is None else telegrams.drop_nulls("path_m")
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
-    passages = with_unoffered(lds.passages, monitored, truth, balises, config.lds, solution)
-    result = classify(solution, monitored, truth, passages, balises, run.faults, found.path.locate, config)
+    between = _between(run, config, aligned, truth, reference, reads)
+    passages = with_unoffered(lds.passages, monitored, truth, balises, config.lds, solution, between)
+    result = classify(solution, monitored, truth, passages, balises, run.faults, found.path.locate, config, between)
     epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
     results = SolutionResults(
         solution=solution,
@@ -246,6 +247,24 @@ def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -
         pl.Series("vertical_m", places.vertical_m - context.vehicle.antenna_height_m, nan_to_null=True),
         "sigma_m",
     )
+
+
+def _between(
+    run: RunLog,
+    config: Configuration,
+    aligned: pl.DataFrame,
+    truth: pl.DataFrame,
+    reference: pl.DataFrame | None,
+    reads: pl.DataFrame | None,
+) -> pl.DataFrame | None:
+    """Places inside gaps of the positions, by the streams that go on there."""
+    odometer = run.odometer
+
+    def counted(times: pl.Series) -> pl.Series:
+        unknown = pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
+        return unknown if odometer is None else odometer_at(times, aligned, odometer, config)
+
+    return places_between(aligned, truth, reference, reads, odometer, counted)
 
 
 def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:

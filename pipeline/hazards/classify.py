@@ -26,7 +26,7 @@ from pipeline.hazards.passages import (
     within_spans,
     wrongly_offered,
 )
-from pipeline.hazards.passing import true_passings
+from pipeline.hazards.passing import TruePassings, true_passings
 from pipeline.hazards.rows import Judged, Locate, hazards_table
 from pipeline.hazards.series import Series, series_of
 from pipeline.hazards.states import contradicted, errors_of, lds_states
@@ -59,12 +59,13 @@ def classify(
     faults: pl.DataFrame | None,
     locate: Locate,
     config: Configuration,
+    between: pl.DataFrame | None = None,
 ) -> HazardResult:
     """Judge one solution after the fact.
 
     `epochs`: matched, aligned and monitored, with the LDS columns; `truth`: from `establish_truth`, row by
     row; `passages`: of the LDS; `balises`: `leg, balise_id, kind, path_m` on the path; `faults`: what was
-    injected, where known; `locate(leg, path_m)`: net element and measure.
+    injected, where known; `locate(leg, path_m)`: net element and measure; `between`: from `places_between`.
     """
     errors = errors_of(epochs, truth)
     series = series_of(epochs, truth, config.lds)
@@ -78,7 +79,8 @@ def classify(
     hazards = hazards_table(judged, solution, epochs, series, locate, config.budget_s)
     alarms = alarms_table(fails, judged, solution, witnesses, epochs, config.hazards)
     spans = faulty_spans(series, judged, jumps, fails, faults, config.hazards)
-    seen = _passages(series, judged, spans, epochs, truth, passages, balises, config)
+    passings = true_passings(epochs, truth, balises, between)
+    seen = _passages(series, judged, spans, epochs, truth, passages, passings, config)
     return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, spans, config))
 
 
@@ -118,10 +120,9 @@ def _passages(
     epochs: pl.DataFrame,
     truth: pl.DataFrame,
     passages: pl.DataFrame,
-    balises: pl.DataFrame,
+    passings: TruePassings,
     config: Configuration,
 ) -> pl.DataFrame:
-    passings = true_passings(epochs, truth, balises)
     t_true = passings.assign(passages)
     links: Links = link_unoffered(passages, t_true, judged, link_passages(passages, judged, series))
     suspicious: Bools = suspicious_passages(passages, spans)

@@ -69,19 +69,17 @@ def _about_when(passages: pl.DataFrame) -> list[int | None]:
     return instants.dt.timestamp("ns").to_list()
 
 
-def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFrame) -> TruePassings:
-    """Crossings of the true position over every balise on the path."""
-    place = floats(truth, "truth_path_m")
-    rows = np.flatnonzero(np.isfinite(place))
+def true_passings(
+    epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFrame, between: pl.DataFrame | None = None
+) -> TruePassings:
+    """Crossings of the true position over every balise on the path.
+
+    `between`: places known inside gaps of the epochs (`places_between`).
+    """
+    at_ns, x, speed, legs = _places(epochs, truth, between)
     found: dict[str, tuple[int, ...]] = {}
-    at_ns, x = valid_ns(epochs)[rows], place[rows]
-    if rows.size < 2 or balises.height == 0:
+    if at_ns.size < 2 or balises.height == 0:
         return TruePassings(found, at_ns, x)
-    speed = floats(epochs, "speed_mps")[rows]
-    leg = epochs["leg"]
-    if leg.null_count():
-        leg = leg.fill_null(strategy="forward").fill_null(strategy="backward")
-    legs = ints(leg)[rows]
     for part in balises.sort("path_m").partition_by("leg", maintain_order=True):
         names, places = part["balise_id"].to_list(), floats(part, "path_m")
         changes = _changes(x, legs == part["leg"][0], places)
@@ -89,6 +87,25 @@ def true_passings(epochs: pl.DataFrame, truth: pl.DataFrame, balises: pl.DataFra
             instants = _instants(at_ns, x, speed, changes.get(index, []), beacon_m)
             found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))
     return TruePassings(found, at_ns, x)
+
+
+def _places(
+    epochs: pl.DataFrame, truth: pl.DataFrame, between: pl.DataFrame | None
+) -> tuple[Ints, Floats, Floats, Ints]:
+    """Instants, true positions, speeds and legs in order of time, where the truth is known."""
+    place = floats(truth, "truth_path_m")
+    rows = np.flatnonzero(np.isfinite(place))
+    leg = epochs["leg"]
+    if leg.null_count():
+        leg = leg.fill_null(strategy="forward").fill_null(strategy="backward")
+    at_ns, x, speed, legs = valid_ns(epochs)[rows], place[rows], floats(epochs, "speed_mps")[rows], ints(leg)[rows]
+    if between is None:
+        return at_ns, x, speed, legs
+    at_ns = np.concatenate((at_ns, ints(between["at_ns"])))
+    order = np.argsort(at_ns, kind="stable")
+    x = np.concatenate((x, floats(between, "path_m")))[order]
+    speed = np.concatenate((speed, floats(between, "speed_mps")))[order]
+    return at_ns[order], x, speed, np.concatenate((legs, ints(between["leg"])))[order]
 
 
 def legs_of(epochs: pl.DataFrame) -> Ints:

@@ -27,6 +27,7 @@ def with_unoffered(
     balises: pl.DataFrame,
     lds: LdsConfig,
     solution: str,
+    between: pl.DataFrame | None = None,
 ) -> pl.DataFrame:
     """Passages of the LDS, and one more for each true passage of a virtual balise that has none (CONTRACT section 3).
 
@@ -35,7 +36,7 @@ def with_unoffered(
     as far beyond: where a train only stands beside a balise, noise decides which of the two passes it.
     """
     virtual = balises.filter(pl.col("kind") == BaliseKind.VIRTUAL.value)
-    passings = true_passings(epochs, truth, virtual)
+    passings = true_passings(epochs, truth, virtual, between)
     given = set(zip(passages["balise_id"].to_list(), passings.assign(passages), strict=True))
     lacking = {
         balise: [t_ns for t_ns in instants if (balise, t_ns) not in given]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
+from datasets.motion import MotionSpec, build_motion
 from pipeline.stages import replay
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import PLACES_M, VEHICLE, journey
 
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
 BRAKING = {"start_m": 200.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": 8000.0, "acceleration_mps2": 0.2}]}
@@ -35,6 +36,28 @@ def test_the_speed_in_a_hole_of_the_epochs_is_not_known():
     assert lost["balise_id"].to_list() == ["VB1"]
     assert lost["t_true"].null_count() == 0
     assert lost["speed_mps"].to_list() == [None]
+
+
+STOPPING = {
+    "start_m": 200.0,
+    "phases": [{"speed_mps": 30.0}, {"stop_at_m": 2600.0, "hold_s": 15.0}, {"speed_mps": 25.0}, {"stop_at_m": 8000.0}],
+}
+
+
+@pytest.mark.parametrize("duration_s", [90.0, 140.0])
+@pytest.mark.parametrize("lost", [[], ["reference"], ["reference", "balise_reads"]])
+def test_passages_inside_a_hole_of_the_epochs_are_timed_by_what_goes_on_there(lost, duration_s):
+    # The train brakes, stands and starts inside the hole, longer than the speeds at its ends can bridge or not.
+    run, site = journey({"kind": "outage", "start_s": 80.0, "duration_s": duration_s}, motion=STOPPING)
+    found = replay(run.with_streams(**dict.fromkeys(lost)), site, VEHICLE).passages
+    motion = build_motion(MotionSpec.model_validate(STOPPING))
+    hidden = found.filter(pl.col("t_offered").is_null())
+    assert hidden["balise_id"].to_list()[:2] == ["VB1", "VB2"]
+    at_s = (hidden["t_true"] - run.gnss["t"][0]).dt.total_nanoseconds() * 1e-9
+    places = dict(zip([f"VB{i}" for i in range(len(PLACES_M))], PLACES_M, strict=True))
+    expected = [motion.time_at(places[balise]) for balise in hidden["balise_id"]]
+    # With the odometer alone the error of the position before the hole, some 2 m, counts.
+    assert at_s.to_list() == pytest.approx(expected, abs=0.2)
 
 
 def test_alarms_stand_at_the_place_of_their_first_fail():
