@@ -48,14 +48,16 @@ class Carried:
 
     `confidence_m` is the odometer's half-width (SUBSET-041 5.3.1.1), `slip_m` by how much at most it counted too far
     along growing path between two anchors, 0 where that is within its white noise: nobody knows where it slipped, or
-    whether its scale is wrong, so the place between may be wrong by as much. `backward`: before the first anchor, so
-    that nothing but the odometer itself speaks for the way in between.
+    whether its scale is wrong, so the place between may be wrong by as much. `share`: of the way from the anchor before
+    to the one behind, 0 at the former. `backward`: before the first anchor, so that nothing but the odometer itself
+    speaks for the way in between.
     """
 
     path_m: Floats
     sigma_m: Floats
     confidence_m: Floats
     slip_m: Floats
+    share: Floats
     backward: Bools
 
 
@@ -71,7 +73,7 @@ def carry(
     before = np.searchsorted(reader.at_ns, at_ns, side="right") - 1
     forward = reader.reach(before, travel, lds)
     if not both_ways:
-        return Carried(*forward, np.zeros(at_ns.size), np.zeros(at_ns.size, dtype=np.bool_))
+        return Carried(*forward, np.zeros(at_ns.size), np.zeros(at_ns.size), np.zeros(at_ns.size, dtype=np.bool_))
     backward = reader.reach(before + 1, travel, lds)
     return _between(forward, backward, reader, before, travel, anchor_sigma_m)
 
@@ -149,6 +151,7 @@ def _between(
         sigma_m=smaller(forward[1], backward[1]),
         confidence_m=smaller(forward[2], backward[2]),
         slip_m=np.where(np.abs(difference) > allowed, widened, 0.0),
+        share=share,
         backward=behind & ~ahead,
     )
 

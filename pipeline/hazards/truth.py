@@ -91,7 +91,7 @@ def establish_truth(
         carried = carry(anchors, travel, travel.at_ns, lds, both_ways=True, anchor_sigma_m=sigma_m)
         # Carried to when the odometer counted; how far the train goes from there to the instant of the position.
         since_m = np.nan_to_num(floats(epochs, "speed_mps")) * (at_ns - travel.at_ns) / NS_PER_S
-        rungs.append(_balise_rung(carried, since_m, config))
+        rungs.append(_balise_rung(carried, since_m, positions(epochs), config))
     if config.smoothed_reference:
         rungs.append(_smoothed_rung(epochs, travel, config))
     rungs.append(_odometer_rung(epochs, passages, travel, lds))
@@ -142,7 +142,7 @@ def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
     return Rung(Evidence.REFERENCE, path, sigma, nothing, nothing, cross, up)
 
 
-def _balise_rung(carried: Carried, since_m: Floats, config: HazardConfig) -> Rung:
+def _balise_rung(carried: Carried, since_m: Floats, position_m: Floats, config: HazardConfig) -> Rung:
     """Reads carried on; the odometer's share of the doubt bounds what may be called a hazard, and so does its slip.
 
     Reckoned back from the first read, its whole confidence: a slip on the way would look like an error of GNSS.
@@ -150,8 +150,22 @@ def _balise_rung(carried: Carried, since_m: Floats, config: HazardConfig) -> Run
     nothing = np.full(carried.path_m.size, np.nan)
     sigma = np.hypot(config.balise_read_sigma_m, carried.sigma_m)
     smallest = np.where(carried.backward, carried.confidence_m, np.minimum(3.0 * sigma, carried.confidence_m))
-    bound = np.maximum(smallest, np.abs(carried.slip_m))
+    hidden = _hidden_by_slip(carried, position_m - carried.path_m - since_m, config.failure_limit_m)
+    bound = np.maximum(smallest, hidden)
     return Rung(Evidence.BALISE, carried.path_m + since_m, sigma, bound, carried.slip_m, nothing, nothing)
+
+
+def _hidden_by_slip(carried: Carried, error_m: Floats, limit_m: float) -> Floats:
+    """How large an error has to be beyond which the slip cannot account for it.
+
+    The train is between where the reads before and behind put it. An error that exceeds the limit against both is one
+    wherever the odometer slipped; so is one larger than the slip itself.
+    """
+    by_before, by_behind = carried.share * carried.slip_m, (carried.share - 1.0) * carried.slip_m
+    ahead, behind = np.maximum(by_before, by_behind), np.maximum(-by_before, -by_behind)
+    reach = np.where(error_m > 0.0, ahead, np.where(error_m < 0.0, behind, np.abs(carried.slip_m)))
+    hidden: Floats = np.minimum(np.abs(carried.slip_m), reach + limit_m)
+    return hidden
 
 
 def _smoothed_rung(epochs: pl.DataFrame, travel: Travel, config: HazardConfig) -> Rung:

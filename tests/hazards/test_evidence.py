@@ -108,8 +108,19 @@ def test_reads_that_contradict_the_odometer_widen_the_bound():
     journey = Journey(reference=False, reads=(50.0, 550.0), slip=(10.0, 20.0, 6.0))
     truth = truth_of(journey)
     assert truth["truth_slip_m"][150] == pytest.approx(60.0 + 3.0 * np.sqrt(2.0 + 0.0025 * 25.0), abs=0.1)
-    assert truth["truth_bound_m"][150] == truth["truth_slip_m"][150]
+    assert 30.0 + 20.0 <= truth["truth_bound_m"][150] <= truth["truth_slip_m"][150]
     assert judge(journey).hazards.height == 0
+
+
+@pytest.mark.parametrize(("size_m", "seen"), [(40.0, True), (-40.0, False), (-120.0, True)])
+def test_error_that_no_slip_between_the_reads_accounts_for_is_a_hazard(size_m, seen):
+    # The odometer counts 60 m too far from 22 s on: a position ahead of where either read puts the train is wrong;
+    # one 40 m behind may be right, one 120 m behind is not.
+    journey = Journey(reference=False, reads=(50.0, 550.0), slip=(22.0, 25.0, 20.0), steps=((8.5, 20.0, size_m),))
+    assert bool(judge(journey).hazards.height) is seen
+    state = judge(journey).epochs_columns["lds_state"]
+    assert state[120] == ("P1" if seen else None)
+    assert judge(journey.but(steps=())).hazards.height == 0
 
 
 def test_slip_with_doppler_is_no_hazard_whatever_the_evidence():
