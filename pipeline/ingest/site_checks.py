@@ -25,6 +25,8 @@ LENGTH_TOLERANCE = 1e-3
 LENGTH_TOLERANCE_M = 0.5
 CHORD_ERROR_M = 0.25
 MEASURE_TOLERANCE_M = 0.5
+# An end's direction is that of its last metres: single vertices may lie a centimetre apart.
+END_REACH_M = 20.0
 
 
 @dataclass
@@ -46,7 +48,8 @@ def remarks(
     """All checks over the tables of a site."""
     track = track_of(frame)
     known, findings = _relations_to_nowhere(track, links)
-    found = Remarks(known, findings)
+    passable, turning = _relations_that_turn_back(track, known)
+    found = Remarks(passable, findings + turning)
     _check_elements(track, declared_length_m, found)
     _check_gaps(track, found)
     found.findings += _near_misses(track, known)
@@ -86,6 +89,42 @@ def _relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFra
         for row in links.filter(~known).iter_rows()
     ]
     return links.filter(known), findings
+
+
+def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+    """No train gets round a corner of less than a right angle: such a relation, as between the two branches of a
+    switch, is not navigable, whatever it says.
+    """
+    outward = _outward(track)
+    back = [
+        way != Navigability.NONE.value
+        and bool(outward[track.index[a], position_a] @ outward[track.index[b], position_b] > 0.0)
+        for a, position_a, b, position_b, way in links.iter_rows()
+    ]
+    findings = [
+        Finding(
+            "warning",
+            "links",
+            f"end {a_end} of {a} and end {b_end} of {b} are linked as navigable ({way}), but lie on the same side of "
+            "where they meet: taken for not navigable",
+            "Mend the relation.",
+        )
+        for a, a_end, b, b_end, way in links.filter(pl.Series(back, dtype=pl.Boolean)).iter_rows()
+    ]
+    closed = pl.when(pl.Series(back, dtype=pl.Boolean)).then(pl.lit(Navigability.NONE.value))
+    return links.with_columns(closed.otherwise("navigability").alias("navigability")), findings
+
+
+def _outward(track: Track) -> np.ndarray:
+    """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
+    directions = np.zeros((len(track.ids), 2, 3))
+    for element, _, part in track.elements():
+        surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
+        for position, line in ((0, surface), (1, surface[::-1])):
+            way = np.linalg.norm(line - line[0], axis=1)
+            inside = int(np.argmax(way >= END_REACH_M)) or int(np.argmax(way))
+            directions[element, position] = line[inside] - line[0]
+    return directions
 
 
 def _check_elements(track: Track, declared_length_m: dict[str, float], found: Remarks) -> None:

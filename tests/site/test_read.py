@@ -266,3 +266,27 @@ def test_a_real_network_is_read_whole(tmp_path: Path) -> None:
     assert (found.elements, sum(found.relations.values()), found.parts) == (74, 142, 1)
     assert found.length_m == pytest.approx(56_008.0, abs=1.0)
     assert found.dimensions == "2-D"
+
+
+def test_a_relation_that_turns_back_is_not_navigable(tmp_path: Path) -> None:
+    """Both branches of a switch linked with each other: a train would have to turn on the spot."""
+    given = pl.concat([builders.links(), builders.links()[3:].with_columns(navigability=pl.lit("both"))])
+    site = read_site(builders.write(tmp_path, track=builders.track(), links=given))
+    assert site.links["navigability"].to_list() == ["both", "both", "AB", "none", "none"]
+    told = [finding.message for finding in site.findings if "same side" in finding.message]
+    assert told == [
+        "end 0 of b and end 0 of d are linked as navigable (both), but lie on the same side of where they meet: "
+        "taken for not navigable"
+    ]
+
+
+@pytest.mark.skipif(not INFRABEL.exists(), reason="the shared recordings are not beside the repository")
+def test_the_wrong_relation_of_the_recorded_network_is_told(tmp_path: Path) -> None:
+    """The recorded network links the branches of one switch as `both` and as `none`."""
+    folder = builders.write(tmp_path)
+    (folder / "track.geojson").write_bytes((INFRABEL / "network_airport.geojson").read_bytes())
+    site = read_site(folder)
+    assert [finding.message for finding in site.findings if "same side" in finding.message] == [
+        "end 1 of 88_L_262 and end 1 of 88_L_11886 are linked as navigable (both), but lie on the same side of where "
+        "they meet: taken for not navigable"
+    ]
