@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import tomli_w
 
-from pipeline.calibration.sigmas import SigmaFit, regress_sigmas, sigma_table, worst_fit
+from pipeline.calibration.sigmas import regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
 from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from pipeline.clean import clean
 from pipeline.matching import match
@@ -28,8 +28,8 @@ class Calibration:
 
     The vehicle has no latency where the runs tell none.
 
-    `sigma_intercept_m`, `sigma_slope`: for `[monitors]` of the configuration, from the loudest monitor; None
-    where no monitor was evaluated.
+    `sigma_intercept_m`, `sigma_slope`, from the loudest monitor, and `doppler_sigma_mps` are for `[monitors]` of the
+    configuration; None where the monitors were not evaluated.
     """
 
     vehicle: Vehicle
@@ -37,13 +37,17 @@ class Calibration:
     sigmas: pl.DataFrame
     sigma_intercept_m: float | None
     sigma_slope: float | None
+    doppler_sigma_mps: float | None
+
+    def monitors(self) -> dict[str, float]:
+        """What was measured for `[monitors]` of the configuration, by key."""
+        names = ("sigma_intercept_m", "sigma_slope", "doppler_sigma_mps")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def monitors_toml(self) -> str:
-        """The part of a configuration file that follows from the regression."""
-        if self.sigma_slope is None or self.sigma_intercept_m is None:
-            return ""
-        values = {"sigma_intercept_m": self.sigma_intercept_m, "sigma_slope": self.sigma_slope}
-        return tomli_w.dumps({"monitors": values})
+        """The part of a configuration file that was measured."""
+        measured = self.monitors()
+        return tomli_w.dumps({"monitors": measured}) if measured else ""
 
 
 def calibrate(
@@ -55,10 +59,10 @@ def calibrate(
 ) -> Calibration:
     """Vehicle and monitor sigmas from fault-free runs over one site.
 
-    `vehicle` brings lever arms and heights; what it says of scale and latency is measured anew. Raises `InputError`
-    where no run can be compared with an odometer.
+    `vehicle` brings lever arms and heights; what it says of scale and latency is measured anew, and so are the sigmas
+    of `config`. Raises `InputError` where no run can be compared with an odometer.
     """
-    config, base = config or Configuration(), vehicle or Vehicle()
+    config, base = _uncalibrated(config or Configuration()), vehicle or Vehicle()
     _check_solution(logs, solution)
     estimates = [(log.run_id, _estimate(log, site, base, config, solution)) for log in logs]
     found = [estimate for _, estimate in estimates if estimate is not None]
@@ -70,7 +74,9 @@ def calibrate(
             remedy="Calibrate on longer runs that stop and start.",
         )
     fitted = _vehicle(base, found, config.align.latency_prior_sigma_s)
-    fits = _monitor_fits(logs, site, fitted, config, solution)
+    epochs = [replay(log, site, fitted, config).epochs.filter(pl.col("solution") == solution) for log in logs]
+    factor = threshold_factor(config.monitors.false_alarm_probability)
+    fits = regress_sigmas(epochs, factor)
     worst = worst_fit(fits)
     return Calibration(
         vehicle=fitted,
@@ -78,7 +84,14 @@ def calibrate(
         sigmas=sigma_table(fits),
         sigma_intercept_m=None if worst is None else worst.intercept_m,
         sigma_slope=None if worst is None else worst.slope,
+        doppler_sigma_mps=velocity_sigma_mps(epochs, factor, config.monitors.doppler_sigma_mps),
     )
+
+
+def _uncalibrated(config: Configuration) -> Configuration:
+    """Without the sigmas of an earlier calibration: the regression is on what the receiver states."""
+    stated = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
+    return config.model_copy(update={"monitors": config.monitors.model_copy(update=stated)})
 
 
 def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
@@ -121,14 +134,6 @@ def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: flo
     if latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
     return base.model_copy(update=measured)
-
-
-def _monitor_fits(
-    logs: Sequence[RunLog], site: Site, vehicle: Vehicle, config: Configuration, solution: str
-) -> list[SigmaFit]:
-    """Sigmas as the bank shows them when it runs with the vehicle just measured."""
-    epochs = [replay(log, site, vehicle, config).epochs.filter(pl.col("solution") == solution) for log in logs]
-    return regress_sigmas(epochs, threshold_factor(config.monitors.false_alarm_probability))
 
 
 def _run_table(estimates: Sequence[tuple[str, RunEstimate | None]]) -> pl.DataFrame:

@@ -120,6 +120,22 @@ def _fit(samples: Array) -> Array:
     return np.array([overall, intercept, slope])
 
 
+def velocity_sigma_mps(runs: Sequence[pl.DataFrame], factor: float, assumed_mps: float) -> float | None:
+    """Standard deviation of the GNSS velocity along the track [m/s] as monitor `along_doppler` shows it.
+
+    `runs`: epochs tables of fault-free runs, replayed with `assumed_mps` for it; `factor` is k_T. What the odometer's
+    noise, scale and latency account for is taken off; more odometer noise than assumed is in it. None where the monitor
+    was hardly evaluated, or where what is left is below a tenth of what was assumed, which no such difference tells.
+    """
+    value, threshold = pl.col("along_doppler_value"), pl.col("along_doppler_threshold")
+    looks = pl.concat([run.select(value, threshold).drop_nulls() for run in runs])
+    if looks.height < _LEAST_EPOCHS:
+        return None
+    of_others = (threshold / factor) ** 2 - assumed_mps**2
+    variance = looks.select((value**2 - of_others).mean()).item()
+    return float(np.sqrt(variance)) if variance > (0.1 * assumed_mps) ** 2 else None
+
+
 def sigma_table(fits: Sequence[SigmaFit]) -> pl.DataFrame:
     """The fits as a table; errors are null where one piece of data gives none."""
     names = list(SigmaFit.__dataclass_fields__)

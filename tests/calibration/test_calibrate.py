@@ -12,6 +12,8 @@ from datasets.samples import comma2k19_run
 from datasets.trial import build_run, build_site
 from pipeline.calibrate import calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
+from pipeline.stages import replay
+from schemas.config import Configuration, MonitorConfig
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -90,6 +92,40 @@ def test_calibration_finds_the_simulated_vehicle(fault_free: tuple[list[RunLog],
     assert result.sigma_slope == pytest.approx(1.0, abs=0.1)
     settings = tomllib.loads(result.monitors_toml())
     assert settings["monitors"]["sigma_slope"] == result.sigma_slope
+
+
+def test_sigmas_of_an_earlier_calibration_do_not_count(fault_free: tuple[list[RunLog], Site]) -> None:
+    logs, site = fault_free
+    config = Configuration(monitors=MonitorConfig(sigma_intercept_m=0.5, sigma_slope=2.0, doppler_sigma_mps=0.3))
+    first, again = calibrate(logs[:1], site), calibrate(logs[:1], site, config=config)
+    assert again.sigmas.equals(first.sigmas)
+    assert again.doppler_sigma_mps == pytest.approx(first.doppler_sigma_mps)
+
+
+def test_a_noisy_odometer_shows_in_the_sigma_of_the_velocity(fault_free: tuple[list[RunLog], Site]) -> None:
+    """0.2 m per root second, of which the bank expects 0.05, beside ten velocities of 0.03 m/s a second."""
+    scenario, (_, site) = demo_scenario(), fault_free
+    clean = scenario.runs[0]
+    noisy = clean.model_copy(update={"odometer": clean.odometer.model_copy(update={"noise_m_per_root_s": 0.2})})
+    log = build_run(scenario, noisy)
+    result = calibrate([log], site)
+    assert result.doppler_sigma_mps == pytest.approx(np.sqrt(0.2**2 - 0.05**2 + 0.03**2 / 10), rel=0.1)
+    followed = MonitorConfig.model_validate(tomllib.loads(result.monitors_toml())["monitors"])
+    alarms = [
+        replay(log, site, result.vehicle, Configuration(monitors=monitors)).epochs["along_doppler_state"] == "fail"
+        for monitors in (MonitorConfig(), followed)
+    ]
+    assert alarms[0].sum() > 0
+    assert alarms[1].sum() == 0
+
+
+def test_where_no_velocity_was_recorded_nothing_is_said_of_it(fault_free: tuple[list[RunLog], Site]) -> None:
+    logs, site = fault_free
+    nothing = pl.lit(None, pl.Float64)
+    still = logs[0].gnss.with_columns(pl.col("^velocity_.*_mps$").cast(pl.Float64) * nothing)
+    result = calibrate([logs[0].with_streams(gnss=still)], site)
+    assert result.doppler_sigma_mps is None
+    assert "doppler_sigma_mps" not in result.monitors_toml()
 
 
 def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]) -> None:
