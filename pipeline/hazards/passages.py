@@ -200,6 +200,9 @@ def _modes(
 
 
 def beyond_window(passages: pl.DataFrame) -> Bools:
-    """Offered after its expectation window closed (SUBSET-026 3.4.4.4.3)."""
+    """Offered after its expectation window closed (SUBSET-026 3.4.4.4.3).
+
+    Both count in the direction of travel; both are negative while a train that turned round runs back to the reference.
+    """
     with np.errstate(invalid="ignore"):
-        return np.abs(floats(passages, "odometer_distance_m")) > floats(passages, "window_close_m")
+        return floats(passages, "odometer_distance_m") > floats(passages, "window_close_m")

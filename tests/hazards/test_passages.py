@@ -58,6 +58,17 @@ def test_late_beyond_the_window_is_a_deletion():
     assert result.hazards["failure_mode"].to_list() == ["deletion"]
 
 
+def test_a_window_behind_a_train_that_turned_round_is_no_deletion():
+    # Distances to a balise ahead of a reference that the train now runs back to are negative.
+    offer = {"balise_id": "V3", "t_offered": 34.9, "window_open_m": -2612.6, "window_close_m": -2187.4}
+    inside, early, late = -2398.9, -2700.0, -2100.0
+    modes = {}
+    for distance_m in (inside, early, late):
+        (row,) = passages(Journey(), [{**offer, "odometer_distance_m": distance_m}])
+        modes[distance_m] = row["failure_mode"]
+    assert modes == {inside: "none", early: "none", late: "deletion"}
+
+
 def test_outage_is_a_deletion_without_hazard():
     journey = Journey(outages=((33.0, 37.0),))
     result = judge(journey, journey.passages([{"balise_id": "V3", "status": "not_available"}]))
