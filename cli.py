@@ -266,7 +266,8 @@ def calibrate(
     found = measure(logs, read_site(site), train, settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     if as_json:
-        _print_json({"vehicle": found.vehicle.model_dump(), "runs": found.runs, "sigmas": found.sigmas})
+        measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
+        _print_json({**measured, "runs": found.runs, "sigmas": found.sigmas})
         return
     show_table(found.runs, "Scale and latency")
     show_table(found.sigmas, "Sigma of the monitors")
@@ -308,7 +309,7 @@ def sql(
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
     from pipeline.present import show_table
-    from pipeline.query import run_sql
+    from pipeline.results.query import run_sql
 
     answer = run_sql(out, query)
     if as_json:
@@ -492,7 +493,7 @@ def _write_demo(out: Path, result: Any) -> Path:
     """The demo's tables as a campaign would leave them, and the report; returns the report's first page."""
     from pipeline.campaign.finish import write_campaign
     from pipeline.report import write_report
-    from pipeline.store import write_config, write_run
+    from pipeline.results.store import write_config, write_run
     from schemas.config import Configuration
     from schemas.version import SOFTWARE
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from benchmarks.cluster import ROOT, Cluster, kill_one, wait_for, workers_of
 from benchmarks.results import Figure, stopwatch
 from benchmarks.trials import write_campaign
-from pipeline import store
+from pipeline.results import store
 
 TRIALS = 50
 STOP_S = 2.0

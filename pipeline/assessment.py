@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline import catalogue, store
 from pipeline.campaign_tables import campaign_accuracy, campaign_levels, campaign_runs
 from pipeline.hazards.map_errors import map_places, map_suspects
-from pipeline.ingest.files import Address
 from pipeline.present import tall
-from pipeline.remote import redacted
+from pipeline.results import catalogue, store
 from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally
+from pipeline.storage.files import Address
+from pipeline.storage.object_store import redacted
 from schemas.config import Configuration
 from schemas.enums import RunStatus, ThrVerdict
 from schemas.errors import UsageError

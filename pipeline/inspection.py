@@ -8,15 +8,15 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline import store
-from pipeline.ingest import files
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
-from pipeline.ingest.files import Address
 from pipeline.ingest.site import read_site
 from pipeline.matching.describe import describe_site
 from pipeline.matching.survey import survey_findings
-from pipeline.remote import redacted
+from pipeline.results import store
 from pipeline.site_windows import window_findings
+from pipeline.storage import files
+from pipeline.storage.files import Address
+from pipeline.storage.object_store import redacted
 from schemas.config import IngestConfig
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding

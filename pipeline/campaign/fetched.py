@@ -8,18 +8,17 @@ result later, so that it may be looked up at any time. What it does not name is 
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
 
 from pipeline import storage
 from pipeline.campaign.plan import RunJob
-from pipeline.ingest.files import Address, is_url, join
+from pipeline.storage.files import Address, join
 
 
 def known_digest(job: RunJob, version: str | None) -> str:
     """Digest of the log's files as of this version; empty where nobody has read it at this version."""
     if version is None or job.previous is None:
         return ""
-    name, _, digest = _content(_address(job)).partition(" ")
+    name, _, digest = (storage.content_of(_address(job)) or b"").decode().partition(" ")
     return digest if name == _name(job, version) else ""
 
 
@@ -36,10 +35,3 @@ def _name(job: RunJob, version: str) -> str:
 
 def _address(job: RunJob) -> Address:
     return join(join(join(job.out, ".catalogue"), "inputs"), f"{hashlib.sha256(job.run_id.encode()).hexdigest()}.txt")
-
-
-def _content(place: Address) -> str:
-    if is_url(place):
-        return storage.read_many([str(place)]).get(str(place), b"").decode()
-    path = Path(place)
-    return path.read_text() if path.exists() else ""

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 import polars as pl
 
-from pipeline import catalogue, storage, store
+from pipeline import storage
 from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs
 from pipeline.hazards.map_errors import map_places
-from pipeline.ingest.files import Address, join
+from pipeline.results import catalogue, store
 from pipeline.safety.measured import detection_by_level, measured_figures
+from pipeline.storage.files import Address, join
 from schemas.config import Configuration, digest_of
 from schemas.tables import CONTRACT_VERSION
 from schemas.version import SOFTWARE

@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline import storage
-from pipeline.ingest.files import Address, is_url, join
-from pipeline.remote import redacted
+from pipeline.storage.files import Address, is_url, join
+from pipeline.storage.object_store import redacted
 from schemas.errors import OutputError
 
 _NAME = ".lock"
@@ -100,12 +100,7 @@ def _wait_for_silence(place: str, out: str) -> None:
 
 
 def _content(place: Address) -> str:
-    if is_url(place):
-        return storage.read_many([str(place)]).get(str(place), b"").decode()
-    try:
-        return Path(place).read_text()
-    except FileNotFoundError:
-        return ""
+    return (storage.content_of(place) or b"").decode()
 
 
 def _beat(place: str, own: str, ended: threading.Event) -> None:

@@ -14,14 +14,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
-from pipeline import store
 from pipeline.campaign.engines import Engine, engine_for
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.outcome import Result, RunOutcome, lost, never_begun, overdue
 from pipeline.campaign.plan import Plan, RunJob, held_by, with_previous
 from pipeline.campaign.worker import fail_run
-from pipeline.ingest.files import is_url
+from pipeline.results import store
+from pipeline.storage.files import is_url
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
 

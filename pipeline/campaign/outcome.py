@@ -11,8 +11,8 @@ import dataframely as dy
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
-from pipeline.ingest.files import Address
-from pipeline.remote import redacted
+from pipeline.storage.files import Address
+from pipeline.storage.object_store import redacted
 from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError

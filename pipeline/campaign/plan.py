@@ -10,11 +10,12 @@ from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
-from pipeline import storage, store
-from pipeline.ingest import files
-from pipeline.ingest.files import Address
+from pipeline import storage
 from pipeline.ingest.site import read_site
-from pipeline.remote import redacted
+from pipeline.results import store
+from pipeline.storage import files
+from pipeline.storage.files import Address
+from pipeline.storage.object_store import redacted
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, SiteError, UsageError
 from schemas.run import STREAMS

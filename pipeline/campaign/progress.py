@@ -18,9 +18,9 @@ from pipeline import storage
 from pipeline.campaign.loop import Summary, Watch
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
-from pipeline.ingest.files import is_url, join
 from pipeline.present import duration_text
-from pipeline.remote import redacted
+from pipeline.storage.files import is_url, join
+from pipeline.storage.object_store import redacted
 from schemas.enums import RunStatus
 from schemas.version import SOFTWARE
 

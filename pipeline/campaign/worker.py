@@ -8,14 +8,15 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from pipeline import storage, store
+from pipeline import storage
 from pipeline.campaign import fetched, lock
 from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, worst
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
-from pipeline.ingest.files import is_url
 from pipeline.ingest.site import read_site
-from pipeline.remote import redacted
+from pipeline.results import store
+from pipeline.storage.files import is_url
+from pipeline.storage.object_store import redacted
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site

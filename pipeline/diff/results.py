@@ -5,15 +5,15 @@ from __future__ import annotations
 import io
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 
 import polars as pl
 
-from pipeline import storage, store
+from pipeline import storage
 from pipeline.diff.hazards import HAZARD_WINDOW_S, HazardChange, compare_hazards
 from pipeline.diff.tables import Difference, compare_tables
-from pipeline.ingest.files import Address, is_url
-from pipeline.remote import redacted
+from pipeline.results import store
+from pipeline.storage.files import Address
+from pipeline.storage.object_store import redacted
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
@@ -134,10 +134,7 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> R
 
 def _content(out: Address, table: str, run_id: str) -> bytes:
     address = store.table_address(out, table, run_id)
-    if is_url(address):
-        content = storage.read_many([str(address)]).get(str(address))
-    else:
-        content = Path(address).read_bytes() if Path(address).exists() else None
+    content = storage.content_of(address)
     if content is None:
         place = redacted(str(address))
         raise UsageError("is missing from a complete run", place=place, remedy="Replay the run again with --force.")

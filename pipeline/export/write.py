@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.export.gis import run_geojson, run_gpx
 from pipeline.export.layout import layout_json
 from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
-from pipeline.store import metadata_of, read_table, run_ids, table_address
+from pipeline.results.store import metadata_of, read_table, run_ids, table_address
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES

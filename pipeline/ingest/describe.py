@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from pipeline.ingest import files
 from pipeline.ingest.generic import UndecodableError, decoder_for
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
@@ -17,6 +16,7 @@ from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_run import walk_log
 from pipeline.ingest.plan import Sample, candidates, source_of
 from pipeline.ingest.run import read_run
+from pipeline.storage import files
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream

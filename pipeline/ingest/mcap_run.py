@@ -9,7 +9,6 @@ from typing import Protocol
 import polars as pl
 from isal.isal_zlib import crc32
 
-from pipeline.ingest import files
 from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.byte_window import ByteWindow
@@ -22,6 +21,7 @@ from pipeline.ingest.mcap_records import DamageError
 from pipeline.ingest.mcap_walk import McapWalk
 from pipeline.ingest.plan import Sample, candidates, is_candidate, settle, source_of
 from pipeline.ingest.reader import SourceReader
+from pipeline.storage import files
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog

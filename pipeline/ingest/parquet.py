@@ -9,9 +9,9 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.ingest import files
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.conform import conform, extra_columns
+from pipeline.storage import files
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 

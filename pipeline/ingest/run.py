@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pipeline.ingest import files
 from pipeline.ingest.mcap_run import read_mcap
 from pipeline.ingest.parquet import read_folder
+from pipeline.storage import files
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.files import is_dir, join, list_dir, read_bytes
 from pipeline.ingest.site_checks import drop_repeated_points, remarks
 from pipeline.ingest.site_geojson import Network, read_network
 from pipeline.ingest.site_tables import (
@@ -22,6 +21,7 @@ from pipeline.ingest.site_tables import (
     load_table,
     typed_table,
 )
+from pipeline.storage.files import is_dir, join, list_dir, read_bytes
 from pipeline.track import geometric_measures_m, track_of
 from schemas.errors import InputError, SiteError
 from schemas.inputs import Balises, Links, Route, Track

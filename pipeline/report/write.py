@@ -18,9 +18,9 @@ from pipeline.hazards.map_errors import map_places
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, run_page
+from pipeline.results.store import metadata_of, read_table, run_ids, table_address
 from pipeline.safety.side_by_side import Key, side_by_side
 from pipeline.safety.tally import Tally
-from pipeline.store import metadata_of, read_table, run_ids, table_address
 from pipeline.workers import each
 from schemas.config import Configuration, read_toml, settings_from
 from schemas.errors import OutputError, UsageError

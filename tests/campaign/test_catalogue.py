@@ -10,9 +10,10 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline import catalogue, storage, store
+from pipeline import storage
 from pipeline.campaign import run_campaign
-from pipeline.query import run_sql
+from pipeline.results import catalogue, store
+from pipeline.results.query import run_sql
 from schemas.errors import UsageError
 from tests.campaign.compare import plan_of
 from tests.campaign.test_local import undisturbed

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cluster import Cluster
-from pipeline import store
 from pipeline.campaign import run_campaign
 from pipeline.campaign.outcome import lost, overdue
+from pipeline.results import store
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
 from tests.campaign.compare import ROOT, by_run, plan_of, result_bytes, run, wait_for

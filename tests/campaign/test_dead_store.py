@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import remote, storage
+from pipeline import storage
 from pipeline.campaign import make_plan, run_campaign
+from pipeline.storage import object_store
 from schemas.enums import RunStatus
 from schemas.errors import InputError, OutputError, SiteError, UsageError
 from tests.campaign.compare import by_run, plan_of
@@ -94,7 +95,7 @@ def _forget_stores() -> None:
     """Connections are kept, and know where the store of the test before was."""
     import s3fs
 
-    remote._filesystem.cache_clear()
+    object_store._filesystem.cache_clear()
     s3fs.S3FileSystem.clear_instance_cache()
 
 
@@ -143,15 +144,15 @@ def test_many_objects_may_take_longer_than_the_patience(ill: str) -> None:
 
 def test_patience_is_under_a_minute_unless_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("BALISE_STORE_PATIENCE_S", raising=False)
-    assert remote.patience_s() < 60.0
+    assert object_store.patience_s() < 60.0
     monkeypatch.setenv("BALISE_STORE_PATIENCE_S", "7.5")
-    assert remote.patience_s() == 7.5
+    assert object_store.patience_s() == 7.5
     for wrong in ("0", "-3", "nan", "soon"):
         monkeypatch.setenv("BALISE_STORE_PATIENCE_S", wrong)
         with pytest.raises(UsageError, match="BALISE_STORE_PATIENCE_S"):
-            remote.patience_s()
+            object_store.patience_s()
 
 
 def test_what_is_wrong_for_good_is_not_asked_again() -> None:
-    assert remote._tries(FileNotFoundError()) == remote._tries(PermissionError()) == 1
-    assert remote._tries(ValueError("no credentials")) < remote._tries(OSError(16, "busy"))
+    assert object_store._tries(FileNotFoundError()) == object_store._tries(PermissionError()) == 1
+    assert object_store._tries(ValueError("no credentials")) < object_store._tries(OSError(16, "busy"))

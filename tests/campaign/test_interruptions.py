@@ -14,12 +14,13 @@ import pytest
 
 from benchmarks import interruptions
 from benchmarks.interruptions import STOP_S, Job, Victim, disturb
-from pipeline import storage, store
+from pipeline import storage
 from pipeline.campaign import Interrupted, loop, run_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.plan import held_by
 from pipeline.campaign.worker import replay_one
-from pipeline.ingest.files import Address
+from pipeline.results import store
+from pipeline.storage.files import Address
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
 from tests.campaign.compare import ROOT, campaign_bytes, command, plan_of, result_bytes, run, start, wait_for

@@ -14,12 +14,13 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline import storage, store
+from pipeline import storage
 from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
 from pipeline.campaign.outcome import lost
 from pipeline.campaign.progress import LogWatch
 from pipeline.ingest import read_run
 from pipeline.ingest.mcap_writer import write_mcap
+from pipeline.results import store
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError

@@ -13,10 +13,11 @@ import pytest
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, make_server
 
-from pipeline import catalogue, storage, store
+from pipeline import storage
 from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
-from pipeline.query import run_sql
+from pipeline.results import catalogue, store
+from pipeline.results.query import run_sql
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
 from schemas.tables import TABLES

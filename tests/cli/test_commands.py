@@ -134,7 +134,7 @@ def test_our_own_defect(balise: Balise, monkeypatch: pytest.MonkeyPatch, result:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("pipeline.query.run_sql", broken)
+    monkeypatch.setattr("pipeline.results.query.run_sql", broken)
     said = balise("sql", result, "select 1")
     assert said.status == 3
     assert "a defect of this program: ZeroDivisionError" in said.err

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from pipeline.diff import compare_hazards, diff_results
-from pipeline.store import table_address, write_run
+from pipeline.results.store import table_address, write_run
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import Hazards, Runs

@@ -15,7 +15,7 @@ from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import make_plan
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.worker import replay_one
-from pipeline.store import write_config
+from pipeline.results.store import write_config
 from schemas.config import Configuration, to_toml
 from schemas.tables import BANK_MONITORS
 from tests.docs.blocks import ROOT

@@ -10,7 +10,7 @@ import typer
 
 import cli
 from pipeline.campaign.plan import software_digest
-from pipeline.store import read_table
+from pipeline.results.store import read_table
 from tests.docs.blocks import PAGES, ROOT, blocks, commands, mentioned
 
 # The same ride, converted from the receiver's log, and as it was written.

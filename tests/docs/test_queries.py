@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.query import run_sql
+from pipeline.results.query import run_sql
 from tests.docs.blocks import ROOT, Block, blocks
 
 PAGE = blocks(ROOT / "docs" / "analyst.md")

@@ -9,8 +9,8 @@ import pytest
 
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site
+from pipeline.results.store import write_config, write_run
 from pipeline.stages import replay
-from pipeline.store import write_config, write_run
 from schemas.config import Configuration
 from schemas.run import RunLog, RunTables, Site
 

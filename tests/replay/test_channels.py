@@ -10,9 +10,9 @@ from polars.testing import assert_frame_equal
 from pipeline.assessment import assess
 from pipeline.channels import on_path_of, paired
 from pipeline.report import write_report
+from pipeline.results.store import write_run
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
 from pipeline.stages import replay
-from pipeline.store import write_run
 from schemas.config import Configuration
 from schemas.errors import InputError
 from tests.replay.journeys import VEHICLE, journey

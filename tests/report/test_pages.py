@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from cli import app
 from pipeline.report import page_name, write_report
-from pipeline.store import write_run
+from pipeline.results.store import write_run
 from schemas.errors import UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import MONITORS

@@ -9,8 +9,10 @@ import polars as pl
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline import storage, store
-from pipeline.remote import redacted
+from pipeline import storage
+from pipeline.results import store
+from pipeline.storage.files import Address
+from pipeline.storage.object_store import redacted
 from schemas.config import Configuration
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunTables
@@ -114,7 +116,7 @@ def test_interrupted_write_leaves_no_half_run(tmp_path: Path, monkeypatch: pytes
     calls = 0
     stage = storage.stage
 
-    def stage_or_stop(address: Path, content: bytes) -> tuple[storage.Address, storage.Address]:
+    def stage_or_stop(address: Path, content: bytes) -> tuple[Address, Address]:
         nonlocal calls
         calls += 1
         if calls == failing + 1:
@@ -130,7 +132,7 @@ def test_interrupted_write_leaves_no_half_run(tmp_path: Path, monkeypatch: pytes
 def test_redo_is_unmarked_until_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store.write_run(tables_of("r"), tmp_path, METADATA)
 
-    def stop(staged: list[tuple[storage.Address, storage.Address]]) -> None:
+    def stop(staged: list[tuple[Address, Address]]) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(storage, "commit", stop)

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.assessment import Assessment, alarm_causes, assess, for_reading
-from pipeline.store import write_run
+from pipeline.results.store import write_run
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import Runs

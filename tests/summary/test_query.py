@@ -6,8 +6,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.query import run_sql
-from pipeline.store import table_address, write_run
+from pipeline.results.query import run_sql
+from pipeline.results.store import table_address, write_run
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import Runs

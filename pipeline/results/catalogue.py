@@ -15,8 +15,9 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline import storage, store
-from pipeline.ingest.files import Address, is_url, join
+from pipeline import storage
+from pipeline.results import store
+from pipeline.storage.files import Address, is_url, join
 from schemas.conform import dtypes
 from schemas.tables import TABLES
 

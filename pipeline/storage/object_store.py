@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 from itertools import count
 from typing import Any, TypeVar
 
-from pipeline.ingest.files import Address
+from pipeline.storage.files import Address
 from schemas.errors import BaliseError, OutputError, UsageError
 
 T = TypeVar("T")

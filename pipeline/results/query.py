@@ -11,9 +11,9 @@ import re
 
 import polars as pl
 
-from pipeline import catalogue, store
-from pipeline.ingest.files import Address, exists, is_url, join
-from pipeline.remote import redacted
+from pipeline.results import catalogue, store
+from pipeline.storage.files import Address, exists, is_url, join
+from pipeline.storage.object_store import redacted
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES

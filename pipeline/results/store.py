@@ -11,7 +11,7 @@ from urllib.parse import quote, unquote
 import polars as pl
 
 from pipeline import storage
-from pipeline.ingest.files import Address, exists, is_url, join, read_bytes
+from pipeline.storage.files import Address, exists, is_url, join, read_bytes
 from schemas.config import Configuration, Settings, settings_from, to_toml
 from schemas.conform import conform, dtypes
 from schemas.errors import UsageError

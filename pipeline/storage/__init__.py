@@ -1,0 +1,42 @@
+"""Local folders and object stores behind the same few operations.
+
+`files` reads one file by its address; `fetching` lists, and reads many; `writing` puts files there whole or not at all;
+`identity` tells whether content is still the same; `object_store` is the patience with stores that fail.
+"""
+
+from pipeline.storage.fetching import content_of, folders_in, glob_remote, local_copy, reach, read_many
+from pipeline.storage.identity import content_digest, signature, version, version_of, versions
+from pipeline.storage.writing import (
+    SweptError,
+    absolute,
+    as_output_error,
+    commit,
+    discard,
+    remove,
+    remove_folder,
+    stage,
+    write_bytes,
+)
+
+__all__ = [
+    "SweptError",
+    "absolute",
+    "as_output_error",
+    "commit",
+    "content_digest",
+    "content_of",
+    "discard",
+    "folders_in",
+    "glob_remote",
+    "local_copy",
+    "reach",
+    "read_many",
+    "remove",
+    "remove_folder",
+    "signature",
+    "stage",
+    "version",
+    "version_of",
+    "versions",
+    "write_bytes",
+]
