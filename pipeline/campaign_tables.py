@@ -39,7 +39,7 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
         joined,
         ("hazard_rate", "_per_h", poisson_rate, "faults", "hours_seen"),
         ("missed_share", "", clopper_pearson, "missed", "failures"),
-        ("unsafe_share", "", clopper_pearson, "unsafe_accepted", "balises_accepted"),
+        ("unsafe_share", "", clopper_pearson, "unsafe_accepted", "accepted_judged"),
         ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
     )
     levels = [(level, safety.allowed_time_to_detect_s(level)) for level in safety.service_levels]

@@ -79,6 +79,7 @@ def balise_counts(passages: pl.DataFrame, failure_limit_m: float) -> Row:
         "balises_rejected": virtual & status.is_in(_REJECTED),
         "balises_missed": virtual & (status == PassageStatus.MISSED),
         "balises_not_available": virtual & (status == PassageStatus.NOT_AVAILABLE),
+        "accepted_judged": accepted & error.is_not_null(),
         "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
     }
     known = passages.select(error.filter(accepted)).to_series()

@@ -49,7 +49,7 @@ def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
     columns |= _estimate("hazard_rate", "faults per hour", "1/h", "_per_h")
     columns |= _estimate("missed_share", "share of failures not negated within the budget")
-    columns |= _estimate("unsafe_share", "share of accepted VBs beyond the failure limit")
+    columns |= _estimate("unsafe_share", "share of accepted VBs of known error beyond the failure limit")
     columns |= _estimate("outage_rate", "outages per hour", "1/h", "_per_h")
     for level in levels:
         columns |= _level_columns(level)
@@ -122,6 +122,7 @@ def _figures_schema() -> type[dy.Schema]:
         "solution": text("solution"),
         "runs": count("runs that were replayed"),
         "runs_failed": count("runs that could not be, of all solutions"),
+        "runs_partial": count("of the replayed runs those whose log is damaged; what was read of them counts"),
         "hours": real("h", "recorded time", min=0),
         "hours_with_evidence": real("h", "time with a known error, by any evidence", min=0),
         "hours_with_truth": real("h", "of this in runs judged by a reference or balise reads", min=0),
@@ -135,15 +136,23 @@ def _figures_schema() -> type[dy.Schema]:
         "false_alarms": count("false alarms in it"),
         **_estimate("false_alarm_rate", "false alarms per judged hour", "1/h", "_per_h"),
         "accepted": count("virtual balises accepted"),
+        "accepted_judged": count("of these with a known location error"),
         "unsafe_accepted": count("of these beyond the failure limit"),
+        **_estimate("unsafe_share", "share of acceptances of known location error beyond the failure limit"),
         "outages": count("stretches without a usable position"),
         **_estimate("outage_rate", "outages per hour", "1/h", "_per_h"),
         "trusted_losses": count("how often a valid, confident, unambiguous position was lost"),
         **_estimate("mtbf", "mean time between these losses", "h", "_h"),
         **_estimate("continuity_15s", "exp(-15 s / MTBF) (LOC eq. 8)"),
         **{
-            f"share_{state}": real("1", f"share of time in {state.upper()}; null where it is not known", min=0, max=1)
-            for state in ("p0", "p1", "p2", "p3")
+            f"share_{state}": real("1", f"share of time in {meaning}", min=0, max=1)
+            for state, meaning in (
+                ("p0", "P0, in runs judged by a reference or balise reads; null without any"),
+                ("p1", "P1 in these runs; null without any"),
+                ("p2", "P2 in these runs; in all runs where there are none"),
+                ("p3", "P3 in these runs; in all runs where there are none"),
+                ("unknown", "which the state is not known; the five add up to one"),
+            )
         },
         **{f"stanford_{kind}": count(f"epochs of all runs: {kind}, by confidence") for kind in STANFORD},
         **{

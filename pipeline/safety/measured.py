@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import dataframely as dy
 import polars as pl
@@ -25,7 +24,7 @@ from schemas.enums import Evidence, RunStatus
 
 Row = dict[str, object]
 
-_SHARES = ("share_p0", "share_p1", "share_p2", "share_p3")
+_STATES = ("p0", "p1", "p2", "p3")
 
 TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
 
@@ -62,28 +61,40 @@ def _sums() -> Iterator[pl.Expr]:
     yield evidence_s.filter(evidence.is_in(TRUTH)).sum().alias("truth_s")
     yield pl.col("judged_s").fill_null(0.0).filter(judged).sum()
     yield pl.col("false_alarms").filter(judged).sum()
-    yield pl.col("balises_accepted", "unsafe_accepted", "outages", "trusted_s", "trusted_losses").sum()
-    for name in _SHARES:
-        known = pl.col(name).is_not_null() & (pl.col("held_s") > 0)
-        yield pl.col("held_s").filter(known).sum().alias(f"{name}_of_s")
-        yield (pl.col(name) * pl.col("held_s")).filter(known).sum().alias(f"{name}_s")
+    yield (pl.col("status") == RunStatus.PARTIAL).sum().alias("runs_partial")
+    yield pl.col(
+        "balises_accepted", "accepted_judged", "unsafe_accepted", "outages", "trusted_s", "trusted_losses"
+    ).sum()
     yield pl.col(f"stanford_{kind}" for kind in STANFORD).sum()
     for kind in STANFORD:  # null where no run has a protection level
         counts = pl.col(f"stanford_hpl_{kind}")
         yield pl.when(counts.count() > 0).then(counts.sum())
 
 
-def _shares(sums: Mapping[str, Any]) -> Row:
-    """Shares of the time in P0 to P3 over the runs; P0 and P1 where the runs know them, P2 and P3 of all."""
-    known_s = {name: sums[f"{name}_of_s"] for name in _SHARES}
-    return {name: min(1.0, sums[f"{name}_s"] / held_s) if held_s else None for name, held_s in known_s.items()}
+def _shares(runs: pl.DataFrame) -> Row:
+    """Shares of the time in P0 to P3, all of the same time, and what is left: the state is not known.
+
+    P0 and P1 need a truth, so that the time is that of the runs with one. What the odometer alone tells of the error is
+    not good enough to call a position right. Without a truth P2 and P3 are those of all runs.
+    """
+    with_truth = runs.filter(pl.col("evidence").is_in(TRUTH) & (pl.col("held_s") > 0))
+    judged = with_truth if with_truth.height else runs.filter(pl.col("held_s") > 0)
+    whole_s = float(judged["held_s"].sum())
+    if not whole_s:
+        return {}
+    spent = judged.select((pl.col(f"share_{state}").fill_null(0.0) * pl.col("held_s")).sum() for state in _STATES)
+    shares = {state: min(1.0, spent[f"share_{state}"].item() / whole_s) for state in _STATES}
+    if not with_truth.height:
+        shares |= {"p0": None, "p1": None}
+    known = sum(share for share in shares.values() if share is not None)
+    return {f"share_{state}": share for state, share in (shares | {"unknown": max(0.0, 1.0 - known)}).items()}
 
 
 def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
     sums = runs.select(_sums()).row(0, named=True)
     hours, seen, truth, judged = (sums[f"{name}_s"] / 3600.0 for name in ("duration", "seen", "truth", "judged"))
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
-    same = ("unsafe_accepted", "outages", "trusted_losses", "false_alarms")
+    same = ("runs_partial", "accepted_judged", "unsafe_accepted", "outages", "trusted_losses", "false_alarms")
     return {
         **{name: sums[name] for name in same},
         "runs": runs.height,
@@ -99,9 +110,10 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
         "hours_judged": judged,
         **columns_of("false_alarm_rate", poisson_rate(sums["false_alarms"], judged), "_per_h"),
         "accepted": sums["balises_accepted"],
+        **columns_of("unsafe_share", clopper_pearson(sums["unsafe_accepted"], sums["accepted_judged"])),
         **columns_of("outage_rate", poisson_rate(sums["outages"], hours), "_per_h"),
         **continuity_columns(Uptime(sums["trusted_s"], sums["trusted_losses"])),
-        **_shares(sums),
+        **_shares(runs),
         **{name: count for name, count in sums.items() if name.startswith("stanford_")},
         "thr_vb_per_h": thr_vb_per_h,
         "hours_needed": hours_to_substantiate(thr_vb_per_h, missed),
@@ -160,16 +172,28 @@ def _statement(row: Row) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
     head = (
         f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
-        f" at virtual balises in {row['hours_with_truth']:.6g} h with a truth."
+        f" at virtual balises in {row['hours_with_evidence']:.6g} h with evidence, {row['hours_with_truth']:.6g} h of"
+        f" these with a truth (reference or balise reads). {_acceptances(row)}"
     )
     if row["share_p1"]:
-        head += f" Beyond the failure limit and not negated, at a balise or not: {row['share_p1']:.3%} of the time."
+        head += (
+            f" Beyond the failure limit and not negated, at a balise or not: {row['share_p1']:.3%} of the time in runs"
+            " with a truth."
+        )
     if row["hours_still_needed"] == 0.0:
         return f"{head} This substantiates a {claim}."
     return (
-        f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with no further"
-        f" miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
+        f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with a truth and no"
+        f" further miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
     )
+
+
+def _acceptances(row: Row) -> str:
+    said = (
+        f"Of {row['accepted_judged']} accepted virtual balises of known error {row['unsafe_accepted']} lay beyond the"
+    )
+    unjudged = int(str(row["accepted"])) - int(str(row["accepted_judged"]))
+    return f"{said} failure limit" + (f"; the error of {unjudged} more is not known." if unjudged else ".")
 
 
 def substantiation_table(config: SafetyConfig, events: tuple[int, ...] = (0, 1, 2, 5)) -> pl.DataFrame:

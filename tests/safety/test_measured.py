@@ -78,6 +78,7 @@ def test_rates_over_the_campaign() -> None:
         false_alarms=[2, 0, None, None, None, 1],
         false_alarm_rate_per_h=[2.0, 0.0, None, None, None, None],
         balises_accepted=[10, 5, 5, 5, 0, 5],
+        accepted_judged=[10, 5, 5, 0, 0, 3],
         unsafe_accepted=[0, 1, 0, 0, 0, 0],
         outages=[1, 0, 2, 0, 0, 0],
     )
@@ -87,8 +88,9 @@ def test_rates_over_the_campaign() -> None:
         t_negated=[11 * NS, None, None],
         hazardous_s=[1.0, None, None],
     )
-    found = measured_figures(catalogue, faults, CONFIG).row(0, named=True)
-    assert (found["runs"], found["runs_failed"], found["hours"]) == (5, 1, 5.0)
+    figures = measured_figures(catalogue, faults, CONFIG)
+    found = figures.row(0, named=True)
+    assert (found["runs"], found["runs_failed"], found["runs_partial"], found["hours"]) == (5, 1, 1, 5.0)
     assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (3.75, 1.75, 1.4)
     rate = poisson_rate(3, 3.75)
     assert (found["hazards"], found["hazard_rate_per_h"]) == (3, 0.8)
@@ -98,6 +100,12 @@ def test_rates_over_the_campaign() -> None:
     assert (found["missed_share_low"], found["missed_share_high"]) == (share.low, share.high)
     assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.4))
     assert (found["accepted"], found["unsafe_accepted"], found["outages"]) == (30, 1, 3)
+    unsafe = clopper_pearson(1, 23)  # what nobody can judge is not safe
+    assert (found["accepted_judged"], found["unsafe_share"]) == (23, unsafe.value)
+    assert (found["unsafe_share_low"], found["unsafe_share_high"]) == (unsafe.low, unsafe.high)
+    (sentence,) = plain_statements(figures)
+    assert "in 3.75 h with evidence, 1.75 h of these with a truth (reference or balise reads)" in sentence
+    assert "Of 23 accepted virtual balises of known error 1 lay beyond the failure limit; the error of 7 more" in sentence
 
 
 def test_a_trial_without_a_miss_says_what_it_lacks() -> None:
@@ -123,7 +131,7 @@ def test_a_position_wrong_between_balises_is_not_kept_quiet() -> None:
     """No virtual balise was hit, yet for 0.4 % of the time the position was wrong and in use."""
     figures = measured_figures(runs(2, held_s=3600.0, share_p1=[0.008, 0.0]), NO_HAZARDS, CONFIG)
     assert (
-        "Beyond the failure limit and not negated, at a balise or not: 0.400% of the time"
+        "Beyond the failure limit and not negated, at a balise or not: 0.400% of the time in runs with a truth."
         in plain_statements(figures)[0]
     )
 
@@ -166,6 +174,7 @@ def test_shares_continuity_and_stanford_counts_over_the_campaign() -> None:
     """Two runs of 1 h and 3 h; the truth of the second is missing, and it lost its position four times in 2 h."""
     catalogue = runs(
         2,
+        evidence=["reference", None],
         held_s=[3600.0, 10800.0],
         share_p0=[0.9, None],
         share_p1=[0.02, None],
@@ -179,7 +188,8 @@ def test_shares_continuity_and_stanford_counts_over_the_campaign() -> None:
     )
     found = measured_figures(catalogue, NO_HAZARDS, CONFIG).row(0, named=True)
     assert (found["share_p0"], found["share_p1"]) == (0.9, 0.02)
-    assert (found["share_p2"], found["share_p3"]) == (pytest.approx(0.05), pytest.approx(0.15))
+    assert (found["share_p2"], found["share_p3"]) == (0.08, 0.0)
+    assert found["share_unknown"] == pytest.approx(0.0, abs=1e-12)
     assert (found["trusted_losses"], found["mtbf_h"]) == (4, 0.75)
     rate = poisson_rate(4, 3.0)
     assert rate.low is not None
@@ -189,6 +199,27 @@ def test_shares_continuity_and_stanford_counts_over_the_campaign() -> None:
     assert found["continuity_15s_low"] < found["continuity_15s"] < found["continuity_15s_high"]
     assert (found["stanford_nominal"], found["stanford_hazardous"]) == (30, 3)
     assert (found["stanford_hpl_nominal"], found["stanford_hpl_hazardous"]) == (7, None)
+
+
+def test_shares_of_time_are_of_one_time_and_what_is_left_is_unknown() -> None:
+    """The odometer alone calls no position right, and time without a state is nobody's."""
+    catalogue = runs(
+        3,
+        evidence=["balise", "odometer", "reference"],
+        held_s=[3600.0, 36000.0, 1800.0],
+        share_p0=[0.5, 1.0, 0.8],
+        share_p1=[0.1, 0.0, None],
+        share_p2=[0.2, 0.0, 0.2],
+        share_p3=[0.1, 0.0, 0.0],
+    )
+    found = measured_figures(catalogue, NO_HAZARDS, CONFIG).row(0, named=True)
+    assert found["share_p0"] == pytest.approx((1800 + 1440) / 5400)
+    assert found["share_p1"] == pytest.approx(360 / 5400)
+    assert (found["share_p2"], found["share_p3"]) == (pytest.approx(1080 / 5400), pytest.approx(360 / 5400))
+    assert found["share_unknown"] == pytest.approx(360 / 5400)
+    blind = measured_figures(catalogue.filter(pl.col("evidence") == "odometer"), NO_HAZARDS, CONFIG)
+    row = blind.row(0, named=True)
+    assert (row["share_p0"], row["share_p1"], row["share_p2"], row["share_unknown"]) == (None, None, 0.0, 1.0)
 
 
 def test_without_a_loss_the_mtbf_has_a_lower_bound_alone() -> None:

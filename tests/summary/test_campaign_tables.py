@@ -50,6 +50,7 @@ class TestRuns:
             evidence=["reference", "reference", None, None],
             status=["ok", "ok", "ok", "failed"],
             balises_accepted=[10, 10, 10, 0],
+            accepted_judged=[8, 10, 0, 0],
             unsafe_accepted=[1, 0, 0, 0],
             outages=[3, 0, 0, 0],
             duration_s=[1800.0, 1800.0, 1800.0, None],
@@ -67,12 +68,14 @@ class TestRuns:
         assert (row["hazard_rate_low_per_h"], row["hazard_rate_high_per_h"]) == (rate.low, rate.high)
         assert (row["failures"], row["missed_share"]) == (2, 0.5)
         assert (row["missed_share_low"], row["missed_share_high"]) == (share.low, share.high)
-        assert (row["unsafe_share"], row["outage_rate_per_h"]) == (0.1, 6.0)
+        assert (row["unsafe_share"], row["outage_rate_per_h"]) == (0.125, 6.0)
         assert (row["allowed_lpv200_s"], row["within_lpv200"]) == (pytest.approx(0.5025), 0)
         assert (row["within_npa"], row["verdict_npa"]) == (1, "exceeded")
         assert found["verdict_lpv200"].to_list() == ["no_failure", "exceeded", "unknown", "unknown"]
         assert found["hazard_rate_per_h"].to_list() == [0.0, 4.0, None, None]
         assert found["outage_rate_per_h"].to_list()[3] is None
+        assert found["unsafe_share"].to_list() == [0.0, 0.125, None, None]
+        assert found["unsafe_share_high"][0] == clopper_pearson(0, 10).high
 
     def test_kept_by_one_level_and_not_by_another(self) -> None:
         found = campaign_runs(

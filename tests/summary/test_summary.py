@@ -246,7 +246,7 @@ class TestBalises:
             location_error_m=[20.0, -20.1, 31.0, None, 400.0],
         )
         found = row(epochs(seconds(3)), passages=frame)
-        assert found["unsafe_accepted"] == 2
+        assert (found["unsafe_accepted"], found["accepted_judged"]) == (2, 3)
         assert found["location_error_mean_m"] == pytest.approx(10.3)
         assert found["location_error_max_m"] == 31.0
         wide = Configuration(hazards=HazardConfig(failure_limit_m=25.0))
