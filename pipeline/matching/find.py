@@ -18,7 +18,7 @@ from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.search import search
-from pipeline.matching.steps import Steps, Travelled, resumed, steps_of, travelled
+from pipeline.matching.steps import Steps, Travelled, believable, out_of_reach, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from pipeline.track import end_places
 from schemas.config import MatchingConfig
@@ -46,30 +46,32 @@ def find_path(
 
     `pinned` holds per epoch the element that a balise read proves, -1 without one.
     """
-    trellis = _trellis(fixes, odometer, network, pinned, config)
+    way = travelled(fixes, odometer)
+    believed = believable(fixes, fixes.valid, way, config)
+    trellis = _trellis(fixes, believed, way, network, pinned, config)
     found = search(trellis)
     decoded = aligned(trellis, decode(trellis, found.best))
     legs = legs_of(trellis, decoded)
-    way, at = travelled(fixes, odometer), positions_m(decoded, legs)
+    at = positions_m(decoded, legs)
     if not grows_with(at, trellis.steps.epoch, way, config.orientation_distance_m):
         decoded = decoded.turned(network, range(len(decoded.chains)))
         legs = legs_of(trellis, decoded)
     doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
+    assignment = assignment.without_gate(out_of_reach(fixes, believed, way))
     return path, assignment, stretches(fixes, trellis, found, doubt, config)
 
 
 def _trellis(
-    fixes: Fixes, odometer: pl.DataFrame | None, network: Network, pinned: Ints, config: MatchingConfig
+    fixes: Fixes, believed: Ints, way: Travelled, network: Network, pinned: Ints, config: MatchingConfig
 ) -> Trellis:
-    """Steps with their candidates; steps without any are left out.
+    """Steps among the believed epochs with their candidates; steps without any are left out.
 
     Between epochs near a track, epochs further off count too: a position that drifts away slowly still shows
     by its movement which way the train turned.
     """
-    way = travelled(fixes, odometer)
-    steps = _thinned(fixes, steps_of(fixes, fixes.valid, way, config), network, way, config)
+    steps = _thinned(fixes, steps_of(fixes, believed, way, config), network, way, config)
     wide = _all_candidates(fixes, steps, network, config)
     nearest = np.full(len(steps), np.inf)
     np.minimum.at(nearest, wide.step, wide.distance_m)

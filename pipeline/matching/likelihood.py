@@ -20,8 +20,10 @@ from pipeline.matching.fixes import Fixes
 from pipeline.matching.steps import Steps
 from schemas.config import MatchingConfig
 
-# Floor of what the offset changes from step to step [m]: rounding of surveys and fixes.
+# Floor of what the offset changes from step to step [m]: rounding of surveys and fixes; more where the sigma is a
+# table's, which knows nothing of this receiver's noise.
 _FLOOR_M = 0.02
+_TABLE_FLOOR_M = 0.1
 _HEADING_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
@@ -59,14 +61,15 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     elapsed, way = steps.elapsed_s[candidates.step], steps.chord_m[candidates.step]
     renewed = -np.expm1(-2.0 * np.nan_to_num(elapsed) / config.noise_tau_s)
     new_track = -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
-    fresh = np.clip(gnss_m2 * renewed + survey**2 * new_track, _FLOOR_M**2, variance)
+    floor_m = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M)
+    fresh = np.clip(gnss_m2 * renewed + survey**2 * new_track, np.minimum(floor_m**2, variance), variance)
     heading = _heading(steps, candidates, config)
     return Likelihood(
         variance_m2=variance,
         fresh_m2=fresh,
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
         keep=np.sqrt(1.0 - gnss_m2 * renewed / variance),
-        fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2) + heading * fresh / variance,
+        fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2, config) + heading * fresh / variance,
         heading=heading,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
@@ -87,8 +90,12 @@ def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Lik
     """Log density of an offset: Gaussian, or with small probability an outlier (Cauchy)."""
     gauss = -0.5 * ((offset_m - mean_m) ** 2 / variance_m2 + np.log(2.0 * np.pi * variance_m2))
     scale = like.outlier_scale_m
-    wide = -np.log(np.pi * scale * (1.0 + (offset_m / scale) ** 2))
-    return np.asarray(np.logaddexp(np.log1p(-like.outlier) + gauss, np.log(like.outlier) + wide))
+    return np.asarray(np.logaddexp(np.log1p(-like.outlier) + gauss, np.log(like.outlier) + _wide(offset_m, scale)))
+
+
+def _wide(off_m: Floats, scale_m: float) -> Floats:
+    """Log density of an outlier (Cauchy)."""
+    return np.asarray(-np.log(np.pi * scale_m * (1.0 + (off_m / scale_m) ** 2)))
 
 
 def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
@@ -98,11 +105,12 @@ def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
     return np.maximum(cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn, 1e-6)
 
 
-def _ends(candidates: Candidates, variance_m2: Floats) -> Floats:
+def _ends(candidates: Candidates, variance_m2: Floats, config: MatchingConfig) -> Floats:
     """Log-probability that a position belongs to the element rather than to those linked to its ends.
 
     About a link it is shared between the elements on both sides and adds up to one, so that a track in many
     pieces is as probable as one in a single piece. Past an end without a link it falls off as a Gaussian.
+    As across the track, a single jump past an end does not decide: it may be an outlier.
     """
     sigma = np.sqrt(variance_m2)
     value = np.where(candidates.past != 0, -0.5 * (candidates.beyond_m / sigma) ** 2, 0.0)
@@ -112,7 +120,8 @@ def _ends(candidates: Candidates, variance_m2: Floats) -> Floats:
     ):
         shared = log_ndtr(np.where(past, -candidates.beyond_m, inside_m) / sigma)
         value = np.where(linked & past, shared, value + np.where(linked & ~past, shared, 0.0))
-    return value
+    jumped = np.log(config.outlier_probability) + _wide(candidates.beyond_m, config.outlier_scale_m)
+    return np.where(candidates.past != 0, np.logaddexp(np.log1p(-config.outlier_probability) + value, jumped), value)
 
 
 def _heading(steps: Steps, candidates: Candidates, config: MatchingConfig) -> Floats:

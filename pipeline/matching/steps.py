@@ -16,8 +16,11 @@ from pipeline.matching.fixes import Fixes
 from pipeline.odometer import odometer_track
 from schemas.config import MatchingConfig
 
-# No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s).
+# No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s), none gains speed
+# faster (1.5 m/s² is much), and how fast it was is told by the positions of these last seconds.
 _TOP_SPEED_MPS = 100.0
+_MOST_GAIN_MPS2 = 5.0
+_SPEED_SPAN_S = (1.0, 5.0)
 # How far odometer and GNSS may differ over a step before it counts as a jump: share, and standard deviations.
 _ODOMETER_SHARE = 0.05
 _JUMP_SIGMAS = 5.0
@@ -67,9 +70,8 @@ def travelled(fixes: Fixes, odometer: pl.DataFrame | None) -> Travelled:
     return Travelled(np.where(inside, track.distance_at(t_s), np.nan), track.stretch_at(t_s))
 
 
-def steps_of(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig) -> Steps:
-    """Steps every `step_distance_m` of movement and `step_time_s` of time among the usable epochs."""
-    rows = np.flatnonzero(usable)
+def steps_of(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Steps:
+    """Steps every `step_distance_m` of movement and `step_time_s` of time among the given epochs."""
     if len(rows) == 0:
         return resumed(fixes, rows, way)
     moved = np.linalg.norm(np.diff(fixes.points.surface[rows], axis=0), axis=1)
@@ -78,36 +80,66 @@ def steps_of(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig
     fresh = np.ones(len(rows), dtype=bool)
     fresh[1:] = (np.diff(far) > 0) | (np.diff(late) > 0)
     fresh[-1] = True
-    chosen = rows[fresh]
-    return resumed(fixes, chosen[_believable(fixes, chosen, way, config)], way)
+    return resumed(fixes, rows[fresh], way)
 
 
-def _believable(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Bools:
-    """Steps that the train can have reached from the last believed one; after `jump_hold_s` any."""
+def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig) -> Ints:
+    """Usable epochs that the train can have reached from the last believed one; after `jump_hold_s` any.
+
+    Causal: an epoch is judged by those before it.
+    """
+    rows = np.flatnonzero(usable)
     believed = np.ones(len(rows), dtype=bool)
-    doubtful = np.flatnonzero(~_reachable(fixes, rows[:-1], rows[1:], way, config))
-    while len(doubtful):
-        # Follow the first doubtful step until one is believed again; from there the pairs above hold.
-        last = int(doubtful[0])
-        later = np.flatnonzero(
-            _reachable(fixes, np.full(len(rows) - last - 1, rows[last]), rows[last + 1 :], way, config)
+    speed_mps = _speeds_mps(fixes, rows)
+    t_s = fixes.t_s[rows]
+
+    def reachable(before: Ints, after: Ints) -> Bools:
+        return _reachable(fixes, rows[before], rows[after], speed_mps[before], way) | (
+            t_s[after] - t_s[before] > config.jump_hold_s
         )
-        again = last + 1 + int(later[0]) if len(later) else len(rows)
+
+    number = np.arange(len(rows))
+    doubtful = np.flatnonzero(~reachable(number[:-1], number[1:]))
+    while len(doubtful):
+        # Follow the first doubtful epoch until one is believed again; from there the pairs above hold.
+        last = int(doubtful[0])
+        held = int(np.searchsorted(t_s, t_s[last] + config.jump_hold_s, side="right"))
+        later = number[last + 1 : held + 1]
+        found = np.flatnonzero(reachable(np.full(len(later), last), later))
+        again = int(later[found[0]]) if len(found) else len(rows)
         believed[last + 1 : again] = False
         doubtful = doubtful[doubtful >= again]
-    return believed
+    return rows[believed]
 
 
-def _reachable(fixes: Fixes, rows: Ints, others: Ints, way: Travelled, config: MatchingConfig) -> Bools:
-    """Whether the train can have been at the positions of both epochs, by odometer or else by top speed."""
+def out_of_reach(fixes: Fixes, believed: Ints, way: Travelled) -> Bools:
+    """Positions where the train cannot be, and no odometer by which the monitors along the track would say so."""
+    beyond = fixes.valid & ~np.isfinite(way.distance_m)
+    beyond[believed] = False
+    return beyond
+
+
+def _speeds_mps(fixes: Fixes, rows: Ints) -> Floats:
+    """Speed at epochs by their own positions over the last second or so, NaN where those do not say."""
+    t_s = fixes.t_s[rows]
+    before = np.searchsorted(t_s, t_s - _SPEED_SPAN_S[0], side="right") - 1
+    elapsed = t_s - t_s[before]
+    apart = np.linalg.norm(fixes.points.surface[rows] - fixes.points.surface[rows[before]], axis=1)
+    known = (before >= 0) & (elapsed >= _SPEED_SPAN_S[0]) & (elapsed <= _SPEED_SPAN_S[1])
+    return np.where(known, apart / np.where(known, elapsed, 1.0), np.nan)
+
+
+def _reachable(fixes: Fixes, rows: Ints, others: Ints, speed_mps: Floats, way: Travelled) -> Bools:
+    """Whether the train can have been at the positions of both epochs, by odometer or else by its speed."""
     apart = np.linalg.norm(fixes.points.surface[others] - fixes.points.surface[rows], axis=1)
     elapsed = fixes.t_s[others] - fixes.t_s[rows]
     moved = np.abs(way.between(rows, others))
     variance = 0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)
     sigma = np.sqrt(variance[rows]) + np.sqrt(variance[others])
-    limit = np.where(np.isfinite(moved), moved * (1 + _ODOMETER_SHARE), elapsed * _TOP_SPEED_MPS)
+    fastest = np.fmin(speed_mps + _MOST_GAIN_MPS2 * elapsed, _TOP_SPEED_MPS)
+    limit = np.where(np.isfinite(moved), moved * (1 + _ODOMETER_SHARE), elapsed * fastest)
     limit += _JUMP_MARGIN_M + _JUMP_SIGMAS * sigma
-    return np.asarray((apart <= limit) | (elapsed > config.jump_hold_s))
+    return np.asarray(apart <= limit)
 
 
 def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
