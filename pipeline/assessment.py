@@ -14,10 +14,8 @@ from pipeline.safety.measured import detection_by_level, measured_figures, plain
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally
 from pipeline.storage.files import Address
-from pipeline.storage.object_store import redacted
 from schemas.config import Configuration
 from schemas.enums import RunStatus, ThrVerdict
-from schemas.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
 
     `config` instead of the result's own, to judge it by other service levels.
     """
-    if not store.run_ids(out):
-        raise UsageError(
-            "holds no complete run",
-            place=redacted(str(out)),
-            expected="the output folder of `balise replay`",
-        )
+    store.complete_runs(out)
     settings = config or store.read_config(out) or Configuration()
     names = ("runs", "hazards", "passages", "alarms")
     runs, hazards, passages, alarms = (_table(out, name) for name in names)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 
 import polars as pl
@@ -13,22 +12,22 @@ from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes
 from pipeline.hazards import HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.lds.run import LdsResult, run_lds
+from pipeline.lds.run import run_lds
 from pipeline.matching import Match, match
-from pipeline.matching.fixes import contradictory_covariances
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import channel_monitor, doppler_monitor
+from pipeline.provenance import provenance
+from pipeline.run_notes import run_notes
 from pipeline.statistics import threshold_factor
-from pipeline.summary import Alignment, Provenance, SolutionResults, failed_row, summarise
+from pipeline.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.telegrams import place_reads, places_near
-from schemas.config import Configuration, LdsConfig, Vehicle, digest_of
+from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import Evidence
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
-from schemas.version import SOFTWARE
 
 
 @dataclass(frozen=True)
@@ -137,18 +136,12 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         ingest=run.notes,
         ambiguous_stretches=found.ambiguous.height,
         notes=(
-            *_notes(run, vehicle, fixes, found, lds),
+            *run_notes(run, fixes, found, lds, vehicle),
             *evidence_notes(aligned, truth, config.hazards.failure_limit_m),
             *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
         ),
     )
     return _Solution(epochs, result, summarise(results, config, provenance(context.run, context.site, vehicle, config)))
-
-
-def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
-    """Digests of what a result is made from, and the program that makes it."""
-    inputs = hashlib.sha256(f"{run.input_digest}:{site.digest}".encode()).hexdigest()
-    return Provenance(digest_of(config, vehicle), inputs, SOFTWARE)
 
 
 def _evidence(truth: pl.DataFrame) -> Evidence | None:
@@ -161,50 +154,6 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
     """Scale and latency as they stand at the end of the run."""
     names = ("latency_s", "latency_sigma_s", "odometer_scale", "scale_sigma")
     return Alignment(*(aligned[name][-1] for name in names))
-
-
-def _notes(run: RunLog, vehicle: Vehicle, fixes: pl.DataFrame, found: Match, lds: LdsResult) -> tuple[str, ...]:
-    """What the reader of the `runs` row should know beside its figures."""
-    notes = []
-    if run.faults is not None and run.faults.height:
-        notes.append("faults were injected: " + ", ".join(sorted(set(run.faults["kind"].to_list()))))
-    if run.odometer is not None and _end_ns(run.gnss) > _end_ns(run.odometer) + 1_000_000_000:
-        notes.append("the odometer ends before the GNSS")
-    if run.odometer is not None and _end_ns(run.odometer) > _end_ns(run.gnss) + 1_000_000_000:
-        notes.append("the GNSS ends before the odometer")
-    if run.odometer is not None and _begin_ns(run.gnss) > _begin_ns(run.odometer) + 1_000_000_000:
-        notes.append("the GNSS begins after the odometer")
-    if found.antenna_ahead_m * vehicle.gnss_antenna_ahead_m < 0:
-        notes.append("the odometer falls at first, so the train reverses: the GNSS antenna is taken as behind it")
-    contradictory = contradictory_covariances(fixes)
-    if contradictory:
-        notes.append(f"cov_en_m2 contradicts its variances at {contradictory} epochs and is not used there")
-    if found.ambiguous.height:
-        clock = "%H:%M:%S"
-        stretches = [
-            f"{one} or {other} from {start:{clock}} to {end:{clock}}"
-            for one, other, start, end in found.ambiguous.select(
-                "netelement_id", "other_netelement_id", "t_start", "t_end"
-            ).iter_rows()
-        ]
-        notes.append("ambiguous: " + ", ".join(stretches))
-    if lds.undecided:
-        notes.append(
-            f"after {len(lds.undecided)} breaks of position or odometer nothing could tell whether the position had "
-            "moved meanwhile: what the expectation windows let pass is not seen there"
-        )
-    if lds.unknown_reads.height:
-        names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
-        notes.append("reads of balises that are not on the path: " + ", ".join(names))
-    return tuple(notes)
-
-
-def _begin_ns(stream: pl.DataFrame) -> int:
-    return int(stream["t"].dt.timestamp("ns")[0])
-
-
-def _end_ns(stream: pl.DataFrame) -> int:
-    return int(stream["t"].dt.timestamp("ns")[-1])
 
 
 def _confidence(lds: LdsConfig) -> pl.Expr:

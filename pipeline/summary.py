@@ -11,25 +11,14 @@ import polars as pl
 from pipeline import run_figures as figures
 from pipeline.clean import StreamCounts
 from pipeline.epoch_clock import Clock
+from pipeline.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import (
-    Evidence,
-    RunStatus,
-)
+from schemas.enums import Evidence, RunStatus
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 
 Row = dict[str, object]
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """What the result was made from and by; the same provenance always gives the same tables."""
-
-    config_digest: str
-    input_digest: str
-    software: str
 
 
 @dataclass(frozen=True)

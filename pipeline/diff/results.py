@@ -89,7 +89,7 @@ def diff_results(out_a: Address, out_b: Address, hazard_window_s: float = HAZARD
 
     Hazards of the same solution and class at most `hazard_window_s` [s] apart are the same hazard.
     """
-    runs_a, runs_b = (_runs(out) for out in (out_a, out_b))
+    runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
     found = [_diff_run(out_a, out_b, run, hazard_window_s) for run in common]
     return ResultDiff(
@@ -104,14 +104,6 @@ def diff_results(out_a: Address, out_b: Address, hazard_window_s: float = HAZARD
 def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
     counts = Counter(column for run in runs for column in run.made_otherwise)
     return tuple(f"{column} differs in {counts[column]} runs" for column in _PROVENANCE if counts[column])
-
-
-def _runs(out: Address) -> list[str]:
-    runs = store.run_ids(out)
-    if not runs:
-        place = redacted(str(out))
-        raise UsageError("holds no complete run", place=place, expected="the output folder of `balise replay`")
-    return runs
 
 
 def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> RunDiff:

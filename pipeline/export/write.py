@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 from pipeline.export.gis import run_geojson, run_gpx
 from pipeline.export.layout import layout_json
 from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
-from pipeline.results.store import metadata_of, read_table, run_ids, table_address
+from pipeline.provenance import input_digest
+from pipeline.results.store import check_site, metadata_of, read_run, run_ids, table_address
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import TABLES
 
 SUFFIXES = (".mcap", ".geojson", ".gpx")
 
@@ -32,7 +31,8 @@ def export_run(
     """
     if to.suffix.lower() not in SUFFIXES:
         raise UsageError("cannot be told by its suffix", place=str(to), expected=" or ".join(SUFFIXES))
-    tables = read_run_tables(out, run_id)
+    _check_run(out, run_id)
+    tables = read_run(out, run_id)
     _check(out, tables, site, log)
     to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() == ".mcap":
@@ -45,21 +45,17 @@ def export_run(
     return [_write_text(to, make(tables, site))], []
 
 
-def read_run_tables(out: Path, run_id: str) -> RunTables:
-    """The five tables of one complete run."""
+def _check_run(out: Path, run_id: str) -> None:
     known = run_ids(out)
     if run_id not in known:
         shown = ", ".join(known[:10]) or "no complete run"
         raise UsageError("has no such run", place=str(out), found=run_id, expected=shown)
-    frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
-    return RunTables(run_id, **frames)
 
 
 def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:
     """Site and log have to be those of the replay, as far as the result tells."""
     known = metadata_of(Path(str(table_address(out, "runs", tables.run_id)))).get("site_digest", "")
-    if site is not None and site.digest and known and site.digest != known:
-        raise UsageError("was replayed on another site", place=tables.run_id, found=site.digest, expected=known)
+    check_site(site, known, tables.run_id)
     digest = site.digest if site is not None else known
     if log is not None and log.input_digest and digest:
         found, expected = input_digest(log, digest), str(tables.runs["input_digest"].first())
@@ -67,11 +63,6 @@ def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) 
             raise UsageError("was replayed from another log", place=tables.run_id, found=found, expected=expected)
     if tables.epochs.is_empty():
         raise UsageError("has no epoch to export", place=tables.run_id, found=str(tables.runs["error"].first()))
-
-
-def input_digest(log: RunLog, site_digest: str) -> str:
-    """What the `runs` table calls the input digest: that of log and site."""
-    return hashlib.sha256(f"{log.input_digest}:{site_digest}".encode()).hexdigest()
 
 
 def _write_mcap(

@@ -18,13 +18,21 @@ from pipeline.hazards.map_errors import map_places
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, run_page
-from pipeline.results.store import metadata_of, read_table, run_ids, table_address
+from pipeline.results.store import (
+    check_site,
+    complete_runs,
+    file_name,
+    metadata_of,
+    read_run,
+    read_table,
+    table_address,
+)
 from pipeline.safety.side_by_side import Key, side_by_side
 from pipeline.safety.tally import Tally
 from pipeline.workers import each
 from schemas.config import Configuration, read_toml, settings_from
-from schemas.errors import OutputError, UsageError
-from schemas.run import RunTables, Site
+from schemas.errors import OutputError
+from schemas.run import Site
 from schemas.tables import TABLES
 
 _PAGES_PER_PROCESS = 20
@@ -51,9 +59,7 @@ def write_report(
     from these very tables, settings and program are left as they are. `jobs` processes make the others, by
     default one per core where there are many; `progress` is told how many pages of how many are done.
     """
-    runs = run_ids(out)
-    if not runs:
-        raise UsageError("holds no complete run", place=str(out), expected="a folder that `balise replay` wrote")
+    runs = complete_runs(out)
     made = _made(out, site)
     names = {run: page_name(run) for run in runs}
     pages = [_Page(out, run, out / "report" / "runs" / name, made) for run, name in names.items()]
@@ -75,8 +81,8 @@ def write_report(
 
 
 def page_name(run_id: str) -> str:
-    """File name of a run's page; what a path cannot hold is percent-encoded."""
-    return quote(run_id, safe=" +,()[]@!~") + ".html"
+    """File name of a run's page."""
+    return f"{file_name(run_id)}.html"
 
 
 def _worth(pages: int) -> int:
@@ -87,13 +93,13 @@ def _worth(pages: int) -> int:
 def _written(page: _Page) -> dict[Key, Tally] | None:
     """Write the page, unless it is there already; returns the run's solutions side by side where it has several."""
     metadata = metadata_of(Path(str(table_address(page.out, "runs", page.run))))
-    _check_site(page.made.site, metadata, page.run)
+    check_site(page.made.site, metadata.get("site_digest"), page.run)
     mark = f"<!-- {_made_from(page)} -->\n".encode()
     known_site = page.made.site is None or page.made.site.digest
     kept = bool(known_site) and page.path.exists() and page.path.read_bytes().endswith(mark)
     if kept and read_table(page.out, "runs", page.run).select(pl.len()).collect().item() == 1:
         return None
-    tables = _tables(page.out, page.run)
+    tables = read_run(page.out, page.run)
     tallies = None
     if tables.runs.height > 1:
         tallies = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, page.made.config)
@@ -119,19 +125,6 @@ def _made(out: Path, site: Site | None) -> Made:
         return Made(Configuration(), None, site)
     config = settings_from(read_toml(path), Configuration, str(path))
     return Made(config, path.read_text(encoding="utf-8"), site)
-
-
-def _check_site(site: Site | None, metadata: dict[str, str], run: str) -> None:
-    known = metadata.get("site_digest")
-    if site is not None and site.digest and known and known != site.digest:
-        raise UsageError(
-            "was replayed on another site than the one given", place=run, found=site.digest, expected=known
-        )
-
-
-def _tables(out: Path, run: str) -> RunTables:
-    frames = {name: read_table(out, name, run).drop("run_id").collect() for name in TABLES}
-    return RunTables(run, **frames)
 
 
 def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dict[Key, Tally]]) -> Campaign:

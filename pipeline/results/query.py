@@ -13,7 +13,6 @@ import polars as pl
 
 from pipeline.results import catalogue, store
 from pipeline.storage.files import Address, exists, is_url, join
-from pipeline.storage.object_store import redacted
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES
@@ -41,13 +40,7 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
 
 
 def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
-    runs = store.run_ids(out)
-    if not runs:
-        raise UsageError(
-            "holds no complete run",
-            place=redacted(str(out)),
-            expected="the output folder of `balise replay`",
-        )
+    runs = store.complete_runs(out)
     # Only what the query may name: ten thousand addresses take their time, remote tables their transfer.
     named = [name for name in TABLES if re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
     return {name: _scan(out, name, runs) for name in named} | _campaign_tables(out)

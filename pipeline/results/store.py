@@ -12,10 +12,11 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.storage.files import Address, exists, is_url, join, read_bytes
+from pipeline.storage.object_store import redacted
 from schemas.config import Configuration, Settings, settings_from, to_toml
 from schemas.conform import conform, dtypes
 from schemas.errors import UsageError
-from schemas.run import RunTables
+from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
 
 PREFIX = "balise."
@@ -26,8 +27,13 @@ _MARKER = "runs"
 
 
 def table_address(out: Address, table: str, run_id: str) -> Address:
-    """`OUT/hazards/run_id=R/hazards.parquet`; what a path cannot hold is percent-encoded."""
+    """`OUT/hazards/run_id=R/hazards.parquet`."""
     return join(join(join(out, table), _partition(run_id)), f"{table}.parquet")
+
+
+def file_name(run_id: str) -> str:
+    """The run id as part of a path; what a path cannot hold is percent-encoded."""
+    return quote(run_id, safe=" +,()[]@!~")
 
 
 def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> None:
@@ -71,6 +77,12 @@ def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str]) -> bytes:
         metadata={f"{PREFIX}{key}": metadata[key] for key in sorted(metadata)},
     )
     return buffer.getvalue()
+
+
+def read_run(out: Address, run_id: str) -> RunTables:
+    """The five tables of one complete run."""
+    frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
+    return RunTables(run_id, **frames)
 
 
 def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
@@ -135,6 +147,22 @@ def run_ids(out: Address) -> list[str]:
     return sorted(runs)
 
 
+def complete_runs(out: Address) -> list[str]:
+    """`run_ids` of a result that has some. Raises `UsageError` otherwise."""
+    runs = run_ids(out)
+    if not runs:
+        raise UsageError(
+            "holds no complete run", place=redacted(str(out)), expected="the output folder of `balise replay`"
+        )
+    return runs
+
+
+def check_site(site: Site | None, replayed_digest: str | None, run_id: str) -> None:
+    """Refuse a site that is known to be another one than the run was replayed on."""
+    if site is not None and site.digest and replayed_digest and site.digest != replayed_digest:
+        raise UsageError("was replayed on another site", place=run_id, found=site.digest, expected=replayed_digest)
+
+
 def completed_runs(out: Address) -> dict[str, dict[str, str]]:
     """Metadata of each complete run, without reading any table."""
     runs = run_ids(out)
@@ -195,7 +223,7 @@ def write_config(out: Address, settings: Settings) -> None:
 
 
 def _partition(run_id: str) -> str:
-    return f"run_id={quote(run_id, safe=' +,()[]@!~')}"
+    return f"run_id={file_name(run_id)}"
 
 
 def _read_remote(table: str, paths: list[str], runs: list[str]) -> pl.LazyFrame:

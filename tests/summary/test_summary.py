@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.clean import StreamCounts
-from pipeline.summary import Alignment, Provenance, SolutionResults, failed_row, summarise
+from pipeline.provenance import Provenance
+from pipeline.summary import Alignment, SolutionResults, failed_row, summarise
 from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence
 from schemas.run import IngestNotes

@@ -1,0 +1,29 @@
+"""What a result is made from, and by which program."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from schemas.config import Configuration, Vehicle, digest_of
+from schemas.run import RunLog, Site
+from schemas.version import SOFTWARE
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The same provenance always gives the same tables."""
+
+    config_digest: str
+    input_digest: str
+    software: str
+
+
+def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
+    """Digests of the settings and of log and site, and this program."""
+    return Provenance(digest_of(config, vehicle), input_digest(run, site.digest), SOFTWARE)
+
+
+def input_digest(run: RunLog, site_digest: str) -> str:
+    """What the `runs` table calls the input digest: SHA-256 over those of log and site."""
+    return hashlib.sha256(f"{run.input_digest}:{site_digest}".encode()).hexdigest()

@@ -1,0 +1,81 @@
+"""What the reader of a `runs` row should know beside its figures, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import polars as pl
+
+from pipeline.lds.run import LdsResult
+from pipeline.matching import Match
+from pipeline.matching.fixes import contradictory_covariances
+from schemas.config import Vehicle
+from schemas.run import RunLog
+
+_SAME_TIME_NS = 1_000_000_000  # ends of streams that are no farther apart need no remark
+
+
+def run_notes(run: RunLog, fixes: pl.DataFrame, found: Match, lds: LdsResult, vehicle: Vehicle) -> tuple[str, ...]:
+    """Notes on what went in and what matching and the LDS made of it; `fixes`: the GNSS of this solution."""
+    return (
+        *_injected(run),
+        *_extents(run),
+        *_positions(fixes, found, vehicle),
+        *_ambiguous(found),
+        *_linking(lds),
+    )
+
+
+def _injected(run: RunLog) -> Iterator[str]:
+    if run.faults is not None and run.faults.height:
+        yield "faults were injected: " + ", ".join(sorted(set(run.faults["kind"].to_list())))
+
+
+def _extents(run: RunLog) -> Iterator[str]:
+    """Where GNSS and odometer do not cover the same time."""
+    if run.odometer is None:
+        return
+    (gnss_begin, gnss_end), (odometer_begin, odometer_end) = _extent_ns(run.gnss), _extent_ns(run.odometer)
+    if gnss_end > odometer_end + _SAME_TIME_NS:
+        yield "the odometer ends before the GNSS"
+    if odometer_end > gnss_end + _SAME_TIME_NS:
+        yield "the GNSS ends before the odometer"
+    if gnss_begin > odometer_begin + _SAME_TIME_NS:
+        yield "the GNSS begins after the odometer"
+
+
+def _extent_ns(stream: pl.DataFrame) -> tuple[int, int]:
+    begin, end = stream["t"].to_physical()[[0, -1]]
+    return begin, end
+
+
+def _positions(fixes: pl.DataFrame, found: Match, vehicle: Vehicle) -> Iterator[str]:
+    if found.antenna_ahead_m * vehicle.gnss_antenna_ahead_m < 0:
+        yield "the odometer falls at first, so the train reverses: the GNSS antenna is taken as behind it"
+    contradictory = contradictory_covariances(fixes)
+    if contradictory:
+        yield f"cov_en_m2 contradicts its variances at {contradictory} epochs and is not used there"
+
+
+def _ambiguous(found: Match) -> Iterator[str]:
+    """Stretches on which another path is as likely."""
+    clock = "%H:%M:%S"
+    stretches = [
+        f"{one} or {other} from {start:{clock}} to {end:{clock}}"
+        for one, other, start, end in found.ambiguous.select(
+            "netelement_id", "other_netelement_id", "t_start", "t_end"
+        ).iter_rows()
+    ]
+    if stretches:
+        yield "ambiguous: " + ", ".join(stretches)
+
+
+def _linking(lds: LdsResult) -> Iterator[str]:
+    if lds.undecided:
+        yield (
+            f"after {len(lds.undecided)} breaks of position or odometer nothing could tell whether the position had "
+            "moved meanwhile: what the expectation windows let pass is not seen there"
+        )
+    if lds.unknown_reads.height:
+        names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
+        yield "reads of balises that are not on the path: " + ", ".join(names)
