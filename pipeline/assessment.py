@@ -15,7 +15,9 @@ from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_
 from pipeline.safety.tally import Tally
 from pipeline.storage.files import Address
 from schemas.config import Configuration
-from schemas.enums import RunStatus, ThrVerdict
+from schemas.enums import RunStatus, ThrVerdict, Verdict
+
+_WORTH_SAYING_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,12 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         "alarms": alarm_causes(alarms),
         "map": map_places(alarms),
     }
-    said = [*_reservations(runs), *_slow_receivers(levels), *plain_statements(figures), *_level_statements(detection)]
+    said = [
+        *_reservations(runs, alarms),
+        *_slow_receivers(levels),
+        *plain_statements(figures),
+        *_level_statements(detection),
+    ]
     return Assessment(said, tables)
 
 
@@ -119,8 +126,8 @@ def alarm_causes(alarms: pl.DataFrame) -> pl.DataFrame:
     return named.group_by(keys).agg(**counts).sort(keys)
 
 
-def _reservations(runs: pl.DataFrame) -> list[str]:
-    """What keeps the figures from being those of traffic."""
+def _reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
+    """What keeps the figures from being those of traffic, and what they leave out."""
     injected = runs.filter(pl.col("notes").str.contains("faults were injected").fill_null(value=False))
     failed = runs.filter(pl.col("status") == RunStatus.FAILED)["run_id"].n_unique()
     said = []
@@ -131,6 +138,30 @@ def _reservations(runs: pl.DataFrame) -> list[str]:
         )
     if failed:
         said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and count nowhere.")
+    partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
+    if partial:
+        said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: what was read of them counts.")
+    return [*said, *_unjudged(runs, alarms)]
+
+
+def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
+    """Per solution: the time and the alarms that nothing could judge."""
+    said = []
+    done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
+    for (solution,), rows in done.group_by("solution", maintain_order=True):
+        held_s, seen_s = (float(rows[name].sum()) for name in ("held_s", "evidence_s"))
+        if held_s - seen_s >= _WORTH_SAYING_S:
+            without = rows["evidence"].null_count()
+            said.append(
+                f"{solution}: for {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the error is not known"
+                f" ({without} of {rows.height} runs have no evidence at all): no rate of hazards counts this time."
+            )
+        open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
+        if open_cases.height:
+            said.append(
+                f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs are neither true nor"
+                " false for want of evidence: the rate of false alarms leaves these runs out."
+            )
     return said
 
 

@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.ingest.site import read_site
+from pipeline.known_counts import known_counts
 from pipeline.matching.describe import describe_site
 from pipeline.matching.survey import survey_findings
 from pipeline.results import store
@@ -101,16 +102,13 @@ def inspect_site(path: Address, result: Address | None = None) -> dict[str, pl.D
     tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *window_findings(site)))}
     if result is None:
         return tables
-    runs = store.run_ids(result)
-    if not runs:
-        raise UsageError("holds no complete run", place=redacted(str(result)))
-    epochs = (store.read_table(result, "epochs", run).collect() for run in runs)
+    epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
     return {**tables, "Survey": survey_findings(epochs, site.track)}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:
-    """The runs of a result in their main figures."""
-    return {"Runs": store.read_table(path, "runs").select(_RUN_COLUMNS).collect()}
+    """The runs of a result in their main figures; null what nobody could count."""
+    return {"Runs": known_counts(store.read_table(path, "runs").select(_RUN_COLUMNS).collect())}
 
 
 def _figures(figures: Mapping[str, object]) -> pl.DataFrame:

@@ -11,6 +11,7 @@ import dataframely as dy
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
+from pipeline.known_counts import known_counts
 from pipeline.storage.files import Address
 from pipeline.storage.object_store import redacted
 from schemas.config import digest_of
@@ -25,7 +26,8 @@ from schemas.version import SOFTWARE
 class RunOutcome:
     """What became of one run. `defect` is ours, with its `trace`; everything else is the input's.
 
-    `attempts` is more than one where workers were lost over it.
+    `attempts` is more than one where workers were lost over it; `hazards` and `missed_detections` are None where
+    nothing could be judged.
     """
 
     run_id: str
@@ -36,8 +38,8 @@ class RunOutcome:
     trace: str | None = None
     seconds: float = 0.0
     log_bytes: int = 0
-    hazards: int = 0
-    missed_detections: int = 0
+    hazards: int | None = None
+    missed_detections: int | None = None
     peak_memory_bytes: int = 0
     attempts: int = 1
 
@@ -102,15 +104,16 @@ def worst(runs: pl.DataFrame) -> RunStatus:
 def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) -> RunOutcome:
     """The outcome that the rows of a run's `runs` table tell."""
     errors = runs["error"].drop_nulls().to_list()
-    counts = runs.select(pl.sum("hazards_1a", "hazards_1b", "hazards_shift", "missed_detections")).row(0)
+    judged = known_counts(runs).drop_nulls("missed_detections")
+    counts = judged.select(pl.sum("hazards_1a", "hazards_1b", "hazards_shift", "missed_detections")).row(0)
     return RunOutcome(
         run_id=job.run_id,
         status=worst(runs),
         error=errors[0] if errors else None,
         seconds=seconds,
         log_bytes=log_bytes,
-        hazards=sum(counts[:3]),
-        missed_detections=counts[3],
+        hazards=sum(counts[:3]) if judged.height else None,
+        missed_detections=counts[3] if judged.height else None,
         peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     )
 

@@ -59,7 +59,10 @@ SURVEY_COLUMNS: dict[str, type[pl.DataType]] = {
 
 
 def _passages(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Median residual of one run's solutions on each element, with its variance."""
+    """Median residual of one run on each element, with its variance.
+
+    Several solutions are one observation: they share the sky, the antenna and mostly the ranges.
+    """
     used = epochs.filter(pl.col("on_track") & pl.col("netelement_id").is_not_null())
     # The sense in which the run's path goes over the element, from where both positions grow.
     sense = pl.cov("measure_m", "path_m").sign().fill_null(1.0)
@@ -75,7 +78,11 @@ def _passages(epochs: pl.DataFrame) -> pl.DataFrame:
             ((pl.col(sigma) ** 2).mean() / (1.0 + seconds / (2.0 * _ERROR_TAU_S))).alias("variance_m2"),
         )
         parts.append(part)
-    return pl.concat(parts)
+    return (
+        pl.concat(parts)
+        .group_by("netelement_id", "axis")
+        .agg(pl.col("epochs").sum(), pl.col("residual_m", "variance_m2").mean())
+    )
 
 
 def _survey_variance(track: pl.DataFrame | None) -> pl.DataFrame:

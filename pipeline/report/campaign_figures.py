@@ -14,6 +14,8 @@ from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, p
 from schemas.config import SafetyConfig
 from schemas.enums import BaliseKind, PassageStatus, RunStatus
 
+_REPLAYED = (RunStatus.OK, RunStatus.PARTIAL)
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -25,29 +27,36 @@ class Figure:
 
 
 def headline(
-    runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, safety: SafetyConfig, failure_limit_m: float
+    runs: pl.DataFrame,
+    failed: int,
+    hazards: pl.DataFrame,
+    passages: pl.DataFrame,
+    safety: SafetyConfig,
+    failure_limit_m: float,
 ) -> list[Figure]:
-    """Figures of one solution; every table holds that solution's rows of all runs.
+    """Figures of one solution; every table holds that solution's rows of all runs. `failed`: runs of any solution.
 
     Rates count what the campaign contains, injected faults included.
     """
+    runs = runs.filter(pl.col("status") != RunStatus.FAILED)
     return [
-        *_extent(runs),
+        *_extent(runs, failed),
         *_hazard_figures(runs, hazards, safety),
         *_balise_figures(passages, failure_limit_m),
         _false_alarms(runs),
     ]
 
 
-def _extent(runs: pl.DataFrame) -> list[Figure]:
+def _extent(runs: pl.DataFrame, failed: int) -> list[Figure]:
     hours = _total(runs, "duration_s") / 3600.0
-    counts = [f"{runs.filter(pl.col('status') == status).height} {status.value}" for status in RunStatus]
+    counts = [f"{runs.filter(pl.col('status') == status).height} {status.value}" for status in _REPLAYED]
+    lost = f"; {failed} more failed and count nowhere" if failed else ""
     known = runs.filter(pl.col("availability").is_not_null() & pl.col("duration_s").is_not_null())
     weight = _total(known, "duration_s")
     moving = known.select((pl.col("availability") * pl.col("duration_s")).alias("held"))
     mean = _total(moving, "held") / weight if weight else None
     return [
-        Figure("runs", str(runs.height), ", ".join(counts)),
+        Figure("runs", str(runs.height), ", ".join(counts) + lost),
         Figure("replayed", f"{number(hours)} h", f"{number(_total(runs, 'distance_m') / 1000.0)} km"),
         Figure(
             "availability of the TVB while moving",
@@ -79,12 +88,13 @@ def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyCon
         Figure(
             "missed detections",
             f"{missed} of {failures.height} with a failure",
-            f"{_share(clopper_pearson(missed, failures.height))}; {_rate(poisson_rate(missed, hours))}{claim}",
+            f"{_share(clopper_pearson(missed, failures.height))}; against the hours by reference or balises"
+            f" {_rate(poisson_rate(missed, hours))}{claim}",
         ),
         Figure(
             "to substantiate the THR of a VB",
             f"{needed:.3g} h more",
-            f"without a further missed detection, for {safety.thr_vb_per_h:g} /h",
+            f"by reference or balises, without a further missed detection, for {safety.thr_vb_per_h:g} /h",
         ),
         Figure("longest time to detect", _seconds(hazards["time_to_detect_s"].max()), "of detected hazards"),
         Figure("longest hazardous time", _seconds(hazards["hazardous_s"].max()), "from failure to negation"),
@@ -107,7 +117,7 @@ def _balise_figures(passages: pl.DataFrame, failure_limit_m: float) -> list[Figu
         Figure(
             "accepted beyond the failure limit",
             f"{unsafe} of {judged.height} of known error",
-            _share(clopper_pearson(unsafe, judged.height)),
+            f"{_share(clopper_pearson(unsafe, judged.height))}; {accepted.height - judged.height} not judged",
         ),
     ]
 
@@ -119,7 +129,8 @@ def _false_alarms(runs: pl.DataFrame) -> Figure:
         return Figure("false alarms", "not known", "no run with a truth that judges every alarm")
     hours = _total(judged, "judged_s") / 3600.0
     count = int(_total(judged, "false_alarms"))
-    return Figure("false alarms", f"{count} in {number(hours)} h judged", _rate(poisson_rate(count, hours)))
+    rate = f"{_rate(poisson_rate(count, hours))}; {runs.height - judged.height} runs left out"
+    return Figure("false alarms", f"{count} in {number(hours)} h judged", rate)
 
 
 @dataclass(frozen=True)

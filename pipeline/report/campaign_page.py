@@ -9,6 +9,7 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.known_counts import known_counts
 from pipeline.report.architectures import architectures_section, map_section
 from pipeline.report.availability import availability_map
 from pipeline.report.campaign_figures import Figure, headline, level_figures, share_text
@@ -100,16 +101,20 @@ def _run_counts(runs: pl.DataFrame) -> str:
 
 def _runs_table(campaign: Campaign) -> str:
     order = {status.value: place for place, status in enumerate((RunStatus.FAILED, RunStatus.PARTIAL, RunStatus.OK))}
-    runs = campaign.runs.with_columns(
-        hazards=pl.col("hazards_1a") + pl.col("hazards_1b") + pl.col("hazards_shift"),
-        order=pl.col("status").cast(pl.String).replace_strict(order, return_dtype=pl.Int64),
-    ).sort("order", "run_id", "solution")
+    runs = (
+        known_counts(campaign.runs)
+        .with_columns(
+            hazards=pl.col("hazards_1a") + pl.col("hazards_1b") + pl.col("hazards_shift"),
+            order=pl.col("status").cast(pl.String).replace_strict(order, return_dtype=pl.Int64),
+        )
+        .sort("order", "run_id", "solution")
+    )
     rows = []
     for row in runs.iter_rows(named=True):
         name = Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"]))
         status = Cell(str(row["status"]), str(row["order"]), badge(str(row["status"])))
         reason = cell("; ".join(text for text in (row["error"], row["notes"]) if text) or None)
-        figures = [cell(None if row["status"] == "failed" else row[key]) for key, _ in _RUN_COLUMNS]
+        figures = [cell(row[key]) for key, _ in _RUN_COLUMNS]
         rows.append([name, status, reason, cell(row["solution"] or None), *figures])
     titles = ["run", "status", "reason or notes", "solution", *(title for _, title in _RUN_COLUMNS)]
     return table("table-runs", "Runs, failed ones first", titles, rows)
@@ -119,6 +124,7 @@ def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool
     hazards = _only(campaign.hazards, name)
     figures = headline(
         _only(campaign.runs, name),
+        campaign.runs.filter(pl.col("status") == RunStatus.FAILED)["run_id"].n_unique(),
         hazards,
         _only(campaign.passages, name),
         made.config.safety,

@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 import polars as pl
 
+from pipeline.known_counts import known_counts
 from pipeline.report.architectures import architectures_section
 from pipeline.report.markup import (
     Cell,
@@ -151,9 +152,10 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
         frame.filter(pl.col("solution") == name) for frame in (tables.hazards, tables.passages, tables.alarms)
     )
     epochs = tables.epochs.filter(pl.col("solution") == name)
+    known = known_counts(tables.runs.filter(pl.col("solution") == name)).row(0, named=True)
     title = f"Figures of {name}" if several else "Figures"
     parts = [
-        section(f"figures-{key}", title, *notes, figures(row), levels(key, row)),
+        section(f"figures-{key}", title, *notes, figures(known), levels(key, row)),
         section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
         _drawings(key),
         section(f"passages-{key}", "Passages", _passages(key, passages)),

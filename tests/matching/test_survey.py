@@ -37,6 +37,16 @@ def test_an_element_off_its_survey_is_named() -> None:
     assert table.filter(pl.col("netelement_id") == "a")["inconsistent"].to_list() == [False]
 
 
+def test_solutions_of_one_run_are_one_observation() -> None:
+    frames = runs(1.5, count=4)
+    twice = [pl.concat([frame, frame.with_columns(solution=pl.lit("gps"))]) for frame in frames]
+    keys, same = ("netelement_id", "axis"), ("runs", "residual_m", "sigma_m", "ratio")
+    one, two = (survey_findings(part).sort(keys) for part in (frames, twice))
+    for name in same:
+        assert two[name].to_list() == pytest.approx(one[name].to_list())
+    assert two["epochs"].to_list() == [2 * count for count in one["epochs"]]
+
+
 def test_a_good_survey_is_consistent() -> None:
     assert not survey_findings(runs(0.0))["inconsistent"].any()
 

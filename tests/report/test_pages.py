@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from cli import app
 from pipeline.report import page_name, write_report
+from pipeline.report.campaign_page import _RUN_COLUMNS
 from pipeline.results.store import write_run
 from schemas.errors import UsageError
 from schemas.run import RunTables, Site
@@ -168,6 +169,7 @@ def test_availability_map_counts_moving_epochs(out: Path, replayed: dict[str, Ru
 
 def test_failed_runs_come_first_with_their_reason(out: Path) -> None:
     text = text_of(out, "index.html")
+    assert "3 ok, 0 partial; 1 more failed and count nowhere" in text
     table = text[text.index('id="table-runs"') :]
     first = table[table.index("<tbody>") : table.index("</tr>", table.index("<tbody>"))]
     assert "broken &amp; &lt;b&gt;odd" in first
@@ -190,6 +192,13 @@ def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_
     write_report(tmp_path)
     run, index = text_of(tmp_path, "runs/blind.html"), text_of(tmp_path, "index.html")
     assert "there was nothing to judge the positions by" in run
+    for figure in ("accepted beyond the failure limit", "missed detections", "epochs by error and confidence"):
+        assert re.search(rf"{figure}</dt>\s*<dd>not known<", run), figure
+    (row,) = rows_of_table(index, "table-runs")
+    names = [title for _, title in _RUN_COLUMNS]
+    told = dict(zip(names, row[-len(names) :], strict=True))
+    assert {told[name] for name in ("hazards", "detected", "missed detections", "unsafe accepted")} == {"–"}
+    assert told["VBs accepted"] != "–"
     assert "no run with a truth that judges every alarm" in index
     assert "rate not known" in index
 

@@ -105,7 +105,9 @@ def test_rates_over_the_campaign() -> None:
     assert (found["unsafe_share_low"], found["unsafe_share_high"]) == (unsafe.low, unsafe.high)
     (sentence,) = plain_statements(figures)
     assert "in 3.75 h with evidence, 1.75 h of these with a truth (reference or balise reads)" in sentence
-    assert "Of 23 accepted virtual balises of known error 1 lay beyond the failure limit; the error of 7 more" in sentence
+    assert (
+        "Of 23 accepted virtual balises of known error 1 lay beyond the failure limit; the error of 7 more" in sentence
+    )
 
 
 def test_a_trial_without_a_miss_says_what_it_lacks() -> None:

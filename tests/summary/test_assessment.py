@@ -98,6 +98,24 @@ def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     assert "lpv200; 95 %: 0.0% to 97.5%" in said[-1]
 
 
+def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
+    write_run(run_of("whole"), tmp_path, {})
+    assert not any(
+        "not known" in text or "partial" in text or "neither" in text for text in assess(tmp_path).statements
+    )
+    blind = run_of("blind", alarms=alarms(1, solution="primary", verdict="unknown"))
+    evidence = pl.lit(None, blind.runs.schema["evidence"])
+    rows = blind.runs.with_columns(evidence=evidence, evidence_s=0.0, false_alarm_rate_per_h=pl.lit(None, pl.Float64))
+    write_run(RunTables(**{**vars(blind), "runs": rows}), tmp_path, {})
+    cut = run_of("cut")
+    rows = cut.runs.with_columns(status=pl.lit("partial", cut.runs.schema["status"]))
+    write_run(RunTables(**{**vars(cut), "runs": rows}), tmp_path, {})
+    said = assess(tmp_path).statements
+    assert said[0] == "1 of 3 runs are partial: what was read of them counts."
+    assert said[1].startswith("primary: for 1 of 3 h the error is not known (1 of 3 runs have no evidence at all)")
+    assert said[2].startswith("primary: 1 alarms in 1 runs are neither true nor false for want of evidence")
+
+
 def test_receivers_too_slow_are_named(tmp_path: Path) -> None:
     slow = run_of("a")
     write_run(RunTables(**{**vars(slow), "runs": slow.runs.with_columns(gnss_rate_hz=1.0)}), tmp_path, {})
