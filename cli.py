@@ -466,7 +466,7 @@ def _status_of(summary: Summary) -> int:
 
 
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.progress import summary_line
+    from pipeline.campaign.tally import summary_line
     from pipeline.present import show_table
 
     rows = _summary_rows(summary)

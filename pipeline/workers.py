@@ -12,7 +12,13 @@ from typing import TypeVar
 T = TypeVar("T")
 R = TypeVar("R")
 
-_THREADS = ("POLARS_MAX_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+_THREADS = (
+    "POLARS_MAX_THREADS",
+    "RAYON_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OMP_NUM_THREADS",
+)
 
 
 def mapped(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
@@ -26,13 +32,13 @@ def each(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[
     if workers <= 1:
         yield from map(function, tasks)
         return
-    with _single_threaded_children(), ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with single_threaded_children(), ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         yield from pool.map(function, tasks)
 
 
 @contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Processes are the parallelism: more threads would only fight for the cores."""
+def single_threaded_children() -> Iterator[None]:
+    """Processes started meanwhile have one thread: several of them use the cores better than threads in one."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:

@@ -1,7 +1,9 @@
 """Many runs over one site: on one machine or a cluster, resumed where they stopped, nothing lost."""
 
-from pipeline.campaign.loop import Interrupted, Summary, run_campaign
+from pipeline.campaign.interruption import Interrupted
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan, find_runs, make_plan
+from pipeline.campaign.run import run_campaign
+from pipeline.campaign.watch import Summary
 
 __all__ = ["Interrupted", "Plan", "RunOutcome", "Summary", "find_runs", "make_plan", "run_campaign"]

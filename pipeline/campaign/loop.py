@@ -2,84 +2,23 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from types import FrameType
-from typing import Protocol
+from dataclasses import dataclass, replace
 
-from pipeline.campaign.engines import Engine, engine_for
-from pipeline.campaign.finish import write_campaign
-from pipeline.campaign.lock import locked
+from pipeline.campaign.engines import Engine
+from pipeline.campaign.interruption import Interrupted
 from pipeline.campaign.outcome import Result, RunOutcome, lost, never_begun, overdue
-from pipeline.campaign.plan import Plan, RunJob, held_by, with_previous
+from pipeline.campaign.plan import RunJob
+from pipeline.campaign.watch import Watch
 from pipeline.campaign.worker import fail_run
-from pipeline.results import store
-from pipeline.storage.files import is_url
-from schemas.enums import RunStatus
 from schemas.errors import UsageError
 
 _LOOK_S = 0.2
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ATTEMPTS = 2
 _STARTS = 10
-TIME_LIMIT_S = 3600.0
-
-
-class Interrupted(BaseException):
-    """The user or the system asked to stop; `summary` tells what is complete."""
-
-    def __init__(self, signum: int, summary: Summary | None = None) -> None:
-        super().__init__(signal.Signals(signum).name)
-        self.signum = signum
-        self.summary = summary
-
-
-@dataclass(frozen=True)
-class Summary:
-    """A campaign in figures."""
-
-    planned: int
-    outcomes: tuple[RunOutcome, ...]
-    seconds: float
-
-    def count(self, status: RunStatus) -> int:
-        return sum(outcome.status == status for outcome in self.outcomes)
-
-    @property
-    def skipped(self) -> int:
-        return sum(outcome.skipped for outcome in self.outcomes)
-
-    @property
-    def defects(self) -> int:
-        return sum(outcome.defect for outcome in self.outcomes)
-
-    @property
-    def left(self) -> int:
-        """Runs that were not reached."""
-        return self.planned - len(self.outcomes)
-
-
-class Watch(Protocol):
-    """Whoever wants to see a campaign go on."""
-
-    def begin(self, plan: Plan) -> None: ...
-
-    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
-        """Called several times a second with the runs under way and their age [s]."""
-
-    def lost(self, run_id: str, attempt: int) -> None:
-        """The worker died that was at this attempt of a run; it is tried again."""
-
-    def finished(self, outcome: RunOutcome) -> None: ...
-
-    def end(self, summary: Summary) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -98,186 +37,96 @@ class _UnderWay:
     overdue: bool = False
 
 
-@dataclass
-class _State:
-    """What the loop keeps between two looks."""
+class CampaignLoop:
+    """Takes all jobs through an engine; `outcomes` in order of their ends.
 
-    waiting: deque[_Attempt]
-    under_way: dict[Result, _UnderWay] = field(default_factory=dict)
-    outcomes: list[RunOutcome] = field(default_factory=list)
-    stop: int | None = None
-
-
-def run_campaign(
-    plan: Plan,
-    *,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    force: bool = False,
-    time_limit_s: float = TIME_LIMIT_S,
-    watches: Sequence[Watch] = (),
-) -> Summary:
-    """Replay every run of the plan whose result is not there already.
-
-    Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT, SIGTERM and SIGHUP; either way
-    what is complete stays, and the same call later does the rest. The tables are the same for any `jobs`,
-    any `scheduler` and any order of runs.
+    `limit_s`: how long a run may take before it is given up [s].
     """
-    _check_shared(plan, scheduler)
-    with locked(plan.out) as campaign:
-        store.sweep(plan.out)
-        plan = held_by(plan if force else with_previous(plan), campaign)
-        store.write_config(plan.out, plan.config)
-        state = _State(deque(map(_Attempt, plan.jobs)))
-        engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
+
+    def __init__(self, jobs: Sequence[RunJob], engine: Engine, limit_s: float, watches: Sequence[Watch]) -> None:
+        self.outcomes: list[RunOutcome] = []
+        self._engine, self._limit_s, self._watches = engine, limit_s, watches
+        self._waiting = deque(map(_Attempt, jobs))
+        self._under_way: dict[Result, _UnderWay] = {}
+        self._stop: int | None = None
+
+    def stop(self, signum: int) -> None:
+        """End at the next look, because of this signal."""
+        self._stop = signum
+
+    @property
+    def under_way(self) -> list[str]:
+        """Ids of the runs that were handed out and have not ended."""
+        return [item.attempt.job.run_id for item in self._under_way.values()]
+
+    def run(self) -> None:
+        """Go on until every run has its outcome. Raises `Interrupted` when asked to stop."""
+        while self._waiting or self._under_way:
+            self._hand_out()
+            done, _ = wait(self._under_way, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
+            if self._stop is not None:
+                raise Interrupted(self._stop)
+            for result in done:
+                self._note(self._collect(result))
+            self._end_overdue()
+            now = time.monotonic()
+            ages = [(item.attempt.job.run_id, now - item.since_s) for item in self._under_way.values()]
+            for watch in self._watches:
+                watch.look(ages)
+
+    def _hand_out(self) -> None:
+        capacity = self._engine.capacity()
+        while self._waiting and len(self._under_way) < capacity and self._stop is None:
+            attempt = self._waiting.popleft()
+            self._under_way[self._engine.submit(attempt.job)] = _UnderWay(attempt, time.monotonic())
+
+    def _note(self, outcome: RunOutcome | None) -> None:
+        if outcome is not None:
+            self.outcomes.append(outcome)
+            for watch in self._watches:
+                watch.finished(outcome)
+
+    def _collect(self, result: Result) -> RunOutcome | None:
+        """The outcome, or none where the run is tried again."""
+        item = self._under_way.pop(result)
+        attempt = item.attempt
         try:
-            summary = _watched(plan, state, engine, time_limit_s, watches)
+            error = CancelledError() if result.cancelled() else result.exception()
+            if error is None:
+                return replace(result.result(), attempts=attempt.number)
+            if item.overdue:
+                return _failed(attempt, overdue(self._limit_s))
+            if isinstance(error, CancelledError):
+                raise UsageError(
+                    "the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped."
+                )
+            if not self._engine.is_lost_worker(error):
+                raise error
+            return self._after_loss(attempt, self._engine.has_begun(result))
         finally:
-            engine.close()
-            _tidy(plan, state, scheduler)
-        _finish(plan, state, summary)
-        return summary
+            self._engine.collected(result)
 
+    def _after_loss(self, attempt: _Attempt, begun: bool) -> RunOutcome | None:
+        """A run that was under way when its worker died has one more attempt; one that waited has lost nothing."""
+        if not begun and attempt.starts < _STARTS:
+            self._waiting.appendleft(replace(attempt, starts=attempt.starts + 1))
+            return None
+        if begun and attempt.number < _ATTEMPTS:
+            for watch in self._watches:
+                watch.lost(attempt.job.run_id, attempt.number)
+            self._waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
+            return None
+        return _failed(attempt, lost(attempt.number) if begun else never_begun(attempt.starts))
 
-def _finish(plan: Plan, state: _State, summary: Summary) -> None:
-    """The tables over all runs; they too are given up when somebody asks to stop."""
-    with _listening(state, at_once=True):
-        try:
-            write_campaign(plan.out, plan.config)
-        except Interrupted as interrupted:
-            raise Interrupted(interrupted.signum, summary) from None
-
-
-def _check_shared(plan: Plan, scheduler: str | None) -> None:
-    """Whether a cluster can write there is found out by its workers; that nothing is to do, here."""
-    if not plan.jobs:
-        raise UsageError("no run is named")
-    if scheduler is not None and is_url(plan.out) and plan.out.startswith("memory://"):
-        raise UsageError("workers cannot write into this process's memory", place=plan.out)
-
-
-def _tidy(plan: Plan, state: _State, scheduler: str | None) -> None:
-    """Remove what ended workers left half done; those of a cluster may be at it still."""
-    if scheduler is None and not is_url(plan.out):
-        for item in state.under_way.values():
-            store.sweep_run(Path(plan.out), item.attempt.job.run_id)
-
-
-def _watched(plan: Plan, state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> Summary:
-    begun = time.monotonic()
-    for watch in watches:
-        watch.begin(plan)
-    stopped: Interrupted | None = None
-    with _listening(state, at_once=engine.in_process):
-        try:
-            _loop(state, engine, limit_s, watches)
-        except Interrupted as interrupted:
-            stopped = interrupted
-        finally:
-            summary = Summary(len(plan.jobs), tuple(_in_order(state.outcomes)), time.monotonic() - begun)
-            for watch in watches:
-                watch.end(summary)
-    if stopped is not None:
-        raise Interrupted(stopped.signum, summary)
-    return summary
-
-
-def _in_order(outcomes: list[RunOutcome]) -> list[RunOutcome]:
-    return sorted(outcomes, key=lambda outcome: outcome.run_id)
-
-
-def _loop(state: _State, engine: Engine, limit_s: float, watches: Sequence[Watch]) -> None:
-    while state.waiting or state.under_way:
-        _hand_out(state, engine)
-        done, _ = wait(state.under_way, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
-        if state.stop is not None:
-            raise Interrupted(state.stop)
-        for result in done:
-            outcome = _collect(state, engine, result, limit_s, watches)
-            if outcome is not None:
-                state.outcomes.append(outcome)
-                for watch in watches:
-                    watch.finished(outcome)
-        _end_overdue(state, engine, limit_s)
+    def _end_overdue(self) -> None:
         now = time.monotonic()
-        ages = [(item.attempt.job.run_id, now - item.since_s) for item in state.under_way.values()]
-        for watch in watches:
-            watch.look(ages)
+        for result, item in self._under_way.items():
+            if not self._engine.has_begun(result):
+                item.since_s = now
+            if now - item.since_s > self._limit_s and not item.overdue:
+                item.overdue = True
+                self._engine.kill(result)
 
 
-def _hand_out(state: _State, engine: Engine) -> None:
-    capacity = engine.capacity()
-    while state.waiting and len(state.under_way) < capacity and state.stop is None:
-        attempt = state.waiting.popleft()
-        state.under_way[engine.submit(attempt.job)] = _UnderWay(attempt, time.monotonic())
-
-
-def _collect(
-    state: _State, engine: Engine, result: Result, limit_s: float, watches: Sequence[Watch]
-) -> RunOutcome | None:
-    """The outcome, or none where the run is tried again."""
-    item = state.under_way.pop(result)
-    attempt = item.attempt
-    try:
-        error = CancelledError() if result.cancelled() else result.exception()
-        if error is None:
-            return replace(result.result(), attempts=attempt.number)
-        if item.overdue:
-            return replace(fail_run(attempt.job, overdue(limit_s)), attempts=attempt.number)
-        if isinstance(error, CancelledError):
-            raise UsageError(
-                "the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped."
-            )
-        if not engine.is_lost_worker(error):
-            raise error
-        return _after_loss(state, attempt, engine.has_begun(result), watches)
-    finally:
-        engine.collected(result)
-
-
-def _after_loss(state: _State, attempt: _Attempt, begun: bool, watches: Sequence[Watch]) -> RunOutcome | None:
-    """A run that was under way when its worker died has one more attempt; one that waited there has lost nothing."""
-    if not begun and attempt.starts < _STARTS:
-        state.waiting.appendleft(replace(attempt, starts=attempt.starts + 1))
-        return None
-    if begun and attempt.number < _ATTEMPTS:
-        for watch in watches:
-            watch.lost(attempt.job.run_id, attempt.number)
-        state.waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
-        return None
-    reason = lost(attempt.number) if begun else never_begun(attempt.starts)
+def _failed(attempt: _Attempt, reason: str) -> RunOutcome:
     return replace(fail_run(attempt.job, reason), attempts=attempt.number)
-
-
-def _end_overdue(state: _State, engine: Engine, limit_s: float) -> None:
-    now = time.monotonic()
-    for result, item in state.under_way.items():
-        if not engine.has_begun(result):
-            item.since_s = now
-        if now - item.since_s > limit_s and not item.overdue:
-            item.overdue = True
-            engine.kill(result)
-
-
-@contextmanager
-def _listening(state: _State, at_once: bool) -> Iterator[None]:
-    """Answer SIGINT, SIGTERM and SIGHUP: at the loop's next look, or at once where the work is in this process.
-
-    What the caller ignores (`nohup`) is ignored.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def answer(signum: int, frame: FrameType | None) -> None:
-        state.stop = signum
-        if at_once:
-            raise Interrupted(signum)
-
-    signals = [signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN]
-    before = {signum: signal.signal(signum, answer) for signum in signals}
-    try:
-        yield
-    finally:
-        for signum, handler in before.items():
-            signal.signal(signum, handler)

@@ -14,14 +14,8 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from pipeline.campaign.outcome import Result
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import replay_one
+from pipeline.workers import single_threaded_children
 
-# One thread each: several runs at once use the cores better than several threads in one run.
-_SINGLE_THREADED = {
-    "POLARS_MAX_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "RAYON_NUM_THREADS": "1",
-}
 _RUNS_PER_PROCESS = 200
 
 
@@ -101,29 +95,23 @@ class _Slot:
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker)
             before = set(multiprocessing.active_children())
-            with _as_workers_start():
+            with single_threaded_children(), _deaf():
                 self._answer = self._executor.submit(os.getpid)
             (self._process,) = set(multiprocessing.active_children()) - before
         return self._executor
 
 
 @contextlib.contextmanager
-def _as_workers_start() -> Iterator[None]:
-    """What a worker inherits: one thread per library, and deafness to Ctrl-C, which is the parent's to answer."""
-    before = {name: os.environ.get(name) for name in _SINGLE_THREADED}
-    main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
-    os.environ.update(_SINGLE_THREADED)
+def _deaf() -> Iterator[None]:
+    """What a worker inherits from its start on: deafness to Ctrl-C, which is the parent's to answer."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        if main:
-            signal.signal(signal.SIGINT, handler)
+        signal.signal(signal.SIGINT, handler)
 
 
 def _begin_worker() -> None:

@@ -15,7 +15,7 @@ import pytest
 from benchmarks import interruptions
 from benchmarks.interruptions import STOP_S, Job, Victim, disturb
 from pipeline import storage
-from pipeline.campaign import Interrupted, loop, run_campaign
+from pipeline.campaign import Interrupted, run_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.plan import held_by
 from pipeline.campaign.worker import replay_one
@@ -98,7 +98,7 @@ def test_stop_on_request_at_the_very_end(
 
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
     with monkeypatch.context() as patched:
-        patched.setattr(loop, "write_campaign", slow)
+        patched.setattr("pipeline.campaign.run.write_campaign", slow)
         with pytest.raises(Interrupted) as caught:
             run_campaign(plan)
     assert caught.value.signum == signum

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pipeline.campaign import Plan, RunOutcome, Summary, progress
-from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, Tally, watches
+from pipeline.campaign import Plan, RunOutcome, Summary, progress, tally
+from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
+from pipeline.campaign.tally import Tally
 from schemas.enums import RunStatus
 from tests.campaign.compare import command, plan_of, run
 from tests.conftest import SmallTrial
@@ -35,7 +36,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(progress, "time", clock)
+    for module in (progress, tally):
+        monkeypatch.setattr(module, "time", clock)
     return clock
 
 

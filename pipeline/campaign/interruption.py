@@ -1,0 +1,46 @@
+"""How a campaign is asked to stop, by the user or the system."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from pipeline.campaign.watch import Summary
+
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interrupted(BaseException):
+    """The user or the system asked to stop; `summary` tells what is complete."""
+
+    def __init__(self, signum: int, summary: Summary | None = None) -> None:
+        super().__init__(signal.Signals(signum).name)
+        self.signum = signum
+        self.summary = summary
+
+
+@contextmanager
+def listening(heard: Callable[[int], None], at_once: bool) -> Iterator[None]:
+    """Pass SIGINT, SIGTERM and SIGHUP on to `heard`; `at_once` also raises `Interrupted` where they arrive.
+
+    What the caller ignores (`nohup`) is ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def answer(signum: int, frame: FrameType | None) -> None:
+        heard(signum)
+        if at_once:
+            raise Interrupted(signum)
+
+    signals = [signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN]
+    before = {signum: signal.signal(signum, answer) for signum in signals}
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

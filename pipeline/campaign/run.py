@@ -1,0 +1,96 @@
+"""A campaign from its plan to the tables over all runs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.campaign.engines import engine_for
+from pipeline.campaign.finish import write_campaign
+from pipeline.campaign.interruption import Interrupted, listening
+from pipeline.campaign.lock import locked
+from pipeline.campaign.loop import CampaignLoop
+from pipeline.campaign.plan import Plan, held_by, with_previous
+from pipeline.campaign.watch import Summary, Watch
+from pipeline.results import store
+from pipeline.storage.files import is_url
+from schemas.errors import UsageError
+
+TIME_LIMIT_S = 3600.0
+
+
+def run_campaign(
+    plan: Plan,
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    force: bool = False,
+    time_limit_s: float = TIME_LIMIT_S,
+    watches: Sequence[Watch] = (),
+) -> Summary:
+    """Replay every run of the plan whose result is not there already.
+
+    Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT, SIGTERM and SIGHUP; either way
+    what is complete stays, and the same call later does the rest. The tables are the same for any `jobs`,
+    any `scheduler` and any order of runs.
+    """
+    _check_shared(plan, scheduler)
+    with locked(plan.out) as campaign:
+        store.sweep(plan.out)
+        plan = held_by(plan if force else with_previous(plan), campaign)
+        store.write_config(plan.out, plan.config)
+        engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
+        loop = CampaignLoop(plan.jobs, engine, time_limit_s, watches)
+        try:
+            summary = _watched(plan, loop, watches, at_once=engine.in_process)
+        finally:
+            engine.close()
+            _tidy(plan, loop, scheduler)
+        _finish(plan, loop, summary)
+        return summary
+
+
+def _check_shared(plan: Plan, scheduler: str | None) -> None:
+    """Whether a cluster can write there is found out by its workers; that nothing is to do, here."""
+    if not plan.jobs:
+        raise UsageError("no run is named")
+    if scheduler is not None and is_url(plan.out) and plan.out.startswith("memory://"):
+        raise UsageError("workers cannot write into this process's memory", place=plan.out)
+
+
+def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Watch], at_once: bool) -> Summary:
+    """`at_once`: the work is in this process, so that the loop's next look may be a whole run away."""
+    begun = time.monotonic()
+    for watch in watches:
+        watch.begin(plan)
+    stopped: Interrupted | None = None
+    with listening(loop.stop, at_once):
+        try:
+            loop.run()
+        except Interrupted as interrupted:
+            stopped = interrupted
+        finally:
+            outcomes = sorted(loop.outcomes, key=lambda outcome: outcome.run_id)
+            summary = Summary(len(plan.jobs), tuple(outcomes), time.monotonic() - begun)
+            for watch in watches:
+                watch.end(summary)
+    if stopped is not None:
+        raise Interrupted(stopped.signum, summary)
+    return summary
+
+
+def _tidy(plan: Plan, loop: CampaignLoop, scheduler: str | None) -> None:
+    """Remove what ended workers left half done; those of a cluster may be at it still."""
+    if scheduler is None and not is_url(plan.out):
+        for run_id in loop.under_way:
+            store.sweep_run(Path(plan.out), run_id)
+
+
+def _finish(plan: Plan, loop: CampaignLoop, summary: Summary) -> None:
+    """The tables over all runs; they too are given up when somebody asks to stop."""
+    with listening(loop.stop, at_once=True):
+        try:
+            write_campaign(plan.out, plan.config)
+        except Interrupted as interrupted:
+            raise Interrupted(interrupted.signum, summary) from None

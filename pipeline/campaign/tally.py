@@ -1,0 +1,93 @@
+"""How far a campaign is, counted and in words."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from pipeline.campaign.outcome import RunOutcome
+from pipeline.campaign.watch import Summary
+from pipeline.present import duration_text
+from schemas.enums import RunStatus
+
+_SLOW_SHOWN = 2
+
+
+class Tally:
+    """Counts that every way of showing progress needs."""
+
+    def __init__(self, total: int) -> None:
+        self.total = total
+        self.done = self.failed = self.skipped = 0
+        self.since_s = time.monotonic()
+
+    def add(self, outcome: RunOutcome) -> None:
+        self.done += 1
+        self.failed += outcome.status is not RunStatus.OK
+        self.skipped += outcome.skipped
+
+    @property
+    def rate_per_s(self) -> float | None:
+        """Runs replayed per second; none before the first."""
+        elapsed_s, replayed = time.monotonic() - self.since_s, self.done - self.skipped
+        return replayed / elapsed_s if replayed and elapsed_s > 0 else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the end at this rate."""
+        rate_per_s = self.rate_per_s
+        return None if rate_per_s is None else (self.total - self.done) / rate_per_s
+
+    def line(self, under_way: Sequence[tuple[str, float]] = ()) -> str:
+        """One line: done, failed, rate, time left, slow runs."""
+        parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed or partial"]
+        if self.skipped:
+            parts.append(f"{self.skipped} skipped")
+        if self.rate_per_s is not None and self.left_s is not None:
+            parts += [f"{self.rate_per_s:.2f} runs/s", f"{duration_text(self.left_s)} left"]
+        if slow := slowest(under_way):
+            parts.append("longest now: " + ", ".join(f"{run} ({duration_text(age_s)})" for run, age_s in slow))
+        return ", ".join(parts)
+
+    def figures(self, under_way: Sequence[tuple[str, float]] = ()) -> dict[str, object]:
+        """The same for programs."""
+        counts = {"done": self.done, "failed": self.failed, "skipped": self.skipped, "total": self.total}
+        slow = [{"run_id": run, "seconds": round(age_s, 3)} for run, age_s in slowest(under_way)]
+        times = {"rate_per_s": _rounded(self.rate_per_s), "left_s": _rounded(self.left_s)}
+        return {**counts, **times, "slow": slow}
+
+
+def slowest(under_way: Sequence[tuple[str, float]]) -> list[tuple[str, float]]:
+    """The runs that have been under way for longest."""
+    return sorted(under_way, key=lambda item: -item[1])[:_SLOW_SHOWN]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+def outcome_line(outcome: RunOutcome) -> str:
+    """One run in one line."""
+    how = "skipped, " if outcome.skipped else ""
+    text = f"{outcome.run_id}: {how}{outcome.status.value}"
+    if outcome.error:
+        text += f": {outcome.error}"
+    elif not outcome.skipped:
+        text += f" in {duration_text(outcome.seconds)}"
+    if outcome.attempts > 1:
+        text += f" (attempt {outcome.attempts})"
+    return text
+
+
+def loss_line(run_id: str, attempt: int) -> str:
+    """A lost worker in one line."""
+    return f"{run_id}: its worker died at attempt {attempt}; tried again"
+
+
+def summary_line(summary: Summary) -> str:
+    """A campaign in one line."""
+    counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
+    text = f"{len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
+    if summary.skipped:
+        text += f" ({summary.skipped} of them complete before)"
+    return f"{text}; {duration_text(summary.seconds)}"
