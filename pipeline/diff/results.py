@@ -69,7 +69,8 @@ class ResultDiff:
             lines += [f"{run.run_id}:", *(f"  {finding}" for finding in (*run.hazards, *run.differences))]
         lines += [f"note: {note}" for note in self.notes]
         verdict = "all the same" if not self.runs else f"{len(self.runs)} changed"
-        lines.append(f"{self.compared} runs compared: {verdict}")
+        alone = [f"{len(runs)} only in {name}" for runs, name in ((self.only_in_a, "A"), (self.only_in_b, "B")) if runs]
+        lines.append(", ".join([f"{self.compared} runs in both: {verdict}", *alone]))
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, object]:

@@ -113,7 +113,7 @@ class TestResults:
     def test_the_same(self, a: Path, tmp_path: Path) -> None:
         diff = diff_results(a, result(tmp_path / "b", tables()))
         assert diff.same
-        assert diff.text() == "1 runs compared: all the same"
+        assert diff.text() == "1 runs in both: all the same"
 
     def test_made_by_another_version_is_a_note(self, a: Path, tmp_path: Path) -> None:
         runs = table(Runs, 1, solution="primary", status="ok", availability=0.9, software="balise 2")
@@ -131,6 +131,7 @@ class TestResults:
         diff = diff_results(a, result(tmp_path / "b", tables(), tables("r2")))
         assert not diff.same
         assert (diff.only_in_a, diff.only_in_b, diff.compared) == ((), ("r2",), 1)
+        assert diff.text().splitlines()[-1] == "1 runs in both: all the same, 1 only in B"
         assert diff.text().splitlines()[0] == "r2: only in B"
 
     @pytest.mark.parametrize(
@@ -152,7 +153,7 @@ class TestResults:
         diff = diff_results(a, result(tmp_path / "b", tables(**{name: frame})))
         assert not diff.same
         assert said in diff.text()
-        assert diff.text().splitlines()[-1] == "1 runs compared: 1 changed"
+        assert diff.text().splitlines()[-1] == "1 runs in both: 1 changed"
 
     def test_below_the_tolerance_is_no_change(self, a: Path, tmp_path: Path) -> None:
         near = passages(2, solution="primary", balise_id=["VB1", "VB2"], location_error_m=[0.5 + 4e-7, 1.5])
