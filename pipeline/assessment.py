@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.campaign_tables import campaign_accuracy, campaign_levels, campaign_runs
-from pipeline.hazards.map_errors import map_places, map_suspects
+from pipeline.derived_tables import derived_tables
+from pipeline.hazards.map_errors import map_suspects
 from pipeline.present import tall
 from pipeline.results import catalogue, store
-from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements
+from pipeline.safety.measured import plain_statements
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally
 from pipeline.storage.files import Address
@@ -37,27 +37,24 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
     settings = config or store.read_config(out) or Configuration()
     names = ("runs", "hazards", "passages", "alarms")
     runs, hazards, passages, alarms = (_table(out, name) for name in names)
-    figures = measured_figures(runs, hazards, settings.safety)
-    detection = detection_by_level(hazards, settings.safety)
-    wide = campaign_runs(runs, hazards, settings.safety)
-    levels = campaign_levels(wide, hazards, settings.safety, settings.hazards.reaction_s)
+    derived = derived_tables(runs, hazards, passages, alarms, settings)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
-        "figures": figures,
-        "time_to_detect": detection,
-        "levels": levels_summary(levels),
-        "levels_of_runs": levels,
-        "accuracy": campaign_accuracy(passages, settings),
+        "figures": derived["figures"],
+        "time_to_detect": derived["detection"],
+        "levels": levels_summary(derived["levels"]),
+        "levels_of_runs": derived["levels"],
+        "accuracy": derived["accuracy"],
         "side_by_side": over_all_runs(of_runs),
         "side_by_side_of_runs": by_run(of_runs),
         "alarms": alarm_causes(alarms),
-        "map": map_places(alarms),
+        "map": derived["map"],
     }
     said = [
         *_reservations(runs, alarms),
-        *_slow_receivers(levels),
-        *plain_statements(figures),
-        *_level_statements(detection),
+        *_slow_receivers(derived["levels"]),
+        *plain_statements(derived["figures"]),
+        *_level_statements(derived["detection"]),
     ]
     return Assessment(said, tables)
 

@@ -71,18 +71,10 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
     """The `runs` row of a run that could not be replayed: counts are zero, the rest is not known."""
-    zeros: Row = {name: 0 for name, column in Runs.columns().items() if column.dtype == pl.Int64}
-    row = (
-        zeros
-        | {
-            "solution": solution,
-            "status": RunStatus.FAILED,
-            "error": error,
-            "false_alarms": None,
-        }
-        | {name: None for name in Runs.columns() if name.startswith("stanford_hpl_")}
-    )
-    return _frame(row | _provenance(provenance))
+    zeros: Row = {
+        name: 0 for name, column in Runs.columns().items() if column.dtype == pl.Int64 and not column.nullable
+    }
+    return _frame(zeros | {"solution": solution, "status": RunStatus.FAILED, "error": error} | _provenance(provenance))
 
 
 def _frame(row: Mapping[str, object]) -> pl.DataFrame:

@@ -7,18 +7,18 @@ import traceback
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-import dataframely as dy
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
 from pipeline.known_counts import known_counts
+from pipeline.provenance import Provenance
 from pipeline.storage.files import Address
 from pipeline.storage.object_store import redacted
 from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
-from schemas.tables import CONTRACT_VERSION, TABLES, Runs
+from schemas.tables import TABLES
 from schemas.version import SOFTWARE
 
 
@@ -120,22 +120,11 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) 
 
 def failed_tables(job: RunJob, error: str) -> RunTables:
     """Tables without content but for the row that says why; no path, so that they are the same anywhere."""
+    # Imported here because it takes a while, and only runs that fail need it.
+    from pipeline.summary import failed_row
+
     folder = job.address.rstrip("/").rpartition("/")[0]
-    known = {
-        "status": RunStatus.FAILED.value,
-        "error": error.replace(f"{redacted(folder)}/", ""),
-        "config_digest": digest_of(job.config, job.vehicle),
-        "software": SOFTWARE,
-        "contract": CONTRACT_VERSION,
-    }
-    columns = {name: [known.get(name, _blank(column))] for name, column in Runs.columns().items()}
-    row = pl.DataFrame(columns, schema=Runs.create_empty().schema)
+    made = Provenance(digest_of(job.config, job.vehicle), "", SOFTWARE)
+    row = failed_row(error.replace(f"{redacted(folder)}/", ""), made)
     empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
     return RunTables(run_id=job.run_id, runs=row, **empty)
-
-
-def _blank(column: dy.Column) -> object:
-    """Null where the contract allows it, else nothing counted and nothing named."""
-    if column.nullable:
-        return None
-    return 0 if isinstance(column, dy.Int64) else ""

@@ -1,0 +1,26 @@
+"""The tables of `OUT/campaign/`, all of them, from those of the runs."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs
+from pipeline.hazards.map_errors import map_places
+from pipeline.safety.measured import detection_by_level, measured_figures
+from schemas.config import Configuration
+
+
+def derived_tables(
+    runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
+) -> dict[str, pl.DataFrame]:
+    """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order."""
+    wide = campaign_runs(runs, hazards, config.safety)
+    return {
+        "runs": wide,
+        "balises": campaign_balises(passages, config),
+        "accuracy": campaign_accuracy(passages, config),
+        "figures": measured_figures(runs, hazards, config.safety),
+        "detection": detection_by_level(hazards, config.safety),
+        "levels": campaign_levels(wide, hazards, config.safety, config.hazards.reaction_s),
+        "map": map_places(alarms),
+    }
