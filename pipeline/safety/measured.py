@@ -25,6 +25,7 @@ from schemas.enums import Evidence, RunStatus
 Row = dict[str, object]
 
 _STATES = ("p0", "p1", "p2", "p3")
+_ROUNDING = 1e-9
 
 TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
 
@@ -83,11 +84,12 @@ def _shares(runs: pl.DataFrame) -> Row:
     if not whole_s:
         return {}
     spent = judged.select((pl.col(f"share_{state}").fill_null(0.0) * pl.col("held_s")).sum() for state in _STATES)
-    shares = {state: min(1.0, spent[f"share_{state}"].item() / whole_s) for state in _STATES}
+    shares: dict[str, float | None] = {state: min(1.0, spent[f"share_{state}"].item() / whole_s) for state in _STATES}
     if not with_truth.height:
         shares |= {"p0": None, "p1": None}
-    known = sum(share for share in shares.values() if share is not None)
-    return {f"share_{state}": share for state, share in (shares | {"unknown": max(0.0, 1.0 - known)}).items()}
+    left = 1.0 - sum(share for share in shares.values() if share is not None)
+    shares["unknown"] = left if left > _ROUNDING else 0.0
+    return {f"share_{state}": share for state, share in shares.items()}
 
 
 def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
