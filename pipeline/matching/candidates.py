@@ -117,11 +117,11 @@ def candidates_of(points: Points, network: Network, segments: Segments, reach_m:
 
 
 def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candidates:
-    """Candidates of different steps together; those of the second are numbered anew."""
+    """Candidates of two searches together; the steps of the second are numbered anew."""
     steps = len(some.first) - 1
     others = replace(others, step=step_of_others[others.step])
     columns = {name: np.concatenate([getattr(some, name), getattr(others, name)]) for name in _COLUMNS}
-    order = np.argsort(columns["step"], kind="stable")
+    order = np.lexsort((columns["element"], columns["step"]))
     columns = {name: values[order] for name, values in columns.items()}
     return Candidates(first=np.searchsorted(columns["step"], np.arange(steps + 1)), **columns)
 

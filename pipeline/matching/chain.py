@@ -46,7 +46,7 @@ def path_on_chain(
     ones, zeros = np.ones(len(fixes)), np.zeros(len(fixes), dtype=np.int64)
     found = Assignment(zeros, None, ones, ones, everywhere)
     if not np.isfinite(way.distance_m).all():
-        found = found.without_gate(out_of_reach(fixes, believable(fixes, fixes.valid, way, config), way))
+        found = found.without_gate(out_of_reach(fixes, believable(fixes, fixes.valid, way, config), way, config))
     return TravelledPath(track, (covered,)), found
 
 

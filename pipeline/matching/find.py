@@ -13,6 +13,7 @@ from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.doubt import Doubt, doubt_of, stretches
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
+from pipeline.matching.jumps import with_tracks_aside
 from pipeline.matching.likelihood import likelihood_of
 from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
@@ -59,7 +60,7 @@ def find_path(
     doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
-    assignment = assignment.without_gate(out_of_reach(fixes, believed, way))
+    assignment = assignment.without_gate(out_of_reach(fixes, believed, way, config))
     return path, assignment, stretches(fixes, trellis, found, doubt, config)
 
 
@@ -72,7 +73,8 @@ def _trellis(
     by its movement which way the train turned.
     """
     steps = _thinned(fixes, steps_of(fixes, believed, way, config), network, way, config)
-    wide = _all_candidates(fixes, steps, network, config)
+    segments = segments_of(network.track)
+    wide = _all_candidates(fixes, steps, network, segments, config)
     nearest = np.full(len(steps), np.inf)
     np.minimum.at(nearest, wide.step, wide.distance_m)
     near = np.flatnonzero(nearest <= config.reach_m)
@@ -84,6 +86,7 @@ def _trellis(
     kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
     candidates = wide.take(np.flatnonzero(kept), len(steps)).renumbered(judged)
     steps = resumed(fixes, steps.epoch[judged], way)
+    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config.reach_m)
     like = likelihood_of(fixes, steps, candidates, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, like, config)
@@ -102,9 +105,10 @@ def _thinned(fixes: Fixes, steps: Steps, network: Network, way: Travelled, confi
     return resumed(fixes, steps.epoch[kept], way)
 
 
-def _all_candidates(fixes: Fixes, steps: Steps, network: Network, config: MatchingConfig) -> Candidates:
+def _all_candidates(
+    fixes: Fixes, steps: Steps, network: Network, segments: Segments, config: MatchingConfig
+) -> Candidates:
     """Candidates within reach, and for steps that are not close to a track those in a wider circle."""
-    segments = segments_of(network.track)
     close_m = _CLOSE_M + config.reach_m
     found = _candidates(fixes, steps.epoch, network, segments, close_m)
     close = np.zeros(len(steps), dtype=bool)

@@ -24,6 +24,9 @@ from schemas.config import MatchingConfig
 # table's, which knows nothing of this receiver's noise.
 _FLOOR_M = 0.02
 _TABLE_FLOOR_M = 0.1
+# An offset outside this many sigmas, and the scale of outliers, lasts for this long [s]: being off costs by the time.
+_OFF_SIGMAS = 5.0
+_OFF_S = 8.0
 _HEADING_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
@@ -34,7 +37,7 @@ class Likelihood:
     """Per candidate: variance of the offset, what of it is new since the step before, and the rest.
 
     `fixed` is the log-likelihood that does not depend on the step before (place past an element's end,
-    reads of balises, heading as far as it is new); `heading` is the whole of it, for a first step.
+    reads of balises, heading as far as it is new, time off the track); `heading` is the whole of it, for a first step.
     """
 
     variance_m2: Floats
@@ -69,7 +72,9 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
         fresh_m2=fresh,
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
         keep=np.sqrt(1.0 - gnss_m2 * renewed / variance),
-        fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2, config) + heading * fresh / variance,
+        fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2, config)
+        + heading * fresh / variance
+        - _time_off(steps, candidates, variance, config),
         heading=heading,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
@@ -96,6 +101,17 @@ def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Lik
 def _wide(off_m: Floats, scale_m: float) -> Floats:
     """Log density of an outlier (Cauchy)."""
     return np.asarray(-np.log(np.pi * scale_m * (1.0 + (off_m / scale_m) ** 2)))
+
+
+def _time_off(steps: Steps, candidates: Candidates, variance_m2: Floats, config: MatchingConfig) -> Floats:
+    """Cost of a position that lies off the element by what no error explains, by how long it does.
+
+    Otherwise a constant offset is paid for once, and a run whose positions are elsewhere for a minute, which is paid
+    for twice, would be put on a track far beside for all of it.
+    """
+    limit_m = np.maximum(_OFF_SIGMAS * np.sqrt(variance_m2), config.outlier_scale_m)
+    elapsed_s = np.minimum(np.nan_to_num(steps.elapsed_s[candidates.step]), config.step_time_s)
+    return np.where(candidates.distance_m > limit_m, elapsed_s / _OFF_S, 0.0)
 
 
 def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:

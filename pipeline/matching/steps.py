@@ -112,11 +112,21 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
     return rows[believed]
 
 
-def out_of_reach(fixes: Fixes, believed: Ints, way: Travelled) -> Bools:
-    """Positions where the train cannot be, and no odometer by which the monitors along the track would say so."""
-    beyond = fixes.valid & ~np.isfinite(way.distance_m)
+def out_of_reach(fixes: Fixes, believed: Ints, way: Travelled, config: MatchingConfig) -> Bools:
+    """Positions where the train cannot be, and no odometer by which the monitors along the track would say so.
+
+    After a jump that lasts until the train could have got there, nothing tells which side of it was wrong: no
+    position is taken for the train's before `jump_hold_s` have passed.
+    """
+    usable = np.flatnonzero(fixes.valid)
+    beyond = np.ones(len(fixes), dtype=bool)
     beyond[believed] = False
-    return beyond
+    again = np.flatnonzero(np.diff(np.searchsorted(usable, believed)) > 1) + 1
+    last = np.searchsorted(usable, believed[again]) - 1
+    stayed = _reachable(fixes, usable[last], believed[again], _speeds_mps(fixes, usable)[last], way)
+    for begin in fixes.t_s[believed[again[stayed]]].tolist():
+        beyond |= (fixes.t_s >= begin) & (fixes.t_s < begin + config.jump_hold_s)
+    return np.asarray(beyond & fixes.valid & ~np.isfinite(way.distance_m))
 
 
 def _speeds_mps(fixes: Fixes, rows: Ints) -> Floats:

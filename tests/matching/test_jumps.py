@@ -60,6 +60,18 @@ def test_without_an_odometer_no_position_out_of_reach_is_trusted(place: object) 
     assert with_odometer.epochs["gate_probability"].min() > 0.99
 
 
+def test_without_an_odometer_a_jump_that_stays_is_not_trusted_at_once() -> None:
+    """200 m ahead for 60 s at 15 m/s: neither there nor right after the way back is the position trusted."""
+    x = 6.0 * np.arange(300) + 20.0
+    x[100:250] -= 200.0
+    epochs = matched(run(x, np.zeros(300), 2.5, sigma_m=0.1), CHAIN).epochs
+    gate = epochs["gate_probability"].to_numpy()
+    away = (gate[100:] > 0.99).argmax() / 2.5
+    assert 30.0 < away < 50.0
+    assert (gate[:100] > 0.99).all()
+    assert (gate[250:] < 0.5).all()
+
+
 def test_a_train_that_speeds_up_or_lost_its_position_is_believed() -> None:
     """From standstill at 1.5 m/s², then 20 s without a position: no epoch is out of reach."""
     t = np.concatenate([np.arange(0.0, 20.0, 0.4), np.arange(40.0, 50.0, 0.4)])
@@ -83,3 +95,25 @@ def test_noise_of_a_receiver_without_accuracy_does_not_change_the_track(seed: in
     found = matched(run(x + noise[0], y + noise[1], 2.5, sigma_m=None, fix=["rtk_fixed"] * len(x)), place)
     wrong = (found.epochs["netelement_id"] == "m") & (found.epochs["path_probability"] > 0.99)
     assert wrong.sum() <= 0.01 * len(wrong)
+
+
+@pytest.mark.parametrize("track_y", [0.0, 20.0])
+def test_a_stretch_of_positions_on_another_track_does_not_move_the_run(track_y: float) -> None:
+    """For 40 s of 160 s the positions lie along a track 200 m away, to which nothing leads."""
+    x = np.arange(20.0, 1980.0, 4.9)
+    y = np.full(len(x), track_y)
+    y[150:250] = 215.0
+    found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
+    assert found.path.elements() == (["a", "b"] if track_y == 0.0 else ["c", "d"])
+    before_and_after = np.r_[0:140, 360:400]
+    assert found.epochs["gate_probability"].fill_null(0.0).to_numpy()[before_and_after].min() > 0.99
+    assert not found.epochs["on_track"][150:250].any()
+
+
+def test_a_track_far_beside_is_paid_for_by_the_time_on_it() -> None:
+    """The first 10 s lie on the far track, then the position comes back to where the train has been for 150 s."""
+    x = np.arange(20.0, 1980.0, 4.9)
+    y = np.where(np.arange(len(x)) < 25, 20.0, 0.0)
+    found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
+    assert found.path.elements() == ["a", "b"]
+    assert found.epochs["path_probability"][200] > 0.99
