@@ -16,8 +16,6 @@ DEFAULTS: dict[str, str] = {"solution": "primary"}
 NEVER_EMPTY: tuple[Stream, ...] = ("gnss", "odometer")
 _EXACT_INTEGER = 2**53  # above it not every integer is a float
 
-Convert = Callable[[pl.Series], pl.Series | str]
-
 
 def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Breach]) -> pl.DataFrame:
     """The stream's columns with the contract's types, in the contract's order; rows are left as they stand.

@@ -19,8 +19,9 @@ from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_records import DamageError
 from pipeline.ingest.mcap_walk import McapWalk
-from pipeline.ingest.plan import Sample, candidates, is_candidate, settle, source_of
+from pipeline.ingest.plan import Sample, candidates, is_candidate, source_of
 from pipeline.ingest.reader import SourceReader
+from pipeline.ingest.settle import settle
 from pipeline.storage import files
 from schemas.config import IngestConfig
 from schemas.errors import InputError

@@ -55,7 +55,6 @@ class McapWalk:
         self.without_own_crc: list[tuple[int, int]] = []  # contents of chunks, from and to
         self._loose_blocks = 0
         self.cut_at: int | None = None
-        self.unknown_records = 0
         self._window = window
         self._file = file
         self._limit = chunk_limit
@@ -183,7 +182,6 @@ class McapWalk:
         """Unknown opcodes are skipped, by specification; known ones stand where they must not."""
         if opcode <= max(Op):
             raise DamageError(position, f"a {Op(opcode).name} record stands in the data section")
-        self.unknown_records += 1
 
     def _header(self, body: memoryview, position: int) -> None:
         if position != len(MAGIC):
@@ -260,8 +258,6 @@ class McapWalk:
             self._channel(body, position)
         elif opcode <= max(Op):
             raise DamageError(position, f"a record of opcode {opcode} stands inside a chunk")
-        else:
-            self.unknown_records += 1
 
     def _counted(self, block: Block, offset: int, size: int) -> Block:
         for channel_id, messages in block.items():

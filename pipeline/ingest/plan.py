@@ -1,24 +1,21 @@
-"""Which channel of a log feeds which stream, and how."""
+"""Which streams a channel of a log may feed, and how its messages make rows."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import dataframely as dy
 import polars as pl
 
-from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.breaches import Breach
 from pipeline.ingest.generic import protobuf_descriptor
 from pipeline.ingest.inventory import stamp_parts
+from pipeline.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.ingest.mcap_model import Channel
-from pipeline.ingest.recipe import FIX_TYPE, Recipe
-from pipeline.ingest.recipes import recipes_for, recorded_type
+from pipeline.ingest.recipe import Recipe
+from pipeline.ingest.recipes import recipes_for
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, time_source
 from schemas.config import IngestConfig, StreamMapping
-from schemas.enums import Fix
-from schemas.errors import ConfigError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
@@ -67,12 +64,6 @@ class Source:
 Candidate = tuple[Recipe, StreamMapping | None]
 
 
-def mappings_of(config: IngestConfig, stream: Stream) -> tuple[StreamMapping, ...]:
-    """What the configuration says about a stream (injected faults cannot be mapped)."""
-    mappings: tuple[StreamMapping, ...] = getattr(config, stream, ())
-    return mappings
-
-
 def candidates(sample: Sample, config: IngestConfig) -> list[Candidate]:
     """The streams that a channel may feed: by configuration, else by its schema."""
     channel = sample.channel
@@ -81,7 +72,9 @@ def candidates(sample: Sample, config: IngestConfig) -> list[Candidate]:
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
         found += [
-            (mapped_recipe(sample, stream, mapping), mapping) for mapping in mappings if mapping.topic == channel.topic
+            (mapped_recipe(known, sample.fields, stream, mapping), mapping)
+            for mapping in mappings
+            if mapping.topic == channel.topic
         ]
         if known is not None and known.stream == stream and (not mappings or known.supplement):
             found.append((known, None))
@@ -103,61 +96,9 @@ def _fitting(sample: Sample) -> Recipe | None:
     return next(whole, recipes[0] if recipes else None)
 
 
-def mapped_recipe(sample: Sample, stream: Stream, mapping: StreamMapping) -> Recipe:
-    """The mapping over the recipe of the schema, if that is one of the same stream."""
-    base = _fitting(sample)
-    if base is None or base.stream != stream:
-        fix = {"fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE)} if stream == "gnss" else {}
-        base = Recipe(stream=stream, columns=fix, stamps={})
-    contract = STREAM_SCHEMAS[stream].columns()
-    _refuse_unknown_columns(stream, mapping, contract)
-    fields = {name: path for name, path in mapping.fields.items() if name != "t"}
-    columns = dict(base.columns) | {name: pl.col(path) for name, path in fields.items()}
-    types = dict(base.types) | {path: recorded_type(contract[name]) for name, path in fields.items()}
-    if "fix" in fields and mapping.fix_codes:
-        types[fields["fix"]], columns["fix"] = _coded(sample, fields["fix"], mapping)
-    columns |= {name: _constant(stream, mapping, name, contract[name]) for name in mapping.constants}
-    columns |= {name: columns[name] * factor for name, factor in mapping.factors.items() if name in columns}
-    return replace(base, columns=columns, types=types)
-
-
-def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]) -> None:
-    named = {*mapping.fields, *mapping.constants, *mapping.factors}
-    unknown = sorted(named - set(contract))
-    if unknown:
-        raise ConfigError(
-            "is no column of this stream",
-            place=f"[ingest.{stream}] topic {mapping.topic}",
-            found=", ".join(unknown),
-            expected=", ".join(contract),
-        )
-
-
-def _coded(sample: Sample, path: str, mapping: StreamMapping) -> tuple[pl.DataType, pl.Expr]:
-    """Kinds of fix by recorded number or text; a code that is not listed stays as it is, and is refused later."""
-    kinds: dict[object, str] = {code: kind.value for code, kind in mapping.fix_codes.items()}
-    dtype: pl.DataType = pl.String()
-    if sample.fields.get(path) != "text" and all(re.fullmatch(r"-?\d+", code) for code in mapping.fix_codes):
-        kinds, dtype = {int(str(code)): kind for code, kind in kinds.items()}, pl.Int64()
-    known = pl.col(path).replace_strict(kinds, default=None, return_dtype=pl.String)
-    return dtype, pl.coalesce(known, pl.format("code {}", pl.col(path)))
-
-
-def _constant(stream: Stream, mapping: StreamMapping, name: str, column: dy.Column) -> pl.Expr:
-    value = mapping.constants[name]
-    words = column.categories if isinstance(column, dy.Enum) else None
-    if isinstance(column, dy.Float64 | dy.Int64):  # to Python, true is a number as well
-        fits = isinstance(value, float) and (value.is_integer() or isinstance(column, dy.Float64))
-    else:
-        fits = isinstance(value, bool if isinstance(column, dy.Bool) else str)
-    if not fits or (words is not None and value not in words):
-        raise ConfigError(
-            "cannot be the constant of this column",
-            place=f"[ingest.{stream}] topic {mapping.topic}: constants.{name}",
-            found=repr(value),
-            expected=", ".join(words) if words is not None else str(column.dtype),
-        )
-    return pl.lit(value, dtype=FIX_TYPE if words is not None else column.dtype)
+def mapped_source(sample: Sample, stream: Stream, mapping: StreamMapping) -> Source:
+    """The source that the configuration makes of a channel."""
+    return source_of(sample, (mapped_recipe(_fitting(sample), sample.fields, stream, mapping), mapping))
 
 
 def source_of(sample: Sample, candidate: Candidate) -> Source:
@@ -256,89 +197,3 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
     if named:
         breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
     return log_time
-
-
-def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
-    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
-    breaches = _absent_topics(topics, config, file)
-    kept: list[Source] = []
-    for stream in STREAMS:
-        chosen = _preferred([source for source in sources if source.stream == stream and not source.dropped])
-        _refuse_shared_solutions(stream, chosen)
-        breaches += _competing(stream, chosen, file)
-        breaches += [breach for source in chosen for breach in source.breaches]
-        kept += chosen
-    refuse(breaches)
-    return _with_solutions(kept)
-
-
-def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[Breach]:
-    return [
-        Breach(
-            f"{file}: topic {mapping.topic}",
-            f"is configured for {stream} but has no messages",
-            found=", ".join(sorted(set(topics))) or "no topics",
-            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
-        )
-        for stream in STREAMS
-        for mapping in mappings_of(config, stream)
-        if mapping.topic not in topics
-    ]
-
-
-def _preferred(sources: Sequence[Source]) -> list[Source]:
-    """This project's own schema alone where it is present; a supplement only with what it adds to."""
-    own = [source for source in sources if source.recipe.own]
-    if own:
-        return own
-    whole = [source for source in sources if not source.recipe.supplement]
-    return list(sources) if whole else []
-
-
-def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
-    """Two receivers under one name would be read as one that jumps between their positions."""
-    if stream != "gnss":
-        return
-    topics: dict[str, str] = {}
-    for source in sources:
-        if source.solution is None or source.recipe.supplement:
-            continue
-        if topics.setdefault(source.solution, source.channel.topic) != source.channel.topic:
-            raise ConfigError(
-                "several topics feed the same solution",
-                place=f"[ingest.gnss] solution {source.solution}",
-                found=f"{topics[source.solution]}, {source.channel.topic}",
-                expected="one name per topic",
-                remedy="Set solution in each [[ingest.gnss]].",
-            )
-
-
-def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Breach]:
-    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
-    topics = list(dict.fromkeys(source.channel.topic for source in sources))
-    if stream in ("gnss", "satellites") or len(topics) < 2:
-        return []
-    return [
-        Breach(
-            file,
-            f"several topics could be the {stream}",
-            found=", ".join(topics),
-            expected="one",
-            remedy=f"Choose one by [ingest.{stream}] topic in the configuration.",
-        )
-    ]
-
-
-def _with_solutions(sources: Sequence[Source]) -> list[Source]:
-    """Names of solutions: as configured, `primary` for the only topic, else after the topic."""
-    topics = {source.channel.topic for source in sources if source.stream == "gnss" and not source.recipe.supplement}
-    return [
-        source
-        if source.solution is not None or source.stream not in ("gnss", "satellites")
-        else replace(source, solution=_named_after(source.channel.topic) if len(topics) > 1 else "primary")
-        for source in sources
-    ]
-
-
-def _named_after(topic: str) -> str:
-    return topic.strip("/").replace("/", "_") or "primary"

@@ -9,8 +9,9 @@ import polars as pl
 
 from pipeline.ingest.breaches import refuse
 from pipeline.ingest.csv_text import read_table
+from pipeline.ingest.mapping import mappings_of
 from pipeline.ingest.mcap_model import Channel
-from pipeline.ingest.plan import Sample, Source, mapped_recipe, mappings_of, source_of
+from pipeline.ingest.plan import Sample, Source, mapped_source
 from pipeline.ingest.stamps import time_source
 from pipeline.ingest.timescale import utc_from_gps
 from schemas.config import IngestConfig, StreamMapping
@@ -50,7 +51,7 @@ def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: P
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
     kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
     sample = Sample(Channel(0, path.name, "csv", None, str(path)), kinds)
-    source = source_of(sample, (mapped_recipe(sample, stream, mapping), mapping))
+    source = mapped_source(sample, stream, mapping)
     refuse(source.breaches)
     fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
     columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}

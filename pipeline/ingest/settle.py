@@ -1,0 +1,99 @@
+"""Which of the channels that could feed a stream do, and under which names, once all of them are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.mapping import mappings_of
+from pipeline.ingest.plan import Source
+from schemas.config import IngestConfig
+from schemas.errors import ConfigError
+from schemas.run import STREAMS, Stream
+
+
+def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
+    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
+    breaches = _absent_topics(topics, config, file)
+    kept: list[Source] = []
+    for stream in STREAMS:
+        chosen = _preferred([source for source in sources if source.stream == stream and not source.dropped])
+        _refuse_shared_solutions(stream, chosen)
+        breaches += _competing(stream, chosen, file)
+        breaches += [breach for source in chosen for breach in source.breaches]
+        kept += chosen
+    refuse(breaches)
+    return _with_solutions(kept)
+
+
+def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[Breach]:
+    return [
+        Breach(
+            f"{file}: topic {mapping.topic}",
+            f"is configured for {stream} but has no messages",
+            found=", ".join(sorted(set(topics))) or "no topics",
+            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
+        )
+        for stream in STREAMS
+        for mapping in mappings_of(config, stream)
+        if mapping.topic not in topics
+    ]
+
+
+def _preferred(sources: Sequence[Source]) -> list[Source]:
+    """This project's own schema alone where it is present; a supplement only with what it adds to."""
+    own = [source for source in sources if source.recipe.own]
+    if own:
+        return own
+    whole = [source for source in sources if not source.recipe.supplement]
+    return list(sources) if whole else []
+
+
+def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
+    """Two receivers under one name would be read as one that jumps between their positions."""
+    if stream != "gnss":
+        return
+    topics: dict[str, str] = {}
+    for source in sources:
+        if source.solution is None or source.recipe.supplement:
+            continue
+        if topics.setdefault(source.solution, source.channel.topic) != source.channel.topic:
+            raise ConfigError(
+                "several topics feed the same solution",
+                place=f"[ingest.gnss] solution {source.solution}",
+                found=f"{topics[source.solution]}, {source.channel.topic}",
+                expected="one name per topic",
+                remedy="Set solution in each [[ingest.gnss]].",
+            )
+
+
+def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Breach]:
+    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
+    topics = list(dict.fromkeys(source.channel.topic for source in sources))
+    if stream in ("gnss", "satellites") or len(topics) < 2:
+        return []
+    return [
+        Breach(
+            file,
+            f"several topics could be the {stream}",
+            found=", ".join(topics),
+            expected="one",
+            remedy=f"Choose one by [ingest.{stream}] topic in the configuration.",
+        )
+    ]
+
+
+def _with_solutions(sources: Sequence[Source]) -> list[Source]:
+    """Names of solutions: as configured, `primary` for the only topic, else after the topic."""
+    topics = {source.channel.topic for source in sources if source.stream == "gnss" and not source.recipe.supplement}
+    return [
+        source
+        if source.solution is not None or source.stream not in ("gnss", "satellites")
+        else replace(source, solution=_named_after(source.channel.topic) if len(topics) > 1 else "primary")
+        for source in sources
+    ]
+
+
+def _named_after(topic: str) -> str:
+    return topic.strip("/").replace("/", "_") or "primary"
