@@ -103,9 +103,7 @@ def dictionary(
     if markdown:
         print(dictionary_markdown(), end="")
         return
-    columns = dictionary_frame()
-    if table is not None:
-        columns = _one_table(columns, table)
+    columns = dictionary_frame(table)
     if as_json:
         _print_json(columns if table else {"columns": columns, "settings": settings_frame()})
         return
@@ -122,10 +120,11 @@ def dictionary(
 def demo(out: OutFolder = Path("demo-out"), seed: int | None = None, quiet: Quiet = False) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
+    from datasets.demo import write_demo
     from pipeline.present import show_table
 
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
-    page = _write_demo(out / "tables", result)
+    page = write_demo(result, out / "tables")
     if not quiet:
         show_table(result.checks, "What was injected, expected and found")
         print(f"\nThe trial is in {out}, its tables in {out / 'tables'}, the report is {page}.")
@@ -447,16 +446,6 @@ def _assess(out: str, config: Path | None, as_json: bool) -> None:
     print("\n".join(found.statements))
 
 
-def _one_table(columns: Any, table: str) -> Any:
-    from schemas.errors import UsageError
-
-    chosen = columns.filter(columns["table"] == table)
-    if chosen.is_empty():
-        known = ", ".join(columns["table"].unique(maintain_order=True))
-        raise UsageError("is no table", place=table, expected=known)
-    return chosen
-
-
 def _status_of(summary: Summary) -> int:
     from schemas.enums import RunStatus
 
@@ -466,10 +455,10 @@ def _status_of(summary: Summary) -> int:
 
 
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.tally import summary_line
+    from pipeline.campaign.tally import outcome_rows, summary_line
     from pipeline.present import show_table
 
-    rows = _summary_rows(summary)
+    rows = outcome_rows(summary)
     if as_json:
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
         _print_json({**figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
@@ -478,32 +467,6 @@ def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> Non
         if shown.height:
             show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))
         print(f"{summary_line(summary)}. Tables are in {out}.")
-
-
-def _summary_rows(summary: Summary) -> Any:
-    import polars as pl
-
-    names = ("run_id", "status", "hazards", "missed_detections", "seconds", "skipped", "attempts", "error")
-    rows = [tuple(getattr(outcome, name) for name in names) for outcome in summary.outcomes]
-    kinds = (pl.String, pl.String, pl.Int64, pl.Int64, pl.Float64, pl.Boolean, pl.Int64, pl.String)
-    return pl.DataFrame(rows, schema=dict(zip(names, kinds, strict=True)), orient="row")
-
-
-def _write_demo(out: Path, result: Any) -> Path:
-    """The demo's tables as a campaign would leave them, and the report; returns the report's first page."""
-    from pipeline.campaign.finish import write_campaign
-    from pipeline.report import write_report
-    from pipeline.results.store import write_config, write_run
-    from schemas.config import Configuration
-    from schemas.version import SOFTWARE
-
-    for tables in result.tables:
-        row = tables.runs.row(0, named=True)
-        digests = {name: row[name] for name in ("config_digest", "input_digest")}
-        write_run(tables, out, {"software": SOFTWARE, "site_digest": result.site.digest, **digests})
-    write_config(out, Configuration())
-    write_campaign(out, Configuration())
-    return write_report(out, result.site)[0]
 
 
 if __name__ == "__main__":

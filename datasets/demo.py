@@ -12,11 +12,15 @@ import polars as pl
 from datasets.comparison import Check, checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
+from pipeline.campaign.finish import write_campaign
 from pipeline.ingest.run import read_run
 from pipeline.ingest.site import read_site
+from pipeline.report import write_report
+from pipeline.results.store import write_config, write_run
 from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
+from schemas.version import SOFTWARE
 
 Progress = Callable[[str], None]
 
@@ -69,3 +73,15 @@ def replay_trial(
         if progress is not None:
             progress(spec.id)
     return DemoResult(scenario, site, checks_table(checks), tuple(tables))
+
+
+def write_demo(result: DemoResult, out: Path) -> Path:
+    """The demo's tables as a campaign would leave them, and the report; returns the report's first page."""
+    config = Configuration()
+    for tables in result.tables:
+        row = tables.runs.row(0, named=True)
+        digests = {name: row[name] for name in ("config_digest", "input_digest")}
+        write_run(tables, out, {"software": SOFTWARE, "site_digest": result.site.digest, **digests})
+    write_config(out, config)
+    write_campaign(out, config)
+    return write_report(out, result.site)[0]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
@@ -28,21 +27,6 @@ from schemas.run import STREAMS, RunLog, Site
 
 # Runs of a trial start one hour after the other.
 _RUN_SPACING = timedelta(hours=1)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A trial in memory."""
-
-    scenario: Scenario
-    site: Site
-    runs: tuple[RunLog, ...]
-
-
-def build_trial(scenario: Scenario) -> Trial:
-    """Simulate the site and all runs."""
-    line = build_line(scenario.line)
-    return Trial(scenario, build_site(scenario, line), tuple(build_run(scenario, run, line) for run in scenario.runs))
 
 
 def build_site(scenario: Scenario, line: Line | None = None) -> Site:

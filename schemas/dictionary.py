@@ -10,6 +10,7 @@ from pydantic import BaseModel
 
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, Vehicle
+from schemas.errors import UsageError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
 from schemas.tables import CONTRACT_VERSION, TABLES
 
@@ -39,8 +40,11 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
     }
 
 
-def dictionary_frame() -> pl.DataFrame:
-    """One row per column: `group, table, column, dtype, unit, nullable, meaning`."""
+def dictionary_frame(only: str | None = None) -> pl.DataFrame:
+    """One row per column, of all tables or `only` one: `group, table, column, dtype, unit, nullable, meaning`."""
+    known = [table for tables in groups().values() for table in tables]
+    if only is not None and only not in known:
+        raise UsageError("is no table", place=only, expected=", ".join(known))
     rows = [
         {
             "group": group,
@@ -54,6 +58,7 @@ def dictionary_frame() -> pl.DataFrame:
         for group, tables in groups().items()
         for table, schema in tables.items()
         for name, column in schema.columns().items()
+        if only in (None, table)
     ]
     return pl.DataFrame(rows)
 

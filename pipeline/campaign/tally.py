@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+import polars as pl
+
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.watch import Summary
 from pipeline.present import duration_text
@@ -91,3 +93,19 @@ def summary_line(summary: Summary) -> str:
     if summary.skipped:
         text += f" ({summary.skipped} of them complete before)"
     return f"{text}; {duration_text(summary.seconds)}"
+
+
+def outcome_rows(summary: Summary) -> pl.DataFrame:
+    """A campaign as a table: one row per run that was reached."""
+    kinds = {
+        "run_id": pl.String,
+        "status": pl.String,
+        "hazards": pl.Int64,
+        "missed_detections": pl.Int64,
+        "seconds": pl.Float64,
+        "skipped": pl.Boolean,
+        "attempts": pl.Int64,
+        "error": pl.String,
+    }
+    rows = [tuple(getattr(outcome, name) for name in kinds) for outcome in summary.outcomes]
+    return pl.DataFrame(rows, schema=kinds, orient="row")

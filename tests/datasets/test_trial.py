@@ -11,7 +11,7 @@ import pytest
 from datasets.line import build_line
 from datasets.motion import build_motion
 from datasets.scenario import Scenario, load_scenario
-from datasets.trial import build_run, build_trial, write_run_as, write_trial
+from datasets.trial import build_run, build_site, write_run_as, write_trial
 from pipeline.geodesy import earth_centred_m
 from pipeline.ingest.run import read_run
 from pipeline.ingest.site import read_site
@@ -52,10 +52,11 @@ def test_one_seed_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -
 
 
 def test_a_run_does_not_depend_on_the_others() -> None:
-    whole = build_trial(scenario({}, {"faults": [STEP]}, {})).runs[1]
-    alone = run_of(scenario({}, {"faults": [STEP]}), 1)
+    """Neither on how many there are nor on what the one before it draws."""
+    one = run_of(scenario({}, {"faults": [STEP]}, {}), 1)
+    other = run_of(scenario({"faults": [STEP], "gnss": {"sky": GPS_ONLY}}, {"faults": [STEP]}), 1)
     for name in STREAMS:
-        ours, theirs = whole.stream(name), alone.stream(name)
+        ours, theirs = one.stream(name), other.stream(name)
         assert (ours is None) == (theirs is None)
         assert ours is None or theirs is None or ours.equals(theirs)
 
@@ -77,7 +78,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path, log: str) -> None:
                 assert gap is None or gap < 1e-12, (name, column)
     site = read_site(tmp_path / "site")
     assert [finding for finding in site.findings if finding.severity == "error"] == []
-    assert site.track.equals(build_trial(spec).site.track)
+    assert site.track.equals(build_site(spec).track)
     assert load_scenario(tmp_path / "scenario.toml") == spec
 
 
