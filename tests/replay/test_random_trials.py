@@ -5,7 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from datasets.random_trials import KINDS, deviations, random_trial
+from datasets.random_deviations import deviations
+from datasets.random_trials import KINDS, random_trial
 from pipeline.stages import replay
 
 # Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma;

@@ -1,0 +1,125 @@
+"""The hazards that a run must show: the definitions applied to its true motion and injected error, without noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.faults import PlacedFault, offset_m
+from datasets.motion import build_motion
+from datasets.scenario import RunSpec, Scenario
+from datasets.trial import placed
+
+Floats = npt.NDArray[np.float64]
+
+LIMIT_M = 20.0
+
+
+@dataclass(frozen=True)
+class ExpectedRow:
+    """One hazard row; `t_s` is the step after the first epoch, or about when the first VB is hit."""
+
+    hazard: str
+    balise_ids: frozenset[str]
+    t_s: float
+    early: bool | None
+    caused_by: int | None
+
+
+def expected_hazards(scenario: Scenario, spec: RunSpec) -> tuple[ExpectedRow, ...] | None:
+    """The rows of the hazard table; `None` where noise could change them."""
+    position = [fault for fault in spec.faults if fault.target == "along"]
+    if not position:
+        return ()
+    world = _world(scenario, spec, position[0])
+    found = _Found()
+    moves = np.flatnonzero((np.diff(world.error_m) != 0.0) | (np.abs(world.error_m[1:]) > LIMIT_M / 2.0)) + 1
+    for k in moves.tolist():
+        if not _look(world, k, found):
+            return None
+    return tuple(found.rows())
+
+
+@dataclass(frozen=True)
+class _World:
+    """Without noise, at the epochs: time [s], way run, error in the direction of travel, places of the VBs [m]."""
+
+    t_s: Floats
+    way_m: Floats
+    error_m: Floats
+    names: tuple[str, ...]
+    places_m: Floats
+    margin_m: float
+
+    def passed(self, a_m: float, b_m: float) -> frozenset[str]:
+        low, high = min(a_m, b_m), max(a_m, b_m)
+        return frozenset(n for n, at in zip(self.names, self.places_m, strict=True) if low < at <= high)
+
+    def near(self, at_m: float) -> bool:
+        return bool((np.abs(self.places_m - at_m) <= self.margin_m).any())
+
+
+def _world(scenario: Scenario, spec: RunSpec, fault: PlacedFault) -> _World:
+    motion = build_motion(spec.motion)
+    t_s = np.arange(0.0, motion.duration_s + 1e-9, 1.0 / spec.gnss.rate_hz)
+    exact = placed(fault, motion, spec.gnss.rate_hz)
+    error_m = offset_m(exact, t_s, np.random.default_rng(0))
+    way_m = motion.distance_m(t_s - spec.gnss.latency_s)
+    names = tuple(balise.id for balise in scenario.line.balises)
+    at_m = np.array([balise.at_m for balise in scenario.line.balises])
+    places_m = (at_m - motion.start_m) * motion.sign
+    return _World(t_s, way_m, error_m, names, places_m, 6.0 * spec.gnss.sigma_east_m + 2.0)
+
+
+class _Found:
+    """Jumps and early or late offers in time, sorted into rows."""
+
+    def __init__(self) -> None:
+        self.jumps: list[tuple[float, frozenset[str], bool]] = []
+        self.hits: list[tuple[float, str, float]] = []
+
+    def rows(self) -> list[ExpectedRow]:
+        """An error's first event names its row; a jump back makes one of its own."""
+        rows: list[ExpectedRow] = []
+        hit = frozenset(name for _, name, _ in self.hits)
+        begun = [jump for jump in self.jumps if not jump[2]]
+        if begun:
+            t_s, ids, _ = begun[0]
+            rows.append(ExpectedRow(_class_of(ids), ids | hit, t_s, None, None))
+        elif hit:
+            t_s, _, error_m = self.hits[0]
+            rows.append(ExpectedRow("VB_SHIFT", hit, t_s, error_m > 0.0, None))
+        for t_s, ids, back in self.jumps:
+            if back:
+                rows.append(ExpectedRow(_class_of(ids), ids, t_s, None, 0 if rows else None))
+        return rows
+
+
+def _class_of(ids: frozenset[str]) -> str:
+    return "VB_JUMP_1A" if len(ids) > 1 else "VB_JUMP_1B"
+
+
+def _look(world: _World, k: int, found: _Found) -> bool:
+    """Take the movement that leads to epoch `k`; false where it is too close to call."""
+    a_m, b_m = world.way_m[k - 1] + world.error_m[k - 1], world.way_m[k] + world.error_m[k]
+    step_m = world.error_m[k] - world.error_m[k - 1]
+    t_s = float(world.t_s[k])
+    if abs(step_m) > LIMIT_M:
+        if any(world.near(at_m) for at_m in (a_m, b_m, world.way_m[k - 1], world.way_m[k])):
+            return False
+        ids = world.passed(a_m, b_m) - world.passed(a_m, a_m + world.way_m[k] - world.way_m[k - 1])
+        if ids:
+            found.jumps.append((t_s, ids, abs(world.error_m[k]) < abs(world.error_m[k - 1])))
+        return True
+    offered = world.passed(a_m, b_m)
+    size_m = abs(float(world.error_m[k]))
+    if offered and abs(size_m - LIMIT_M) < world.margin_m:
+        return False
+    if size_m > LIMIT_M:
+        # A stand near a VB offers it again and again by noise alone.
+        if world.near(b_m) and world.way_m[k] == world.way_m[k - 1]:
+            return False
+        found.hits += [(t_s, name, float(world.error_m[k])) for name in sorted(offered)]
+    return True
