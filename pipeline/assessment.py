@@ -209,7 +209,7 @@ _SHORT = {
 def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
     """The tables as they fit a screen: without those of single runs, wide ones in fewer columns or turned."""
     shown = {
-        "figures": tall(tables["figures"], ("solution",)),
+        "figures": tall(tables["figures"], ("solution",)) if tables["figures"].height else tables["figures"],
         "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
         "runs by verdict per service level": tables["levels"],
         "location error of accepted virtual balises": tables["accuracy"].select(_SHORT["accuracy"]),

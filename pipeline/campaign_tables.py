@@ -15,7 +15,7 @@ from pipeline.statistics import Estimate, clopper_pearson, poisson_rate
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform
-from schemas.enums import BaliseKind, FailureMode, LinkingError, PassageStatus, RunStatus, ThrVerdict
+from schemas.enums import TRUTH, BaliseKind, FailureMode, LinkingError, PassageStatus, RunStatus, ThrVerdict
 
 SPEED_BAND_KMH = 40.0
 
@@ -32,6 +32,7 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
         .with_columns(
             pl.col(counted).fill_null(0),
             hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
+            unsafe_judged=pl.when(pl.col("accepted_judged") > 0).then(pl.col("unsafe_accepted")).otherwise(0),
             hours_seen=pl.when(pl.col("evidence").is_not_null()).then(known_h).otherwise(0.0),
         )
     )
@@ -39,7 +40,7 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfi
         joined,
         ("hazard_rate", "_per_h", poisson_rate, "faults", "hours_seen"),
         ("missed_share", "", clopper_pearson, "missed", "failures"),
-        ("unsafe_share", "", clopper_pearson, "unsafe_accepted", "accepted_judged"),
+        ("unsafe_share", "", clopper_pearson, "unsafe_judged", "accepted_judged"),
         ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
     )
     levels = [(level, safety.allowed_time_to_detect_s(level)) for level in safety.service_levels]
@@ -123,9 +124,20 @@ def _with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
     return frame.with_columns(series)
 
 
+def with_judgement(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
+    """Passages with `judged`: an acceptance whose location error a reference or balise reads tell.
+
+    By the odometer alone a position that is wrong from the start looks right at every balise.
+    """
+    true = runs.filter(pl.col("evidence").is_in(TRUTH)).select(*_RUN, truth=pl.lit(value=True))
+    known = (pl.col("status") == PassageStatus.ACCEPTED) & pl.col("location_error_m").is_not_null()
+    joined = passages.join(true, on=_RUN, how="left", maintain_order="left")
+    return joined.with_columns(judged=known & pl.col("truth").fill_null(value=False)).drop("truth")
+
+
 def _spread(name: str = "location_error") -> dict[str, pl.Expr]:
-    """Mean, sigma, 95 % and largest of the location errors [m] of acceptances."""
-    error = pl.col("location_error_m").filter(pl.col("status") == PassageStatus.ACCEPTED)
+    """Mean, sigma, 95 % and largest of the location errors [m] of judged acceptances."""
+    error = pl.col("location_error_m").filter(pl.col("judged"))
     return {
         f"{name}_mean_m": error.mean(),
         f"{name}_sigma_m": error.std(),
@@ -147,7 +159,8 @@ def _counts(failure_limit_m: float) -> dict[str, pl.Expr]:
         "deletions": (mode == FailureMode.DELETION) & passage,
         "insertions": mode == FailureMode.INSERTION,
         "linking_errors": pl.col("linking_error") != LinkingError.NONE,
-        "accepted_judged": accepted & error.is_not_null(),
+        "accepted_judged": pl.col("judged"),
+        "unsafe_judged": pl.col("judged") & (error.abs() > failure_limit_m),
         "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
         "suspect_after_the_fact": pl.col("suspect_after_the_fact"),
     }
@@ -158,7 +171,7 @@ def campaign_balises(passages: pl.DataFrame, config: Configuration) -> pl.DataFr
     """Per balise and solution: how often accepted, lost or accepted unsafely, with exact bounds.
 
     Deletions and acceptances are shares of the trains that passed; unsafe acceptances are shares of
-    the acceptances whose location error is known.
+    the acceptances that a truth judged (`with_judgement`).
     """
     table = (
         _in_order(passages)
@@ -173,7 +186,7 @@ def campaign_balises(passages: pl.DataFrame, config: Configuration) -> pl.DataFr
             _with_estimates,
             ("accepted_share", "", clopper_pearson, "accepted_passages", "passages"),
             ("deletion_rate", "", clopper_pearson, "deletions", "passages"),
-            ("unsafe_rate", "", clopper_pearson, "unsafe_accepted", "accepted_judged"),
+            ("unsafe_rate", "", clopper_pearson, "unsafe_judged", "accepted_judged"),
         )
     )
     return conform(table.sort("solution", "kind", "balise_id"), CampaignBalises)
@@ -187,14 +200,11 @@ def _in_order(passages: pl.DataFrame) -> pl.DataFrame:
 def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Location error of accepted VBs over all, by net element and by speed, against Q_LOCACC and the CI limit.
 
-    Each acceptance is held against the location accuracy of its own balise. Bands of 40 km/h from 0.
+    Each judged acceptance (`with_judgement`) is held against the location accuracy of its own balise. Bands of 40 km/h
+    from 0.
     """
-    accepted = _in_order(passages).filter(
-        (pl.col("kind") == BaliseKind.VIRTUAL)
-        & (pl.col("status") == PassageStatus.ACCEPTED)
-        & pl.col("location_error_m").is_not_null()
-    )
-    values = ("solution", "status", "location_error_m", "location_accuracy_m")
+    accepted = _in_order(passages).filter((pl.col("kind") == BaliseKind.VIRTUAL) & pl.col("judged"))
+    values = ("solution", "judged", "location_error_m", "location_accuracy_m")
     groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
     grouped = accepted.select(*values, **groups).unpivot(
         list(groups), index=values, variable_name="grouped_by", value_name="group"

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs
+from pipeline.campaign_tables import (
+    campaign_accuracy,
+    campaign_balises,
+    campaign_levels,
+    campaign_runs,
+    with_judgement,
+)
 from pipeline.hazards.map_errors import map_places
 from pipeline.safety.measured import detection_by_level, measured_figures
 from schemas.config import Configuration
@@ -15,10 +21,11 @@ def derived_tables(
 ) -> dict[str, pl.DataFrame]:
     """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order."""
     wide = campaign_runs(runs, hazards, config.safety)
+    judged = with_judgement(passages, runs)
     return {
         "runs": wide,
-        "balises": campaign_balises(passages, config),
-        "accuracy": campaign_accuracy(passages, config),
+        "balises": campaign_balises(judged, config),
+        "accuracy": campaign_accuracy(judged, config),
         "figures": measured_figures(runs, hazards, config.safety),
         "detection": detection_by_level(hazards, config.safety),
         "levels": campaign_levels(wide, hazards, config.safety, config.hazards.reaction_s),

@@ -14,6 +14,7 @@ from pipeline.statistics import UNKNOWN, Estimate, poisson_rate
 from pipeline.timeline import availability, moved, outages_s, share_of_time, uptime
 from schemas.config import Configuration, SafetyConfig
 from schemas.enums import (
+    TRUTH,
     BaliseKind,
     Evidence,
     Hazard,
@@ -70,7 +71,8 @@ def accuracy(epochs: pl.DataFrame) -> Row:
     return row
 
 
-def balise_counts(passages: pl.DataFrame, failure_limit_m: float) -> Row:
+def balise_counts(passages: pl.DataFrame, evidence: Evidence | None, failure_limit_m: float) -> Row:
+    """What became of the virtual balises; `accepted_judged` without a truth is zero, whatever the odometer says."""
     virtual, status, error = pl.col("kind") == BaliseKind.VIRTUAL, pl.col("status"), pl.col("location_error_m")
     accepted = virtual & (status == PassageStatus.ACCEPTED)
     counts = {
@@ -79,7 +81,7 @@ def balise_counts(passages: pl.DataFrame, failure_limit_m: float) -> Row:
         "balises_rejected": virtual & status.is_in(_REJECTED),
         "balises_missed": virtual & (status == PassageStatus.MISSED),
         "balises_not_available": virtual & (status == PassageStatus.NOT_AVAILABLE),
-        "accepted_judged": accepted & error.is_not_null(),
+        "accepted_judged": accepted & error.is_not_null() & pl.lit(evidence in TRUTH),
         "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
     }
     known = passages.select(error.filter(accepted)).to_series()

@@ -56,7 +56,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | _extent(results.epochs, clock)
         | figures.positions(results.epochs, clock, config)
         | figures.accuracy(results.epochs)
-        | figures.balise_counts(results.passages, config.hazards.failure_limit_m)
+        | figures.balise_counts(results.passages, results.evidence, config.hazards.failure_limit_m)
         | figures.hazard_counts(results.hazards)
         | figures.service_levels(results.hazards, results.evidence, config.safety)
         | figures.alarm_counts(results.alarms, results.epochs, results.evidence, clock)

@@ -49,7 +49,7 @@ def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
     columns |= _estimate("hazard_rate", "faults per hour", "1/h", "_per_h")
     columns |= _estimate("missed_share", "share of failures not negated within the budget")
-    columns |= _estimate("unsafe_share", "share of accepted VBs of known error beyond the failure limit")
+    columns |= _estimate("unsafe_share", "share of `accepted_judged` beyond the failure limit")
     columns |= _estimate("outage_rate", "outages per hour", "1/h", "_per_h")
     for level in levels:
         columns |= _level_columns(level)
@@ -78,11 +78,11 @@ def _campaign_balises_schema() -> type[dy.Schema]:
         **_estimate("deletion_rate", "share of passages with the failure mode deletion"),
         "insertions": count("rows with the ETCS failure mode insertion"),
         "linking_errors": count("linking errors at it"),
-        "accepted_judged": count("acceptances of known location error"),
-        "unsafe_accepted": count("of these beyond the failure limit"),
+        "accepted_judged": count("acceptances whose location error a reference or balise reads tell"),
+        "unsafe_accepted": count("acceptances beyond the failure limit, by any evidence"),
         **_estimate("unsafe_rate", "share of judged acceptances beyond the failure limit"),
         "suspect_after_the_fact": count("accepted between a fault's onset and its detection"),
-        **_spread("location_error", "location error of acceptances"),
+        **_spread("location_error", "location error of judged acceptances"),
     }
     doc = "One row per balise and solution over all runs of the campaign."
     return type("CampaignBalises", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
@@ -96,9 +96,9 @@ def _accuracy_schema() -> type[dy.Schema]:
         "solution": text("solution"),
         "grouped_by": text("what the group has in common: all, netelement_id or speed_band_kmh"),
         "group": text("the net element or speed band"),
-        "accepted_judged": count("acceptances of known location error"),
-        **_spread("location_error", "location error of acceptances"),
-        "location_error_median_m": real("m", "median location error of acceptances"),
+        "accepted_judged": count("acceptances whose location error a reference or balise reads tell"),
+        **_spread("location_error", "location error of judged acceptances"),
+        "location_error_median_m": real("m", "median location error of judged acceptances"),
         "location_accuracy_m": real("m", "smallest Q_LOCACC among them; each is held against its own", min=0),
         "location_accuracy_max_m": real("m", "largest Q_LOCACC among them", min=0),
         "within_location_accuracy": count("of these within Q_LOCACC"),
@@ -136,9 +136,10 @@ def _figures_schema() -> type[dy.Schema]:
         "false_alarms": count("false alarms in it"),
         **_estimate("false_alarm_rate", "false alarms per judged hour", "1/h", "_per_h"),
         "accepted": count("virtual balises accepted"),
-        "accepted_judged": count("of these with a known location error"),
-        "unsafe_accepted": count("of these beyond the failure limit"),
-        **_estimate("unsafe_share", "share of acceptances of known location error beyond the failure limit"),
+        "accepted_judged": count("of these with a location error that a reference or balise reads tell"),
+        "unsafe_judged": count("of the judged ones beyond the failure limit"),
+        **_estimate("unsafe_share", "share of judged acceptances beyond the failure limit"),
+        "unsafe_accepted": count("accepted beyond the failure limit by any evidence"),
         "outages": count("stretches without a usable position"),
         **_estimate("outage_rate", "outages per hour", "1/h", "_per_h"),
         "trusted_losses": count("how often a valid, confident, unambiguous position was lost"),

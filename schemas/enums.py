@@ -57,6 +57,10 @@ class Evidence(StrEnum):
     ODOMETER = "odometer"
 
 
+TRUTH = (Evidence.REFERENCE.value, Evidence.BALISE.value)
+"""Evidence that can call a position right; the odometer alone sees errors beyond its confidence only."""
+
+
 class Suspect(StrEnum):
     GNSS = "gnss"
     ODOMETER = "odometer"

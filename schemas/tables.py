@@ -292,7 +292,7 @@ class Runs(dy.Schema):
     judged_s = real("s", "of this with both: what the false alarm rate counts", min=0)
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
-    accepted_judged = count("accepted VBs of known location error: those that `unsafe_accepted` is of")
+    accepted_judged = count("accepted VBs whose location error a reference or balise reads tell")
 
 
 TABLES: dict[str, type[dy.Schema]] = {

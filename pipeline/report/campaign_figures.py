@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.campaign_tables import with_judgement
 from pipeline.hazards.independent import independent_episodes
 from pipeline.report.markup import UNKNOWN, number
 from pipeline.run_figures import is_passage
-from pipeline.safety.measured import TRUTH
 from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
 from schemas.config import SafetyConfig
-from schemas.enums import BaliseKind, PassageStatus, RunStatus
+from schemas.enums import TRUTH, BaliseKind, PassageStatus, RunStatus
 
 _REPLAYED = (RunStatus.OK, RunStatus.PARTIAL)
 
@@ -42,7 +42,7 @@ def headline(
     return [
         *_extent(runs, failed),
         *_hazard_figures(runs, hazards, safety),
-        *_balise_figures(passages, failure_limit_m),
+        *_balise_figures(with_judgement(passages, runs), failure_limit_m),
         _false_alarms(runs),
     ]
 
@@ -106,7 +106,8 @@ def _balise_figures(passages: pl.DataFrame, failure_limit_m: float) -> list[Figu
     accepted = virtual.filter(pl.col("status") == PassageStatus.ACCEPTED)
     passages_known = virtual.filter(is_passage())
     through = passages_known.filter(pl.col("status") == PassageStatus.ACCEPTED)
-    judged = accepted.filter(pl.col("location_error_m").is_not_null())
+    judged = accepted.filter(pl.col("judged"))
+    seen = accepted.filter(pl.col("location_error_m").abs() > failure_limit_m).height
     unsafe = judged.filter(pl.col("location_error_m").abs() > failure_limit_m).height
     return [
         Figure(
@@ -116,8 +117,9 @@ def _balise_figures(passages: pl.DataFrame, failure_limit_m: float) -> list[Figu
         ),
         Figure(
             "accepted beyond the failure limit",
-            f"{unsafe} of {judged.height} of known error",
-            f"{_share(clopper_pearson(unsafe, judged.height))}; {accepted.height - judged.height} not judged",
+            f"{unsafe} of {judged.height} judged by a truth",
+            f"{_share(clopper_pearson(unsafe, judged.height))}; {accepted.height - judged.height} more not judged by"
+            f" one, {seen - unsafe} of these beyond it by the odometer",
         ),
     ]
 

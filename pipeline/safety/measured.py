@@ -20,14 +20,12 @@ from pipeline.timeline import Uptime
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
 from schemas.conform import conform, dtypes
-from schemas.enums import Evidence, RunStatus
+from schemas.enums import TRUTH, RunStatus
 
 Row = dict[str, object]
 
 _STATES = ("p0", "p1", "p2", "p3")
 _ROUNDING = 1e-9
-
-TRUTH = [Evidence.REFERENCE.value, Evidence.BALISE.value]
 
 
 def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
@@ -63,6 +61,7 @@ def _sums() -> Iterator[pl.Expr]:
     yield pl.col("judged_s").fill_null(0.0).filter(judged).sum()
     yield pl.col("false_alarms").filter(judged).sum()
     yield (pl.col("status") == RunStatus.PARTIAL).sum().alias("runs_partial")
+    yield pl.col("unsafe_accepted").filter(evidence.is_in(TRUTH)).sum().alias("unsafe_judged")
     yield pl.col(
         "balises_accepted", "accepted_judged", "unsafe_accepted", "outages", "trusted_s", "trusted_losses"
     ).sum()
@@ -96,9 +95,9 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
     sums = runs.select(_sums()).row(0, named=True)
     hours, seen, truth, judged = (sums[f"{name}_s"] / 3600.0 for name in ("duration", "seen", "truth", "judged"))
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
-    same = ("runs_partial", "accepted_judged", "unsafe_accepted", "outages", "trusted_losses", "false_alarms")
+    same = ("runs_partial", "accepted_judged", "unsafe_judged", "unsafe_accepted", "outages", "trusted_losses")
     return {
-        **{name: sums[name] for name in same},
+        **{name: sums[name] for name in (*same, "false_alarms")},
         "runs": runs.height,
         "hours": hours,
         "hours_with_evidence": seen,
@@ -112,7 +111,7 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
         "hours_judged": judged,
         **columns_of("false_alarm_rate", poisson_rate(sums["false_alarms"], judged), "_per_h"),
         "accepted": sums["balises_accepted"],
-        **columns_of("unsafe_share", clopper_pearson(sums["unsafe_accepted"], sums["accepted_judged"])),
+        **columns_of("unsafe_share", clopper_pearson(sums["unsafe_judged"], sums["accepted_judged"])),
         **columns_of("outage_rate", poisson_rate(sums["outages"], hours), "_per_h"),
         **continuity_columns(Uptime(sums["trusted_s"], sums["trusted_losses"])),
         **_shares(runs),
@@ -191,11 +190,15 @@ def _statement(row: Row) -> str:
 
 
 def _acceptances(row: Row) -> str:
-    said = (
-        f"Of {row['accepted_judged']} accepted virtual balises of known error {row['unsafe_accepted']} lay beyond the"
+    accepted, judged, unsafe, seen = (
+        int(str(row[name])) for name in ("accepted", "accepted_judged", "unsafe_judged", "unsafe_accepted")
     )
-    unjudged = int(str(row["accepted"])) - int(str(row["accepted_judged"]))
-    return f"{said} failure limit" + (f"; the error of {unjudged} more is not known." if unjudged else ".")
+    said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} lay beyond the failure limit"
+    if accepted > judged:
+        said += f"; {accepted - judged} more were not judged by one"
+    if seen > unsafe:
+        said += f", and {seen - unsafe} of these lay beyond it by the odometer"
+    return f"{said}."
 
 
 def substantiation_table(config: SafetyConfig, events: tuple[int, ...] = (0, 1, 2, 5)) -> pl.DataFrame:

@@ -78,8 +78,8 @@ def test_rates_over_the_campaign() -> None:
         false_alarms=[2, 0, None, None, None, 1],
         false_alarm_rate_per_h=[2.0, 0.0, None, None, None, None],
         balises_accepted=[10, 5, 5, 5, 0, 5],
-        accepted_judged=[10, 5, 5, 0, 0, 3],
-        unsafe_accepted=[0, 1, 0, 0, 0, 0],
+        accepted_judged=[10, 5, 0, 0, 0, 3],
+        unsafe_accepted=[0, 1, 2, 0, 0, 0],
         outages=[1, 0, 2, 0, 0, 0],
     )
     faults = fault(
@@ -99,15 +99,14 @@ def test_rates_over_the_campaign() -> None:
     assert (found["failures"], found["missed"], found["missed_share"]) == (2, 1, 0.5)
     assert (found["missed_share_low"], found["missed_share_high"]) == (share.low, share.high)
     assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.4))
-    assert (found["accepted"], found["unsafe_accepted"], found["outages"]) == (30, 1, 3)
-    unsafe = clopper_pearson(1, 23)  # what nobody can judge is not safe
-    assert (found["accepted_judged"], found["unsafe_share"]) == (23, unsafe.value)
+    assert (found["accepted"], found["unsafe_accepted"], found["outages"]) == (30, 3, 3)
+    unsafe = clopper_pearson(1, 18)  # what no truth can judge is not safe
+    assert (found["accepted_judged"], found["unsafe_judged"], found["unsafe_share"]) == (18, 1, unsafe.value)
     assert (found["unsafe_share_low"], found["unsafe_share_high"]) == (unsafe.low, unsafe.high)
     (sentence,) = plain_statements(figures)
     assert "in 3.75 h with evidence, 1.75 h of these with a truth (reference or balise reads)" in sentence
-    assert (
-        "Of 23 accepted virtual balises of known error 1 lay beyond the failure limit; the error of 7 more" in sentence
-    )
+    assert "Of 18 accepted virtual balises judged by a truth 1 lay beyond the failure limit; 12 more were" in sentence
+    assert "not judged by one, and 2 of these lay beyond it by the odometer." in sentence
 
 
 def test_a_trial_without_a_miss_says_what_it_lacks() -> None:

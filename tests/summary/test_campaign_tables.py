@@ -5,7 +5,7 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs
+from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs, with_judgement
 from pipeline.statistics import clopper_pearson, poisson_rate
 from schemas.campaign import CampaignAccuracy, CampaignBalises, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig, ServiceLevel
@@ -26,7 +26,8 @@ def faults(ids: list[str], **columns: Any) -> pl.DataFrame:
     return hazards(len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
 
 
-def met(ids: list[str], **columns: Any) -> pl.DataFrame:
+def met(ids: list[str], evidence: str | None = "reference", **columns: Any) -> pl.DataFrame:
+    """Passages of runs with this evidence."""
     plain: dict[str, Any] = {
         "solution": "primary",
         "balise_id": "VB1",
@@ -40,7 +41,10 @@ def met(ids: list[str], **columns: Any) -> pl.DataFrame:
         "t_true": [k * NS for k in range(len(ids))],
         "location_error_m": 1.0,
     }
-    return passages(len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
+    frame = passages(len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
+    of_runs = frame.select("run_id", "solution").unique(maintain_order=True)
+    catalogue = runs(of_runs["run_id"].to_list(), solution=of_runs["solution"].to_list(), evidence=evidence)
+    return with_judgement(frame, catalogue)
 
 
 class TestRuns:
@@ -131,6 +135,16 @@ class TestBalises:
         row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None), CONFIG).row(0, named=True)
         assert (row["passages"], row["accepted"], row["accepted_judged"]) == (2, 2, 0)
         assert (row["unsafe_rate"], row["unsafe_rate_high"], row["location_error_mean_m"]) == (None, None, None)
+
+    def test_the_odometer_alone_calls_no_acceptance_safe(self) -> None:
+        """A position wrong from the start looks right to it; what it finds beyond the limit is told all the same."""
+        errors = {"location_error_m": [0.1, 25.0]}
+        frame = pl.concat([met(["a"], "balise", location_error_m=2.0), met(["b", "b"], "odometer", **errors)])
+        row = campaign_balises(frame, CONFIG).row(0, named=True)
+        assert (row["accepted"], row["accepted_judged"], row["unsafe_accepted"]) == (3, 1, 1)
+        assert (row["unsafe_rate"], row["unsafe_rate_high"]) == (0.0, clopper_pearson(0, 1).high)
+        assert (row["location_error_mean_m"], row["location_error_max_m"]) == (2.0, 2.0)
+        assert campaign_accuracy(frame, CONFIG)["accepted_judged"].to_list() == [1, 1, 1]
 
     def test_solutions_and_kinds_apart_and_in_order(self) -> None:
         frame = pl.concat(

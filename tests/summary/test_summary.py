@@ -248,6 +248,9 @@ class TestBalises:
         )
         found = row(epochs(seconds(3)), passages=frame)
         assert (found["unsafe_accepted"], found["accepted_judged"]) == (2, 3)
+        assert row(epochs(seconds(3)), passages=frame, evidence=Evidence.BALISE)["accepted_judged"] == 3
+        for evidence in (Evidence.ODOMETER, None):  # which cannot tell a position right
+            assert row(epochs(seconds(3)), passages=frame, evidence=evidence)["accepted_judged"] == 0
         assert found["location_error_mean_m"] == pytest.approx(10.3)
         assert found["location_error_max_m"] == 31.0
         wide = Configuration(hazards=HazardConfig(failure_limit_m=25.0))
