@@ -96,8 +96,16 @@ def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyCon
             f"{needed:.3g} h more",
             f"by reference or balises, without a further missed detection, for {safety.thr_vb_per_h:g} /h",
         ),
-        Figure("longest time to detect", _seconds(hazards["time_to_detect_s"].max()), "of detected hazards"),
-        Figure("longest hazardous time", _seconds(hazards["hazardous_s"].max()), "from failure to negation"),
+        Figure(
+            "longest time to detect",
+            _seconds(hazards["time_to_detect_s"].max()),
+            f"of the {hazards['detected'].sum()} hazards detected; {(~hazards['detected']).sum()} were not",
+        ),
+        Figure(
+            "longest hazardous time",
+            _seconds(failures["hazardous_s"].max()),
+            f"from failure to negation; {failures['hazardous_s'].null_count()} failures were never negated",
+        ),
     ]
 
 

@@ -136,6 +136,8 @@ def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
     assert "3 in 5 rows" in section
     assert "1 of 3 with a failure" in section
     assert "33.3% (95 %: 0.8% to 90.6%)" in section
+    assert "of the 3 hazards detected; 2 were not" in section
+    assert "from failure to negation; 1 failures were never negated" in section
 
 
 def test_allowed_times_of_every_level_are_drawn(out: Path) -> None:
