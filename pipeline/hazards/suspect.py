@@ -50,6 +50,10 @@ class Witnesses:
     by_odometer: Bools
     doubtful_track: Bools
 
+    def epoch_before(self, epoch: int, lookback_s: float) -> int:
+        """The first epoch no more than this time before another."""
+        return int(np.searchsorted(self.t_ns, self.t_ns[epoch] - round(lookback_s * NS_PER_S)))
+
 
 def witnesses_of(
     epochs: pl.DataFrame, truth: pl.DataFrame, errors: dict[str, Floats], ambiguity_probability: float
@@ -125,7 +129,7 @@ def reference_left_map(w: Witnesses, first: int, last: int, monitors: tuple[str,
         if not any(name.startswith(axis) for name in monitors):
             continue
         for lookback_s in _LOOKBACKS_S[:2]:
-            begin = int(np.searchsorted(w.t_ns, w.t_ns[first] - round(lookback_s * NS_PER_S)))
+            begin = w.epoch_before(first, lookback_s)
             moved = place[begin : last + 1]
             moved = moved[np.isfinite(moved)]
             if moved.size > 1 and float(np.ptp(moved)) > max(_MAP_ERROR_M, 6.0 * float(w.truth_sigma_m[first])):
@@ -162,7 +166,7 @@ def by_reference_healthy(w: Witnesses, first: int, last: int, healthy_m: float) 
 def odometer_left_truth(w: Witnesses, first: int, last: int) -> bool:
     """Odometer minus truth moved by more than 3 of its sigma around the alarm (needs the reference)."""
     for lookback_s in _LOOKBACKS_S:
-        begin = int(np.searchsorted(w.t_ns, w.t_ns[first] - round(lookback_s * NS_PER_S)))
+        begin = w.epoch_before(first, lookback_s)
         rows = np.arange(begin, last + 1)
         rows = rows[w.by_reference[rows] & np.isfinite(w.odometer_m[rows]) & (w.stretch[rows] == w.stretch[first])]
         if rows.size < 2:
@@ -198,7 +202,7 @@ def doppler_vote(w: Witnesses, first: int, last: int) -> Suspect | None:
     None where one of them is missing or no two of them part by more than their noise.
     """
     for lookback_s in _LOOKBACKS_S:
-        begin = int(np.searchsorted(w.t_ns, w.t_ns[first] - round(lookback_s * NS_PER_S)))
+        begin = w.epoch_before(first, lookback_s)
         rows = np.arange(begin, last + 1)
         known = np.isfinite(w.path_m[rows]) & np.isfinite(w.velocity_mps[rows]) & np.isfinite(w.odometer_m[rows])
         rows = rows[known & (w.stretch[rows] == w.stretch[first])]

@@ -13,13 +13,13 @@ from itertools import permutations
 import polars as pl
 
 from pipeline.channels import on_path_of, paired
-from pipeline.epoch_clock import trusted
+from pipeline.epoch_clock import Clock, flags, trusted
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Side, verdicts_of
 from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from pipeline.statistics import threshold_factor
-from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s, uptime
+from pipeline.timeline import Flags, held_s, uptime
 from schemas.config import Configuration
 from schemas.enums import Evidence, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
@@ -43,9 +43,7 @@ Key = tuple[str, str, str | None]
 class _Channel:
     """Epochs under one kind of diagnosis: its fails, where it judged, and where it worked."""
 
-    t_ns: Instants
-    limit_s: float
-    held_s: Floats
+    clock: Clock
     fails: Fails
     judged: Flags
     working: Flags
@@ -187,31 +185,26 @@ def _channel(
     """`epochs`: those of the solution, with the columns that `monitors`, `judged` and `position` take."""
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = fails_of(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
-    t_ns = epochs["t"].to_physical().to_numpy()
-    limit_s = gap_limit_s(nominal_period_s(t_ns), config.align.gap_reset_s)
-    seen = _flags(epochs, judged)
-    working = seen & _flags(epochs, position)
+    clock = Clock.of(epochs, config)
+    seen = flags(epochs, judged)
+    working = seen & flags(epochs, position)
     for span in fails.alarms:
-        working &= (t_ns < span.start_ns) | (t_ns > span.end_ns + round(config.lds.recovery_s * 1e9))
-    known = _flags(one.epochs, pl.col("error_along_m").is_not_null() & pl.lit(one.with_truth))
-    wrong = known & _flags(one.epochs, pl.col("error_along_m").abs() > config.hazards.failure_limit_m)
-    return _Channel(t_ns, limit_s, held_s(t_ns, limit_s), fails, seen, working, known, wrong)
-
-
-def _flags(epochs: pl.DataFrame, condition: pl.Expr) -> Flags:
-    """A condition with false for null."""
-    return epochs.select(condition.fill_null(value=False).alias("flag"))["flag"].to_numpy()
+        until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
+        working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
+    known = flags(one.epochs, pl.col("error_along_m").is_not_null() & pl.lit(one.with_truth))
+    wrong = known & flags(one.epochs, pl.col("error_along_m").abs() > config.hazards.failure_limit_m)
+    return _Channel(clock, fails, seen, working, known, wrong)
 
 
 def _tally(channel: _Channel, faults: Faults, verdicts: list[Verdict]) -> Tally:
-    judged_s = float(channel.held_s[channel.judged].sum())
+    judged_s = float(channel.clock.held_s[channel.judged].sum())
     alarms = Alarms(len(verdicts), verdicts.count(Verdict.FALSE), verdicts.count(Verdict.UNKNOWN), judged_s)
     return Tally(faults, alarms, _working(channel))
 
 
 def _working(channel: _Channel) -> Working:
-    up = uptime(channel.t_ns, channel.working, channel.limit_s)
-    held = channel.held_s
+    clock, held = channel.clock, channel.clock.held_s
+    up = uptime(clock.t_ns, channel.working, clock.limit_s)
     return Working(
         held_s=float(held.sum()),
         working_s=float(held[channel.working].sum()),
@@ -224,10 +217,10 @@ def _working(channel: _Channel) -> Working:
 
 def _redundant(one: _Channel, other: _Channel) -> Working:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
-    parts = [pl.DataFrame({"t_ns": channel.t_ns, "working": channel.working}) for channel in (one, other)]
+    parts = [pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working}) for channel in (one, other)]
     merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working").any()).sort("t_ns")
     t_ns, working = merged["t_ns"].to_numpy(), merged["working"].to_numpy()
-    limit_s = max(one.limit_s, other.limit_s)
+    limit_s = max(one.clock.limit_s, other.clock.limit_s)
     whole_s, up = float(held_s(t_ns, limit_s).sum()), uptime(t_ns, working, limit_s)
     return Working(whole_s, min(up.up_s, whole_s), up.up_s, up.losses)
 
@@ -237,7 +230,7 @@ def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel
     hazards = failures = missed = common = common_missed = 0
     delays: list[float] = []
     for begin, failure, end, budget_s in faults.select("begin", "failure", "end", "budget_s").iter_rows():
-        last = int(channel.t_ns[-1]) if end is None else end
+        last = int(channel.clock.t_ns[-1]) if end is None else end
         detected = _detected_ns(channel.fails, begin, last)
         late = failure is not None and _is_late(detected, failure, budget_s, channel, config)
         shared = failure is not None and others is not None and _overlaps(others, begin, last)
@@ -261,7 +254,7 @@ def _is_late(
 ) -> bool:
     reaction_s = config.hazards.reaction_s
     if reaction_s is None:
-        reaction_s = nominal_period_s(channel.t_ns) or 0.0
+        reaction_s = channel.clock.period_s or 0.0
     return detected is None or detected + round(reaction_s * 1e9) > failure + round((budget_s or 0.0) * 1e9)
 
 
