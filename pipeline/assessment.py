@@ -31,10 +31,13 @@ class Assessment:
 def assess(out: Address, config: Configuration | None = None) -> Assessment:
     """Everything that `balise safety OUT` says, from the tables of all complete runs.
 
-    `config` instead of the result's own, to judge it by other service levels.
+    `config`: its safety budget instead of the result's own, to judge it by other service levels. All else stays as the
+    tables were made with it: limits and the time of a negation are in them.
     """
     store.complete_runs(out)
-    settings = config or store.read_config(out) or Configuration()
+    settings = store.read_config(out) or Configuration()
+    if config is not None:
+        settings = settings.model_copy(update={"safety": config.safety})
     names = ("runs", "hazards", "passages", "alarms")
     runs, hazards, passages, alarms = (_table(out, name) for name in names)
     derived = derived_tables(runs, hazards, passages, alarms, settings)
@@ -166,7 +169,7 @@ def _slow_receivers(levels: pl.DataFrame) -> list[str]:
     """Service levels whose allowed time is over before the next epoch can negate anything (TVB section 5)."""
     slow = levels.filter(~pl.col("receiver_quick_enough"))
     return [
-        f"{solution}: epochs come too slowly for {level} in {runs} runs: period and negation take "
+        f"{solution}: epochs come too slowly for {level} in {runs} runs: period and negation take up to "
         f"{needed_s:.4g} s of the {allowed_s:.4g} s allowed."
         for solution, level, allowed_s, runs, needed_s in slow.group_by(
             "solution", "service_level", "allowed_s", maintain_order=True

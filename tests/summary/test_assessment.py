@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.assessment import Assessment, alarm_causes, assess, for_reading
-from pipeline.results.store import write_run
+from pipeline.results.store import write_config, write_run
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import Runs
@@ -122,8 +122,24 @@ def test_receivers_too_slow_are_named(tmp_path: Path) -> None:
     said = assess(tmp_path).statements
     assert "primary: epochs come too slowly for lpv200 in 1 runs" in said[0]
     assert not any("npa" in text for text in said)
-    quick = assess(tmp_path, Configuration.model_validate({"hazards": {"reaction_s": 0.1}})).statements
-    assert sum("too slowly" in text for text in quick) == 1
+    write_config(tmp_path, Configuration.model_validate({"hazards": {"reaction_s": 0.1}}))
+    assert sum("too slowly" in text for text in assess(tmp_path).statements) == 1
+
+
+def test_other_service_levels_leave_the_limits_of_the_result_alone(tmp_path: Path) -> None:
+    limits = {"lds": {"ci_limit_m": 25.0}, "hazards": {"failure_limit_m": 10.0, "reaction_s": 0.1}}
+    one = passages(1, solution="primary", kind="virtual", status="accepted", location_error_m=20.0)
+    write_run(run_of("a", ("gps", "primary"), passages=one), tmp_path, {})
+    write_config(tmp_path, Configuration.model_validate(limits))
+    other = Configuration.model_validate({"safety": {"demands_per_hour": 4.0}})
+    own, judged = assess(tmp_path), assess(tmp_path, other)
+    for name in ("accuracy", "side_by_side", "figures", "alarms"):
+        assert judged.tables[name].equals(own.tables[name]), name
+    assert set(judged.tables["accuracy"]["ci_limit_m"]) == {25.0}
+    needed, allowed = ("receiver_needs_s", "allowed_s")
+    assert judged.tables["levels_of_runs"][needed].equals(own.tables["levels_of_runs"][needed])
+    quarter = own.tables["levels_of_runs"][allowed] / 4.0
+    assert judged.tables["levels_of_runs"][allowed].to_list() == pytest.approx(quarter.to_list())
 
 
 def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessment) -> None:
