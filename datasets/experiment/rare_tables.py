@@ -76,27 +76,23 @@ def missed_table(
 ) -> pl.DataFrame:
     """Pmd at the mean failure, and the time that makes it as rare as each target, with the error of the estimate."""
     rows = []
-    for (constellation, spec, bank), rate in _asked(config):
+    for (constellation, _, bank), rate in _asked(config):
         at_failure = failure_epoch(bank, rate)
-        rows.append(_missed_row(constellation, spec, bank, rate, at_failure, "failure", runs, seed, jobs))
+        asked = [("failure", at_failure)]
         for target, epochs in zip(TARGETS, epochs_until(bank, rate, TARGETS, seed, jobs), strict=True):
             if epochs is not None:
-                rows.append(_missed_row(constellation, spec, bank, rate, epochs, f"{target:g}", runs, seed, jobs))
+                asked.append((f"{target:g}", epochs))
+        for reason, epochs in asked:
+            missed = missed_detection_probability(bank, epochs, rate, runs, seed, jobs)
+            rows.append(_missed_row(constellation, bank, rate, epochs, reason) | figures(missed))
     return pl.DataFrame(rows)
 
 
 def _missed_row(
-    constellation: Constellation,
-    spec: BankSpec,
-    bank: LinearBank,
-    rate: float,
-    epochs: int,
-    reason: str,
-    runs: int,
-    seed: int,
-    jobs: int,
+    constellation: Constellation, bank: LinearBank, rate: float, epochs: int, reason: str
 ) -> dict[str, object]:
-    result = missed_detection_probability(bank, epochs, rate, runs, seed, jobs)
+    """What was asked: a ramp of this rate [m/s] on a bank, so many epochs after its onset."""
+    spec = bank.spec
     return {
         "constellation": constellation,
         "reading": spec.reading,
@@ -107,7 +103,6 @@ def _missed_row(
         "chosen_for": reason,
         "time_s": epochs / spec.rate_hz,
         "mean_failure_s": failure_epoch(bank, rate) / spec.rate_hz,
-        **figures(result),
     }
 
 
@@ -128,8 +123,9 @@ def transient_table(
             epochs = epochs_until(bank, rate, (max(TARGETS),), seed, jobs)[0]
             for age_s in AGES_S if epochs is not None else ():
                 young = linear_bank(default_geometry(constellation), 0.0, replace(spec, age_s=age_s))
-                row = _missed_row(constellation, spec, young, rate, epochs or 0, "transient", runs, seed, jobs)
-                rows.append({"age_s": age_s, **row})
+                missed = missed_detection_probability(young, epochs or 0, rate, runs, seed, jobs)
+                row = _missed_row(constellation, young, rate, epochs or 0, "transient")
+                rows.append({"age_s": age_s, **row, **figures(missed)})
     return pl.DataFrame(rows, infer_schema_length=None)
 
 
