@@ -22,7 +22,7 @@ from pipeline.track import GAP_COUNTS_M, Track
 
 # A hint further than this from the nearest place may mean another passage of the same place,
 # if the track of that passage lies within the second distance of the first.
-HINT_WINDOW_M = 300.0
+HINT_WINDOW_M = 100.0
 SAME_PLACE_M = 10.0
 
 

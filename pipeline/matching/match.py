@@ -109,10 +109,19 @@ def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame |
     pinned = np.full(len(fixes), -1, dtype=np.int64)
     if balise_reads is None or site.balises is None:
         return pinned
-    place = dict(site.balises.select("balise_id", "netelement_id").iter_rows())
+    numbers: dict[str, list[int]] = {}
+    for number, name in enumerate(track.ids):
+        numbers.setdefault(name, []).append(number)
+    low, high = track.measure_m[track.first[:-1]], track.measure_m[track.first[1:] - 1]
+    place = {}
+    for balise, name, measure_m in site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows():
+        inside = [number for number in numbers.get(name, ()) if low[number] <= measure_m <= high[number]]
+        # Of an element that is passed twice, or about a cut, a read does not say which it was.
+        if len(inside) == 1:
+            place[balise] = inside[0]
     times = balise_reads["t"].to_physical().to_list()
-    for t_ns, name in zip(times, balise_reads["balise_id"].to_list(), strict=True):
+    for t_ns, balise in zip(times, balise_reads["balise_id"].to_list(), strict=True):
         epoch = int(np.searchsorted(fixes.t_ns, t_ns))
-        if epoch < len(fixes) and place.get(name) in track.index:
-            pinned[epoch] = track.index[place[name]]
+        if epoch < len(fixes) and balise in place:
+            pinned[epoch] = place[balise]
     return pinned

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import polars as pl
 
+from pipeline.geodesy import points_of
 from pipeline.matching.leg import Visit
 from pipeline.matching.network import Edge, Network
 from pipeline.track import Track, end_places, gaps_m
 
 # `Site.route` names directions as the site reader writes them: from an element's start to its end, or back.
 _FORWARD = "AB"
+# An element's direction is taken over so much of it [m]: single vertices may lie a centimetre apart.
+_DIRECTION_OVER_M = 10.0
 
 
 def visits_of(track: Track, route: pl.DataFrame) -> list[Visit]:
@@ -22,33 +27,64 @@ def visits_of(track: Track, route: pl.DataFrame) -> list[Visit]:
 
 
 def network_along(track: Track, visits: list[Visit]) -> Network:
-    """A network of nothing but the route; an element passed twice is there twice, one after the other."""
-    doubled = _in_order(track, [visit.element for visit in visits])
-    successors: list[list[Edge]] = [[] for _ in range(2 * len(visits))]
-    ends = end_places(doubled)
-    for number in range(len(visits) - 1):
-        here, there = visits[number].forward, visits[number + 1].forward
+    """A network of nothing but the route; an element passed twice is there twice, one after the other.
+
+    An element that turns round is there in pieces that do not, so that no place is near two places of one piece:
+    a ramp that crosses itself, a road up and down beside itself.
+    """
+    pieces, parts = _pieces(track, visits)
+    split = _of_parts(track, [visit.element for visit in pieces], parts)
+    successors: list[list[Edge]] = [[] for _ in range(2 * len(pieces))]
+    ends = end_places(split)
+    for number in range(len(pieces) - 1):
+        here, there = pieces[number].forward, pieces[number + 1].forward
         gap = float(gaps_m(ends[[number], [int(here)]], ends[[number + 1], [int(not there)]])[0])
         leaving, entering = 2 * number + (not here), 2 * (number + 1) + (not there)
         successors[leaving].append(Edge(entering, gap, True, True))
         successors[entering ^ 1].append(Edge(leaving ^ 1, gap, True, True))
-    usable = [bool(visit.forward) == (side == 0) for visit in visits for side in (0, 1)]
-    return Network(doubled, successors, usable, orientable=True)
+    usable = [bool(visit.forward) == (side == 0) for visit in pieces for side in (0, 1)]
+    return Network(split, successors, usable, orientable=True)
 
 
-def _in_order(track: Track, elements: list[int]) -> Track:
-    """The track's elements in the given order, repeated where the order repeats them."""
-    rows = np.concatenate([np.arange(track.first[element], track.first[element + 1]) for element in elements])
-    counts = [int(track.first[element + 1] - track.first[element]) for element in elements]
+def _pieces(track: Track, visits: list[Visit]) -> tuple[list[Visit], list[slice]]:
+    """Per piece, in order of travel, the visit that it belongs to and its vertices."""
+    pieces: list[Visit] = []
+    parts: list[slice] = []
+    for visit in visits:
+        whole = track.vertices(visit.element)
+        cuts = [whole.start, *_turning_vertices(track, whole), whole.stop - 1]
+        own = [slice(begin, end + 1) for begin, end in itertools.pairwise(cuts)]
+        parts += own if visit.forward else own[::-1]
+        pieces += [visit] * len(own)
+    return pieces, parts
+
+
+def _turning_vertices(track: Track, part: slice) -> list[int]:
+    """Vertices where an element has turned by more than a right angle since its start or the vertex before."""
+    measure = track.measure_m[part]
+    rows = np.flatnonzero(np.diff(np.floor((measure - measure[0]) / _DIRECTION_OVER_M), prepend=-1.0) > 0)
+    along = np.diff(points_of(track.latitude_deg[part], track.longitude_deg[part]).surface[rows], axis=0)
+    cuts: list[int] = []
+    since = 0
+    for number in range(1, len(along)):
+        if along[number] @ along[since] < 0.0:
+            cuts.append(part.start + int(rows[number]))
+            since = number
+    return cuts
+
+
+def _of_parts(track: Track, elements: list[int], parts: list[slice]) -> Track:
+    """Parts of elements in the given order, as elements of their names and measures."""
+    rows = np.concatenate([np.arange(part.start, part.stop) for part in parts])
     names = tuple(track.ids[element] for element in elements)
     return Track(
         ids=names,
         index={name: number for number, name in reversed(list(enumerate(names)))},
-        first=np.concatenate([[0], np.cumsum(counts)]),
+        first=np.concatenate([[0], np.cumsum([part.stop - part.start for part in parts])]),
         latitude_deg=track.latitude_deg[rows],
         longitude_deg=track.longitude_deg[rows],
         height_m=track.height_m[rows],
         measure_m=track.measure_m[rows],
         sigma_m=track.sigma_m[rows],
-        length_m=track.length_m[elements],
+        length_m=np.array([track.measure_m[part.stop - 1] - track.measure_m[part.start] for part in parts]),
     )
