@@ -42,4 +42,4 @@ lock:
 		--no-emit-trusted-host --output-file requirements.txt pyproject.toml
 
 clean:
-	rm -rf build dist demo-out bench-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf build dist demo-out bench-out experiment-out .hypothesis .pytest_cache .mypy_cache .ruff_cache *.egg-info
