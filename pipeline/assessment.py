@@ -129,7 +129,7 @@ def alarm_causes(alarms: pl.DataFrame) -> pl.DataFrame:
 def _reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """What keeps the figures from being those of traffic, and what they leave out."""
     injected = runs.filter(pl.col("notes").str.contains("faults were injected").fill_null(value=False))
-    failed = runs.filter(pl.col("status") == RunStatus.FAILED)["run_id"].n_unique()
+    failed = runs.filter((pl.col("status") == RunStatus.FAILED).all().over("run_id"))["run_id"].n_unique()
     said = []
     if injected.height:
         said.append(
@@ -138,10 +138,22 @@ def _reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
         )
     if failed:
         said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and count nowhere.")
+    said += [
+        f"{solution}: {count} of {runs['run_id'].n_unique()} runs failed with this solution alone and count nowhere in"
+        " its figures."
+        for solution, count in _failed_alone(runs)
+    ]
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     if partial:
         said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: what was read of them counts.")
     return [*said, *_unjudged(runs, alarms)]
+
+
+def _failed_alone(runs: pl.DataFrame) -> list[tuple[str, int]]:
+    """Solutions that failed in runs of which another one was replayed, and in how many."""
+    failed = pl.col("status") == RunStatus.FAILED
+    alone = runs.filter(failed & ~failed.all().over("run_id"))
+    return alone.group_by("solution").agg(pl.col("run_id").n_unique()).sort("solution").rows()
 
 
 def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:

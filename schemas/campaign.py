@@ -121,7 +121,7 @@ def _figures_schema() -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {
         "solution": text("solution"),
         "runs": count("runs that were replayed"),
-        "runs_failed": count("runs that could not be, of all solutions"),
+        "runs_failed": count("runs that could not be, with this solution or before any was known"),
         "runs_partial": count("of the replayed runs those whose log is damaged; what was read of them counts"),
         "hours": real("h", "recorded time", min=0),
         "hours_with_evidence": real("h", "time with a known error, by any evidence", min=0),

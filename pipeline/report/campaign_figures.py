@@ -34,7 +34,8 @@ def headline(
     safety: SafetyConfig,
     failure_limit_m: float,
 ) -> list[Figure]:
-    """Figures of one solution; every table holds that solution's rows of all runs. `failed`: runs of any solution.
+    """Figures of one solution; every table holds that solution's rows of all runs. `failed`: runs that could not be
+    replayed with it.
 
     Rates count what the campaign contains, injected faults included.
     """

@@ -9,6 +9,7 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.campaign.outcome import worst
 from pipeline.known_counts import known_counts
 from pipeline.report.architectures import architectures_section, map_section
 from pipeline.report.availability import availability_map
@@ -16,6 +17,7 @@ from pipeline.report.campaign_figures import Figure, headline, level_figures, sh
 from pipeline.report.markup import Cell, badge, cell, figure, link, number, page, pairs, section, table
 from pipeline.report.packing import Json, script_json
 from pipeline.report.run_page import Made, hazard_hash
+from pipeline.safety.measured import failed_runs
 from schemas.enums import Hazard, RunStatus
 
 Row = Mapping[str, Any]
@@ -91,11 +93,9 @@ def _only(frame: pl.DataFrame, name: str) -> pl.DataFrame:
 
 
 def _run_counts(runs: pl.DataFrame) -> str:
-    worst = runs.group_by("run_id").agg(pl.col("status").cast(pl.String).unique().sort())
-    counts = []
-    for status in RunStatus:
-        count = sum(status.value in states for states in worst["status"].to_list())
-        counts.append(f"{badge(status.value)} {count}")
+    """Runs by the worst status of their solutions, so that each counts once."""
+    found = [worst(part) for _, part in runs.group_by("run_id")]
+    counts = [f"{badge(status.value)} {found.count(status)}" for status in RunStatus]
     return f"<p>{' '.join(counts)}</p>"
 
 
@@ -124,7 +124,7 @@ def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool
     hazards = _only(campaign.hazards, name)
     figures = headline(
         _only(campaign.runs, name),
-        campaign.runs.filter(pl.col("status") == RunStatus.FAILED)["run_id"].n_unique(),
+        failed_runs(campaign.runs, name),
         hazards,
         _only(campaign.passages, name),
         made.config.safety,

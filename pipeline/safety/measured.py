@@ -44,11 +44,17 @@ def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyCo
     episodes = independent_episodes(hazards)
     parts = done.partition_by("solution", as_dict=True)
     rows = [
-        {"solution": solution, "runs_failed": runs.height - done.height}
+        {"solution": solution, "runs_failed": failed_runs(runs, solution)}
         | _figures(parts[(solution,)], episodes.filter(pl.col("solution") == solution), config.thr_vb_per_h)
         for (solution,) in sorted(parts)
     ]
     return _table(rows, CampaignFigures)
+
+
+def failed_runs(runs: pl.DataFrame, solution: str) -> int:
+    """How many runs failed for a solution, or before any solution was known."""
+    concerned = pl.col("solution").is_in([solution, ""])
+    return runs.filter(concerned & (pl.col("status") == RunStatus.FAILED))["run_id"].n_unique()
 
 
 def _sums() -> Iterator[pl.Expr]:

@@ -151,6 +151,15 @@ def test_solutions_are_counted_apart() -> None:
     assert figures["hours"].to_list() == [1.5, 1.5]
 
 
+def test_a_run_fails_for_the_solution_that_failed_or_for_all() -> None:
+    catalogue = with_run(
+        runs(5, solution=["gps", "primary", "gps", "primary", ""], status=["failed", "ok", "ok", "ok", "failed"]),
+        ["half", "half", "whole", "whole", "lost"],
+    )
+    figures = measured_figures(catalogue, NO_HAZARDS, CONFIG)
+    assert figures.select("solution", "runs", "runs_failed").rows() == [("gps", 1, 2), ("primary", 2, 1)]
+
+
 def test_measured_times_against_every_level() -> None:
     """Hazardous times 0.2, 1.0, 20 s and one never negated, against 24.12, 0.5025, 1.675 and 100.5 s."""
     faults = fault(

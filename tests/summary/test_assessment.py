@@ -116,6 +116,17 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     assert said[2].startswith("primary: 1 alarms in 1 runs are neither true nor false for want of evidence")
 
 
+def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
+    half, lost = run_of("half", ("gps", "primary")), run_of("lost", ("",))
+    status = pl.Series("status", ["failed", "ok"]).cast(half.runs.schema["status"])
+    write_run(RunTables(**{**vars(half), "runs": half.runs.with_columns(status)}), tmp_path, {})
+    failed = lost.runs.with_columns(status=pl.lit("failed", lost.runs.schema["status"]))
+    write_run(RunTables(**{**vars(lost), "runs": failed}), tmp_path, {})
+    said = assess(tmp_path).statements
+    assert said[0] == "1 of 2 runs failed and count nowhere."
+    assert said[1].startswith("gps: 1 of 2 runs failed with this solution alone and count nowhere")
+
+
 def test_receivers_too_slow_are_named(tmp_path: Path) -> None:
     slow = run_of("a")
     write_run(RunTables(**{**vars(slow), "runs": slow.runs.with_columns(gnss_rate_hz=1.0)}), tmp_path, {})
