@@ -1,6 +1,6 @@
 """The error family: one message that names the place, the finding, the expectation and the remedy.
 
-Caught at two places only: the command line, and the batch boundary that turns a failed run into a row.
+Ends at the command line, at the batch boundary that turns a failed run into a row, and where one part may fail alone.
 """
 
 from __future__ import annotations

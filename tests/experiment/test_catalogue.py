@@ -178,8 +178,7 @@ def test_a_healthy_journey_is_quiet(found: pl.DataFrame) -> None:
     ],
 )
 def test_each_monitor_sees_the_fault_it_exists_for_first(found: pl.DataFrame, monitor: str, fault: str) -> None:
-    for run in of_fault(found, fault):
-        assert monitor in run["first"]  # type: ignore[operator]
+    assert [monitor in run["first"] for run in of_fault(found, fault)] == [True, True]  # type: ignore[operator]
 
 
 def test_a_jump_over_balises_is_seen_at_once_and_a_drift_of_one_solution_by_the_other_alone(
