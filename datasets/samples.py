@@ -18,7 +18,7 @@ import polars.selectors as cs
 import pyproj
 from dataframely import Schema
 
-from pipeline.geodesy import distances_m
+from pipeline.geodesy import distances_m, points_of
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.conform import conform, rows_text
 from pipeline.ingest.csv_text import read_table
@@ -273,11 +273,7 @@ def _comma_odometer(segment: Path, offset_s: float) -> pl.DataFrame | None:
 
 def _comma_site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
     """Poses at least 5 m apart, joined to one net element."""
-    along = np.concatenate(
-        ([0.0], np.cumsum(distances_m(places["latitude_deg"], places["longitude_deg"], places["height_m"])))
-    )
-    cell = np.floor(along / _TRACK_STEP_M)
-    kept = np.concatenate(([0], np.flatnonzero(np.diff(cell) > 0) + 1))
+    kept = _poses_apart(places)
     track = {name: values[kept] for name, values in places.items()}
     measure = np.concatenate(
         ([0.0], np.cumsum(distances_m(track["latitude_deg"], track["longitude_deg"], track["height_m"])))
@@ -285,3 +281,13 @@ def _comma_site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Sit
     table = _contract(Track, netelement_id=_COMMA_ELEMENT, measure_m=measure, **track, sigma_m=_POSE_SIGMA_M)
     balises = [(_COMMA_ELEMENT, at_m) for at_m in balises_at_m]
     return Site(table, Links.create_empty(), virtual_balises(balises) if balises else None)
+
+
+def _poses_apart(places: dict[str, Floats]) -> list[int]:
+    """Each pose that lies a step from the one kept before: one that wanders at standstill adds nothing."""
+    surface = points_of(places["latitude_deg"], places["longitude_deg"]).surface
+    kept = [0]
+    for row in range(1, len(surface)):
+        if np.linalg.norm(surface[row] - surface[kept[-1]]) >= _TRACK_STEP_M:
+            kept.append(row)
+    return kept if len(kept) > 1 else [0, len(surface) - 1]

@@ -87,6 +87,21 @@ def test_what_a_segment_does_not_know_is_null_or_left_out(segment: Path) -> None
     assert run.reference.height == 39
 
 
+def test_a_pose_that_wanders_at_standstill_adds_nothing_to_the_track(segment: Path) -> None:
+    """Ten seconds standing with 0.3 m of noise: no point of the track lies behind the one before."""
+
+    def stand(values: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(1)
+        standing = np.repeat(values[20:21], 200, axis=0) + 0.3 * rng.normal(size=(200, 3))
+        return np.concatenate([values[:20], standing, values[20:]])
+
+    edit(segment / "global_pose/frame_positions", stand)
+    edit(segment / "global_pose/frame_times", lambda values: 100.0 + np.arange(240) * 0.08)
+    track = comma2k19_run(segment)[1].track
+    assert (track["latitude_deg"].diff().drop_nulls() > 0.0).all()
+    assert track["measure_m"].max() == pytest.approx(97.5, abs=5.0)
+
+
 @pytest.mark.parametrize("change", [lambda values: values[:0], None])
 def test_a_segment_without_wheel_speeds_has_no_odometer(segment: Path, change: Edit | None) -> None:
     for name in ("t", "value"):
