@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import polars as pl
@@ -30,11 +29,6 @@ class Clock:
     @property
     def duration_s(self) -> float | None:
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
-
-
-def floats(frame: pl.DataFrame, column: str) -> Floats:
-    """A column with NaN for null."""
-    return frame[column].cast(pl.Float64).fill_null(math.nan).to_numpy()
 
 
 def flags(frame: pl.DataFrame, condition: pl.Expr) -> Flags:

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from pipeline.epoch_clock import Clock, flags, floats, trusted, usable
+from pipeline.columns import floats
+from pipeline.epoch_clock import Clock, flags, trusted, usable
 from pipeline.hazards.independent import independent_episodes, missed_detection
 from pipeline.statistics import UNKNOWN, Estimate, poisson_rate
 from pipeline.timeline import availability, moved, outages_s, share_of_time, uptime

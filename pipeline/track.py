@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.columns import floats
 from pipeline.geodesy import Floats, Ints, distances_m, points_of
 
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
@@ -50,7 +51,7 @@ def track_of(frame: pl.DataFrame) -> Track:
     codes = frame["netelement_id"].cast(pl.Enum(names)).to_physical().cast(pl.Int64).to_numpy()
     order = np.argsort(codes, kind="stable")
     first = np.searchsorted(codes[order], np.arange(len(index) + 1))
-    columns = {name: _floats(frame, name)[order] for name in _NUMBERS}
+    columns = {name: floats(frame, name)[order] for name in _NUMBERS}
     columns["height_m"] = _all_or_none(columns["height_m"], first)
     length_m = columns["measure_m"][first[1:] - 1] - columns["measure_m"][first[:-1]]
     return Track(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
@@ -77,11 +78,6 @@ def gaps_m(one: Floats, other: Floats) -> Floats:
 
 
 _NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")
-
-
-def _floats(frame: pl.DataFrame, column: str) -> Floats:
-    """A column with null as NaN."""
-    return frame[column].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
 def _all_or_none(height_m: Floats, first: Ints) -> Floats:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import polars as pl
 
+from pipeline.columns import floats
 from pipeline.export.places import Ground, beside, ground_at, ground_of, sign_of, stretches_of
-from pipeline.geodesy import Floats
 from schemas.run import Site
 
 _COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
@@ -30,7 +29,7 @@ class Positions:
 
 def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
     """Positions of one solution's epochs. Truth is the path position less the error along it (CONTRACT section 3)."""
-    column = {name: _floats(epochs, name) for name in _NEEDED}
+    column = {name: floats(epochs, name) for name in _NEEDED}
     rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
     stretches = stretches_of(epochs)
     sign = sign_of(epochs, stretches)
@@ -57,8 +56,3 @@ def _frame(t: pl.Series, ground: Ground) -> pl.DataFrame:
     }
     frame = pl.DataFrame({"t": t, **columns}).with_columns(pl.col(pl.Float64).fill_nan(None))
     return frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
-
-
-def _floats(frame: pl.DataFrame, name: str) -> Floats:
-    values: Floats = frame[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return values

@@ -1,43 +1,30 @@
-"""Columns of frames as numpy arrays, and the few array operations that several stages of this area share."""
+"""The columns and array operations that the modules of this area work with."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 
-NS_PER_S = 1_000_000_000
-
-
-def floats(frame: pl.DataFrame, column: str) -> Floats:
-    """A nullable numeric column, null as NaN."""
-    return frame[column].cast(pl.Float64).to_numpy()
-
-
-def ints(series: pl.Series, unknown: int = -1) -> Ints:
-    """Whole numbers, null as `unknown`."""
-    return (series.fill_null(unknown) if series.null_count() else series).cast(pl.Int64).to_numpy()
-
-
-def times_ns(frame: pl.DataFrame, column: str = "t") -> Ints:
-    """A time column without nulls as int64 nanoseconds."""
-    return frame[column].dt.timestamp("ns").to_numpy()
-
-
-def flags(frame: pl.DataFrame, column: str) -> Bools:
-    """A nullable boolean column, null as false."""
-    return truths(frame[column])
-
-
-def truths(series: pl.Series) -> Bools:
-    """Booleans, null as false."""
-    return (series.fill_null(False) if series.null_count() else series).to_numpy().astype(np.bool_, copy=False)
+__all__ = [
+    "NS_PER_S",
+    "Bools",
+    "Floats",
+    "Ints",
+    "flags",
+    "floats",
+    "interpolate_known",
+    "ints",
+    "linking_gap_s",
+    "nominal_period_s",
+    "runs_of",
+    "times_ns",
+    "truths",
+    "words",
+]
 
 
 def words(kinds: Sequence[str], codes: Ints) -> pl.Series:

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.columns import floats
 from pipeline.lds.bank_protocol import LdsLimits
 from schemas.config import LdsConfig
 from schemas.enums import PassageStatus
@@ -76,10 +77,10 @@ class Journey:
 def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Journey:
     """Take the columns of matched and aligned epochs (see `run_lds`)."""
     t_ns = epochs["t"].dt.epoch("ns").to_numpy().astype(np.int64)
-    path_m = _floats(epochs["path_m"])
+    path_m = floats(epochs, "path_m")
     fix_valid = epochs["fix_valid"].fill_null(False).to_numpy()
     positioned = fix_valid & np.isfinite(path_m)
-    odometer_m = _floats(epochs["odometer_m"])
+    odometer_m = floats(epochs, "odometer_m")
     heading, travel = _headings(odometer_m, epochs["direction"], config.odometer_fixed_m)
     gap_ns = crossing_gap_ns(t_ns, config)
     return Journey(
@@ -89,13 +90,13 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
         positioned=positioned,
         placed_nowhere=fix_valid & ~positioned,
         refusal=_refusals(epochs, positioned, config, limits),
-        sigma_m=_floats(epochs["sigma_along_m"].fill_null(strategy="forward")),
-        confidence_m=_floats(epochs["confidence_m"]),
+        sigma_m=floats(epochs.select(pl.col("sigma_along_m").forward_fill()), "sigma_along_m"),
+        confidence_m=floats(epochs, "confidence_m"),
         odometer_m=odometer_m,
         stretch=epochs["odometer_stretch"].to_numpy().astype(np.int64),
-        speed_mps=np.nan_to_num(_floats(epochs["speed_mps"])),
-        latency_sigma_s=np.nan_to_num(_floats(epochs["latency_sigma_s"])),
-        scale_sigma=np.nan_to_num(_floats(epochs["scale_sigma"])),
+        speed_mps=np.nan_to_num(floats(epochs, "speed_mps")),
+        latency_sigma_s=np.nan_to_num(floats(epochs, "latency_sigma_s")),
+        scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         heading=heading,
         travel=travel,
         travelled_m=_travelled_m(odometer_m, travel),
@@ -118,17 +119,13 @@ def _blind(t_ns: Integers, positioned: Bools, gap_ns: int) -> Bools:
     return blind
 
 
-def _floats(column: pl.Series) -> Floats:
-    return column.cast(pl.Float64).fill_null(np.nan).to_numpy()
-
-
 def _refusals(
     epochs: pl.DataFrame, positioned: Bools, config: LdsConfig, limits: LdsLimits
 ) -> list[PassageStatus | None]:
     """Ambiguity before confidence; what is not known (null) is never taken as good."""
     on_track = epochs["on_track"].fill_null(False).to_numpy()
-    probable = _floats(epochs["gate_probability"]) >= limits.ambiguity_probability
-    confident = _floats(epochs["confidence_m"]) <= config.ci_limit_m
+    probable = floats(epochs, "gate_probability") >= limits.ambiguity_probability
+    confident = floats(epochs, "confidence_m") <= config.ci_limit_m
     refusals: list[PassageStatus | None] = [None] * len(positioned)
     for k in np.flatnonzero(~(positioned & on_track & probable & confident)).tolist():
         if not positioned[k]:

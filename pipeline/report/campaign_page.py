@@ -68,14 +68,12 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
     body = [
-        section("runs", "Runs", _run_counts(campaign.runs), _runs_table(campaign)),
         *(_solution(f"s{index}", name, campaign, made, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
         map_section(campaign.map),
+        section("runs", "Runs", _run_counts(campaign.runs), _runs_table(campaign)),
         section("provenance", "Provenance", _provenance(campaign.runs), _configuration(made)),
     ]
-    # Figures come before the long table where there are any.
-    body = [*body[1:-1], body[0], body[-1]]
     data = {
         "order": solutions,
         "solutions": {name: _solution_data(name, campaign, made) for name in solutions},
@@ -161,7 +159,14 @@ def _levels(key: str, hazards: pl.DataFrame, made: Made) -> str:
         ]
         for row in level_figures(hazards, made.config.safety)
     ]
-    titles = ["service level", "allowed T_D [s]", "negated within it", "too late", "never negated", "share within it"]
+    titles = [
+        "service level",
+        "allowed T_D [s]",
+        "negated within it",
+        "too late",
+        "never negated",
+        "share within it, by a truth",
+    ]
     return table(
         f"table-levels-{key}", "Faults with a position failure against the allowed T_D (TVB eq. 7)", titles, rows
     )

@@ -1,0 +1,38 @@
+"""Columns of frames as numpy arrays: what null becomes."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+NS_PER_S = 1_000_000_000
+
+
+def floats(frame: pl.DataFrame, column: str) -> Floats:
+    """A nullable numeric column, null as NaN."""
+    return frame[column].cast(pl.Float64).to_numpy()
+
+
+def ints(series: pl.Series, unknown: int = -1) -> Ints:
+    """Whole numbers, null as `unknown`."""
+    return (series.fill_null(unknown) if series.null_count() else series).cast(pl.Int64).to_numpy()
+
+
+def times_ns(frame: pl.DataFrame, column: str = "t") -> Ints:
+    """A time column without nulls as int64 nanoseconds."""
+    return frame[column].dt.timestamp("ns").to_numpy()
+
+
+def flags(frame: pl.DataFrame, column: str) -> Bools:
+    """A nullable boolean column, null as false."""
+    return truths(frame[column])
+
+
+def truths(series: pl.Series) -> Bools:
+    """Booleans, null as false."""
+    return (series.fill_null(False) if series.null_count() else series).to_numpy().astype(np.bool_, copy=False)
