@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
@@ -196,8 +197,7 @@ def _level_statements(detection: pl.DataFrame) -> list[str]:
     said = []
     for (solution,), rows in detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True):
         levels = [
-            f"{row['within']} within {row['allowed_s']:.4g} s ({row['service_level']}; 95 %: "
-            f"{row['within_share_low']:.1%} to {row['within_share_high']:.1%})"
+            f"{row['within']} within {row['allowed_s']:.4g} s ({row['service_level']}{_within_bounds(row)})"
             for row in rows.iter_rows(named=True)
         ]
         failures, never = rows["failures"][0], rows["never_negated"][0]
@@ -207,9 +207,18 @@ def _level_statements(detection: pl.DataFrame) -> list[str]:
     return said
 
 
+def _within_bounds(row: dict[str, Any]) -> str:
+    """The bounds of the share of failures that a truth judged; nothing without any."""
+    if row["within_share"] is None:
+        return ""
+    of = "" if row["failures_judged"] == row["failures"] else f" of the {row['failures_judged']} judged by a truth"
+    return f"; 95 %{of}: {row['within_share_low']:.1%} to {row['within_share_high']:.1%}"
+
+
 _SHORT = {
     "time_to_detect": (
-        *("solution", "service_level", "allowed_s", "failures", "within", "within_share_low", "within_share_high"),
+        *("solution", "service_level", "allowed_s", "failures", "within", "failures_judged", "within_judged"),
+        *("within_share_low", "within_share_high"),
         *("never_negated", "hazardous_median_s", "hazardous_p95_s", "hazardous_max_s"),
         *("time_to_detect_median_s", "time_to_detect_p95_s", "time_to_detect_max_s"),
     ),

@@ -130,7 +130,9 @@ def _figures_schema() -> type[dy.Schema]:
         **_estimate("hazard_rate", "faults per hour with evidence", "1/h", "_per_h"),
         "failures": count("faults with a position failure"),
         "missed": count("of these not negated within the budget"),
-        **_estimate("missed_share", "share of failures not negated within the budget"),
+        "failures_judged": count("of the failures those that a reference or balise reads tell"),
+        "missed_judged": count("of these not negated within the budget"),
+        **_estimate("missed_share", "share of judged failures not negated within the budget"),
         "missed_rate_upper_per_h": real("1/h", "one-sided 95 % upper bound of missed failures per hour", min=0),
         "hours_judged": real("h", "judged time in runs whose alarms all have a verdict", min=0),
         "false_alarms": count("false alarms in it"),
@@ -155,9 +157,12 @@ def _figures_schema() -> type[dy.Schema]:
                 ("unknown", "which the state is not known; the five add up to one"),
             )
         },
-        **{f"stanford_{kind}": count(f"epochs of all runs: {kind}, by confidence") for kind in STANFORD},
         **{
-            f"stanford_hpl_{kind}": count(f"epochs of all runs: {kind}, by the receiver's HPL", nullable=True)
+            f"stanford_{kind}": count(f"epochs of runs judged by a reference or balise reads: {kind}, by confidence")
+            for kind in STANFORD
+        },
+        **{
+            f"stanford_hpl_{kind}": count(f"epochs of these runs: {kind}, by the receiver's HPL", nullable=True)
             for kind in STANFORD
         },
         "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
@@ -179,9 +184,11 @@ class CampaignDetection(dy.Schema):
     allowed_s = real("s", "allowed T_D", min=0)
     failures = count("faults with a position failure")
     within = count("of these negated within the allowed T_D")
-    within_share = real("1", "share of failures negated within it", min=0)
-    within_share_low = real("1", "share of failures negated within it: lower 95 % bound", min=0)
-    within_share_high = real("1", "share of failures negated within it: upper 95 % bound", min=0)
+    failures_judged = count("of the failures those that a reference or balise reads tell")
+    within_judged = count("of these negated within the allowed T_D")
+    within_share = real("1", "share of judged failures negated within it", min=0)
+    within_share_low = real("1", "share of judged failures negated within it: lower 95 % bound", min=0)
+    within_share_high = real("1", "share of judged failures negated within it: upper 95 % bound", min=0)
     never_negated = count("failures that were never negated; the quantiles leave them out")
     hazardous_median_s = real("s", "median of the hazardous time", min=0)
     hazardous_p95_s = real("s", "95 % of the hazardous time", min=0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import polars as pl
 
+from schemas.enums import TRUTH
+
 
 def missed_detection() -> pl.Expr:
     """A hazard with a failure that was not negated by `t_failure` + budget (DOMAIN section 5).
@@ -16,11 +18,13 @@ def missed_detection() -> pl.Expr:
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
-    """One row per fault: `run_id, solution, failed, missed, time_to_detect_s, hazardous_s`.
+    """One row per fault: `run_id, solution, failed, missed, with_truth, time_to_detect_s, hazardous_s`.
 
     A fault may stand in several rows of `hazards` (one per class, and the jump back as a row
     `caused_by` the first); counted one by one they would make the bounds too narrow. Takes the
-    hazards of many runs with their `run_id`. `hazardous_s` is null where a failure was never negated.
+    hazards of many runs with their `run_id`. `hazardous_s` is null where a failure was never negated. Shares are of
+    faults `with_truth` (reference or balise reads): the odometer alone mostly sees what was detected, because a virtual
+    balise accepted in the wrong place hides the rest.
     """
     failed = pl.col("t_failure").is_not_null()
     return (
@@ -30,6 +34,7 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
         .agg(
             failed=failed.any(),
             missed=pl.col("missed").any(),
+            with_truth=pl.col("evidence").is_in(TRUTH).all(),
             time_to_detect_s=pl.col("time_to_detect_s").max(),
             # One row that was never negated makes the whole fault one that was never negated.
             hazardous_s=pl.when((failed & pl.col("hazardous_s").is_null()).any())

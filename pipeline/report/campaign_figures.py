@@ -76,6 +76,8 @@ def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyCon
     faults = independent_episodes(hazards)
     failures = faults.filter(pl.col("failed"))
     missed = failures.filter(pl.col("missed")).height
+    judged = failures.filter(pl.col("with_truth"))
+    share = clopper_pearson(judged.filter(pl.col("missed")).height, judged.height)
     upper = poisson_rate_upper(missed, hours)
     needed = hours_still_needed(safety.thr_vb_per_h, missed, hours)
     claim = "" if upper is None else f"; one-sided 95 %: below {number(upper)} /h"
@@ -89,7 +91,7 @@ def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyCon
         Figure(
             "missed detections",
             f"{missed} of {failures.height} with a failure",
-            f"{_share(clopper_pearson(missed, failures.height))}; against the hours by reference or balises"
+            f"of the {judged.height} judged by a truth {_share(share)}; against the hours by reference or balises"
             f" {_rate(poisson_rate(missed, hours))}{claim}",
         ),
         Figure(
@@ -165,7 +167,8 @@ def level_figures(hazards: pl.DataFrame, safety: SafetyConfig) -> list[LevelFigu
         allowed_s = safety.allowed_time_to_detect_s(level)
         within = negated.filter(pl.col("hazardous_s") <= allowed_s).height
         never = failures.height - negated.height
-        share = clopper_pearson(within, failures.height)
+        judged = failures.filter(pl.col("with_truth"))
+        share = clopper_pearson(judged.filter(pl.col("hazardous_s") <= allowed_s).height, judged.height)
         rows.append(LevelFigures(level, allowed_s, within, negated.height - within, never, share))
     return rows
 

@@ -71,9 +71,9 @@ def _sums() -> Iterator[pl.Expr]:
     yield pl.col(
         "balises_accepted", "accepted_judged", "unsafe_accepted", "outages", "trusted_s", "trusted_losses"
     ).sum()
-    yield pl.col(f"stanford_{kind}" for kind in STANFORD).sum()
-    for kind in STANFORD:  # null where no run has a protection level
-        counts = pl.col(f"stanford_hpl_{kind}")
+    yield pl.col(f"stanford_{kind}" for kind in STANFORD).filter(evidence.is_in(TRUTH)).sum()
+    for kind in STANFORD:  # null where no such run has a protection level
+        counts = pl.col(f"stanford_hpl_{kind}").filter(evidence.is_in(TRUTH))
         yield pl.when(counts.count() > 0).then(counts.sum())
 
 
@@ -101,6 +101,8 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
     sums = runs.select(_sums()).row(0, named=True)
     hours, seen, truth, judged = (sums[f"{name}_s"] / 3600.0 for name in ("duration", "seen", "truth", "judged"))
     failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
+    judged_failures = episodes.filter(pl.col("failed") & pl.col("with_truth"))
+    missed_judged = int(judged_failures["missed"].sum())
     same = ("runs_partial", "accepted_judged", "unsafe_judged", "unsafe_accepted", "outages", "trusted_losses")
     return {
         **{name: sums[name] for name in (*same, "false_alarms")},
@@ -112,7 +114,9 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
         **columns_of("hazard_rate", poisson_rate(episodes.height, seen), "_per_h"),
         "failures": failures,
         "missed": missed,
-        **columns_of("missed_share", clopper_pearson(missed, failures)),
+        "failures_judged": judged_failures.height,
+        "missed_judged": missed_judged,
+        **columns_of("missed_share", clopper_pearson(missed_judged, judged_failures.height)),
         "missed_rate_upper_per_h": poisson_rate_upper(missed, truth),
         "hours_judged": judged,
         **columns_of("false_alarm_rate", poisson_rate(sums["false_alarms"], judged), "_per_h"),
@@ -151,14 +155,22 @@ def _by_level(episodes: pl.DataFrame, solution: str, config: SafetyConfig) -> li
         **_quantiles(episodes["time_to_detect_s"], "time_to_detect"),
     }
     return [
-        same | _against(hazardous_s, level, config.allowed_time_to_detect_s(level)) for level in config.service_levels
+        same | _against(episodes.filter("failed"), level, config.allowed_time_to_detect_s(level))
+        for level in config.service_levels
     ]
 
 
-def _against(hazardous_s: pl.Series, level: str, allowed_s: float) -> Row:
-    within = int((hazardous_s <= allowed_s).sum())
-    share = columns_of("within_share", clopper_pearson(within, hazardous_s.len()))
-    return {"service_level": level, "allowed_s": allowed_s, "within": within, **share}
+def _against(failures: pl.DataFrame, level: str, allowed_s: float) -> Row:
+    judged = failures.filter("with_truth")
+    within, within_judged = (int((part["hazardous_s"] <= allowed_s).sum()) for part in (failures, judged))
+    return {
+        "service_level": level,
+        "allowed_s": allowed_s,
+        "within": within,
+        "failures_judged": judged.height,
+        "within_judged": within_judged,
+        **columns_of("within_share", clopper_pearson(within_judged, judged.height)),
+    }
 
 
 def _quantiles(values: pl.Series, name: str) -> Row:
@@ -180,7 +192,7 @@ def _statement(row: Row) -> str:
     head = (
         f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
         f" at virtual balises in {row['hours_with_evidence']:.6g} h with evidence, {row['hours_with_truth']:.6g} h of"
-        f" these with a truth (reference or balise reads). {_acceptances(row)}"
+        f" these with a truth (reference or balise reads).{_by_odometer(row)} {_acceptances(row)}"
     )
     if row["share_p1"]:
         head += (
@@ -192,6 +204,16 @@ def _statement(row: Row) -> str:
     return (
         f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with a truth and no"
         f" further miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
+    )
+
+
+def _by_odometer(row: Row) -> str:
+    failures, missed = (int(str(row[name])) - int(str(row[f"{name}_judged"])) for name in ("failures", "missed"))
+    if not failures:
+        return ""
+    return (
+        f" {failures} of these failures, {missed} of them missed, were seen by the odometer alone, which hardly sees"
+        " what no monitor did: shares leave them out."
     )
 
 
