@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from pipeline import storage
-from pipeline.campaign import fetched, lock
+from pipeline.campaign import known_logs, lock
 from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, worst
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
@@ -35,7 +35,7 @@ def replay_one(job: RunJob) -> RunOutcome:
         _same_software(job)
         site = _site(job.site, job.site_digest)
         version = _version(job)
-        if (known := fetched.known_digest(job, version)) and _is_done(job, known):
+        if (known := known_logs.known_digest(job, version)) and _is_done(job, known):
             return _earlier(job)
         with _fetched(job, version) as path:
             before = _signature(path)
@@ -136,7 +136,7 @@ def _files_digest(job: RunJob, path: Path, version: str | None, known: str = "")
     """What the log holds, kept for the next campaign; `known`: the SHA-256 of a log of one file that was read."""
     with _as_input_error(path):
         digest = storage.content_digest(path, known)
-    fetched.remember(job, version, digest)
+    known_logs.remember(job, version, digest)
     return digest
 
 
