@@ -226,14 +226,11 @@ def convert(
     """Make a run of receiver logs."""
     from datasets.samples import known_recording
     from datasets.trial import write_run_as
-    from pipeline.receivers import Converted
     from pipeline.receivers import convert as convert_logs
 
     settings, _ = _settings(config, None)
-    recording = known_recording(logs[0]) if len(logs) == 1 and config is None else None
-    if recording is not None:
-        converted = Converted(recording, {})
-    else:
+    converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
+    if converted is None:
         converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
     write_run_as(converted.run, to)
     print(f"{converted.run.gnss.height} epochs in {to}")

@@ -21,8 +21,10 @@ from dataframely import Schema
 from pipeline.geodesy import distances_m, points_of
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.conform import conform, rows_text
-from pipeline.ingest.csv_text import read_table
+from pipeline.ingest.csv_text import read_log_table
 from pipeline.ingest.site import read_site
+from pipeline.receivers import Converted
+from pipeline.receivers.csv import CUT_ROW
 from schemas.enums import BaliseKind, Fix, Reaction
 from schemas.errors import InputError
 from schemas.inputs import Balises, Links, Track
@@ -44,24 +46,42 @@ _COMMA_ELEMENT = "road"
 _FEWEST_POSES = 2
 
 _INFRABEL_COLUMNS = ("timestamp", "latitude", "longitude", "solution_status", "position_type")
-_INFRABEL_FIX = {
-    "NARROW_INT": Fix.RTK_FIXED,
-    "NARROW_FLOAT": Fix.RTK_FLOAT,
+# A time cut off before its seconds is another time.
+_TO_THE_SECOND = r"^(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?)$"
+# Position types of NovAtel's receivers, by what the ambiguities rest on; with inertial sensors they begin with INS_.
+_NOVATEL_FIX = {
+    "NONE": Fix.NONE,
+    "FIXEDPOS": Fix.NONE,
+    "DOPPLER_VELOCITY": Fix.NONE,
     "SINGLE": Fix.AUTONOMOUS,
+    "PSRSP": Fix.AUTONOMOUS,
     "PSRDIFF": Fix.DIFFERENTIAL,
+    "OMNISTAR": Fix.DIFFERENTIAL,
+    "PPP_CONVERGING": Fix.DIFFERENTIAL,
+    "WAAS": Fix.SBAS,
+    "SBAS": Fix.SBAS,
+    "L1_FLOAT": Fix.RTK_FLOAT,
+    "IONOFREE_FLOAT": Fix.RTK_FLOAT,
+    "NARROW_FLOAT": Fix.RTK_FLOAT,
+    "RTKFLOAT": Fix.RTK_FLOAT,
+    "WIDE_INT": Fix.RTK_FLOAT,
+    "PPP": Fix.RTK_FLOAT,
+    "L1_INT": Fix.RTK_FIXED,
+    "NARROW_INT": Fix.RTK_FIXED,
+    "RTKFIXED": Fix.RTK_FIXED,
     "PROPAGATED": Fix.ESTIMATED,
 }
 
 
-def known_recording(path: Path) -> RunLog | None:
+def known_recording(path: Path) -> Converted | None:
     """A segment of comma2k19 (a folder) or a log of the Infrabel train (a CSV with its columns); none if neither."""
     if (path / "processed_log").is_dir():
-        return comma2k19_run(path)[0]
+        return Converted(comma2k19_run(path)[0], {})
     if path.suffix.lower() != ".csv" or not path.is_file():
         return None
     with path.open("rb") as stream:
         head = stream.readline()
-    return infrabel_run(path) if all(name.encode() in head for name in _INFRABEL_COLUMNS) else None
+    return infrabel_recording(path) if all(name.encode() in head for name in _INFRABEL_COLUMNS) else None
 
 
 def comma2k19_run(segment: Path, balises_at_m: Sequence[float] = ()) -> tuple[RunLog, Site]:
@@ -88,37 +108,44 @@ def comma2k19_run(segment: Path, balises_at_m: Sequence[float] = ()) -> tuple[Ru
 
 
 def infrabel_run(log: Path) -> RunLog:
+    """A log of the Infrabel measurement train: see `infrabel_recording`."""
+    return infrabel_recording(log).run
+
+
+def infrabel_recording(log: Path) -> Converted:
     """A log of the Infrabel measurement train: positions with the receiver's own type, nothing else.
 
-    Its naive local times are taken as UTC, and `NARROW_INT`, `NARROW_FLOAT`, `SINGLE`, `PSRDIFF` and `PROPAGATED`
-    (each with any number behind) as kinds of fix; without a computed solution there is none.
+    Its naive local times are taken as UTC, and NovAtel's position types (each with any number behind) as kinds of fix;
+    without a computed solution, or without a type, there is none. Half a row at the end is left out.
     """
     try:
-        table = read_table(log.read_bytes(), infer=False)
+        table, cut = read_log_table(log.read_bytes(), infer=False)
     except (OSError, ValueError, pl.exceptions.PolarsError) as error:
         raise InputError(f"is no CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
     missing = set(_INFRABEL_COLUMNS) - set(table.columns)
     if missing:
         raise InputError("lacks columns of an Infrabel log", place=str(log), found=f"no {', '.join(sorted(missing))}")
     computed = pl.col("solution_status") == "SOL_COMPUTED"
-    kind = pl.col("position_type").str.replace(r"\d+$", "").replace_strict(_INFRABEL_FIX, default=None)
-    fix = pl.when(computed).then(kind).otherwise(pl.lit(Fix.NONE.value))
-    unknown = table.filter(computed & kind.is_null())["position_type"].unique().sort()
+    word = pl.col("position_type").replace("", None)
+    kind = word.str.replace(r"\d+$", "").str.replace("^INS_", "").replace_strict(_NOVATEL_FIX, default=None)
+    fix = pl.when(computed & word.is_not_null()).then(kind).otherwise(pl.lit(Fix.NONE.value))
+    unknown = table.filter(computed & word.is_not_null() & kind.is_null())["position_type"].unique().sort()
     if unknown.len():
         raise InputError(
             "a position type is not known",
             place=f"{log}: position_type",
-            found=", ".join(str(word) for word in unknown),
-            expected=", ".join(_INFRABEL_FIX),
+            found=", ".join(unknown),
+            expected=", ".join(_NOVATEL_FIX),
         )
+    time = pl.col("timestamp").str.extract(_TO_THE_SECOND)
     gnss = table.select(
-        t=pl.col("timestamp").str.to_datetime(time_unit="ns", strict=False).dt.replace_time_zone("UTC"),
+        t=time.str.to_datetime(time_unit="ns", strict=False).dt.replace_time_zone("UTC"),
         latitude_deg=pl.col("latitude").cast(pl.Float64, strict=False),
         longitude_deg=pl.col("longitude").cast(pl.Float64, strict=False),
         fix=fix,
     )
     _refuse_unreadable(table.select("timestamp", "latitude", "longitude"), gnss.select(pl.nth(0, 1, 2)), log)
-    return RunLog(log.stem, _conformed(gnss, "gnss", log))
+    return Converted(RunLog(log.stem, _conformed(gnss, "gnss", log)), {CUT_ROW: cut} if cut else {})
 
 
 def _refuse_unreadable(texts: pl.DataFrame, values: pl.DataFrame, log: Path) -> None:

@@ -19,9 +19,33 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
     The separator is the one of comma, semicolon and tab that divides the header most. Names and texts lose the
     blanks around them. Raises ValueError or a polars error where there is no table.
     """
-    lines = [line for line in text_of(data).splitlines() if not line.startswith("#")]
+    return _table(_lines(data), infer)
+
+
+def read_log_table(data: bytes, infer: bool) -> tuple[pl.DataFrame, int]:
+    """As `read_table`, without a last row that breaks off, and the number of such rows (0 or 1).
+
+    A recorder that lost power leaves half a row: without a line end, and with fewer fields than the header.
+    """
+    lines = _lines(data)
+    separator = _separator(lines)
     header = next((line for line in lines if line.strip()), "")
-    separator = max(_SEPARATORS, key=header.count)
+    ended = data.rstrip(b" \0").endswith((b"\n", b"\r"))
+    cut = len(lines) > 1 and not ended and lines[-1].count(separator) < header.count(separator)
+    return _table(lines[:-1] if cut else lines, infer), int(cut)
+
+
+def _lines(data: bytes) -> list[str]:
+    return [line for line in text_of(data).splitlines() if not line.startswith("#")]
+
+
+def _separator(lines: list[str]) -> str:
+    header = next((line for line in lines if line.strip()), "")
+    return max(_SEPARATORS, key=header.count)
+
+
+def _table(lines: list[str], infer: bool) -> pl.DataFrame:
+    separator = _separator(lines)
     body = "\n".join(lines).lstrip("\n")
     length = None if infer else 0
     frame = pl.read_csv(io.StringIO(body), separator=separator, infer_schema=infer, infer_schema_length=length)

@@ -96,8 +96,7 @@ def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
 
 def _convert_one(log: Path, config: IngestConfig) -> tuple[Streams, Mapping[str, int]]:
     if log.suffix.lower() == ".csv":
-        mapped: Streams = read_csv(log, config)
-        return mapped, {}
+        return read_csv(log, config)
     try:
         content = log.read_bytes()
     except OSError as error:

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.breaches import refuse
-from pipeline.ingest.csv_text import read_table
+from pipeline.ingest.csv_text import read_log_table
 from pipeline.ingest.mapping import mappings_of
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Sample, Source, mapped_source
@@ -23,10 +23,16 @@ from schemas.run import STREAMS, Stream
 _MOST_SECONDS, _LEAST_NANOSECONDS = 9 * 10**9, 10**17
 
 
-def read_csv(path: Path, config: IngestConfig) -> dict[Stream, pl.DataFrame]:
-    """Streams of a CSV file: each mapping whose `topic` is the file's name, its stem or `*` makes one."""
+# Why a row was left out.
+CUT_ROW = "row that breaks off at the end of the file"
+
+
+def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
+    """Streams of a CSV file, each mapping whose `topic` is the file's name, its stem or `*` makes one; what was left
+    out, reason to number.
+    """
     try:
-        table = read_table(path.read_bytes(), infer=True)
+        table, cut = read_log_table(path.read_bytes(), infer=True)
     except (OSError, ValueError, pl.exceptions.PolarsError) as error:
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(path)) from None
     streams: dict[Stream, pl.DataFrame] = {}
@@ -43,7 +49,7 @@ def read_csv(path: Path, config: IngestConfig) -> dict[Stream, pl.DataFrame]:
             expected=f'a table [ingest.gnss] with topic = "{path.name}"',
             remedy='Give --config with time = "field:COLUMN" and fields = {latitude_deg = "COLUMN", ...}.',
         )
-    return streams
+    return streams, {CUT_ROW: cut} if cut else {}
 
 
 def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:

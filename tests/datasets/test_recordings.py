@@ -163,10 +163,41 @@ def test_a_log_of_the_measurement_train(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("word", "fix"),
+    [
+        ("NARROW_INT", "rtk_fixed"),
+        ("INS_RTKFIXED", "rtk_fixed"),
+        ("WIDE_INT", "rtk_float"),
+        ("INS_PSRSP", "autonomous"),
+        ("WAAS", "sbas"),
+        ("NONE", "none"),
+        ("", "none"),
+    ],
+)
+def test_position_types_of_the_receiver(tmp_path: Path, word: str, fix: str) -> None:
+    log = tmp_path / "log_1.csv"
+    log.write_text(INFRABEL.replace("NARROW_INT3", word))
+    assert infrabel_run(log).gnss["fix"][0] == fix
+
+
+@pytest.mark.parametrize("cut", range(1, 29))
+def test_half_a_row_at_the_end_is_left_out(tmp_path: Path, cut: int) -> None:
+    """However much of the last row the recorder wrote."""
+    whole = INFRABEL + "SOL_COMPUTED,SINGLE,50.6,4.6,2022-01-14T10:46:26"
+    log = tmp_path / "log_1.csv"
+    log.write_text(whole[: len(INFRABEL) + cut])
+    found = known_recording(log)
+    assert found is not None
+    assert found.run.gnss.height == 2
+    assert list(found.dropped.values()) == [1]
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("50.5", "north", "column latitude: cannot be read.*'north' in row 0"),
         ("2022-01-14T10:45:26", "noon", "column timestamp: cannot be read.*'noon'"),
+        ("2022-01-14T10:45:26", "2022-01-14T10:45", "column timestamp: cannot be read.*'2022-01-14T10:45' in row 1"),
         ("2022-01-14T10:45:26", "", "column t: is not complete"),
         ("50.5", "95.5", "latitude_deg: is out of range"),
         ("NARROW_INT3", "MAGIC", "position_type: a position type is not known; found MAGIC"),
