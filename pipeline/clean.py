@@ -59,6 +59,11 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
     return run.with_streams(**streams), CleanCounts(solutions, counts)
 
 
+def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
+    """What `clean` would count in one stream, of GNSS in one solution."""
+    return _in_order(frame.drop_nulls("t"), _KEYS.get(stream, ["t"]))[1]
+
+
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
+from pipeline.clean import StreamCounts, stamp_counts
 from pipeline.ingest.generic import UndecodableError, decoder_for
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
@@ -122,9 +123,9 @@ def _summaries(run: RunLog) -> list[StreamSummary]:
 def _summary(stream: Stream, solution: str | None, frame: pl.DataFrame) -> StreamSummary:
     # Satellites share the time of their epoch: an epoch is one step.
     t_ns = frame.to_series(0).to_physical().drop_nulls().to_numpy()
-    steps = np.diff(t_ns)
     ordered = np.diff(np.unique(t_ns))
     step = float(np.median(ordered)) if len(ordered) else None
+    stamps = stamp_counts(stream, frame) if stream != "faults" else StreamCounts()
     late = ordered[ordered > _GAP_PERIODS * step] if step else ordered[:0]
     mix = frame["fix"].value_counts().sort("fix") if stream == "gnss" else None
     return StreamSummary(
@@ -136,8 +137,8 @@ def _summary(stream: Stream, solution: str | None, frame: pl.DataFrame) -> Strea
         rate_hz=1e9 / step if step else None,
         gaps=len(late),
         longest_gap_s=float(late.max()) / 1e9 if len(late) else None,
-        duplicates=int((steps == 0).sum()) if stream != "satellites" else 0,
-        out_of_order=int((steps < 0).sum()),
+        duplicates=stamps.duplicates,
+        out_of_order=stamps.out_of_order,
         fix_mix=dict(mix.iter_rows()) if mix is not None else {},
         columns=tuple(name for name in frame.columns if frame[name].null_count() < frame.height),
     )

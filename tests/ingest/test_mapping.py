@@ -12,6 +12,7 @@ import pytest
 from mcap.writer import Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
+from pipeline.clean import clean
 from pipeline.ingest import describe_log, read_run
 from pipeline.ingest.timescale import utc_from_gps
 from schemas.config import IngestConfig, settings_from
@@ -386,3 +387,16 @@ def test_describe_measures_rates_and_gaps(tmp_path):
     assert describe_log(folder, IngestConfig()).streams[0].gaps == 1
     cut = samples.save(tmp_path, path.read_bytes()[:4000], "cut.mcap")
     assert "cut off" in describe_log(cut, IngestConfig()).notes.damage
+
+
+def test_described_stamps_are_counted_as_the_replay_counts_them(tmp_path):
+    """A row that stands again later is a duplicate, and two late rows are two, however far back they belong."""
+    gnss = samples.run().gnss
+    mixed = pl.concat([gnss[:12], gnss[10:11], gnss[20:], gnss[12:14]])
+    folder = tmp_path / "parquet"
+    folder.mkdir()
+    mixed.write_parquet(folder / "gnss.parquet")
+    (found,) = describe_log(folder, IngestConfig()).streams
+    assert (found.duplicates, found.out_of_order, found.rows) == (1, 3, mixed.height)
+    (counts,) = clean(read_run(folder, IngestConfig()))[1].solutions.values()
+    assert (counts.duplicates, counts.out_of_order) == (1, 3)
