@@ -16,7 +16,7 @@ from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_
 from pipeline.safety.tally import Tally
 from pipeline.storage.files import Address
 from schemas.config import Configuration
-from schemas.enums import RunStatus, ThrVerdict, Verdict
+from schemas.enums import TRUTH, RunStatus, ThrVerdict, Verdict
 
 _WORTH_SAYING_S = 1.0
 
@@ -107,14 +107,18 @@ def over_all_runs(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
 
 
 def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
-    """Runs by verdict, per solution and service level."""
+    """Runs by verdict, per solution and service level; `no_truth`: how many of them no reference or balise reads judged,
+    so that no failure means little.
+    """
+    no_truth = (~pl.col("evidence").is_in(TRUTH).fill_null(value=False)).sum().cast(pl.Int64)
+    too_slow = (~pl.col("receiver_quick_enough")).sum().cast(pl.Int64)
     counts: dict[str, pl.Expr] = {
         verdict.value: (pl.col("verdict") == verdict.value).sum().cast(pl.Int64) for verdict in ThrVerdict
     }
     return (
         levels.filter(pl.col("solution") != "")
         .group_by("solution", "service_level", "allowed_s", maintain_order=True)
-        .agg(**counts, receiver_too_slow=(~pl.col("receiver_quick_enough")).sum().cast(pl.Int64))
+        .agg(**counts, no_truth=no_truth, receiver_too_slow=too_slow)
         .sort("solution", maintain_order=True)
     )
 

@@ -7,7 +7,7 @@ FIGURES = (
     ("distance_m", "distance", "m"),
     ("epochs", "epochs", ""),
     ("gnss_rate_hz", "GNSS rate", "Hz"),
-    ("evidence", "truth taken from", ""),
+    ("evidence", "errors judged by", ""),
     ("availability", "availability of the TVB while moving", ""),
     ("outages", "outages", ""),
     ("longest_outage_s", "longest outage", "s"),

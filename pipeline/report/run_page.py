@@ -32,6 +32,7 @@ from pipeline.report.stanford import stanford_data
 from pipeline.safety.side_by_side import Key, side_by_side_table
 from pipeline.safety.tally import Tally
 from schemas.config import Configuration
+from schemas.enums import TRUTH
 from schemas.run import RunTables, Site
 
 Row = Mapping[str, Any]
@@ -175,6 +176,11 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
     if hazards.is_empty():
         if run["evidence"] is None:
             return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
+        if run["evidence"] not in TRUTH:
+            return (
+                '<p class="notice partial">No hazard was found, but the odometer alone sees errors beyond its confidence'
+                " only, and none that a virtual balise accepted in the wrong place hides.</p>"
+            )
         return f'<p class="none">No hazard was found; truth was taken from: {escape(str(run["evidence"]))}.</p>'
     rows = []
     for row in hazards.iter_rows(named=True):

@@ -205,6 +205,25 @@ def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_
     assert "rate not known" in index
 
 
+def test_by_the_odometer_alone_no_hazard_is_no_health(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    tables = replayed["jump_two"]
+    evidence = pl.lit("odometer", tables.runs.schema["evidence"])
+    by_odometer = RunTables(
+        "seen",
+        tables.hazards.clear(),
+        tables.passages,
+        tables.alarms,
+        tables.epochs,
+        tables.runs.with_columns(evidence=evidence),
+    )
+    write_run(by_odometer, tmp_path, {})
+    write_report(tmp_path)
+    run, index = text_of(tmp_path, "runs/seen.html"), text_of(tmp_path, "index.html")
+    assert "the odometer alone sees errors beyond its confidence only" in run
+    assert "truth was taken from" not in run
+    assert "0 of 0 judged by a truth" in index
+
+
 def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
     files = sorted(path for path in (out / "report").rglob("*") if path.is_file())
     before = {path: path.read_bytes() for path in files}

@@ -110,7 +110,9 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     cut = run_of("cut")
     rows = cut.runs.with_columns(status=pl.lit("partial", cut.runs.schema["status"]))
     write_run(RunTables(**{**vars(cut), "runs": rows}), tmp_path, {})
-    said = assess(tmp_path).statements
+    found = assess(tmp_path)
+    said = found.statements
+    assert set(found.tables["levels"].select("no_failure", "unknown", "no_truth").rows()) == {(2, 1, 1)}
     assert said[0] == "1 of 3 runs are partial: what was read of them counts."
     assert said[1].startswith("primary: for 1 of 3 h the error is not known (1 of 3 runs have no evidence at all)")
     assert said[2].startswith("primary: 1 alarms in 1 runs are neither true nor false for want of evidence")
