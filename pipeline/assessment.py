@@ -107,8 +107,8 @@ def over_all_runs(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
 
 
 def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
-    """Runs by verdict, per solution and service level; `no_truth`: how many of them no reference or balise reads judged,
-    so that no failure means little.
+    """Runs by verdict, per solution and service level; `no_truth`: of how many neither a reference nor balise
+    reads judged, so that no failure means little.
     """
     no_truth = (~pl.col("evidence").is_in(TRUTH).fill_null(value=False)).sum().cast(pl.Int64)
     too_slow = (~pl.col("receiver_quick_enough")).sum().cast(pl.Int64)

@@ -178,8 +178,8 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
             return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
         if run["evidence"] not in TRUTH:
             return (
-                '<p class="notice partial">No hazard was found, but the odometer alone sees errors beyond its confidence'
-                " only, and none that a virtual balise accepted in the wrong place hides.</p>"
+                '<p class="notice partial">No hazard was found, but the odometer alone sees errors beyond its'
+                " confidence only, and none that a virtual balise accepted in the wrong place hides.</p>"
             )
         return f'<p class="none">No hazard was found; truth was taken from: {escape(str(run["evidence"]))}.</p>'
     rows = []
