@@ -9,7 +9,8 @@ from pipeline.safety.budget import allocation_table, allowed_table, demands_tabl
 from pipeline.safety.continuity import continuity_table
 from pipeline.safety.errata import Erratum, errata, errata_table
 from pipeline.safety.markov import markov_table
-from pipeline.safety.measured import detection_by_level, measured_figures, plain_statements, substantiation_table
+from pipeline.safety.measured import detection_by_level, measured_figures, substantiation_table
+from pipeline.safety.sentences import plain_statements
 from schemas.config import SafetyConfig
 
 __all__ = [

@@ -182,53 +182,6 @@ def _quantiles(values: pl.Series, name: str) -> Row:
     }
 
 
-def plain_statements(figures: pl.DataFrame) -> list[str]:
-    """What the figures do and do not show, one sentence or two per solution."""
-    return [_statement(row) for row in figures.iter_rows(named=True)]
-
-
-def _statement(row: Row) -> str:
-    claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
-    head = (
-        f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
-        f" at virtual balises in {row['hours_with_evidence']:.6g} h with evidence, {row['hours_with_truth']:.6g} h of"
-        f" these with a truth (reference or balise reads).{_by_odometer(row)} {_acceptances(row)}"
-    )
-    if row["share_p1"]:
-        head += (
-            f" Beyond the failure limit and not negated, at a balise or not: {row['share_p1']:.3%} of the time in runs"
-            " with a truth."
-        )
-    if row["hours_still_needed"] == 0.0:
-        return f"{head} This substantiates a {claim}."
-    return (
-        f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with a truth and no"
-        f" further miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
-    )
-
-
-def _by_odometer(row: Row) -> str:
-    failures, missed = (int(str(row[name])) - int(str(row[f"{name}_judged"])) for name in ("failures", "missed"))
-    if not failures:
-        return ""
-    return (
-        f" {failures} of these failures, {missed} of them missed, were seen by the odometer alone, which hardly sees"
-        " what no monitor did: shares leave them out."
-    )
-
-
-def _acceptances(row: Row) -> str:
-    accepted, judged, unsafe, seen = (
-        int(str(row[name])) for name in ("accepted", "accepted_judged", "unsafe_judged", "unsafe_accepted")
-    )
-    said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} lay beyond the failure limit"
-    if accepted > judged:
-        said += f"; {accepted - judged} more were not judged by one"
-    if seen > unsafe:
-        said += f", and {seen - unsafe} of these lay beyond it by the odometer"
-    return f"{said}."
-
-
 def substantiation_table(config: SafetyConfig, events: tuple[int, ...] = (0, 1, 2, 5)) -> pl.DataFrame:
     """Hours [h] that show a rate at 95 %, by events seen, for THR_VB and the rate of each service level."""
     targets = {"THR_VB": config.thr_vb_per_h} | {

@@ -1,0 +1,148 @@
+"""What the figures of a result do and do not show, in sentences for an assessor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import polars as pl
+
+from schemas.enums import RunStatus, Verdict
+
+Row = dict[str, object]
+
+_WORTH_SAYING_S = 1.0
+
+
+def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
+    """What keeps the figures from being those of traffic, and what they leave out."""
+    injected = runs.filter(pl.col("notes").str.contains("faults were injected").fill_null(value=False))
+    failed = runs.filter((pl.col("status") == RunStatus.FAILED).all().over("run_id"))["run_id"].n_unique()
+    said = []
+    if injected.height:
+        said.append(
+            f"Faults were injected into {injected['run_id'].n_unique()} of {runs['run_id'].n_unique()} runs: rates of "
+            "hazards, misses and outages per hour are those of the trial, not of traffic."
+        )
+    if failed:
+        said.append(f"{failed} of {runs['run_id'].n_unique()} runs failed and count nowhere.")
+    said += [
+        f"{solution}: {count} of {runs['run_id'].n_unique()} runs failed with this solution alone and count nowhere in"
+        " its figures."
+        for solution, count in _failed_alone(runs)
+    ]
+    partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
+    if partial:
+        said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: what was read of them counts.")
+    return [*said, *_unjudged(runs, alarms)]
+
+
+def _failed_alone(runs: pl.DataFrame) -> list[tuple[str, int]]:
+    """Solutions that failed in runs of which another one was replayed, and in how many."""
+    failed = pl.col("status") == RunStatus.FAILED
+    alone = runs.filter(failed & ~failed.all().over("run_id"))
+    return alone.group_by("solution").agg(pl.col("run_id").n_unique()).sort("solution").rows()
+
+
+def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
+    """Per solution: the time and the alarms that nothing could judge."""
+    said = []
+    done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
+    for (solution,), rows in done.group_by("solution", maintain_order=True):
+        held_s, seen_s = (float(rows[name].sum()) for name in ("held_s", "evidence_s"))
+        if held_s - seen_s >= _WORTH_SAYING_S:
+            without = rows["evidence"].null_count()
+            said.append(
+                f"{solution}: for {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the error is not known"
+                f" ({without} of {rows.height} runs have no evidence at all): no rate of hazards counts this time."
+            )
+        open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
+        if open_cases.height:
+            said.append(
+                f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs are neither true nor"
+                " false for want of evidence: the rate of false alarms leaves these runs out."
+            )
+    return said
+
+
+def slow_receivers(levels: pl.DataFrame) -> list[str]:
+    """Service levels whose allowed time is over before the next epoch can negate anything (TVB section 5)."""
+    slow = levels.filter(~pl.col("receiver_quick_enough"))
+    return [
+        f"{solution}: epochs come too slowly for {level} in {runs} runs: period and negation take up to "
+        f"{needed_s:.4g} s of the {allowed_s:.4g} s allowed."
+        for solution, level, allowed_s, runs, needed_s in slow.group_by(
+            "solution", "service_level", "allowed_s", maintain_order=True
+        )
+        .agg(pl.col("run_id").n_unique(), pl.col("receiver_needs_s").max())
+        .iter_rows()
+    ]
+
+
+def level_statements(detection: pl.DataFrame) -> list[str]:
+    """Per solution: how many failures were negated in the time that each service level allows."""
+    said = []
+    for (solution,), rows in detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True):
+        levels = [
+            f"{row['within']} within {row['allowed_s']:.4g} s ({row['service_level']}{_within_bounds(row)})"
+            for row in rows.iter_rows(named=True)
+        ]
+        failures, never = rows["failures"][0], rows["never_negated"][0]
+        said.append(
+            f"{solution}: of {failures} position failures {never} were never negated; " + ", ".join(levels) + "."
+        )
+    return said
+
+
+def _within_bounds(row: dict[str, Any]) -> str:
+    """The bounds of the share of failures that a truth judged; nothing without any."""
+    if row["within_share"] is None:
+        return ""
+    of = "" if row["failures_judged"] == row["failures"] else f" of the {row['failures_judged']} judged by a truth"
+    return f"; 95 %{of}: {row['within_share_low']:.1%} to {row['within_share_high']:.1%}"
+
+
+def plain_statements(figures: pl.DataFrame) -> list[str]:
+    """What the figures do and do not show, one sentence or two per solution."""
+    return [_statement(row) for row in figures.iter_rows(named=True)]
+
+
+def _statement(row: Row) -> str:
+    claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
+    head = (
+        f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
+        f" at virtual balises in {row['hours_with_evidence']:.6g} h with evidence, {row['hours_with_truth']:.6g} h of"
+        f" these with a truth (reference or balise reads).{_by_odometer(row)} {_acceptances(row)}"
+    )
+    if row["share_p1"]:
+        head += (
+            f" Beyond the failure limit and not negated, at a balise or not: {row['share_p1']:.3%} of the time in runs"
+            " with a truth."
+        )
+    if row["hours_still_needed"] == 0.0:
+        return f"{head} This substantiates a {claim}."
+    return (
+        f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with a truth and no"
+        f" further miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
+    )
+
+
+def _by_odometer(row: Row) -> str:
+    failures, missed = (int(str(row[name])) - int(str(row[f"{name}_judged"])) for name in ("failures", "missed"))
+    if not failures:
+        return ""
+    return (
+        f" {failures} of these failures, {missed} of them missed, were seen by the odometer alone, which hardly sees"
+        " what no monitor did: shares leave them out."
+    )
+
+
+def _acceptances(row: Row) -> str:
+    accepted, judged, unsafe, seen = (
+        int(str(row[name])) for name in ("accepted", "accepted_judged", "unsafe_judged", "unsafe_accepted")
+    )
+    said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} lay beyond the failure limit"
+    if accepted > judged:
+        said += f"; {accepted - judged} more were not judged by one"
+    if seen > unsafe:
+        said += f", and {seen - unsafe} of these lay beyond it by the odometer"
+    return f"{said}."
