@@ -21,7 +21,7 @@ from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from pipeline.statistics import threshold_factor
 from pipeline.timeline import Flags, held_s, uptime
 from schemas.config import Configuration
-from schemas.enums import Evidence, MonitorState, RunStatus, Verdict
+from schemas.enums import TRUTH, Evidence, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
 
 COMPARISON = "channel"
@@ -136,16 +136,17 @@ def _solution(
 
 
 def _one_per_fault(hazards: pl.DataFrame) -> pl.DataFrame:
-    """`begin, failure, end` [ns] and `budget_s`; the rows of one fault, and those that its end made, are one."""
+    """`begin, failure, end` [ns], `budget_s` and `with_truth`; rows of one fault, and those its end made, are one."""
     instants = [pl.col(name).to_physical() for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
     return (
         hazards.filter(pl.col("caused_by").is_null())
-        .select(*instants, "budget_s")
+        .select(*instants, "budget_s", with_truth=pl.col("evidence").is_in(TRUTH))
         .group_by(begin=pl.coalesce("t_onset", "t_hazard"), maintain_order=True)
         .agg(
             failure=pl.col("t_failure").min(),
             end=pl.when(pl.col("t_end").is_null().any()).then(None).otherwise(pl.col("t_end").max()),
             budget_s=pl.col("budget_s").first(),
+            with_truth=pl.col("with_truth").all(),
         )
     )
 
@@ -227,18 +228,20 @@ def _redundant(one: _Channel, other: _Channel) -> Working:
 
 def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel, config: Configuration) -> Faults:
     """`others`: faults of the other solution, so that common ones can be told apart."""
-    hazards = failures = missed = common = common_missed = 0
+    hazards = failures = missed = common = common_missed = judged = missed_judged = 0
     delays: list[float] = []
-    for begin, failure, end, budget_s in faults.select("begin", "failure", "end", "budget_s").iter_rows():
+    columns = ("begin", "failure", "end", "budget_s", "with_truth")
+    for begin, failure, end, budget_s, with_truth in faults.select(columns).iter_rows():
         last = int(channel.clock.t_ns[-1]) if end is None else end
         detected = _detected_ns(channel.fails, begin, last)
         late = failure is not None and _is_late(detected, failure, budget_s, channel, config)
         shared = failure is not None and others is not None and _overlaps(others, begin, last)
         hazards, failures, missed = hazards + 1, failures + (failure is not None), missed + late
         common, common_missed = common + shared, common_missed + (shared and late)
+        judged, missed_judged = judged + (failure is not None and with_truth), missed_judged + (late and with_truth)
         if detected is not None:
             delays.append((detected - begin) / 1e9)
-    return Faults(hazards, failures, missed, common, common_missed, tuple(delays))
+    return Faults(hazards, failures, missed, common, common_missed, tuple(delays), judged, missed_judged)
 
 
 def _detected_ns(fails: Fails, begin: int, last: int) -> int | None:

@@ -26,7 +26,9 @@ def columns_of(name: str, estimate: Estimate, unit: str = "") -> Row:
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults of the position and what became of them; `common`: the other solution had one at the same time."""
+    """Faults of the position and what became of them; `common`: the other solution had one at the same time; `judged`:
+    failures that a reference or balise reads tell.
+    """
 
     hazards: int = 0
     failures: int = 0
@@ -34,6 +36,8 @@ class Faults:
     common: int = 0
     common_missed: int = 0
     time_to_detect_s: tuple[float, ...] = ()
+    judged: int = 0
+    missed_judged: int = 0
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,9 @@ def _fault_columns(faults: Faults | None) -> Row:
         "detected": len(detected),
         "failures": faults.failures,
         "missed": faults.missed,
-        **columns_of("missed_share", clopper_pearson(faults.missed, faults.failures)),
+        "failures_judged": faults.judged,
+        "missed_judged": faults.missed_judged,
+        **columns_of("missed_share", clopper_pearson(faults.missed_judged, faults.judged)),
         "common_failures": faults.common,
         "common_missed": faults.common_missed,
         "time_to_detect_median_s": float(np.median(detected)) if detected else None,

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, REDUNDANT, side_by_side, side_by_side_table
 from pipeline.safety.tally import Alarms, Faults, Tally, Working
+from pipeline.statistics import clopper_pearson
 from schemas.config import Configuration, HazardConfig
 from schemas.tables import Runs
 from tests.summary.tables import NS, alarms, epochs, hazards, table
@@ -101,6 +102,17 @@ class TestFaults:
         assert [found[name, COMPOSITE]["common_failures"] for name in ("gps", "galileo")] == [0, 0]
         assert [found[name, COMPOSITE]["missed"] for name in ("gps", "galileo")] == [0, 0]
         assert [found[name, REACTIVE]["missed"] for name in ("gps", "galileo")] == [1, 1]
+
+    def test_the_odometer_alone_judges_no_share(self) -> None:
+        gps, galileo = solution("gps", during(50, 69, 40.0)), solution("galileo")
+        faults = rows_of(fault("gps", 50, 50, 70), fault("gps", 100, 100, 120))
+        seen = pl.Series("evidence", ["odometer", "reference"]).cast(faults.schema["evidence"])
+        row = compared(gps, galileo, faults=faults.with_columns(seen))["gps", REACTIVE]
+        assert (row["failures"], row["missed"], row["failures_judged"], row["missed_judged"]) == (2, 2, 1, 1)
+        assert row["missed_share_low"] == clopper_pearson(1, 1).low
+        blind = faults.with_columns(pl.lit("odometer", faults.schema["evidence"]).alias("evidence"))
+        row = compared(gps, galileo, faults=blind)["gps", REACTIVE]
+        assert (row["missed"], row["missed_share"]) == (2, None)
 
     @pytest.mark.parametrize(("failing", "missed"), [(108, 0), (109, 1)])
     def test_missed_is_later_than_the_budget(self, failing: int, missed: int) -> None:
