@@ -25,8 +25,10 @@ from schemas.config import MatchingConfig
 _FLOOR_M = 0.02
 _TABLE_FLOOR_M = 0.1
 # An offset outside this many sigmas, and the scale of outliers, lasts for this long [s]: being off costs by the time.
+# Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_SIGMAS = 5.0
 _OFF_S = 8.0
+_OFF_WANDER = 0.01
 _HEADING_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
@@ -66,15 +68,16 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     new_track = -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
     floor_m = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M)
     fresh = np.clip(gnss_m2 * renewed + survey**2 * new_track, np.minimum(floor_m**2, variance), variance)
+    off = candidates.distance_m > np.maximum(_OFF_SIGMAS * np.sqrt(variance), config.outlier_scale_m)
     heading = _heading(steps, candidates, config)
     return Likelihood(
         variance_m2=variance,
-        fresh_m2=fresh,
+        fresh_m2=fresh + _wander_m2(candidates, off, config),
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
         keep=np.sqrt(1.0 - gnss_m2 * renewed / variance),
         fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2, config)
         + heading * fresh / variance
-        - _time_off(steps, candidates, variance, config),
+        - _time_off(steps, candidates, off, config),
         heading=heading,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
@@ -103,15 +106,26 @@ def _wide(off_m: Floats, scale_m: float) -> Floats:
     return np.asarray(-np.log(np.pi * scale_m * (1.0 + (off_m / scale_m) ** 2)))
 
 
-def _time_off(steps: Steps, candidates: Candidates, variance_m2: Floats, config: MatchingConfig) -> Floats:
+def _wander_m2(candidates: Candidates, off: Bools, config: MatchingConfig) -> Floats:
+    """What the offset changes besides where a position is off every element: that much of the distance to the nearest.
+
+    A lost position drifts by metres in seconds, whatever it says of itself; how it moves is weak evidence. It is the
+    same for all elements, so none is preferred for explaining noise.
+    """
+    begin = candidates.first[:-1]
+    nearest_m = np.minimum.reduceat(candidates.distance_m, begin)[candidates.step]
+    lost = np.logical_and.reduceat(off, begin)[candidates.step]
+    return np.where(lost, (_OFF_WANDER * nearest_m) ** 2, 0.0)
+
+
+def _time_off(steps: Steps, candidates: Candidates, off: Bools, config: MatchingConfig) -> Floats:
     """Cost of a position that lies off the element by what no error explains, by how long it does.
 
     Otherwise a constant offset is paid for once, and a run whose positions are elsewhere for a minute, which is paid
     for twice, would be put on a track far beside for all of it.
     """
-    limit_m = np.maximum(_OFF_SIGMAS * np.sqrt(variance_m2), config.outlier_scale_m)
     elapsed_s = np.minimum(np.nan_to_num(steps.elapsed_s[candidates.step]), config.step_time_s)
-    return np.where(candidates.distance_m > limit_m, elapsed_s / _OFF_S, 0.0)
+    return np.where(off, elapsed_s / _OFF_S, 0.0)
 
 
 def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:

@@ -16,10 +16,10 @@ from pipeline.matching.fixes import Fixes
 from pipeline.odometer import odometer_track
 from schemas.config import MatchingConfig
 
-# No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s), none gains speed
-# faster (1.5 m/s² is much), and how fast it was is told by the positions of these last seconds.
+# No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s), none speeds up, brakes
+# or turns faster (3 m/s² is much), and how fast it was is told by the positions of these last seconds.
 _TOP_SPEED_MPS = 100.0
-_MOST_GAIN_MPS2 = 5.0
+_MOST_CHANGE_MPS2 = 5.0
 _SPEED_SPAN_S = (1.0, 5.0)
 # How far odometer and GNSS may differ over a step before it counts as a jump: share, and standard deviations.
 _ODOMETER_SHARE = 0.05
@@ -90,11 +90,12 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
     """
     rows = np.flatnonzero(usable)
     believed = np.ones(len(rows), dtype=bool)
-    speed_mps = _speeds_mps(fixes, rows)
     t_s = fixes.t_s[rows]
+    since = _second_before(t_s)
 
     def reachable(before: Ints, after: Ints) -> Bools:
-        return _reachable(fixes, rows[before], rows[after], speed_mps[before], way) | (
+        velocity = _velocity_mps(fixes, rows, since[before], before)
+        return _reachable(fixes, rows[before], rows[after], velocity, way) | (
             t_s[after] - t_s[before] > config.jump_hold_s
         )
 
@@ -108,7 +109,12 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
         found = np.flatnonzero(reachable(np.full(len(later), last), later))
         again = int(later[found[0]]) if len(found) else len(rows)
         believed[last + 1 : again] = False
-        doubtful = doubtful[doubtful >= again]
+        # What is not believed tells no speed of the epochs after it.
+        near = number[again : int(np.searchsorted(since, again))]
+        since[near] = np.minimum(since[near], last)
+        pairs = near[near < len(rows) - 1]
+        doubt = pairs[~reachable(pairs, pairs + 1)]
+        doubtful = np.concatenate([doubt, doubtful[doubtful >= again + len(near)]])
     return rows[believed]
 
 
@@ -123,33 +129,50 @@ def out_of_reach(fixes: Fixes, believed: Ints, way: Travelled, config: MatchingC
     beyond[believed] = False
     again = np.flatnonzero(np.diff(np.searchsorted(usable, believed)) > 1) + 1
     last = np.searchsorted(usable, believed[again]) - 1
-    stayed = _reachable(fixes, usable[last], believed[again], _speeds_mps(fixes, usable)[last], way)
+    stayed = _reachable(fixes, usable[last], believed[again], _velocity_away(fixes, usable, believed, again), way)
     for begin in fixes.t_s[believed[again[stayed]]].tolist():
         beyond |= (fixes.t_s >= begin) & (fixes.t_s < begin + config.jump_hold_s)
     return np.asarray(beyond & fixes.valid & ~np.isfinite(way.distance_m))
 
 
-def _speeds_mps(fixes: Fixes, rows: Ints) -> Floats:
-    """Speed at epochs by their own positions over the last second or so, NaN where those do not say."""
-    t_s = fixes.t_s[rows]
-    before = np.searchsorted(t_s, t_s - _SPEED_SPAN_S[0], side="right") - 1
-    elapsed = t_s - t_s[before]
-    apart = np.linalg.norm(fixes.points.surface[rows] - fixes.points.surface[rows[before]], axis=1)
-    known = (before >= 0) & (elapsed >= _SPEED_SPAN_S[0]) & (elapsed <= _SPEED_SPAN_S[1])
-    return np.where(known, apart / np.where(known, elapsed, 1.0), np.nan)
+def _velocity_away(fixes: Fixes, usable: Ints, believed: Ints, again: Ints) -> Floats:
+    """Velocity before epochs that are believed again, by the positions that were not, else by those before them."""
+    away = np.searchsorted(usable, believed[again]) - 1
+    since = _second_before(fixes.t_s[usable])[away]
+    own = _velocity_mps(fixes, usable, since, away)
+    own[usable[np.maximum(since, 0)] <= believed[again - 1]] = np.nan
+    before = _velocity_mps(fixes, believed, _second_before(fixes.t_s[believed])[again - 1], again - 1)
+    return np.where(np.isfinite(own), own, before)
 
 
-def _reachable(fixes: Fixes, rows: Ints, others: Ints, speed_mps: Floats, way: Travelled) -> Bools:
-    """Whether the train can have been at the positions of both epochs, by odometer or else by its speed."""
-    apart = np.linalg.norm(fixes.points.surface[others] - fixes.points.surface[rows], axis=1)
+def _second_before(t_s: Floats) -> Ints:
+    """Per time the number of the last one at least a second before, -1 without one."""
+    return np.searchsorted(t_s, t_s - _SPEED_SPAN_S[0], side="right") - 1
+
+
+def _velocity_mps(fixes: Fixes, rows: Ints, since: Ints, until: Ints) -> Floats:
+    """Mean velocity between numbers of `rows`, one vector each, NaN where they are too far apart to say."""
+    begin, end = rows[np.maximum(since, 0)], rows[until]
+    elapsed = np.where(since >= 0, fixes.t_s[end] - fixes.t_s[begin], np.nan)
+    elapsed[elapsed > _SPEED_SPAN_S[1]] = np.nan
+    return np.asarray((fixes.points.surface[end] - fixes.points.surface[begin]) / elapsed[:, None])
+
+
+def _reachable(fixes: Fixes, rows: Ints, others: Ints, velocity_mps: Floats, way: Travelled) -> Bools:
+    """Whether the train can have been at the positions of both epochs, by odometer or else by its velocity.
+
+    Without an odometer a position that falls back is as far from where the train was heading as one that runs ahead.
+    """
+    moved = fixes.points.surface[others] - fixes.points.surface[rows]
     elapsed = fixes.t_s[others] - fixes.t_s[rows]
-    moved = np.abs(way.between(rows, others))
+    apart = np.linalg.norm(moved, axis=1)
+    aside = np.linalg.norm(moved - velocity_mps * elapsed[:, None], axis=1)
+    by_odometer = np.abs(way.between(rows, others))
     variance = 0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)
-    sigma = np.sqrt(variance[rows]) + np.sqrt(variance[others])
-    fastest = np.fmin(speed_mps + _MOST_GAIN_MPS2 * elapsed, _TOP_SPEED_MPS)
-    limit = np.where(np.isfinite(moved), moved * (1 + _ODOMETER_SHARE), elapsed * fastest)
-    limit += _JUMP_MARGIN_M + _JUMP_SIGMAS * sigma
-    return np.asarray(apart <= limit)
+    margin = _JUMP_MARGIN_M + _JUMP_SIGMAS * (np.sqrt(variance[rows]) + np.sqrt(variance[others]))
+    heading_there = (apart <= elapsed * _TOP_SPEED_MPS + margin) & ~(aside > _MOST_CHANGE_MPS2 * elapsed**2 + margin)
+    counted = apart <= by_odometer * (1 + _ODOMETER_SHARE) + margin
+    return np.asarray(np.where(np.isfinite(by_odometer), counted, heading_there))
 
 
 def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:

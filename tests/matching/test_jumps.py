@@ -117,3 +117,21 @@ def test_a_track_far_beside_is_paid_for_by_the_time_on_it() -> None:
     found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
     assert found.path.elements() == ["a", "b"]
     assert found.epochs["path_probability"][200] > 0.99
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_how_a_lost_position_moves_does_not_choose_between_parallel_tracks(seed: int) -> None:
+    """For a minute the positions are 100 m off and wander as the other track bends, 5 m beside all else of the run."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(20.0, 1980.0, 4.9)
+
+    def bend(at_m: np.ndarray) -> np.ndarray:
+        return 6.0 * np.sin(np.pi * np.clip((at_m - 755.0) / 735.0, 0.0, 1.0)) ** 2
+
+    along = np.linspace(0.0, 2000.0, 201)
+    place = site({"a": line((0, 0), (2000, 0)), "b": np.column_stack([along, 5.0 + bend(along)])}, sigma_m=None)
+    y = 0.05 * rng.normal(size=len(x))
+    y[150:300] += 100.0 + bend(x[150:300])
+    found = matched(run(x, y, 2.5, sigma_m=None, fix=["rtk_fixed"] * len(x)), place)
+    assert found.path.elements() == ["a"]
+    assert found.epochs["gate_probability"].to_numpy()[-8:].min() > 0.5
