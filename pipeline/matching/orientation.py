@@ -29,8 +29,12 @@ def grows_with(position_m: Floats, epoch: Ints, way: Travelled, distance_m: floa
 
 def _moved_by_odometer(position_m: Floats, rows: Ints, way: Travelled, distance_m: float) -> float | None:
     """Median displacement while the odometer covered the distance, none where it did not or is not known."""
-    start = np.full(len(rows), rows[0])
-    since = way.between(start, rows)
+    known = np.isfinite(way.distance_m[rows])
+    if not known.any():
+        return None
+    since = way.between(np.full(len(rows), rows[known][0]), rows)
+    known = np.isfinite(since)
+    position_m, rows, since = position_m[known], rows[known], since[known]
     covered = np.flatnonzero(np.abs(since) >= distance_m)
     if len(covered) == 0:
         return None

@@ -25,7 +25,7 @@ _SPEED_SPAN_S = (1.0, 5.0)
 _ODOMETER_SHARE = 0.05
 _JUMP_SIGMAS = 5.0
 _JUMP_MARGIN_M = 10.0
-# A pause in an odometer of speeds alone that is longer loses the way.
+# Inside a pause of the odometer that is longer the way is not known; of speeds alone it is lost.
 ODOMETER_GAP_S = 1.0
 
 
@@ -49,7 +49,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Travelled:
-    """Odometer distance at each epoch [m], NaN outside its span; comparable within one `stretch` only."""
+    """Odometer distance at each epoch [m], NaN where it is not known; comparable within one `stretch` only."""
 
     distance_m: Floats
     stretch: Ints
@@ -66,8 +66,7 @@ def travelled(fixes: Fixes, odometer: pl.DataFrame | None) -> Travelled:
         return Travelled(np.full(len(fixes), np.nan), np.zeros(len(fixes), dtype=np.int64))
     track = odometer_track(odometer, gap_s=ODOMETER_GAP_S, sigma_mps=1.0)
     t_s = track.seconds(fixes.t_ns)
-    inside = (t_s >= track.t_s[0]) & (t_s <= track.t_s[-1])
-    return Travelled(np.where(inside, track.distance_at(t_s), np.nan), track.stretch_at(t_s))
+    return Travelled(np.where(track.known_at(t_s), track.distance_at(t_s), np.nan), track.stretch_at(t_s))
 
 
 def steps_of(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Steps:
@@ -125,14 +124,22 @@ def out_of_reach(fixes: Fixes, believed: Ints, way: Travelled, config: MatchingC
     position is taken for the train's before `jump_hold_s` have passed.
     """
     usable = np.flatnonzero(fixes.valid)
-    beyond = np.ones(len(fixes), dtype=bool)
-    beyond[believed] = False
+    away = np.setdiff1d(usable, believed)
+    beyond = np.zeros(len(fixes), dtype=bool)
+    beyond[away] = _no_way(way, believed[np.searchsorted(believed, away) - 1], away)
     again = np.flatnonzero(np.diff(np.searchsorted(usable, believed)) > 1) + 1
     last = np.searchsorted(usable, believed[again]) - 1
     stayed = _reachable(fixes, usable[last], believed[again], _velocity_away(fixes, usable, believed, again), way)
-    for begin in fixes.t_s[believed[again[stayed]]].tolist():
-        beyond |= (fixes.t_s >= begin) & (fixes.t_s < begin + config.jump_hold_s)
-    return np.asarray(beyond & fixes.valid & ~np.isfinite(way.distance_m))
+    for number in again[stayed].tolist():
+        begin_s = fixes.t_s[believed[number]]
+        held = np.flatnonzero(fixes.valid & (fixes.t_s >= begin_s) & (fixes.t_s < begin_s + config.jump_hold_s))
+        beyond[held] |= _no_way(way, np.full(len(held), believed[number - 1]), held)
+    return beyond
+
+
+def _no_way(way: Travelled, rows: Ints, others: Ints) -> Bools:
+    """No odometer tells the way between epochs."""
+    return ~np.isfinite(way.between(rows, others))
 
 
 def _velocity_away(fixes: Fixes, usable: Ints, believed: Ints, again: Ints) -> Floats:
