@@ -15,7 +15,7 @@ from pipeline.matching.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.segments import Feet, no_feet
-from pipeline.matching.steps import believable, out_of_reach, travelled
+from pipeline.matching.steps import travelled
 from pipeline.track import Track
 from schemas.config import MatchingConfig
 from schemas.enums import Navigability
@@ -34,8 +34,7 @@ def path_on_chain(
     position[known] = np.where(near, path_at(leg, feet), np.nan)
     used = leg.visit[feet.segment[near]]
     part = slice(int(used.min()), int(used.max()) + 1)
-    way = travelled(fixes, odometer)
-    forward = grows_with(position, np.arange(len(fixes)), way, config.orientation_distance_m)
+    forward = grows_with(position, np.arange(len(fixes)), travelled(fixes, odometer), config.orientation_distance_m)
     if forward and len(leg.visits[part]) == len(leg.visits):
         covered = leg
     else:
@@ -44,10 +43,7 @@ def path_on_chain(
     everywhere = no_feet(len(fixes))
     everywhere.put(known, feet)
     ones, zeros = np.ones(len(fixes)), np.zeros(len(fixes), dtype=np.int64)
-    found = Assignment(zeros, None, ones, ones, everywhere)
-    if not np.isfinite(way.distance_m).all():
-        found = found.without_gate(out_of_reach(fixes, believable(fixes, fixes.valid, way, config), way, config))
-    return TravelledPath(track, (covered,)), found
+    return TravelledPath(track, (covered,)), Assignment(zeros, None, ones, ones, everywhere)
 
 
 def turned(visits: Sequence[Visit]) -> list[Visit]:

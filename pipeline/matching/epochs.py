@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.geodesy import Bools, Floats, Ints
+from pipeline.geodesy import Floats, Ints
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.leg import segments_at
 from pipeline.matching.path import TravelledPath
@@ -32,10 +32,6 @@ class Assignment:
     path_probability: Floats
     gate_probability: Floats
     feet: Feet | None = None
-
-    def without_gate(self, rows: Bools) -> Assignment:
-        """As before, some epochs not to be trusted."""
-        return replace(self, gate_probability=np.where(rows, 0.0, self.gate_probability))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.search import search
-from pipeline.matching.steps import Steps, Travelled, believable, out_of_reach, resumed, steps_of, travelled
+from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from pipeline.track import end_places
 from schemas.config import MatchingConfig
@@ -60,7 +60,6 @@ def find_path(
     doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
-    assignment = assignment.without_gate(out_of_reach(fixes, believed, way, config))
     return path, assignment, stretches(fixes, trellis, found, doubt, config)
 
 

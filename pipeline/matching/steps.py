@@ -117,41 +117,6 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
     return rows[believed]
 
 
-def out_of_reach(fixes: Fixes, believed: Ints, way: Travelled, config: MatchingConfig) -> Bools:
-    """Positions where the train cannot be, and no odometer by which the monitors along the track would say so.
-
-    After a jump that lasts until the train could have got there, nothing tells which side of it was wrong: no
-    position is taken for the train's before `jump_hold_s` have passed.
-    """
-    usable = np.flatnonzero(fixes.valid)
-    away = np.setdiff1d(usable, believed)
-    beyond = np.zeros(len(fixes), dtype=bool)
-    beyond[away] = _no_way(way, believed[np.searchsorted(believed, away) - 1], away)
-    again = np.flatnonzero(np.diff(np.searchsorted(usable, believed)) > 1) + 1
-    last = np.searchsorted(usable, believed[again]) - 1
-    stayed = _reachable(fixes, usable[last], believed[again], _velocity_away(fixes, usable, believed, again), way)
-    for number in again[stayed].tolist():
-        begin_s = fixes.t_s[believed[number]]
-        held = np.flatnonzero(fixes.valid & (fixes.t_s >= begin_s) & (fixes.t_s < begin_s + config.jump_hold_s))
-        beyond[held] |= _no_way(way, np.full(len(held), believed[number - 1]), held)
-    return beyond
-
-
-def _no_way(way: Travelled, rows: Ints, others: Ints) -> Bools:
-    """No odometer tells the way between epochs."""
-    return ~np.isfinite(way.between(rows, others))
-
-
-def _velocity_away(fixes: Fixes, usable: Ints, believed: Ints, again: Ints) -> Floats:
-    """Velocity before epochs that are believed again, by the positions that were not, else by those before them."""
-    away = np.searchsorted(usable, believed[again]) - 1
-    since = _second_before(fixes.t_s[usable])[away]
-    own = _velocity_mps(fixes, usable, since, away)
-    own[usable[np.maximum(since, 0)] <= believed[again - 1]] = np.nan
-    before = _velocity_mps(fixes, believed, _second_before(fixes.t_s[believed])[again - 1], again - 1)
-    return np.where(np.isfinite(own), own, before)
-
-
 def _second_before(t_s: Floats) -> Ints:
     """Per time the number of the last one at least a second before, -1 without one."""
     return np.searchsorted(t_s, t_s - _SPEED_SPAN_S[0], side="right") - 1
