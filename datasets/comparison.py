@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import timedelta
 
@@ -129,17 +129,13 @@ def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:
 
 
 def _balises(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
-    """The status that all rows of a balise have, or all that occur; for some balises that there is one row only."""
+    """The status that all rows of a balise have, and for some balises that there is one row only."""
     statuses = {
         str(balise): _one_of(rows["status"].to_list())
         for (balise,), rows in found.group_by(["balise_id"], maintain_order=True)
     }
-    wanted = {
-        balise: _one_of([status] if isinstance(status, str) else list(status))
-        for balise, status in expected.passages.items()
-    }
-    balises = sorted({*wanted, *statuses})
-    pairs = [(balise, wanted.get(balise, _NOTHING), statuses.get(balise, _NOTHING)) for balise in balises]
+    balises = sorted({*expected.passages, *statuses})
+    pairs = [(b, str(expected.passages.get(b, _NOTHING)), statuses.get(b, _NOTHING)) for b in balises]
     many = found["balise_id"].value_counts().filter(pl.col("count") > 1)["balise_id"].to_list()
     repeated = sorted(set(many) & set(expected.once))
     if expected.once:
@@ -175,6 +171,6 @@ def _scale(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     return [("odometer scale", text, text if near else str(scale))]
 
 
-def _one_of(values: Sequence[str]) -> str:
+def _one_of(values: list[str]) -> str:
     """The value that all have, or all values that occur."""
     return " ".join(sorted(set(values))) or _NOTHING

@@ -26,13 +26,12 @@ class ExpectedHazard(Settings):
 class ExpectedRun(Settings):
     """What must be found in one run: all hazards in order, the status of each balise on the path, alarms.
 
-    `passages` names for each balise the status of all its rows, or those that occur; `once` are balises with exactly
-    one row.
+    `passages` names for each balise the status of all its rows; `once` are balises with exactly one row.
     `alarms`: `none`, `true` (at least one, none of them false) or `false` (at least one, all of them false).
     """
 
     hazards: tuple[ExpectedHazard, ...] = ()
-    passages: dict[str, PassageStatus | tuple[PassageStatus, ...]]
+    passages: dict[str, PassageStatus]
     once: tuple[str, ...] = ()
     alarms: Annotated[str, Field(pattern=r"^(none|true|false)$")] = "none"
     suspect: str | None = None
