@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.align import align, odometer_at
+from pipeline.alignment.align import align, odometer_at
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.align import odometer_at
+from pipeline.alignment.align import odometer_at
 from pipeline.geodesy import Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import BaliseKind

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.odometer import OdometerTrack
+from pipeline.alignment.odometer import OdometerTrack
 
 Array = npt.NDArray[np.float64]
 

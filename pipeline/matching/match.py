@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
+from pipeline.alignment.odometer import odometer_track, polarity
 from pipeline.geodesy import Ints
 from pipeline.matching.chain import path_on_chain, whole_chain
 from pipeline.matching.doubt import no_doubt
@@ -20,7 +21,6 @@ from pipeline.matching.path import TravelledPath
 from pipeline.matching.residuals import biases
 from pipeline.matching.route import network_along, visits_of
 from pipeline.matching.steps import ODOMETER_GAP_S
-from pipeline.odometer import odometer_track, polarity
 from pipeline.track import Track, track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.alignment.odometer_filter import error_model
 from pipeline.monitors.axis import AlongSteps, AxisSeries, Mask, along_axis, calibrated, decorrelation_of, with_memory
 from pipeline.monitors.recursion import Array
-from pipeline.odometer_filter import error_model
 from schemas.config import Configuration
 
 NO_POSITION = "no position"

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at
+from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at
 from pipeline.monitors.bank import MonitorBank
 from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.alignment.odometer import OdometerTrack
+from pipeline.alignment.odometer_filter import error_model
 from pipeline.calibration.vehicle import Observations, estimate_run, pooled
-from pipeline.odometer import OdometerTrack
-from pipeline.odometer_filter import error_model
 from schemas.config import MonitorConfig
 
 SHARES, TAUS_S = error_model(MonitorConfig())

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.align import NO_ODOMETER, align
+from pipeline.alignment.align import NO_ODOMETER, align
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
 from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged

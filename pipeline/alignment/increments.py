@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.alignment.odometer import OdometerTrack
+from pipeline.alignment.odometer_filter import Estimate, error_model
 from pipeline.monitors.axis import AlongSteps, AxisSeries, along_axis
 from pipeline.monitors.recursion import Array
-from pipeline.odometer import OdometerTrack
-from pipeline.odometer_filter import Estimate, error_model
 from schemas.config import Configuration
 
 Index = npt.NDArray[np.int64]

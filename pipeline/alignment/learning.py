@@ -7,11 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.increments import EpochArrays, Index, Learned, along_series, odometer_steps
-from pipeline.monitors.axis import AxisSeries, run_axis
-from pipeline.monitors.recursion import Array, AxisState
-from pipeline.odometer import OdometerTrack
-from pipeline.odometer_filter import (
+from pipeline.alignment.increments import EpochArrays, Index, Learned, along_series, odometer_steps
+from pipeline.alignment.odometer import OdometerTrack
+from pipeline.alignment.odometer_filter import (
     SPEED_SPAN_S,
     Estimate,
     FilterState,
@@ -20,6 +18,8 @@ from pipeline.odometer_filter import (
     estimates_of,
     prior_of,
 )
+from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.monitors.recursion import Array, AxisState
 from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 

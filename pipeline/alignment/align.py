@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.increments import EpochArrays, Learned, Mask, odometer_steps, stamp_jitter_s
-from pipeline.learning import learn
+from pipeline.alignment.increments import EpochArrays, Learned, Mask, odometer_steps, stamp_jitter_s
+from pipeline.alignment.learning import learn
+from pipeline.alignment.odometer import OdometerTrack, odometer_track, polarity
+from pipeline.columns import floats
 from pipeline.monitors.axis import calibrated
 from pipeline.monitors.recursion import Array
-from pipeline.odometer import OdometerTrack, odometer_track, polarity
 from schemas.config import Configuration, Vehicle
 
 NO_ODOMETER = "no odometer"
@@ -29,12 +30,12 @@ def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle,
     sigma_mps = config.monitors.odometer_sigma_mps
     track = odometer_track(odometer, config.align.odometer_gap_s, sigma_mps)
     t_s = track.seconds(epochs["t"].dt.timestamp("ns").to_numpy())
-    path_m = _floats(epochs["path_m"])
+    path_m = floats(epochs, "path_m")
     matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy() & np.isfinite(path_m)
     sign = polarity(track, t_s, np.where(matched, path_m, np.nan), config.matching.orientation_distance_m)
     track = track.oriented(sign)
     along_m = unrolled(epochs, matched)
-    sigma_m = calibrated(_floats(epochs["sigma_along_m"]), config.monitors)
+    sigma_m = calibrated(floats(epochs, "sigma_along_m"), config.monitors)
     arrays = EpochArrays(t_s, along_m, sigma_m, matched, stamp_jitter_s(t_s))
     learned = learn(arrays, track, vehicle, config)
     return epochs.with_columns(
@@ -50,8 +51,8 @@ def unrolled(epochs: pl.DataFrame, matched: Mask) -> Array:
     """
     along = np.full(matched.size, np.nan)
     rows = np.flatnonzero(matched)
-    path_m = _floats(epochs["path_m"])[rows]
-    beside = np.nan_to_num(_floats(epochs["curvature_per_m"])[rows] * _floats(epochs["cross_track_m"])[rows])
+    path_m = floats(epochs, "path_m")[rows]
+    beside = np.nan_to_num(floats(epochs, "curvature_per_m")[rows] * floats(epochs, "cross_track_m")[rows])
     along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
     return along
 
@@ -65,22 +66,16 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometer: pl.DataFrame,
     if anchors.is_empty():
         return pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
     track = odometer_track(odometer, config.align.odometer_gap_s, config.monitors.odometer_sigma_mps)
-    anchor_s = track.seconds(anchors["t"].dt.timestamp("ns").to_numpy()) - _floats(anchors["latency_s"])
-    travelled = _floats(anchors["odometer_m"])
+    anchor_s = track.seconds(anchors["t"].dt.timestamp("ns").to_numpy()) - floats(anchors, "latency_s")
+    travelled = floats(anchors, "odometer_m")
     forward = np.sum(np.diff(travelled) * np.diff(track.distance_at(anchor_s)))
     track = track.oriented(-1 if forward < 0 else 1)
     at_s = track.seconds(times.dt.timestamp("ns").to_numpy())
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
     way = track.distance_at(at_s) - track.distance_at(anchor_s[near])
     known = track.known_at(at_s) & (track.stretch_at(at_s) == track.stretch_at(anchor_s[near]))
-    distance = np.where(known, travelled[near] + _floats(anchors["odometer_scale"])[near] * way, np.nan)
+    distance = np.where(known, travelled[near] + floats(anchors, "odometer_scale")[near] * way, np.nan)
     return pl.Series("odometer_m", distance, nan_to_null=True)
-
-
-def _floats(series: pl.Series) -> Array:
-    """A nullable float column as an array with NaN for null."""
-    values: Array = series.to_numpy().astype(np.float64)
-    return values
 
 
 def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration) -> list[pl.Series]:
@@ -127,8 +122,8 @@ def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configurat
     t_s = epochs["t"].dt.timestamp("ns").to_numpy() * 1e-9
     t_s = t_s - t_s[0]
     valid = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
-    by_position = speed_of_positions(t_s, np.where(valid, _floats(epochs["path_m"]), np.nan))
-    by_doppler = _floats(epochs["velocity_along_mps"])
+    by_position = speed_of_positions(t_s, np.where(valid, floats(epochs, "path_m"), np.nan))
+    by_doppler = floats(epochs, "velocity_along_mps")
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
     return epochs.with_columns(

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.odometer import OdometerTrack
+from pipeline.alignment.odometer import OdometerTrack
 from schemas.config import AlignConfig, MonitorConfig, Vehicle
 
 Array = npt.NDArray[np.float64]
