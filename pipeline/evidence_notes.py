@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import polars as pl
 
-from schemas.enums import Evidence
+from pipeline.alignment.align import INTERRUPTED, NO_ODOMETER
+from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 _BALISE = (
     "evidence balise: reads carried on by the odometer; unless Doppler velocity sides with the position, a slip or "
@@ -23,6 +24,10 @@ _SMOOTHED = "evidence odometer, smoothed from the position itself: slow errors t
 _NOTHING = "no evidence for {share:.0%} of the positions: their errors are not known"
 _DRIFT = "a slow drift of the position and a change of the odometer's scale look alike"
 _NO_DOPPLER = "without GNSS velocity nothing tells a fault of the position from one of the odometer"
+_UNDIAGNOSED = (
+    "virtual balises accepted without diagnosis along the track: {count} ({reason}); a jump or drift along it is not "
+    "seen there"
+)
 
 
 def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame, failure_limit_m: float) -> tuple[str, ...]:
@@ -84,3 +89,20 @@ def return_notes(epochs: pl.DataFrame, hazards: pl.DataFrame, failure_limit_m: f
                 f"{again.height} epochs beyond {failure_limit_m:.0f} m, up to {largest_m:.0f} m"
             )
     return tuple(notes)
+
+
+def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> tuple[str, ...]:
+    """Virtual balises that were accepted while no odometer could contradict the position.
+
+    `epochs`: monitored, in order of time; `passages`: of the same solution.
+    """
+    accepted = passages.filter(
+        (pl.col("kind") == BaliseKind.VIRTUAL.value) & (pl.col("status") == PassageStatus.ACCEPTED.value)
+    )
+    offers = accepted.select(pl.col("t_offered").drop_nulls().sort())
+    judged = offers.join_asof(
+        epochs.select("t", "along_raw_reason"), left_on="t_offered", right_on="t", strategy="forward"
+    )
+    reasons = judged["along_raw_reason"]
+    counts = [(reason, (reasons == reason).sum()) for reason in (NO_ODOMETER, INTERRUPTED)]
+    return tuple(_UNDIAGNOSED.format(reason=reason, count=count) for reason, count in counts if count)

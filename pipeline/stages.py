@@ -9,7 +9,7 @@ import polars as pl
 from pipeline.alignment.align import align, odometer_at
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_two_times
-from pipeline.evidence_notes import evidence_notes, return_notes
+from pipeline.evidence_notes import evidence_notes, return_notes, undiagnosed_notes
 from pipeline.hazards import HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import run_lds
@@ -139,6 +139,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
             *run_notes(run, fixes, found, lds, vehicle),
             *evidence_notes(aligned, truth, config.hazards.failure_limit_m),
             *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
+            *undiagnosed_notes(epochs, result.passages),
         ),
     )
     return _Solution(epochs, result, summarise(results, config, provenance(context.run, context.site, vehicle, config)))

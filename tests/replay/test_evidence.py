@@ -67,6 +67,25 @@ def test_odometer_alone_does_not_see_an_offset_within_its_confidence_and_says_so
     assert replay(logs["reference"], site, VEHICLE).runs["notes"].item() is None
 
 
+def test_balises_accepted_while_no_odometer_could_contradict_are_told():
+    run, site = journey(OFFSET)
+    undiagnosed = "virtual balises accepted without diagnosis along the track: "
+    assert undiagnosed not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
+    without = replay(run.with_streams(odometer=None), site, VEHICLE)
+    accepted = without.passages.filter((pl.col("kind") == "virtual") & (pl.col("status") == "accepted"))
+    assert f"{undiagnosed}{accepted.height} (no odometer); a jump" in without.runs["notes"].item()
+    begin = run.odometer["t"][0]
+    pause = pl.col("t").is_between(begin + timedelta(seconds=135), begin + timedelta(seconds=205))
+    paused = replay(run.with_streams(odometer=run.odometer.filter(~pause)), site, VEHICLE)
+    inside = paused.passages.filter(
+        (pl.col("kind") == "virtual")
+        & (pl.col("status") == "accepted")
+        & pl.col("t_offered").is_between(begin + timedelta(seconds=137), begin + timedelta(seconds=205))
+    )
+    assert inside.height > 0
+    assert f"{undiagnosed}{inside.height} (odometer interrupted or slipping); a jump" in paused.runs["notes"].item()
+
+
 @pytest.mark.parametrize("kind", ["reference", "balise", "odometer"])
 def test_slip_is_no_hazard_with_any_evidence(kind):
     run, site = journey(SLIP)
