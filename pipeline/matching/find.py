@@ -146,4 +146,9 @@ def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: D
     exact[steps.epoch] = True
     last = np.maximum(last, 0)
     leg = np.where(exact, decoded.leg[last], decoded.leg[following])
-    return Assignment(leg, at_m[last], doubt.posterior[last], doubt.gate[last])
+    # Until positions are believed again after a jump, steps are hundreds of metres apart: both tell passages apart.
+    begin_s, end_s = fixes.t_s[steps.epoch[last]], fixes.t_s[steps.epoch[following]]
+    elapsed = np.clip(fixes.t_s - begin_s, 0.0, np.maximum(end_s - begin_s, 0.0))
+    share = np.divide(elapsed, end_s - begin_s, out=np.zeros(len(fixes)), where=end_s > begin_s)
+    moved_m = np.where(decoded.leg[last] == decoded.leg[following], at_m[following] - at_m[last], 0.0)
+    return Assignment(leg, at_m[last] + share * moved_m, doubt.posterior[last], doubt.gate[last])

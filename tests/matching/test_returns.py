@@ -76,3 +76,18 @@ def test_a_jump_along_the_way_stays_a_jump() -> None:
     x, y = points[shown.astype(int)].T
     found = matched(run(x, y, RATE_HZ), place_of(points), odometer(at, RATE_HZ))
     assert np.abs(found.epochs["path_m"].to_numpy() - shown).max() < 1.0
+
+
+@pytest.mark.parametrize("back_m", [2560.0, 2600.0, 2640.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_soon_after_a_jump_the_passage_is_told_by_the_steps_on_both_sides(back_m: float, seed: int) -> None:
+    """A wide ramp crosses itself at 700 m and 2714 m; for 200 m the position lies 60 m behind, until shortly before."""
+    points = way((1000, 0), (1414, 270), (900, 0))
+    at = np.arange(20.0, len(points) - 21.0, 4.0)
+    rng = np.random.default_rng(seed)
+    lasting = np.convolve(rng.normal(size=len(at) + 199), np.full(200, 0.05), "valid")
+    shown = at - 60.0 * ((at >= back_m - 200.0) & (at < back_m))
+    x, y = points[shown.astype(int)].T
+    fixes = run(x + lasting, y - lasting[::-1], RATE_HZ, sigma_m=0.7)
+    epochs = matched(fixes, site({"r": points}), odometer(at, RATE_HZ)).epochs
+    assert np.abs(epochs["path_m"].to_numpy() - shown).max() < 8.0
