@@ -141,13 +141,21 @@ def segments_at(leg: Leg, path_m: Floats) -> tuple[Ints, Floats]:
 
 
 def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -> None:
-    inside = np.flatnonzero((leg.path_end_m >= hint_m - HINT_WINDOW_M) & (leg.path_start_m <= hint_m + HINT_WINDOW_M))
-    if len(inside) == 0:
-        return
+    """Of the passages no farther from the hint than the nearest place, the closest to it that is as near the point.
+
+    A position that jumped may lie farther than the window from where it is expected, and on a crossing there.
+    """
+    found_m = float(path_at(leg, feet.take(np.array([row])))[0])
+    reach_m = max(HINT_WINDOW_M, abs(found_m - hint_m))
+    inside = np.flatnonzero((leg.path_end_m >= hint_m - reach_m) & (leg.path_start_m <= hint_m + reach_m))
     trial = on_segments(point.take(np.zeros(len(inside), dtype=np.int64)), leg.line, inside)
-    best = int(np.argmin(trial.distance_m))
-    if trial.distance_m[best] <= feet.distance_m[row] + SAME_PLACE_M:
-        feet.put(np.array([row]), held_to_line(trial.take(np.array([best])), len(leg.line)))
+    same = np.flatnonzero(trial.distance_m <= feet.distance_m[row] + SAME_PLACE_M)
+    if len(same) == 0:
+        return
+    at_m = path_at(leg, trial.take(same))
+    near = same[np.abs(at_m - at_m[np.argmin(np.abs(at_m - hint_m))]) <= HINT_WINDOW_M]
+    best = int(near[np.argmin(trial.distance_m[near])])
+    feet.put(np.array([row]), held_to_line(trial.take(np.array([best])), len(leg.line)))
 
 
 def _returns(line: Polyline, path_start_m: Floats) -> bool:

@@ -91,3 +91,17 @@ def test_soon_after_a_jump_the_passage_is_told_by_the_steps_on_both_sides(back_m
     fixes = run(x + lasting, y - lasting[::-1], RATE_HZ, sigma_m=0.7)
     epochs = matched(fixes, site({"r": points}), odometer(at, RATE_HZ)).epochs
     assert np.abs(epochs["path_m"].to_numpy() - shown).max() < 8.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_jump_over_a_crossing_stays_on_the_passage_that_is_nearer(seed: int) -> None:
+    """The same ramp; from 2400 m on the position lies 250 m ahead for 200 m and so runs over the crossing at 2714 m."""
+    points = way((1000, 0), (1414, 270), (900, 0))
+    at = np.arange(20.0, len(points) - 21.0, 2.0)
+    rng = np.random.default_rng(seed)
+    lasting = np.convolve(rng.normal(size=len(at) + 199), np.full(200, 0.05), "valid")
+    shown = at + 250.0 * ((at >= 2400.0) & (at < 2600.0))
+    x, y = points[shown.astype(int)].T
+    fixes = run(x + lasting, y - lasting[::-1], 10.0, sigma_m=0.7)
+    epochs = matched(fixes, site({"r": points}), odometer(at, 10.0)).epochs
+    assert np.abs(epochs["path_m"].to_numpy() - shown).max() < 8.0
