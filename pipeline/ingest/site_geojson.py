@@ -1,8 +1,8 @@
 """RailTopoModel networks as GeoJSON: net elements are LineStrings, net relations join their ends.
 
-Read as ERA RINF exports and measurement-train networks write it: an element carries `id` or
-`netelement_id`; a relation carries `netelementA`, `positionOnA`, `netelementB`, `positionOnB` and
-`navigability`, or in the words of the ERA vocabulary `elementA`, `isOnOriginOfElementA` and so on. Case and
+Read as ERA RINF exports and measurement-train networks write it: an element carries `id` or `netelement_id`, and
+`sigma_m` where its survey states one; a relation carries `netelementA`, `positionOnA`, `netelementB`, `positionOnB`
+and `navigability`, or in the words of the ERA vocabulary `elementA`, `isOnOriginOfElementA` and so on. Case and
 underscores of property names do not matter.
 """
 
@@ -76,6 +76,7 @@ _TRACK_COLUMNS = {
     "latitude_deg": pl.Float64,
     "longitude_deg": pl.Float64,
     "height_m": pl.Float64,
+    "sigma_m": pl.Float64,
 }
 _LINK_COLUMNS = {
     "netelement_a": pl.String,
@@ -127,9 +128,14 @@ def _add_element(
     if str(name) in lengths:
         breaches.append(f"{place}: net element {name} stands in the file twice")
         return
+    sigma_m = keys.get("sigmam")
+    if isinstance(sigma_m, bool) or not isinstance(sigma_m, int | float | None):
+        breaches.append(f"{place} ({name}): sigma_m {sigma_m!r}; expected a number of metres")
+        return
     declared = _first(keys, _LENGTH_KEYS)
     lengths[str(name)] = float(declared) if isinstance(declared, int | float) else float("nan")
     points["netelement_id"] += [str(name)] * len(triples)
+    points["sigma_m"] += [None if sigma_m is None else float(sigma_m)] * len(triples)
     for column, part in (("longitude_deg", 0), ("latitude_deg", 1), ("height_m", 2)):
         points[column] += [triple[part] for triple in triples]
 

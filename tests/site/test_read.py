@@ -40,6 +40,18 @@ def test_parquet_geojson_and_csv_give_the_same_site(tmp_path: Path) -> None:
     Links.validate(parquet.links)
 
 
+def test_a_net_element_of_geojson_may_state_the_sigma_of_its_survey(tmp_path: Path) -> None:
+    document = builders.geojson()
+    document["features"][0]["properties"]["sigma_m"] = 2
+    track = read_site(builders.write(tmp_path / "g", track=document)).track
+    stated = track.filter(pl.col("netelement_id") == document["features"][0]["properties"]["id"])
+    assert stated["sigma_m"].unique().to_list() == [2.0]
+    assert track["sigma_m"].null_count() == track.height - stated.height
+    for wrong, said in (("2 m", "'2 m'; expected a number"), (True, "True; expected a number"), (-1.0, "sigma_m")):
+        document["features"][0]["properties"]["sigma_m"] = wrong
+        assert said in messages(builders.write(tmp_path / str(wrong), track=document))
+
+
 def test_measures_without_declaration_are_the_geometry(tmp_path: Path) -> None:
     site = read_site(builders.write(tmp_path, track=builders.track(), links=builders.links()))
     part = site.track.filter(pl.col("netelement_id") == "a")["measure_m"].to_list()
