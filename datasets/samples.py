@@ -22,6 +22,7 @@ from pipeline.geodesy import distances_m, points_of
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.conform import conform, rows_text
 from pipeline.ingest.csv_text import read_log_table
+from pipeline.ingest.novatel import FIX_BY_WORD
 from pipeline.ingest.site import read_site
 from pipeline.receivers import Converted
 from pipeline.receivers.csv import CUT_ROW
@@ -48,29 +49,6 @@ _FEWEST_POSES = 2
 _INFRABEL_COLUMNS = ("timestamp", "latitude", "longitude", "solution_status", "position_type")
 # A time cut off before its seconds is another time.
 _TO_THE_SECOND = r"^(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?)$"
-# Position types of NovAtel's receivers, by what the ambiguities rest on; with inertial sensors they begin with INS_.
-_NOVATEL_FIX = {
-    "NONE": Fix.NONE,
-    "FIXEDPOS": Fix.NONE,
-    "DOPPLER_VELOCITY": Fix.NONE,
-    "SINGLE": Fix.AUTONOMOUS,
-    "PSRSP": Fix.AUTONOMOUS,
-    "PSRDIFF": Fix.DIFFERENTIAL,
-    "OMNISTAR": Fix.DIFFERENTIAL,
-    "PPP_CONVERGING": Fix.DIFFERENTIAL,
-    "WAAS": Fix.SBAS,
-    "SBAS": Fix.SBAS,
-    "L1_FLOAT": Fix.RTK_FLOAT,
-    "IONOFREE_FLOAT": Fix.RTK_FLOAT,
-    "NARROW_FLOAT": Fix.RTK_FLOAT,
-    "RTKFLOAT": Fix.RTK_FLOAT,
-    "WIDE_INT": Fix.RTK_FLOAT,
-    "PPP": Fix.RTK_FLOAT,
-    "L1_INT": Fix.RTK_FIXED,
-    "NARROW_INT": Fix.RTK_FIXED,
-    "RTKFIXED": Fix.RTK_FIXED,
-    "PROPAGATED": Fix.ESTIMATED,
-}
 
 
 def known_recording(path: Path) -> Converted | None:
@@ -127,7 +105,7 @@ def infrabel_recording(log: Path) -> Converted:
         raise InputError("lacks columns of an Infrabel log", place=str(log), found=f"no {', '.join(sorted(missing))}")
     computed = pl.col("solution_status") == "SOL_COMPUTED"
     word = pl.col("position_type").replace("", None)
-    kind = word.str.replace(r"\d+$", "").str.replace("^INS_", "").replace_strict(_NOVATEL_FIX, default=None)
+    kind = word.str.replace(r"\d+$", "").replace_strict(FIX_BY_WORD, default=None)
     fix = pl.when(computed & word.is_not_null()).then(kind).otherwise(pl.lit(Fix.NONE.value))
     unknown = table.filter(computed & word.is_not_null() & kind.is_null())["position_type"].unique().sort()
     if unknown.len():
@@ -135,7 +113,7 @@ def infrabel_recording(log: Path) -> Converted:
             "a position type is not known",
             place=f"{log}: position_type",
             found=", ".join(unknown),
-            expected=", ".join(_NOVATEL_FIX),
+            expected=", ".join(FIX_BY_WORD),
         )
     time = pl.col("timestamp").str.extract(_TO_THE_SECOND)
     gnss = table.select(

@@ -10,6 +10,7 @@ import math
 
 import polars as pl
 
+from pipeline.ingest import novatel
 from pipeline.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, position_unless_no_fix, unless
 from pipeline.ingest.stamps import CivilTime
 from schemas.enums import Fix
@@ -164,26 +165,10 @@ def _nav_sat(stamps: dict[str, str], rows: str, used: pl.Expr, types: dict[str, 
     )
 
 
-# NovAtel OEM7 commands and logs reference manual, "Position or velocity type".
-# Services (OmniSTAR, CDGPS, PPP of any kind) count as differential; a velocity alone (8) is no position.
-_NOVATEL_TYPES = {
-    code: kind
-    for kind, codes in {
-        Fix.AUTONOMOUS: (1, 2, 16, 53, 70, 71, 72),
-        Fix.DIFFERENTIAL: (17, 20, 54, 57, 58, 59, 64, 65, 66, 68, 69, 73, 74, 75, 76, 77, 78, 79, 80),
-        Fix.SBAS: (18, 52),
-        Fix.ESTIMATED: (19, 67),
-        Fix.RTK_FLOAT: (4, 32, 33, 34, 35, 55),
-        Fix.RTK_FIXED: (5, 6, 46, 47, 48, 49, 50, 51, 56),
-    }.items()
-    for code in codes
-}
-
-
 def _bestpos() -> Recipe:
     """novatel_oem7_msgs/msg/BESTPOS: height over mean sea level, so the undulation is added."""
     computed = pl.col("sol_status.status") == 0
-    fix = fix_from(pl.col("pos_type.type"), _NOVATEL_TYPES)
+    fix = fix_from(pl.col("pos_type.type"), novatel.FIX_BY_CODE)
     return Recipe(
         stream="gnss",
         stamps={"t": "header.stamp"},

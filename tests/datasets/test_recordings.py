@@ -167,7 +167,9 @@ def test_a_log_of_the_measurement_train(tmp_path: Path) -> None:
     [
         ("NARROW_INT", "rtk_fixed"),
         ("INS_RTKFIXED", "rtk_fixed"),
-        ("WIDE_INT", "rtk_float"),
+        ("WIDE_INT", "rtk_fixed"),
+        ("OMNISTAR_HP", "differential"),
+        ("PPP", "differential"),
         ("INS_PSRSP", "autonomous"),
         ("WAAS", "sbas"),
         ("NONE", "none"),
@@ -175,6 +177,7 @@ def test_a_log_of_the_measurement_train(tmp_path: Path) -> None:
     ],
 )
 def test_position_types_of_the_receiver(tmp_path: Path, word: str, fix: str) -> None:
+    """As the same receiver's ROS messages have them (`test_kinds_of_novatel_solutions`)."""
     log = tmp_path / "log_1.csv"
     log.write_text(INFRABEL.replace("NARROW_INT3", word))
     assert infrabel_run(log).gnss["fix"][0] == fix
