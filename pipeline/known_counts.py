@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import polars as pl
 
+from schemas.campaign import STANFORD
 from schemas.enums import RunStatus
 
 JUDGED_COUNTS = (
     *("unsafe_accepted", "hazards_1a", "hazards_1b", "hazards_shift", "hazards_detected", "hazards_within_budget"),
     *("missed_detections", "failures"),
-    *(f"stanford_{kind}" for kind in ("nominal", "misleading", "hazardous", "unavailable")),
+    *(f"stanford_{kind}" for kind in STANFORD),
 )
 """Counts that need evidence: a run without any has none, which is not the same as having found nothing."""
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.channels import paired
+from pipeline.columns import floats
 from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
 from schemas.config import Configuration
 from schemas.enums import MonitorState
@@ -67,20 +68,20 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
     Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
     """
     t_s = (epochs["t"].dt.timestamp("ns") - epochs["t"].dt.timestamp("ns")[0]).to_numpy() * 1e-9
-    velocity = _floats(epochs["velocity_along_mps"])
+    velocity = floats(epochs, "velocity_along_mps")
     usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
     first, span = _window(t_s, usable, epochs["odometer_stretch"].to_numpy())
     total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
     by_doppler = (total - total[first]) / span
-    odometer = _floats(epochs["odometer_m"])
+    odometer = floats(epochs, "odometer_m")
     by_odometer = (odometer - odometer[first]) / span
-    speed = np.abs(_floats(epochs["speed_mps"]))
+    speed = np.abs(floats(epochs, "speed_mps"))
     change = np.abs(velocity - velocity[first])
     variance = (
         config.monitors.doppler_sigma_mps**2
-        + _floats(epochs["odometer_white_m2_per_s"]) / span
-        + (_floats(epochs["scale_sigma"]) * speed) ** 2
-        + ((_floats(epochs["latency_sigma_s"]) + np.abs(_floats(epochs["latency_s"]))) * change / span) ** 2
+        + floats(epochs, "odometer_white_m2_per_s") / span
+        + (floats(epochs, "scale_sigma") * speed) ** 2
+        + ((floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))) * change / span) ** 2
     )
     reasons = pl.select(
         pl.when(pl.Series(usable & np.isfinite(span)))
@@ -109,21 +110,15 @@ def channel_monitor(epochs: pl.DataFrame, other: pl.DataFrame | None, factor: fl
     placed = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
     pairs = paired(epochs.select("t", path_m=placed), usable)
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
-    sigma_m, sigma_other_m = epochs["sigma_along_m"], met["sigma_along_m"]
-    value = _floats(pairs["path_m"]) - _floats(met["path_m"])
-    threshold = factor * np.hypot(_floats(sigma_m), _floats(sigma_other_m))
+    value = floats(pairs, "path_m") - floats(met, "path_m")
+    threshold = factor * np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
     reasons = epochs.select(
         pl.when(~pl.col("fix_valid") | ~pl.col("on_track") | pl.col("sigma_along_m").is_null())
         .then(pl.lit(NO_POSITION))
-        .when(met["path_m"].is_null() | sigma_other_m.is_null())
+        .when(met["path_m"].is_null() | met["sigma_along_m"].is_null())
         .then(pl.lit(NO_OTHER_EPOCH))
     ).to_series()
     return judged(value, threshold, reasons)
-
-
-def _floats(series: pl.Series) -> Array:
-    values: Array = series.cast(pl.Float64).to_numpy()
-    return values.astype(np.float64)
 
 
 def _window(
