@@ -16,8 +16,7 @@ from pipeline.matching.survey import survey_findings
 from pipeline.results import store
 from pipeline.site_windows import window_findings
 from pipeline.storage import files
-from pipeline.storage.files import Address
-from pipeline.storage.object_store import redacted
+from pipeline.storage.files import Address, redacted
 from schemas.config import IngestConfig
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding

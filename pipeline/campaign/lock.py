@@ -16,8 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline import storage
-from pipeline.storage.files import Address, is_url, join
-from pipeline.storage.object_store import redacted
+from pipeline.storage.files import Address, is_url, join, redacted
 from schemas.errors import OutputError
 
 _NAME = ".lock"

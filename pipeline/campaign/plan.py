@@ -14,8 +14,7 @@ from pipeline import storage
 from pipeline.ingest.site import read_site
 from pipeline.results import store
 from pipeline.storage import files
-from pipeline.storage.files import Address
-from pipeline.storage.object_store import redacted
+from pipeline.storage.files import Address, redacted
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, SiteError, UsageError
 from schemas.run import STREAMS

@@ -15,8 +15,7 @@ from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
 from pipeline.ingest.site import read_site
 from pipeline.results import store
-from pipeline.storage.files import is_url
-from pipeline.storage.object_store import redacted
+from pipeline.storage.files import is_url, redacted
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site

@@ -24,10 +24,10 @@ def read_run(path: files.Address, config: IngestConfig, with_digest: bool = True
     if files.is_dir(path):
         return read_folder(path, with_digest)
     if not files.exists(path):
-        raise InputError("does not exist", place=str(path), expected="RUN.mcap or a folder RUN/")
+        raise InputError("does not exist", place=files.shown(path), expected="RUN.mcap or a folder RUN/")
     raise InputError(
         "is neither an MCAP file nor a folder",
-        place=str(path),
+        place=files.shown(path),
         expected="RUN.mcap or a folder RUN/ of Parquet files",
         remedy="`balise convert` makes runs of receiver logs.",
     )

@@ -21,7 +21,7 @@ from pipeline.ingest.site_tables import (
     load_table,
     typed_table,
 )
-from pipeline.storage.files import is_dir, join, list_dir, read_bytes
+from pipeline.storage.files import is_dir, join, list_dir, read_bytes, shown
 from pipeline.track import geometric_measures_m, track_of
 from schemas.errors import InputError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
@@ -75,17 +75,17 @@ def read_site(path: Path | str) -> Site:
 def _files(folder: Path | str) -> dict[str, bytes]:
     """The site's files by name; of each table there is at most one."""
     if not is_dir(folder):
-        raise SiteError("is not a folder", place=str(folder), remedy="A site is a folder that holds a track.")
+        raise SiteError("is not a folder", place=shown(folder), remedy="A site is a folder that holds a track.")
     names = [table + suffix for table in _NAMES for suffix in _SUFFIXES.get(table, _TABLES)]
     try:
         present = [name for name in list_dir(folder) if name in names]
         for table in _NAMES:
             same = [name for name in present if name.startswith(f"{table}.")]
             if len(same) > 1:
-                raise SiteError(f"{' and '.join(same)}: only one may be there", place=str(folder))
+                raise SiteError(f"{' and '.join(same)}: only one may be there", place=shown(folder))
         if not any(name.startswith("track.") for name in present):
             expected = "track.parquet, track.csv or track.geojson"
-            raise SiteError("has no track", place=str(folder), expected=expected)
+            raise SiteError("has no track", place=shown(folder), expected=expected)
         return {name: read_bytes(join(folder, name)) for name in present}
     except InputError as error:
         raise SiteError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
@@ -100,7 +100,7 @@ def _digest(files: dict[str, bytes]) -> str:
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
     listed = breaches[0] if len(breaches) == 1 else "\n  ".join([f"{len(breaches)} breaches", *breaches]) + "\n"
     remedy = "Mend what is named; `balise dictionary` lists the columns of a site."
-    return SiteError(listed, place=str(path), remedy=remedy)
+    return SiteError(listed, place=shown(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:

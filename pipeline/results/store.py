@@ -11,8 +11,7 @@ from urllib.parse import quote, unquote
 import polars as pl
 
 from pipeline import storage
-from pipeline.storage.files import Address, exists, is_url, join, read_bytes
-from pipeline.storage.object_store import redacted
+from pipeline.storage.files import Address, exists, is_url, join, read_bytes, redacted, shown
 from schemas.config import Configuration, Settings, settings_from, to_toml
 from schemas.conform import conform, dtypes
 from schemas.errors import UsageError
@@ -97,7 +96,7 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     if is_url(out):
         return _read_remote(table, [str(path) for path in paths], runs).select(list(schema))
     if run_id is not None and not Path(paths[0]).exists():
-        raise UsageError("has no such run", place=str(out), found=run_id)
+        raise UsageError("has no such run", place=shown(out), found=run_id)
     files = [Path(path) for path in paths]
     for file, run in zip(files, runs, strict=True):
         _check_columns(table, run, _schema_of(table, run, file))

@@ -6,6 +6,7 @@ fsspec is imported only for addresses.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
@@ -13,10 +14,22 @@ from schemas.errors import InputError
 
 Address = Path | str
 
+_SECRETS = re.compile(r"(?<=://)[^/@\s]+@|\?[^\s'\"]*|((?:AKIA|ASIA)[A-Z0-9]{12,})")
+
 
 def is_url(path: Address) -> bool:
     """Whether the path is an address with a protocol (`s3://bucket/run.mcap`)."""
     return isinstance(path, str) and "://" in path
+
+
+def redacted(text: str) -> str:
+    """The text without user names, passwords, keys and signatures that addresses may carry."""
+    return _SECRETS.sub("", text)
+
+
+def shown(path: Address) -> str:
+    """The path as messages name it."""
+    return redacted(str(path)) if is_url(path) else str(path)
 
 
 def name_of(path: Address) -> str:
@@ -90,7 +103,9 @@ def _filesystem(url: str) -> tuple[Any, str]:
         filesystem, inner = fsspec.core.url_to_fs(url)
     except (ImportError, ValueError) as error:
         raise InputError(
-            f"cannot be opened: {error}", place=url, remedy="Install the extra for this kind of address."
+            f"cannot be opened: {redacted(str(error))}",
+            place=redacted(url),
+            remedy="Install the extra for this kind of address.",
         ) from None
     return filesystem, str(inner)
 
@@ -100,6 +115,7 @@ class _as_input_error:  # noqa: N801 - reads as a phrase at its uses
 
     def __init__(self, path: Address) -> None:
         self.path = path
+        self.place = shown(path)
 
     def __enter__(self) -> None:
         return None
@@ -107,12 +123,12 @@ class _as_input_error:  # noqa: N801 - reads as a phrase at its uses
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if isinstance(error, FileNotFoundError):
             raise InputError(
-                "does not exist", place=str(self.path), expected="a file or folder", remedy="Check the path."
+                "does not exist", place=self.place, expected="a file or folder", remedy="Check the path."
             ) from None
         if isinstance(error, OSError):
             reason = error.strerror or str(error) or type(error).__name__
-            raise InputError(f"cannot be read: {reason}", place=str(self.path)) from None
+            raise InputError(f"cannot be read: {reason}", place=self.place) from None
         if isinstance(error, Exception) and is_url(self.path) and not isinstance(error, InputError):
             # Stores raise their client library's own exceptions, which share no base class.
             reason = str(error) or type(error).__name__
-            raise InputError(f"cannot be read: {reason}", place=str(self.path)) from None
+            raise InputError(f"cannot be read: {redacted(reason)}", place=self.place) from None

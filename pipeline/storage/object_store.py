@@ -6,14 +6,13 @@ import asyncio
 import contextlib
 import errno
 import os
-import re
 import time
 from collections.abc import Awaitable, Callable
 from functools import lru_cache, partial
 from itertools import count
 from typing import Any, TypeVar
 
-from pipeline.storage.files import Address
+from pipeline.storage.files import Address, redacted
 from schemas.errors import BaliseError, OutputError, UsageError
 
 T = TypeVar("T")
@@ -32,12 +31,6 @@ _SETTINGS: dict[str, dict[str, Any]] = {
 }
 _LASTING = (errno.EINVAL, errno.EPERM, errno.ENOSYS)
 _CONNECTION_ERRORS = {"HTTPClientError", "ClientConnectionError", "ClientPayloadError"}
-_SECRETS = re.compile(r"(?<=://)[^/@\s]+@|\?[^\s'\"]*|((?:AKIA|ASIA)[A-Z0-9]{12,})")
-
-
-def redacted(text: str) -> str:
-    """The text without user names, passwords, keys and signatures that addresses may carry."""
-    return _SECRETS.sub("", text)
 
 
 def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[BaliseError] = OutputError) -> T:

@@ -14,7 +14,7 @@ from polars.testing import assert_frame_equal
 
 from pipeline.ingest.site import read_site
 from pipeline.matching.describe import describe_site
-from schemas.errors import SiteError
+from schemas.errors import BaliseError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
 from tests.site import builders
 
@@ -302,3 +302,11 @@ def test_the_wrong_relation_of_the_recorded_network_is_told(tmp_path: Path) -> N
         "end 1 of 88_L_262 and end 1 of 88_L_11886 are linked as navigable (both), but lie on the same side of where "
         "they meet: taken for not navigable"
     ]
+
+
+@pytest.mark.parametrize("address", ["nosuch://key:secret@bucket/site", "memory://key:secret@nowhere/site?X=secret"])
+def test_an_address_that_cannot_be_read_is_told_without_its_credentials(address: str) -> None:
+    with pytest.raises(BaliseError) as caught:
+        read_site(address)
+    assert "secret" not in str(caught.value)
+    assert "://" in str(caught.value)

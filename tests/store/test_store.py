@@ -11,8 +11,7 @@ import pytest
 
 from pipeline import storage
 from pipeline.results import store
-from pipeline.storage.files import Address
-from pipeline.storage.object_store import redacted
+from pipeline.storage.files import Address, redacted
 from schemas.config import Configuration
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunTables
