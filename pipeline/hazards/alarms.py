@@ -51,8 +51,7 @@ def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: Ha
     if hazard_id is not None:
         suspect = judged[hazard_id].suspect
     else:
-        healthy_m = config.false_alarm_margin_m
-        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, verdict, healthy_m)
+        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, verdict)
     return {
         "t_start": span.start_ns,
         "t_end": span.end_ns,
@@ -85,7 +84,7 @@ def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = slice(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
     error, position = np.abs(w.error_m[part]), np.isfinite(w.path_m[part])
-    tolerated = np.fmax(config.false_alarm_margin_m, w.noise_m[part])
+    tolerated = w.tolerated_m[part]
     with np.errstate(invalid="ignore"):
         beyond: Bools = error >= tolerated
         proved = beyond & (error > w.bound_m[part])

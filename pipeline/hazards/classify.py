@@ -70,7 +70,7 @@ def classify(
     errors = errors_of(epochs, truth)
     series = series_of(epochs, truth, config.lds)
     fails = fails_of(epochs, config.lds.recovery_s)
-    witnesses = witnesses_of(epochs, truth, errors, config.matching.ambiguity_probability)
+    witnesses = witnesses_of(epochs, truth, errors, config)
     drafts, jumps = find_episodes(series, beacons_by_leg(balises), config.hazards)
     judged = []
     for draft in drafts:

@@ -16,18 +16,17 @@ from pipeline.hazards.travel import Travel
 _WINDOWS_S = (2.0, 10.0, 60.0)
 _DOPPLER_SIGMA_MPS = 0.1
 _LEAST_M = 2.0
-# Positions may stray from Doppler's way within a window by as much (DOMAIN section 5: below this they are healthy).
-STRAY_M = 5.0
 # Two-sided Gaussian 1e-7, as of the monitors (DOMAIN section 3).
 _FACTOR = 5.3267
 # Longest step between epochs over which the mean of two velocities stands for the way.
 _LONGEST_STEP_S = 2.0
 
 
-def repaired_by_doppler(travel: Travel, position_m: Floats, velocity_mps: Floats) -> Travel:
+def repaired_by_doppler(travel: Travel, position_m: Floats, velocity_mps: Floats, healthy_m: float) -> Travel:
     """The travel with the odometer's steps replaced by Doppler's where the odometer stands alone.
 
-    `position_m`: path position by GNSS, NaN where there is none; `velocity_mps`: GNSS velocity along growing path.
+    `position_m`: path position by GNSS, NaN where there is none; `velocity_mps`: GNSS velocity along growing path;
+    `healthy_m`: by how much a healthy position may be wrong (DOMAIN section 5), and so stray from Doppler's way.
     """
     dt_s = np.diff(travel.at_ns) / NS_PER_S
     by_doppler = 0.5 * (velocity_mps[1:] + velocity_mps[:-1]) * dt_s
@@ -39,12 +38,12 @@ def repaired_by_doppler(travel: Travel, position_m: Floats, velocity_mps: Floats
     apart = np.where(known, by_doppler - by_odometer, 0.0)
     wrong: Bools = np.zeros(apart.size, dtype=np.bool_)
     for window_s in _WINDOWS_S:
-        wrong |= _odometer_alone(travel, position_m, apart, window_s)
+        wrong |= _odometer_alone(travel, position_m, apart, window_s, healthy_m)
     correction = np.concatenate(([0.0], np.cumsum(np.where(wrong & known, apart, 0.0))))
     return replace(travel, distance_m=travel.distance_m + correction)
 
 
-def _odometer_alone(travel: Travel, position_m: Floats, apart: Floats, window_s: float) -> Bools:
+def _odometer_alone(travel: Travel, position_m: Floats, apart: Floats, window_s: float, healthy_m: float) -> Bools:
     """Steps within windows over which Doppler minus odometer exceeds its noise and GNSS positions follow Doppler."""
     stamps = travel.at_ns
     begin = np.searchsorted(stamps, stamps - round(window_s * NS_PER_S), side="left")
@@ -58,7 +57,8 @@ def _odometer_alone(travel: Travel, position_m: Floats, apart: Floats, window_s:
             np.abs(follows - slipped) < 0.5 * np.abs(slipped)
         )
     ends = np.flatnonzero(found)
-    ends = ends[_keeps_to(position_m - travel.distance_m - total, begin[ends], ends, 0.5 * np.abs(slipped[ends]))]
+    limit_m = np.maximum(healthy_m, 0.5 * np.abs(slipped[ends]))
+    ends = ends[_keeps_to(position_m - travel.distance_m - total, begin[ends], ends, limit_m)]
     return _covered(begin[ends], ends, apart.size)
 
 
@@ -70,7 +70,7 @@ def _keeps_to(strayed_m: Floats, begins: Ints, ends: Ints, limit_m: Floats) -> B
     """
     spans = (strayed_m[begin : end + 1] for begin, end in zip(begins.tolist(), ends.tolist(), strict=True))
     ranges = np.array([np.nanmax(span) - np.nanmin(span) for span in spans])
-    kept: Bools = ranges <= np.maximum(STRAY_M, limit_m)
+    kept: Bools = ranges <= limit_m
     return kept
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
-from pipeline.hazards.slip import STRAY_M
+from schemas.config import Configuration
 from schemas.enums import Evidence, Suspect, Verdict
 
 # How far back an alarm's cause may lie: a raw monitor answers at once, the slowest EWMA after minutes.
@@ -24,13 +24,16 @@ _MAP_ERROR_M = 0.5
 class Witnesses:
     """Per epoch, all epochs: truth, position, odometer and GNSS velocity, NaN where not known.
 
-    `slip_m`: size of what two reads around say that the odometer counted wrong.
+    `tolerated_m`: errors along the track below this are a healthy position's, max(5 m, 3 sigma) (DOMAIN section 5);
+    `healthy_m`: the part of it that does not depend on sigma; `slip_m`: size of what two reads around say that the
+    odometer counted wrong.
     """
 
     t_ns: Ints
     path_m: Floats
     error_m: Floats
     noise_m: Floats
+    tolerated_m: Floats
     bound_m: Floats
     slip_m: Floats
     error_cross_m: Floats
@@ -49,6 +52,7 @@ class Witnesses:
     by_reference: Bools
     by_odometer: Bools
     doubtful_track: Bools
+    healthy_m: float
 
     def epoch_before(self, epoch: int, lookback_s: float) -> int:
         """The first epoch no more than this time before another."""
@@ -56,18 +60,20 @@ class Witnesses:
 
 
 def witnesses_of(
-    epochs: pl.DataFrame, truth: pl.DataFrame, errors: dict[str, Floats], ambiguity_probability: float
+    epochs: pl.DataFrame, truth: pl.DataFrame, errors: dict[str, Floats], config: Configuration
 ) -> Witnesses:
     """Everything that can speak for or against the position."""
     truth_sigma = floats(truth, "truth_sigma_m")
     gate = floats(epochs, "gate_probability")
     has_path = np.isfinite(floats(epochs, "path_m"))
-    doubtful = (gate < ambiguity_probability) | (flags(epochs, "fix_valid") & ~flags(epochs, "on_track") & has_path)
+    off_track = flags(epochs, "fix_valid") & ~flags(epochs, "on_track") & has_path
+    noise_m = 3.0 * np.hypot(floats(epochs, "sigma_along_m"), truth_sigma)
     return Witnesses(
         t_ns=times_ns(epochs),
         path_m=np.where(flags(epochs, "fix_valid"), floats(epochs, "path_m"), np.nan),
         error_m=errors["along"],
-        noise_m=3.0 * np.hypot(floats(epochs, "sigma_along_m"), truth_sigma),
+        noise_m=noise_m,
+        tolerated_m=np.fmax(config.hazards.false_alarm_margin_m, noise_m),
         bound_m=floats(truth, "truth_bound_m"),
         slip_m=np.abs(floats(truth, "truth_slip_m")),
         error_cross_m=errors["cross"],
@@ -85,22 +91,18 @@ def witnesses_of(
         velocity_mps=floats(epochs, "velocity_along_mps"),
         by_reference=truths(truth["evidence"] == Evidence.REFERENCE.value),
         by_odometer=truths(truth["evidence"] == Evidence.ODOMETER.value),
-        doubtful_track=doubtful,
+        doubtful_track=(gate < config.matching.ambiguity_probability) | off_track,
+        healthy_m=config.hazards.false_alarm_margin_m,
     )
 
 
-def suspect_of_alarm(
-    w: Witnesses, first: int, last: int, monitors: tuple[str, ...], verdict: Verdict, healthy_m: float
-) -> Suspect:
-    """Who caused the alarm over epochs `first..last`, in the order in which the evidence speaks.
-
-    `healthy_m`: an error that a healthy position may have whatever its sigma.
-    """
+def suspect_of_alarm(w: Witnesses, first: int, last: int, monitors: tuple[str, ...], verdict: Verdict) -> Suspect:
+    """Who caused the alarm over epochs `first..last`, in the order in which the evidence speaks."""
     across = all(name.startswith(_ACROSS) for name in monitors)
     if verdict is Verdict.TRUE:
         # The position was wrong at some other time; whoever left the truth when the alarm came made it.
         came = min(int(np.searchsorted(w.t_ns, w.t_ns[first] + round(_COMING_S * NS_PER_S))), last)
-        healthy = by_reference_healthy(w, first, came, healthy_m) or doppler_vote(w, first, came) is Suspect.ODOMETER
+        healthy = by_reference_healthy(w, first, came) or doppler_vote(w, first, came) is Suspect.ODOMETER
         if not across and healthy and odometer_left_truth(w, first, came):
             return Suspect.ODOMETER
         return suspect_of_error(w, first, last, monitors)
@@ -155,11 +157,11 @@ def suspect_of_error(w: Witnesses, first: int, last: int, monitors: tuple[str, .
     return Suspect.GNSS if any(name.startswith(_ACROSS) for name in monitors) else Suspect.UNKNOWN
 
 
-def by_reference_healthy(w: Witnesses, first: int, last: int, healthy_m: float) -> bool:
-    """The reference has the position below max(`healthy_m`, 3 sigma) along the track over epochs `first..last`."""
+def by_reference_healthy(w: Witnesses, first: int, last: int) -> bool:
+    """The reference has the position's error along the track within what is tolerated over epochs `first..last`."""
     part = slice(first, last + 1)
     known = np.isfinite(w.error_m[part]) & w.by_reference[part]
-    within: Bools = np.abs(w.error_m[part][known]) < np.fmax(healthy_m, w.noise_m[part][known])
+    within: Bools = np.abs(w.error_m[part][known]) < w.tolerated_m[part][known]
     return bool(known.any() and within.all())
 
 
@@ -232,7 +234,7 @@ def _vote(w: Witnesses, rows: Ints) -> Suspect | None:
     to_position, to_odometer = abs(by_doppler[at] - by_position[at]), abs(by_doppler[at] - by_odometer[at])
     if to_position < 0.5 * apart and to_odometer > to_position:
         strayed_m = float(np.ptp((by_position - by_doppler)[: at + 1]))
-        return Suspect.ODOMETER if strayed_m <= max(STRAY_M, 0.5 * apart) else Suspect.GNSS
+        return Suspect.ODOMETER if strayed_m <= max(w.healthy_m, 0.5 * apart) else Suspect.GNSS
     return Suspect.GNSS if to_odometer < 0.5 * apart else None
 
 

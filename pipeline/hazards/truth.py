@@ -83,7 +83,8 @@ def establish_truth(
         rungs.append(_reference_rung(at_ns, reference))
         if np.isfinite(rungs[0].path_m).all():
             return _ladder(epochs["t"], rungs, travel)
-    travel = repaired_by_doppler(travel, positions(epochs), floats(epochs, "velocity_along_mps"))
+    velocity_mps = floats(epochs, "velocity_along_mps")
+    travel = repaired_by_doppler(travel, positions(epochs), velocity_mps, config.false_alarm_margin_m)
     if balise_reads is not None and balise_reads.height:
         counted = floats(balise_reads, "odometer_m") if "odometer_m" in balise_reads.columns else None
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"), counted)

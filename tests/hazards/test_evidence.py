@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.hazards import classify, establish_truth
-from schemas.config import Configuration
+from schemas.config import Configuration, HazardConfig
 from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of, with_hazards
 
 READS = tuple(np.arange(50.0, 2400.0, 500.0))
@@ -265,3 +265,19 @@ def test_doppler_along_a_track_that_heads_elsewhere_hides_no_jump():
         first = found.row(0, named=True)
         assert (seconds(first["t_hazard"]), first["suspect"]) == (31.0, "gnss")
         assert first["size_m"] == pytest.approx(-700.0, abs=1.0)
+
+
+@pytest.mark.parametrize(("margin_m", "evidence_error_m"), [(5.0, 0.0), (4.0, -6.0)])
+def test_how_far_a_healthy_position_strays_from_doppler_is_the_margin_of_false_alarms(margin_m, evidence_error_m):
+    """The odometer slips by 6 m within a second, in which the position wavers by 4.5 m."""
+    wavers = ((50.1, 50.3, 4.5), (50.8, 51.1, 4.5))
+    journey = Journey(steps=wavers, slip=(50.0, 51.0, 6.0), doppler=True, fails={"along_raw": ((50.5, 51.0),)})
+    config = Configuration(hazards=HazardConfig(false_alarm_margin_m=margin_m))
+    epochs, passages = journey.epochs(), journey.passages()
+    truth = establish_truth(epochs, None, None, passages, config.hazards, config.lds)
+    error_m = (epochs["path_m"] - truth["truth_path_m"])[-1]
+    assert error_m == pytest.approx(evidence_error_m, abs=0.1)
+    (alarm,) = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config).alarms.iter_rows(
+        named=True
+    )
+    assert alarm["suspect"] == ("odometer" if margin_m == 5.0 else "gnss")
