@@ -20,6 +20,7 @@ from schemas.errors import InputError, SiteError, UsageError
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
+_NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
 _DECIDING_LIBRARIES = ("dataframely", "numpy", "polars", "pyarrow", "pyproj", "scipy")
 
 
@@ -107,6 +108,12 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
     for name in named:
         for address in _expand(name):
             run_id = files.stem_of(address)
+            if run_id == _NULL_OF_HIVE:
+                raise UsageError(
+                    f"a run cannot be called {run_id!r}: readers of Hive partitions take it for null",
+                    place=redacted(str(address)),
+                    remedy="Rename it: results are filed by run id.",
+                )
             other = found.setdefault(run_id, storage.absolute(address))
             if other != storage.absolute(address):
                 raise UsageError(

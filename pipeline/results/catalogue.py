@@ -44,15 +44,7 @@ def scan(out: Address, table: str, runs: Iterable[str]) -> pl.LazyFrame:
     The contract's columns are expected, not looked for in each file: a file that has others makes the query fail.
     """
     contract = dtypes(TABLES[table])
-    paths = [str(store.table_address(out, table, run)) for run in runs]
-    frame = pl.scan_parquet(
-        paths,
-        glob=False,
-        hive_partitioning=True,
-        hive_schema={"run_id": pl.String()},
-        schema=contract,
-        extra_columns="ignore",
-    )
+    frame = store.scan_runs(out, table, list(runs), schema=contract, extra_columns="ignore")
     return frame.select("run_id", *contract)
 
 

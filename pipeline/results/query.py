@@ -58,7 +58,7 @@ def _campaign_tables(out: Address) -> dict[str, pl.LazyFrame]:
     addresses = {
         name: join(join(out, "campaign"), f"{name.removeprefix('campaign_')}.parquet") for name in CAMPAIGN_TABLES
     }
-    return {name: pl.scan_parquet(address) for name, address in addresses.items() if exists(address)}
+    return {name: pl.scan_parquet(address, glob=False) for name, address in addresses.items() if exists(address)}
 
 
 def _first_line(error: Exception) -> str:

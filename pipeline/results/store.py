@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote, unquote
 
 import polars as pl
@@ -100,8 +101,21 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     files = [Path(path) for path in paths]
     for file, run in zip(files, runs, strict=True):
         _check_columns(table, run, _schema_of(table, run, file))
-    scan = pl.scan_parquet(files, hive_partitioning=True, hive_schema={"run_id": pl.String}, glob=False)
-    return scan.select(list(schema))
+    return scan_runs(out, table, runs).select(list(schema))
+
+
+def scan_runs(out: Address, table: str, runs: Sequence[str], **options: Any) -> pl.LazyFrame:
+    """One table of these runs of a local result as its files hold it, and `run_id`, a condition on which prunes files.
+
+    `options` go to `polars.scan_parquet`.
+    """
+    files = [Path(table_address(out, table, run)) for run in runs]
+    if "=" not in str(out):
+        schema = {"run_id": pl.String()}
+        return pl.scan_parquet(files, glob=False, hive_partitioning=True, hive_schema=schema, **options)
+    # Above the tables, too, polars takes each `key=value` for a partition.
+    scans = (pl.scan_parquet(file, glob=False, hive_partitioning=False, **options) for file in files)
+    return pl.concat(scan.with_columns(run_id=pl.lit(run)) for scan, run in zip(scans, runs, strict=True))
 
 
 def check_tables(out: Address, tables: Iterable[str]) -> None:
@@ -113,7 +127,9 @@ def check_tables(out: Address, tables: Iterable[str]) -> None:
 
 def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]:
     try:
-        return pl.read_parquet_schema(file)
+        # Opened here: given a path, polars takes its brackets for a glob.
+        with file.open("rb") as source:
+            return pl.read_parquet_schema(source)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise UsageError(
             f"cannot be read: {str(error).strip().splitlines()[0]}",

@@ -23,6 +23,12 @@ def logs(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_a_run_is_not_called_as_hive_calls_null(tmp_path: Path) -> None:
+    (tmp_path / "__HIVE_DEFAULT_PARTITION__.mcap").touch()
+    with pytest.raises(UsageError, match=r"cannot be called '__HIVE_DEFAULT_PARTITION__'.*[Rr]ename"):
+        find_runs([str(tmp_path)])
+
+
 def test_a_folder_of_runs(logs: Path) -> None:
     assert list(find_runs([str(logs)])) == ["a", "b", "c", "d"]
 

@@ -10,7 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline import storage
-from pipeline.results import store
+from pipeline.results import catalogue, store
+from pipeline.results.query import run_sql
 from pipeline.storage.files import Address, redacted
 from schemas.config import Configuration
 from schemas.errors import OutputError, UsageError
@@ -63,12 +64,26 @@ def test_same_content_same_bytes(tmp_path: Path) -> None:
     assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
 
 
-@pytest.mark.parametrize("run_id", ["r1", "007", "2024-01-02", "a b", "ü%20", "a=b", "x;y:z"])
+@pytest.mark.parametrize("run_id", ["r1", "007", "2024-01-02", "a b", "ü%20", "a=b", "x;y:z", "copy[1]", "s*"])
 def test_any_run_id_comes_back(tmp_path: Path, run_id: str) -> None:
     store.write_run(tables_of(run_id), tmp_path, METADATA)
     assert store.run_ids(tmp_path) == [run_id]
     assert store.read_table(tmp_path, "runs").collect()["run_id"].to_list() == [run_id]
     assert store.read_table(tmp_path, "runs", run_id).collect()["run_id"].to_list() == [run_id]
+    assert store.completed_runs(tmp_path)[run_id]["log_digest"] == "l"
+    assert run_sql(tmp_path, "SELECT run_id FROM runs").rows() == [(run_id,)]
+
+
+@pytest.mark.parametrize("folder", ["trial=3", "run_id=7", "hazard=none/trial=3", "t[1]", "t{a}*"])
+def test_any_output_folder_is_read(tmp_path: Path, folder: str) -> None:
+    out = tmp_path / folder
+    for run_id in ("b", "a"):
+        store.write_run(tables_of(run_id), out, METADATA)
+    assert store.read_table(out, "runs").collect()["run_id"].to_list() == ["a", "b"]
+    for _ in ("gathered anew", "from the catalogue"):
+        assert catalogue.gather(out)["runs"]["run_id"].to_list() == ["a", "b"]
+    assert run_sql(out, "SELECT run_id FROM hazards").height == 0
+    assert run_sql(out, "SELECT run_id FROM runs WHERE run_id = 'b'").rows() == [("b",)]
 
 
 def test_tables_of_several_runs(tmp_path: Path) -> None:
