@@ -18,11 +18,16 @@ _AGAIN_M = 10.0
 
 @dataclass(frozen=True)
 class TruePassings:
-    """Instants at which the train passed each balise, in order of time, and the true positions over time."""
+    """Instants at which the train passed each balise, in order of time, and the true positions over time.
+
+    `slip_m`: by how much two balise reads around an instant contradict the odometer between them; the place there may
+    be wrong by as much.
+    """
 
     by_balise: dict[str, tuple[int, ...]]
     at_ns: Ints
     path_m: Floats
+    slip_m: Floats
 
     def assign(self, passages: pl.DataFrame) -> list[int | None]:
         """The true passage of each row; none for an offer beyond it (each true passage is given once).
@@ -54,12 +59,13 @@ class TruePassings:
         return result
 
     def _one_passage(self, a_ns: int | None, b_ns: int, balise_m: float) -> bool:
-        """Between an offer and a true crossing the train only went from the one to the other."""
+        """Between an offer and a true crossing the train only went from the one to the other, as far as is known."""
         begin, end = np.searchsorted(self.at_ns, sorted((a_ns or b_ns, b_ns)))
         way = np.abs(self.path_m[begin:end] - balise_m)
         if way.size == 0:
             return True
-        return bool(way.max() <= (way[0] if b_ns >= (a_ns or b_ns) else way[-1]) + _AGAIN_M)
+        unseen_m = max(_AGAIN_M, float(self.slip_m[begin:end].max()))
+        return bool(way.max() <= (way[0] if b_ns >= (a_ns or b_ns) else way[-1]) + unseen_m)
 
 
 def _about_when(passages: pl.DataFrame) -> list[int | None]:
@@ -76,36 +82,38 @@ def true_passings(
 
     `between`: places known inside gaps of the epochs (`places_between`).
     """
-    at_ns, x, speed, legs = _places(epochs, truth, between)
+    at_ns, x, speed, legs, slip = _places(epochs, truth, between)
     found: dict[str, tuple[int, ...]] = {}
     if at_ns.size < 2 or balises.height == 0:
-        return TruePassings(found, at_ns, x)
+        return TruePassings(found, at_ns, x, slip)
     for part in balises.sort("path_m").partition_by("leg", maintain_order=True):
         names, places = part["balise_id"].to_list(), floats(part, "path_m")
         changes = _changes(x, legs == part["leg"][0], places)
         for index, (balise, beacon_m) in enumerate(zip(names, places.tolist(), strict=True)):
             instants = _instants(at_ns, x, speed, changes.get(index, []), beacon_m)
             found[balise] = tuple(sorted((*found.get(balise, ()), *instants)))
-    return TruePassings(found, at_ns, x)
+    return TruePassings(found, at_ns, x, slip)
 
 
 def _places(
     epochs: pl.DataFrame, truth: pl.DataFrame, between: pl.DataFrame | None
-) -> tuple[Ints, Floats, Floats, Ints]:
-    """Instants, true positions, speeds and legs in order of time, where the truth is known."""
+) -> tuple[Ints, Floats, Floats, Ints, Floats]:
+    """Instants, true positions, speeds, legs and slips in order of time, where the truth is known."""
     place = floats(truth, "truth_path_m")
     rows = np.flatnonzero(np.isfinite(place))
     leg = epochs["leg"]
     if leg.null_count():
         leg = leg.fill_null(strategy="forward").fill_null(strategy="backward")
     at_ns, x, speed, legs = valid_ns(epochs)[rows], place[rows], floats(epochs, "speed_mps")[rows], ints(leg)[rows]
+    slip = np.nan_to_num(np.abs(floats(truth, "truth_slip_m")[rows]))
     if between is None:
-        return at_ns, x, speed, legs
+        return at_ns, x, speed, legs, slip
     at_ns = np.concatenate((at_ns, ints(between["at_ns"])))
     order = np.argsort(at_ns, kind="stable")
     x = np.concatenate((x, floats(between, "path_m")))[order]
     speed = np.concatenate((speed, floats(between, "speed_mps")))[order]
-    return at_ns[order], x, speed, np.concatenate((legs, ints(between["leg"])))[order]
+    legs = np.concatenate((legs, ints(between["leg"])))[order]
+    return at_ns[order], x, speed, legs, np.concatenate((slip, np.zeros(between.height)))[order]
 
 
 def legs_of(epochs: pl.DataFrame) -> Ints:

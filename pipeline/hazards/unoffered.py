@@ -63,8 +63,8 @@ def _doubt_m(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Float
     """How far beyond a balise the true position has to be seen on both sides [m]."""
     known = floats(epochs, "sigma_along_m")
     sigma_m = np.where(np.isfinite(known), known, np.nanmax(known, initial=0.0))
-    bound_m = np.nan_to_num(floats(truth, "truth_bound_m"))
-    return np.maximum(lds.rearm_m, np.maximum(_SIGMAS * sigma_m, bound_m))
+    bound_m, slip_m = np.nan_to_num(floats(truth, "truth_bound_m")), np.nan_to_num(floats(truth, "truth_slip_m"))
+    return np.maximum(lds.rearm_m, np.maximum(_SIGMAS * sigma_m, np.maximum(bound_m, np.abs(slip_m))))
 
 
 def _direction(passings: TruePassings, balise: str, t_ns: int, balise_m: float, doubt_m: float) -> Direction | None:
