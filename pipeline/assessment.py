@@ -13,7 +13,7 @@ from pipeline.results import catalogue, store
 from pipeline.safety.sentences import level_statements, plain_statements, reservations, slow_receivers
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally
-from pipeline.storage.files import Address
+from pipeline.storage.address import Address
 from schemas.config import Configuration
 from schemas.enums import TRUTH, RunStatus, ThrVerdict
 

@@ -16,7 +16,7 @@ from pipeline.matching.survey import survey_findings
 from pipeline.results import store
 from pipeline.site_windows import window_findings
 from pipeline.storage import files
-from pipeline.storage.files import Address, redacted
+from pipeline.storage.address import Address, name_of, redacted
 from schemas.config import IngestConfig
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding
@@ -42,7 +42,7 @@ def inspect_path(
         raise UsageError("is no site", place=redacted(str(path)), expected="a site, to hold a result against")
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
-    if files.name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
+    if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
         return inspect_log(path, config or IngestConfig())
     raise UsageError(
         "is neither a log, a site nor a result",

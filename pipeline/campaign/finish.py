@@ -9,7 +9,7 @@ import polars as pl
 from pipeline import storage
 from pipeline.derived_tables import derived_tables
 from pipeline.results import catalogue, store
-from pipeline.storage.files import Address, join
+from pipeline.storage.address import Address, join
 from schemas.config import Configuration, digest_of
 from schemas.tables import CONTRACT_VERSION
 from schemas.version import SOFTWARE

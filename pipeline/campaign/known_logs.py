@@ -11,7 +11,7 @@ import hashlib
 
 from pipeline import storage
 from pipeline.campaign.plan import RunJob
-from pipeline.storage.files import Address, join
+from pipeline.storage.address import Address, join
 
 
 def known_digest(job: RunJob, version: str | None) -> str:

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline import storage
-from pipeline.storage.files import Address, is_url, join, redacted
+from pipeline.storage.address import Address, is_url, join, redacted
 from schemas.errors import OutputError
 
 _NAME = ".lock"

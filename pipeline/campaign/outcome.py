@@ -12,7 +12,7 @@ import polars as pl
 from pipeline.campaign.plan import RunJob
 from pipeline.known_counts import known_counts
 from pipeline.provenance import Provenance
-from pipeline.storage.files import Address, redacted
+from pipeline.storage.address import Address, redacted
 from schemas.config import digest_of
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError

@@ -14,9 +14,9 @@ from pipeline import storage
 from pipeline.ingest.site import read_site
 from pipeline.results import store
 from pipeline.storage import files
-from pipeline.storage.files import Address, redacted
+from pipeline.storage.address import Address, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
-from schemas.errors import InputError, SiteError, UsageError
+from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
@@ -64,7 +64,6 @@ def make_plan(
     """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done."""
     config, vehicle = config or Configuration(), vehicle or Vehicle()
     addresses = find_runs(runs)
-    storage.reach(site, SiteError)
     site_digest = read_site(site).digest
     base = RunJob(
         run_id="",
@@ -107,7 +106,7 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for name in named:
         for address in _expand(name):
-            run_id = files.stem_of(address)
+            run_id = stem_of(address)
             if run_id == _NULL_OF_HIVE:
                 raise UsageError(
                     f"a run cannot be called {run_id!r}: readers of Hive partitions take it for null",
@@ -137,7 +136,7 @@ def _expand(name: str) -> list[Address]:
 
 
 def _matches(name: str) -> list[Address]:
-    if files.is_url(name):
+    if is_url(name):
         return storage.glob_remote(name) if glob.has_magic(name) else [name]
     if Path(name).exists():
         return [Path(name)]
@@ -146,17 +145,16 @@ def _matches(name: str) -> list[Address]:
 
 def _is_run(address: Address) -> bool:
     """A file, or a folder that holds a stream itself; whether it can be read is found out later."""
-    if files.name_of(address).endswith(".mcap"):
-        return True
-    storage.reach(address)
-    if not files.is_dir(address):
-        return True
-    names = files.list_dir(address)
+    return name_of(address).endswith(".mcap") or not files.is_dir(address) or _holds_stream(address)
+
+
+def _holds_stream(folder: Address) -> bool:
+    names = files.list_dir(folder)
     return any(f"{stream}.parquet" in names for stream in STREAMS)
 
 
 def _runs_in(folder: Address) -> list[Address]:
-    inside = [files.join(folder, name) for name in files.list_dir(folder)]
+    inside = [join(folder, name) for name in files.list_dir(folder)]
     runs = [child for child in inside if _looks_like_run(child)]
     if not runs:
         raise UsageError(
@@ -166,11 +164,15 @@ def _runs_in(folder: Address) -> list[Address]:
 
 
 def _looks_like_run(child: Address) -> bool:
-    if files.name_of(child).startswith("."):
+    if name_of(child).startswith("."):
         return False
+    if name_of(child).endswith(".mcap"):
+        return True
     try:
-        return files.name_of(child).endswith(".mcap") or (files.is_dir(child) and _is_run(child))
+        return files.is_dir(child) and _holds_stream(child)
     except InputError:
+        if is_url(child):
+            raise  # the store is silent: nobody knows what would be left out
         return False
 
 

@@ -19,7 +19,7 @@ from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
 from pipeline.campaign.tally import Tally, loss_line, outcome_line, summary_line
 from pipeline.campaign.watch import Summary, Watch
-from pipeline.storage.files import is_url, join, redacted
+from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
 from schemas.version import SOFTWARE
 

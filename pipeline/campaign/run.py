@@ -14,7 +14,7 @@ from pipeline.campaign.loop import CampaignLoop
 from pipeline.campaign.plan import Plan, held_by, with_previous
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
-from pipeline.storage.files import is_url
+from pipeline.storage.address import is_url
 from schemas.errors import UsageError
 
 TIME_LIMIT_S = 3600.0

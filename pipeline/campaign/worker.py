@@ -15,7 +15,7 @@ from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
 from pipeline.ingest.site import read_site
 from pipeline.results import store
-from pipeline.storage.files import is_url, redacted
+from pipeline.storage.address import is_url, redacted
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
@@ -108,7 +108,7 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
 @lru_cache(maxsize=2)
 def _site(address: str, digest: str) -> Site:
     """The site, read once per worker."""
-    storage.reach(address)
+    storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
     site = read_site(address)
     if site.digest != digest:
         raise SiteError(

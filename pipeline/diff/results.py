@@ -12,7 +12,7 @@ from pipeline import storage
 from pipeline.diff.hazards import HAZARD_WINDOW_S, HazardChange, compare_hazards
 from pipeline.diff.tables import Difference, compare_tables
 from pipeline.results import store
-from pipeline.storage.files import Address, redacted
+from pipeline.storage.address import Address, redacted
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 

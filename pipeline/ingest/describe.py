@@ -18,6 +18,7 @@ from pipeline.ingest.mcap_run import walk_log
 from pipeline.ingest.plan import Sample, candidates, source_of
 from pipeline.ingest.run import read_run
 from pipeline.storage import files
+from pipeline.storage.address import Address, join, name_of
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -73,9 +74,9 @@ class LogDescription:
     starting_config: str
 
 
-def describe_log(path: files.Address, config: IngestConfig) -> LogDescription:
+def describe_log(path: Address, config: IngestConfig) -> LogDescription:
     """Describe a run; a log that cannot be replayed is described as far as it can be read."""
-    is_mcap = files.name_of(path).endswith(".mcap")
+    is_mcap = name_of(path).endswith(".mcap")
     topics = _topics(path, config) if is_mcap else ()
     run: RunLog | None = None
     problems: tuple[str, ...] = ()
@@ -99,11 +100,11 @@ def describe_log(path: files.Address, config: IngestConfig) -> LogDescription:
     )
 
 
-def _size(path: files.Address, is_file: bool) -> int:
+def _size(path: Address, is_file: bool) -> int:
     if is_file:
         return files.size_of(path)
     names = [name for name in files.list_dir(path) if name.endswith(".parquet")]
-    return sum(files.size_of(files.join(path, name)) for name in names)
+    return sum(files.size_of(join(path, name)) for name in names)
 
 
 def _summaries(run: RunLog) -> list[StreamSummary]:
@@ -177,7 +178,7 @@ def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
         return {}
 
 
-def _topics(path: files.Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
+def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
     """All topics as far as the log can be read; damage is a problem that reading reports."""
     census = _Census()
     try:

@@ -23,6 +23,7 @@ from pipeline.ingest.plan import Sample, candidates, is_candidate, source_of
 from pipeline.ingest.reader import SourceReader
 from pipeline.ingest.settle import settle
 from pipeline.storage import files
+from pipeline.storage.address import Address, stem_of
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog
@@ -60,7 +61,7 @@ def sample_of(messages: Messages, channel: Channel) -> Sample:
         raise undecodable(channel, messages, 0, error) from None
 
 
-def read_mcap(path: files.Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
+def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """All streams of a log, read strictly from front to back in pieces."""
     if not with_digest:
         return _read(path, config, lambda _: None)
@@ -69,12 +70,12 @@ def read_mcap(path: files.Address, config: IngestConfig, with_digest: bool = Tru
         return replace(run, input_digest=digest.hexdigest())
 
 
-def _read(path: files.Address, config: IngestConfig, on_bytes: Callable[[memoryview], object]) -> RunLog:
+def _read(path: Address, config: IngestConfig, on_bytes: Callable[[memoryview], object]) -> RunLog:
     streams = McapStreams(config)
     walk = walk_log(path, config, streams, on_bytes)
     frames, slow_messages, left_over = _frames(path, config, walk, streams)
     return RunLog(
-        run_id=files.stem_of(path),
+        run_id=stem_of(path),
         notes=IngestNotes(
             partial_until_ns=_last_ns(frames["gnss"]) if walk.cut_at is not None else None,
             damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
@@ -92,7 +93,7 @@ class BlockSink(Protocol):
 
 
 def walk_log(
-    path: files.Address, config: IngestConfig, streams: BlockSink, on_bytes: Callable[[memoryview], object]
+    path: Address, config: IngestConfig, streams: BlockSink, on_bytes: Callable[[memoryview], object]
 ) -> McapWalk:
     """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind."""
     limit = int(config.chunk_limit_mib * _MIB)
@@ -113,7 +114,7 @@ def walk_log(
     return walk
 
 
-def _check_data_crc(path: files.Address, walk: McapWalk) -> None:
+def _check_data_crc(path: Address, walk: McapWalk) -> None:
     """The checksum over the whole data section, which few recorders write.
 
     The Rust writer leaves the contents of chunks out of it when it is told to give chunks no checksums.
@@ -126,7 +127,7 @@ def _check_data_crc(path: files.Address, walk: McapWalk) -> None:
     walk.crc_covers_chunks = False
 
 
-def _crc_of(path: files.Address, end: int, left_out: Sequence[tuple[int, int]]) -> int:
+def _crc_of(path: Address, end: int, left_out: Sequence[tuple[int, int]]) -> int:
     """CRC-32 of the file up to `end`, without some parts."""
     crc, at = 0, 0
     with files.open_binary(path) as stream:
@@ -139,7 +140,7 @@ def _crc_of(path: files.Address, end: int, left_out: Sequence[tuple[int, int]]) 
 
 
 def _frames(
-    path: files.Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
+    path: Address, config: IngestConfig, walk: McapWalk, streams: McapStreams
 ) -> tuple[dict[str, pl.DataFrame], int, tuple[str, ...]]:
     """Frames of all streams, messages decoded one by one, and the topics that fed none."""
     readers = [reader for found in streams.readers.values() for reader in found]
@@ -164,7 +165,7 @@ def _frames(
     return frames, slow_messages, (*left_over, *remarks)
 
 
-def _no_gnss(path: files.Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:
+def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:
     if walk.cut_at is not None and not walk.met.message_counts:
         return Breach(
             str(path),

@@ -12,11 +12,12 @@ import pyarrow.parquet as pq
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.conform import conform, extra_columns
 from pipeline.storage import files
+from pipeline.storage.address import Address, join, stem_of
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 
-def read_folder(path: files.Address, with_digest: bool = True) -> RunLog:
+def read_folder(path: Address, with_digest: bool = True) -> RunLog:
     """A folder `RUN/` of `gnss.parquet`, `odometer.parquet`, ...; every breach of every file in one error."""
     present = set(files.list_dir(path))
     breaches: list[Breach] = []
@@ -28,7 +29,7 @@ def read_folder(path: files.Address, with_digest: bool = True) -> RunLog:
     for stream in STREAMS:
         if f"{stream}.parquet" not in present:
             continue
-        file = files.join(path, f"{stream}.parquet")
+        file = join(path, f"{stream}.parquet")
         content = files.read_bytes(file)
         if with_digest:
             digest.update(f"{stream}:{len(content)}:".encode())
@@ -40,14 +41,14 @@ def read_folder(path: files.Address, with_digest: bool = True) -> RunLog:
     refuse(breaches)
     skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
     return RunLog(
-        run_id=files.stem_of(path),
+        run_id=stem_of(path),
         notes=IngestNotes(skipped_topics=tuple(skipped)),
         input_digest=digest.hexdigest() if with_digest else "",
         **frames,
     )
 
 
-def _no_gnss(path: files.Address, present: set[str]) -> Breach:
+def _no_gnss(path: Address, present: set[str]) -> Breach:
     return Breach(
         str(path),
         "holds no GNSS stream",

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pipeline.ingest.mcap_run import read_mcap
 from pipeline.ingest.parquet import read_folder
 from pipeline.storage import files
+from pipeline.storage.address import Address, name_of, shown
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog
 
 
-def read_run(path: files.Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
+def read_run(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """One run from `RUN.mcap` or a folder `RUN/` of Parquet files (CONTRACT section 1).
 
     `with_digest`: also the SHA-256 of its files, which results are stamped with; else `input_digest` is empty.
@@ -19,15 +20,15 @@ def read_run(path: files.Address, config: IngestConfig, with_digest: bool = True
     included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
     damage and says so in `notes`.
     """
-    if files.name_of(path).endswith(".mcap"):
+    if name_of(path).endswith(".mcap"):
         return read_mcap(path, config, with_digest)
     if files.is_dir(path):
         return read_folder(path, with_digest)
     if not files.exists(path):
-        raise InputError("does not exist", place=files.shown(path), expected="RUN.mcap or a folder RUN/")
+        raise InputError("does not exist", place=shown(path), expected="RUN.mcap or a folder RUN/")
     raise InputError(
         "is neither an MCAP file nor a folder",
-        place=files.shown(path),
+        place=shown(path),
         expected="RUN.mcap or a folder RUN/ of Parquet files",
         remedy="`balise convert` makes runs of receiver logs.",
     )

@@ -21,7 +21,8 @@ from pipeline.ingest.site_tables import (
     load_table,
     typed_table,
 )
-from pipeline.storage.files import is_dir, join, list_dir, read_bytes, shown
+from pipeline.storage.address import join, shown
+from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.track import geometric_measures_m, track_of
 from schemas.errors import InputError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
@@ -74,10 +75,10 @@ def read_site(path: Path | str) -> Site:
 
 def _files(folder: Path | str) -> dict[str, bytes]:
     """The site's files by name; of each table there is at most one."""
-    if not is_dir(folder):
-        raise SiteError("is not a folder", place=shown(folder), remedy="A site is a folder that holds a track.")
     names = [table + suffix for table in _NAMES for suffix in _SUFFIXES.get(table, _TABLES)]
     try:
+        if not is_dir(folder):
+            raise SiteError("is not a folder", place=shown(folder), remedy="A site is a folder that holds a track.")
         present = [name for name in list_dir(folder) if name in names]
         for table in _NAMES:
             same = [name for name in present if name.startswith(f"{table}.")]

@@ -12,7 +12,8 @@ import re
 import polars as pl
 
 from pipeline.results import catalogue, store
-from pipeline.storage.files import Address, exists, is_url, join
+from pipeline.storage.address import Address, is_url, join
+from pipeline.storage.files import exists
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES

@@ -1,7 +1,8 @@
 """Local folders and object stores behind the same few operations.
 
-`files` reads one file by its address; `fetching` lists, and reads many; `writing` puts files there whole or not at all;
-`identity` tells whether content is still the same; `object_store` is the patience with stores that fail.
+`address` is how places are named; `files` reads one file; `fetching` lists, and reads many; `writing` puts files there
+whole or not at all; `identity` tells whether content is still the same; `object_store` opens the stores, and is the
+patience with those that fail.
 """
 
 from pipeline.storage.fetching import content_of, folders_in, glob_remote, local_copy, reach, read_many

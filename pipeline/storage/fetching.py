@@ -9,18 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.storage.files import Address, is_url, name_of
+from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.object_store import arrivals, on_store, opened
-from schemas.errors import BaliseError, InputError
+from schemas.errors import InputError
 
 
-def reach(address: Address, kind: type[BaliseError] = InputError) -> None:
-    """Raises where the store of an address does not answer; local paths answer always.
-
-    For reading through `storage.files`, whose patience is that of the store's own library: many minutes.
-    """
+def reach(address: Address) -> None:
+    """Raises `InputError` where the store of an address does not answer; local paths answer always."""
     if is_url(address):
-        on_store(address, lambda store, path: store.isdir(path), kind=kind)
+        on_store(address, lambda store, path: store.isdir(path), kind=InputError)
 
 
 def folders_in(address: Address) -> list[str]:
@@ -88,7 +85,10 @@ def local_copy(address: Address) -> Iterator[Path]:
         target = Path(folder) / name_of(address)
 
         def fetch(store: Any, path: str) -> None:
-            store.get(path, str(target), recursive=store.isdir(path), callback=arrivals(store))
+            if store.isdir(path):
+                store.get(path, str(target), recursive=True, callback=arrivals(store))
+            else:
+                store.get_file(path, str(target), callback=arrivals(store))
 
         on_store(address, fetch, kind=InputError)
         yield target

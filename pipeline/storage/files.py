@@ -1,134 +1,89 @@
-"""Access to files by path or address: local paths, and `s3://`-style addresses through fsspec.
+"""Reading by path or address: local paths, and `s3://`-style addresses with the patience of `object_store`.
 
-Everything that ingest and campaigns read goes through here, so that both kinds behave alike.
-fsspec is imported only for addresses.
+All that ingest reads goes through here, so that both kinds behave alike. Raises `InputError` that names the place.
 """
 
 from __future__ import annotations
 
-import re
-from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, TypeVar
 
+from pipeline.storage.address import Address, is_url, join, name_of, redacted, shown, stem_of
+from pipeline.storage.fetching import local_copy
+from pipeline.storage.object_store import on_store
 from schemas.errors import InputError
 
-Address = Path | str
+# Those of `address` for the modules that still look for them here.
+__all__ = [
+    "Address",
+    "exists",
+    "is_dir",
+    "is_url",
+    "join",
+    "list_dir",
+    "name_of",
+    "open_binary",
+    "read_bytes",
+    "redacted",
+    "shown",
+    "size_of",
+    "stem_of",
+]
 
-_SECRETS = re.compile(r"(?<=://)[^/@\s]+@|\?[^\s'\"]*|((?:AKIA|ASIA)[A-Z0-9]{12,})")
-
-
-def is_url(path: Address) -> bool:
-    """Whether the path is an address with a protocol (`s3://bucket/run.mcap`)."""
-    return isinstance(path, str) and "://" in path
-
-
-def redacted(text: str) -> str:
-    """The text without user names, passwords, keys and signatures that addresses may carry."""
-    return _SECRETS.sub("", text)
-
-
-def shown(path: Address) -> str:
-    """The path as messages name it."""
-    return redacted(str(path)) if is_url(path) else str(path)
-
-
-def name_of(path: Address) -> str:
-    """The last part of the path, without a trailing slash."""
-    return PurePosixPath(str(path).rstrip("/")).name if is_url(path) else Path(path).name
-
-
-def stem_of(path: Address) -> str:
-    """The run id: the name without `.mcap`."""
-    return name_of(path).removesuffix(".mcap")
-
-
-def join(path: Address, name: str) -> Address:
-    return f"{str(path).rstrip('/')}/{name}" if is_url(path) else Path(path) / name
+T = TypeVar("T")
 
 
 def exists(path: Address) -> bool:
     if not is_url(path):
         return Path(path).exists()
-    filesystem, inner = _filesystem(str(path))
-    with _as_input_error(path):
-        return bool(filesystem.exists(inner))
+    return on_store(path, lambda store, inner: bool(store.exists(inner)), kind=InputError)
 
 
 def is_dir(path: Address) -> bool:
     if not is_url(path):
         return Path(path).is_dir()
-    filesystem, inner = _filesystem(str(path))
-    with _as_input_error(path):
-        return bool(filesystem.isdir(inner))
+    return on_store(path, lambda store, inner: bool(store.isdir(inner)), kind=InputError)
 
 
 def list_dir(path: Address) -> list[str]:
     """Names in a folder, sorted."""
-    with _as_input_error(path):
-        if not is_url(path):
-            return sorted(entry.name for entry in Path(path).iterdir())
-        filesystem, inner = _filesystem(str(path))
-        return sorted(name_of(f"x://{entry}") for entry in filesystem.ls(inner, detail=False))
+    if not is_url(path):
+        return _local(path, lambda folder: sorted(entry.name for entry in folder.iterdir()))
+
+    def names(store: Any, inner: str) -> list[str]:
+        return sorted(name_of(f"x://{entry}") for entry in store.ls(inner, detail=False))
+
+    return on_store(path, names, kind=InputError)
 
 
 def open_binary(path: Address) -> IO[bytes]:
-    """A seekable binary file."""
-    with _as_input_error(path):
-        if not is_url(path):
-            return Path(path).open("rb", buffering=0)
-        filesystem, inner = _filesystem(str(path))
-        stream: IO[bytes] = filesystem.open(inner, "rb")
-        return stream
+    """A seekable binary file; of an address a copy on this machine, whose room is free again once it is closed."""
+    with local_copy(path) as file:
+        return _local(file, lambda present: present.open("rb", buffering=0))
 
 
 def read_bytes(path: Address) -> bytes:
     """The whole content."""
-    with open_binary(path) as stream, _as_input_error(path):
-        return stream.read()
+    with local_copy(path) as file:
+        return _local(file, Path.read_bytes)
 
 
 def size_of(path: Address) -> int:
     """Size in bytes."""
-    with _as_input_error(path):
-        if not is_url(path):
-            return Path(path).stat().st_size
-        filesystem, inner = _filesystem(str(path))
-        return int(filesystem.size(inner))
+    if not is_url(path):
+        return _local(path, lambda file: file.stat().st_size)
+    return on_store(path, lambda store, inner: int(store.size(inner)), kind=InputError)
 
 
-def _filesystem(url: str) -> tuple[Any, str]:
-    import fsspec
-
+def _local(path: Address, operation: Callable[[Path], T]) -> T:
+    """What an operating system raises, as one message that names the place."""
     try:
-        filesystem, inner = fsspec.core.url_to_fs(url)
-    except (ImportError, ValueError) as error:
+        return operation(Path(path))
+    except FileNotFoundError:
         raise InputError(
-            f"cannot be opened: {redacted(str(error))}",
-            place=redacted(url),
-            remedy="Install the extra for this kind of address.",
+            "does not exist", place=str(path), expected="a file or folder", remedy="Check the path."
         ) from None
-    return filesystem, str(inner)
-
-
-class _as_input_error:  # noqa: N801 - reads as a phrase at its uses
-    """Turns what an operating system or a store raises into one message that names the place."""
-
-    def __init__(self, path: Address) -> None:
-        self.path = path
-        self.place = shown(path)
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, FileNotFoundError):
-            raise InputError(
-                "does not exist", place=self.place, expected="a file or folder", remedy="Check the path."
-            ) from None
-        if isinstance(error, OSError):
-            reason = error.strerror or str(error) or type(error).__name__
-            raise InputError(f"cannot be read: {reason}", place=self.place) from None
-        if isinstance(error, Exception) and is_url(self.path) and not isinstance(error, InputError):
-            # Stores raise their client library's own exceptions, which share no base class.
-            reason = str(error) or type(error).__name__
-            raise InputError(f"cannot be read: {redacted(reason)}", place=self.place) from None
+    except OSError as error:
+        reason = error.strerror or str(error) or type(error).__name__
+        raise InputError(f"cannot be read: {reason}", place=str(path)) from None

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.fetching import folders_in
-from pipeline.storage.files import Address, is_url, name_of
 from pipeline.storage.object_store import on_store
 from schemas.errors import InputError
 

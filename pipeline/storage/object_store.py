@@ -12,8 +12,8 @@ from functools import lru_cache, partial
 from itertools import count
 from typing import Any, TypeVar
 
-from pipeline.storage.files import Address, redacted
-from schemas.errors import BaliseError, OutputError, UsageError
+from pipeline.storage.address import Address, redacted
+from schemas.errors import BaliseError, InputError, OutputError, UsageError
 
 T = TypeVar("T")
 
@@ -39,7 +39,7 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
     An answer that may be another one later (busy, broken connection, none at all) is asked for again as long as
     there is patience: `BALISE_STORE_PATIENCE_S` seconds without anything having come, 45 unless set.
     """
-    store, path = opened(address)
+    store, path = opened(address, kind)
     limit_s = patience_s()
     watched = _Watched(store, limit_s)
     reason = "no answer"
@@ -50,6 +50,8 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
             raise
         except Exception as error:
             # Stores raise their client library's own exceptions, which share no base class.
+            if isinstance(error, FileNotFoundError) and kind is InputError:
+                raise _absent(address) from None
             reason = _told(error, reason)
             pause_s = min(_FIRST_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
             silent = _may_pass(error) and watched.silence_s + pause_s > limit_s
@@ -71,14 +73,14 @@ def patience_s() -> float:
     return limit_s
 
 
-def opened(address: Address) -> tuple[Any, str]:
-    """The file system of an address and its path there."""
+def opened(address: Address, kind: type[BaliseError] = OutputError) -> tuple[Any, str]:
+    """The file system of an address and its path there: every access to a store goes through this one."""
     protocol, _, rest = str(address).partition("://")
     try:
         store = _filesystem(protocol, f"{protocol}://{rest.split('/', 1)[0]}")
         return store, str(store._strip_protocol(str(address)))
     except (ImportError, ValueError) as error:
-        raise OutputError(
+        raise kind(
             f"cannot be opened: {redacted(str(error))}",
             place=redacted(str(address)),
             remedy="Install the extra for this kind of address (`balise[s3]`).",
@@ -168,6 +170,12 @@ def _may_pass(error: Exception) -> bool:
     if isinstance(error, OSError):
         return error.errno not in _LASTING and not isinstance(error, FileNotFoundError | PermissionError)
     return any(kind.__name__ in _CONNECTION_ERRORS for kind in type(error).__mro__)
+
+
+def _absent(address: Address) -> InputError:
+    return InputError(
+        "does not exist", place=redacted(str(address)), expected="a file or folder", remedy="Check the address."
+    )
 
 
 def _refused(address: Address, reason: str, kind: type[BaliseError], after_s: float | None) -> BaliseError:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.storage.files import Address, is_url, redacted
+from pipeline.storage.address import Address, is_url, redacted
 from pipeline.storage.object_store import on_store
 from schemas.errors import OutputError
 

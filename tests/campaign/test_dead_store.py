@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import pytest
 
 from pipeline import storage
 from pipeline.campaign import make_plan, run_campaign
-from pipeline.storage import object_store
+from pipeline.storage import files, object_store
 from schemas.enums import RunStatus
 from schemas.errors import InputError, OutputError, SiteError, UsageError
 from tests.campaign.compare import by_run, plan_of
@@ -123,6 +123,20 @@ def test_dead_store_ends_the_command_soon(ill: str, small_trial: SmallTrial, tmp
     with pytest.raises(OutputError, match="asked in vain"):
         run_campaign(plan_of(small_trial, f"{ill}/out", small_trial.paths[:1]))
     assert time.monotonic() - begun_s < 5 * _PATIENCE_S
+
+
+@pytest.mark.parametrize("ill", ["busy", "silent", "broken"], indirect=True)
+@pytest.mark.parametrize(
+    "read", [files.exists, files.is_dir, files.list_dir, files.open_binary, files.read_bytes, files.size_of]
+)
+def test_reading_by_address_is_as_patient(
+    ill: str, read: Callable[[str], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BALISE_STORE_PATIENCE_S", "0.3")
+    begun_s = time.monotonic()
+    with pytest.raises(InputError, match=r"far/track.csv: the store was asked in vain for 0.3 s: "):
+        read(f"{ill}/far/track.csv")
+    assert time.monotonic() - begun_s < 3.0
 
 
 @pytest.mark.parametrize("ill", ["slow"], indirect=True)

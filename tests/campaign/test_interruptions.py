@@ -20,7 +20,7 @@ from pipeline.campaign.lock import locked
 from pipeline.campaign.plan import held_by
 from pipeline.campaign.worker import replay_one
 from pipeline.results import store
-from pipeline.storage.files import Address
+from pipeline.storage.address import Address
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
 from tests.campaign.compare import ROOT, campaign_bytes, command, plan_of, result_bytes, run, start, wait_for

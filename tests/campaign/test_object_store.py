@@ -18,8 +18,9 @@ from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
+from pipeline.storage import files
 from schemas.enums import RunStatus
-from schemas.errors import OutputError
+from schemas.errors import InputError, OutputError
 from schemas.tables import TABLES
 from tests.campaign.compare import by_run, result_bytes
 from tests.campaign.test_local import undisturbed
@@ -123,6 +124,22 @@ def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
     storage.write_bytes(place, storage.read_many([place])[place] + b"more")
     assert catalogue.fresh(out, "passages") is None
     assert catalogue.fresh(out, "runs") is not None
+
+
+def test_what_others_write_is_seen_at_once(bucket: str) -> None:
+    import s3fs
+
+    folder = f"{bucket}/shared"
+    with pytest.raises(InputError, match="shared: does not exist"):
+        files.list_dir(folder)
+    for count in (1, 2):
+        s3fs.S3FileSystem(skip_instance_cache=True).pipe_file(f"trials/shared/{count}[a].csv", b"x" * count)
+        assert len(files.list_dir(folder)) == count
+    assert files.read_bytes(f"{folder}/2[a].csv") == b"xx"
+    with files.open_binary(f"{folder}/2[a].csv") as stream:
+        assert (stream.seek(1), stream.read()) == (1, b"x")
+    with pytest.raises(InputError, match=r"3.csv: does not exist"):
+        files.read_bytes(f"{folder}/3.csv")
 
 
 def test_store_that_refuses_now_and_then(

@@ -8,7 +8,9 @@ import fsspec
 import pytest
 
 from pipeline.campaign import find_runs
-from schemas.errors import UsageError
+from pipeline.storage import files
+from pipeline.storage.address import Address
+from schemas.errors import InputError, UsageError
 
 
 @pytest.fixture
@@ -71,3 +73,19 @@ def test_addresses() -> None:
     assert list(find_runs(["memory://find/*.mcap"])) == ["y"]
     with pytest.raises(UsageError, match="no such run"):
         find_runs(["memory://find/*.bag"])
+
+
+def test_a_store_that_falls_silent_leaves_no_run_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    store = fsspec.filesystem("memory")
+    for name in ("/silent/x/gnss.parquet", "/silent/y/gnss.parquet"):
+        store.pipe_file(name, b"")
+    listed = files.list_dir
+
+    def silent(folder: Address) -> list[str]:
+        if str(folder).endswith("/y"):
+            raise InputError("the store was asked in vain for 45 s: no answer", place=str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(files, "list_dir", silent)
+    with pytest.raises(InputError, match="silent/y: the store was asked in vain"):
+        find_runs(["memory://silent"])

@@ -12,7 +12,7 @@ import pytest
 from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
-from pipeline.storage.files import Address, redacted
+from pipeline.storage.address import Address, redacted
 from schemas.config import Configuration
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunTables
