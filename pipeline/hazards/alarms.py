@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm

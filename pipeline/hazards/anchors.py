@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, linking_gap_s, nominal_period_s
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.arrays import linking_gap_s, nominal_period_s
 from pipeline.hazards.travel import Travel
 from schemas.config import LdsConfig
 

@@ -1,4 +1,4 @@
-"""The columns and array operations that the modules of this area work with."""
+"""Array operations that several modules of this area need."""
 
 from __future__ import annotations
 
@@ -7,24 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
-
-__all__ = [
-    "NS_PER_S",
-    "Bools",
-    "Floats",
-    "Ints",
-    "flags",
-    "floats",
-    "interpolate_known",
-    "ints",
-    "linking_gap_s",
-    "nominal_period_s",
-    "runs_of",
-    "times_ns",
-    "truths",
-    "words",
-]
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints
 
 
 def words(kinds: Sequence[str], codes: Ints) -> pl.Series:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
 from pipeline.hazards.truth import valid_ns
 
 Counted = Callable[[pl.Series], pl.Series]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.columns import Bools, Floats, flags, times_ns
 from pipeline.hazards.alarms import alarms_table
-from pipeline.hazards.arrays import Bools, Floats, flags, linking_gap_s, times_ns
+from pipeline.hazards.arrays import linking_gap_s
 from pipeline.hazards.crossings import beacons_by_leg
 from pipeline.hazards.episodes import Draft, find_episodes
 from pipeline.hazards.excursions import faulty_spans

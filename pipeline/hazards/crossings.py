@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import Bools, Floats, Ints, floats
+from pipeline.columns import Bools, Floats, Ints, floats
 from pipeline.hazards.series import Series
 from schemas.enums import BaliseKind
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, runs_of
+from pipeline.columns import NS_PER_S
+from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.episodes import Calm, Draft
 from pipeline.hazards.fails import Fails
 from pipeline.hazards.jumps import Jump

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, runs_of
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.crossings import Beacons, Crossing, crossing_at
 from pipeline.hazards.series import Series
 from schemas.config import HazardConfig

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, interpolate_known, ints, times_ns
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
+from pipeline.hazards.arrays import interpolate_known
 from pipeline.hazards.rows import Judged
 from pipeline.hazards.series import Series, direction_of
 from pipeline.hazards.states import contradicted

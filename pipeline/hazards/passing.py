@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints, floats, ints
 from pipeline.hazards.truth import valid_ns
 
 # A hole in the epochs over which the train's speed at both ends gives the passage between them.

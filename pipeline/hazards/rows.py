@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Floats
+from pipeline.columns import NS_PER_S, Floats
 from pipeline.hazards.crossings import Crossing
 from pipeline.hazards.episodes import Draft
 from pipeline.hazards.series import Series

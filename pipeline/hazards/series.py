@@ -7,18 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import (
-    NS_PER_S,
-    Bools,
-    Floats,
-    Ints,
-    flags,
-    floats,
-    ints,
-    linking_gap_s,
-    nominal_period_s,
-    times_ns,
-)
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
+from pipeline.hazards.arrays import linking_gap_s, nominal_period_s
 from schemas.config import LdsConfig
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints
 from pipeline.hazards.travel import Travel
 
 # A short slip shows over seconds, a slow one over a minute.

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.hazards.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats
 from pipeline.hazards.travel import Travel
 
 Matrix = npt.NDArray[np.float64]

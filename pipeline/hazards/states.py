@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import Bools, Floats, flags, floats, times_ns, truths, words
+from pipeline.columns import Bools, Floats, flags, floats, times_ns, truths
+from pipeline.hazards.arrays import words
 from pipeline.hazards.series import direction_of
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import BaliseKind, LdsState, PassageStatus

@@ -11,19 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
+from pipeline.columns import NS_PER_S, Floats, Ints, flags, floats, times_ns
 from pipeline.hazards.anchors import Anchors, Carried, carry
-from pipeline.hazards.arrays import (
-    NS_PER_S,
-    Floats,
-    Ints,
-    flags,
-    floats,
-    interpolate_known,
-    linking_gap_s,
-    nominal_period_s,
-    times_ns,
-    words,
-)
+from pipeline.hazards.arrays import interpolate_known, linking_gap_s, nominal_period_s, words
 from pipeline.hazards.slip import repaired_by_doppler
 from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.hazards.arrays import Floats, floats, linking_gap_s, nominal_period_s
+from pipeline.columns import Floats, floats
+from pipeline.hazards.arrays import linking_gap_s, nominal_period_s
 from pipeline.hazards.passages import positions_at
 from pipeline.hazards.passing import TruePassings, legs_of, true_passings
 from pipeline.hazards.truth import valid_ns
