@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.timeline import NS_PER_S, nominal_period_s
+from pipeline.columns import NS_PER_S
+from pipeline.timeline import nominal_period_s
 
 _PLACE = ("netelement_id", "measure_m", "path_m")
 _LEAST_GAP_S = 1.0

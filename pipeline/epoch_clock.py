@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.timeline import Flags, Floats, Instants, gap_limit_s, held_s, nominal_period_s
+from pipeline.columns import Bools, Floats, Ints
+from pipeline.timeline import gap_limit_s, held_s, nominal_period_s
 from schemas.config import Configuration
 
 
@@ -14,7 +15,7 @@ from schemas.config import Configuration
 class Clock:
     """The epochs' times and how long the state of each holds."""
 
-    t_ns: Instants
+    t_ns: Ints
     period_s: float | None
     limit_s: float
     held_s: Floats
@@ -31,7 +32,7 @@ class Clock:
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
 
 
-def flags(frame: pl.DataFrame, condition: pl.Expr) -> Flags:
+def flags(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
     """A condition with false for null."""
     return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
 

@@ -9,13 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Instants = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-NS_PER_S = 1_000_000_000
+from pipeline.columns import NS_PER_S, Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -31,7 +26,7 @@ class Uptime:
         return self.up_s / self.losses / 3600.0 if self.losses and self.up_s > 0 else None
 
 
-def nominal_period_s(t_ns: Instants) -> float | None:
+def nominal_period_s(t_ns: Ints) -> float | None:
     """Median distance of consecutive epochs [s]; None for fewer than two."""
     return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else None
 
@@ -41,7 +36,12 @@ def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
     return min(gap_reset_s, max(1.5 * (period_s or 0.0), 1.0))
 
 
-def outages_s(t_ns: Instants, usable: Flags, limit_s: float) -> Floats:
+def linking_gap_s(period_s: float | None, crossing_gap_s: float = 1.0) -> float:
+    """Longest time between epochs [s] over which a movement is interpolated (DOMAIN section 4)."""
+    return max(1.5 * (period_s or 0.0), crossing_gap_s)
+
+
+def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:
     """Lengths [s] of the stretches over `limit_s` without a usable epoch, in order of time.
 
     From one usable epoch to the next; at the ends from the first and to the last epoch.
@@ -53,7 +53,7 @@ def outages_s(t_ns: Instants, usable: Flags, limit_s: float) -> Floats:
     return stretches[stretches > limit_s]
 
 
-def uptime(t_ns: Instants, good: Flags, limit_s: float) -> Uptime:
+def uptime(t_ns: Ints, good: Bools, limit_s: float) -> Uptime:
     """Time during which `good` held [s], and its losses: outages that followed upon a good epoch."""
     held = t_ns[good]
     if len(held) == 0:
@@ -63,7 +63,7 @@ def uptime(t_ns: Instants, good: Flags, limit_s: float) -> Uptime:
     return Uptime(float(stretches[~lost].sum()), int(lost.sum()))
 
 
-def held_s(t_ns: Instants, limit_s: float) -> Floats:
+def held_s(t_ns: Ints, limit_s: float) -> Floats:
     """For how long the state of each epoch is known to hold [s]: to the next epoch, 0 before a gap."""
     if len(t_ns) == 0:
         return np.empty(0)
@@ -71,13 +71,13 @@ def held_s(t_ns: Instants, limit_s: float) -> Floats:
     return np.where(steps <= limit_s, steps, 0.0)
 
 
-def share_of_time(held: Floats, where: Flags) -> float | None:
+def share_of_time(held: Floats, where: Bools) -> float | None:
     """Share of the time held that `where` covers; None without any."""
     total = held.sum()
     return min(1.0, float(held[where].sum() / total)) if total > 0 else None
 
 
-def availability(t_ns: Instants, valid: Flags, moving: Flags, limit_s: float) -> float | None:
+def availability(t_ns: Ints, valid: Bools, moving: Bools, limit_s: float) -> float | None:
     """Share of moving time, gaps included, during which `valid` held; None if it never moved.
 
     `moving[k]` says whether the train moved from epoch k to the next. A gap is time without validity.
@@ -90,7 +90,7 @@ def availability(t_ns: Instants, valid: Flags, moving: Flags, limit_s: float) ->
     return min(1.0, float(held[moving[:-1] & valid[:-1]].sum() / total)) if total > 0 else None
 
 
-def moved(t_ns: Instants, distance_m: Floats, speed_mps: Floats, deadband_mps: float) -> Flags:
+def moved(t_ns: Ints, distance_m: Floats, speed_mps: Floats, deadband_mps: float) -> Bools:
     """Whether the train moved from each epoch to the next (False for the last).
 
     By the distance covered where both ends are known (not NaN), by the speed at the epoch elsewhere.

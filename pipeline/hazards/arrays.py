@@ -7,23 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.columns import Bools, Floats, Ints
 
 
 def words(kinds: Sequence[str], codes: Ints) -> pl.Series:
     """Words of a closed set by their number, null for -1."""
     rows = np.where(codes < 0, len(kinds), codes)
     return pl.Series([*kinds, None], dtype=pl.Enum(kinds)).gather(pl.Series(rows))
-
-
-def nominal_period_s(t_ns: Ints) -> float:
-    """Median step between epochs [s]; 1 s where there is but one epoch."""
-    return float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else 1.0
-
-
-def linking_gap_s(period_s: float, crossing_gap_s: float = 1.0) -> float:
-    """Longest gap between epochs over which a movement is interpolated (DOMAIN section 4)."""
-    return max(1.5 * period_s, crossing_gap_s)
 
 
 def runs_of(mask: Bools) -> tuple[Ints, Ints]:

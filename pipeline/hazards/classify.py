@@ -9,7 +9,6 @@ import polars as pl
 
 from pipeline.columns import Bools, Floats, flags, times_ns
 from pipeline.hazards.alarms import alarms_table
-from pipeline.hazards.arrays import linking_gap_s
 from pipeline.hazards.crossings import beacons_by_leg
 from pipeline.hazards.episodes import Draft, find_episodes
 from pipeline.hazards.excursions import faulty_spans
@@ -33,6 +32,7 @@ from pipeline.hazards.series import Series, series_of
 from pipeline.hazards.states import contradicted, errors_of, lds_states
 from pipeline.hazards.suspect import Witnesses, suspect_of_error, witnesses_of
 from pipeline.hazards.timing import Timing, time_hazard
+from pipeline.timeline import linking_gap_s
 from schemas.config import Configuration
 from schemas.enums import PassageStatus, Suspect
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
-from pipeline.hazards.arrays import linking_gap_s, nominal_period_s
+from pipeline.timeline import linking_gap_s, nominal_period_s
 from schemas.config import LdsConfig
 
 
@@ -50,7 +50,7 @@ def series_of(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Seri
     that is, the gap is short (DOMAIN section 4) and the truth knows the movement over it.
     """
     t_ns = times_ns(epochs)
-    period_s = nominal_period_s(t_ns)
+    period_s = nominal_period_s(t_ns) or 1.0
     path, place = floats(epochs, "path_m"), floats(truth, "truth_path_m")
     usable = flags(epochs, "fix_valid") & np.isfinite(path) & np.isfinite(place)
     row = np.flatnonzero(usable)

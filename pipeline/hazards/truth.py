@@ -13,10 +13,11 @@ import polars as pl
 
 from pipeline.columns import NS_PER_S, Floats, Ints, flags, floats, times_ns
 from pipeline.hazards.anchors import Anchors, Carried, carry
-from pipeline.hazards.arrays import interpolate_known, linking_gap_s, nominal_period_s, words
+from pipeline.hazards.arrays import interpolate_known, words
 from pipeline.hazards.slip import repaired_by_doppler
 from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel
+from pipeline.timeline import linking_gap_s, nominal_period_s
 from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 

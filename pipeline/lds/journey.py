@@ -9,8 +9,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.columns import floats
+from pipeline.columns import NS_PER_S, floats
 from pipeline.lds.bank_protocol import LdsLimits
+from pipeline.timeline import linking_gap_s, nominal_period_s
 from schemas.config import LdsConfig
 from schemas.enums import PassageStatus
 
@@ -82,7 +83,7 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
     positioned = fix_valid & np.isfinite(path_m)
     odometer_m = floats(epochs, "odometer_m")
     heading, travel = _headings(odometer_m, epochs["direction"], config.odometer_fixed_m)
-    gap_ns = crossing_gap_ns(t_ns, config)
+    gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.crossing_gap_s) * NS_PER_S)
     return Journey(
         t_ns=t_ns,
         leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
@@ -103,12 +104,6 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
         blind=_blind(t_ns, positioned, gap_ns),
         gap_ns=gap_ns,
     )
-
-
-def crossing_gap_ns(t_ns: Integers, config: LdsConfig) -> int:
-    """Longest time between epochs over which a crossing is interpolated: max(1.5 periods, 1 s)."""
-    period_ns = float(np.median(np.diff(t_ns))) if t_ns.size > 1 else 0.0
-    return round(max(1.5 * period_ns, config.crossing_gap_s * 1e9))
 
 
 def _blind(t_ns: Integers, positioned: Bools, gap_ns: int) -> Bools:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.columns import NS_PER_S
 from pipeline.hazards.fails import AlarmSpan
 from pipeline.timeline import nominal_period_s
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
 
-_NS_PER_S = 1_000_000_000
 # Streams rarely begin and end with the same epoch: so little without truth says nothing against it.
 _BLIND_S = 1.0
 
@@ -42,7 +42,7 @@ def _verdict(span: AlarmSpan, sides: tuple[Side, Side], config: HazardConfig) ->
 def _of_side(span: AlarmSpan, side: Side, config: HazardConfig) -> Verdict:
     if _known_wrong(span, side):
         return Verdict.TRUE
-    since_ns = span.start_ns - round(config.false_alarm_lookback_s * _NS_PER_S)
+    since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, span.end_ns))
     positioned = part.filter(pl.col("path_m").is_not_null())
     error, sigma = pl.col("error_along_m").abs(), pl.col("sigma_along_m").fill_null(0.0)

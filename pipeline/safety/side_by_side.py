@@ -13,13 +13,14 @@ from itertools import permutations
 import polars as pl
 
 from pipeline.channels import on_path_of, paired
+from pipeline.columns import Bools
 from pipeline.epoch_clock import Clock, flags, trusted
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Side, verdicts_of
 from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from pipeline.statistics import threshold_factor
-from pipeline.timeline import Flags, held_s, uptime
+from pipeline.timeline import held_s, uptime
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Evidence, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
@@ -45,10 +46,10 @@ class _Channel:
 
     clock: Clock
     fails: Fails
-    judged: Flags
-    working: Flags
-    known: Flags
-    wrong: Flags
+    judged: Bools
+    working: Bools
+    known: Bools
+    wrong: Bools
 
 
 @dataclass(frozen=True)
