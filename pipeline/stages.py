@@ -16,7 +16,7 @@ from pipeline.lds.run import run_lds
 from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
-from pipeline.monitors.single import channel_monitor, doppler_monitor
+from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
 from pipeline.provenance import provenance
 from pipeline.run_notes import run_notes
 from pipeline.statistics import threshold_factor
@@ -171,9 +171,10 @@ def _single_monitors(
     ranges = None if satellites is None else satellites.filter(pl.col("solution") == solution)
     named = other in matches and other != solution
     compared = on_path_of(aligned, matches[other].epochs) if other is not None and named else None
+    absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
         "along_doppler": doppler_monitor(aligned, context.config, context.factor),
-        "channel": channel_monitor(aligned, compared, context.factor),
+        "channel": channel_monitor(aligned, compared, context.factor, absent),
         "pseudorange": pseudorange_monitor(aligned, ranges, context.config),
     }
 

@@ -10,14 +10,18 @@ from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
 
 from schemas.enums import Fix
 from schemas.errors import BaliseError, ConfigError
+from schemas.tables import MONITORS
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Probability = Annotated[float, Field(gt=0, lt=1)]
+# Strict: neither text nor true or false is a number.
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Probability = Annotated[Number, Field(gt=0, lt=1)]
 
 
 class Settings(BaseModel):
@@ -115,7 +119,7 @@ class AlignConfig(Settings):
 class MonitorConfig(Settings):
     """Monitor bank (DIAG eq. 1-17; DOMAIN section 3)."""
 
-    ewma_alphas: tuple[float, float, float] = (0.1, 0.01, 0.001)
+    ewma_alphas: tuple[Probability, Probability, Probability] = (0.1, 0.01, 0.001)
     false_alarm_probability: Probability = 1e-7
     ionosphere_share: NonNegative = 0.083
     ionosphere_tau_s: Positive = 360.0
@@ -134,6 +138,20 @@ class MonitorConfig(Settings):
     channel_reference: str | None = None
     disabled: tuple[str, ...] = ()
 
+    @field_validator("ewma_alphas")
+    @classmethod
+    def _fastest_first(cls, alphas: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not alphas[0] > alphas[1] > alphas[2]:
+            raise ValueError(f"found {list(alphas)}; expected three falling weights, the fastest average first")
+        return alphas
+
+    @field_validator("disabled")
+    @classmethod
+    def _monitors_exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if unknown := [name for name in names if name not in MONITORS]:
+            raise ValueError(f"no monitor is called {', '.join(unknown)}; expected some of {', '.join(MONITORS)}")
+        return names
+
 
 class LdsConfig(Settings):
     """Virtual and travelling virtual balises (DOMAIN section 4)."""
@@ -145,7 +163,7 @@ class LdsConfig(Settings):
     init_s: Positive = 10.0
     rearm_m: Positive = 10.0
     odometer_fixed_m: NonNegative = 5.0
-    odometer_share: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
     crossing_gap_s: Positive = 1.0
     entry_from_unfitted_area: bool = False
 
@@ -226,15 +244,16 @@ class Configuration(Settings):
 class Vehicle(Settings):
     """A vehicle file; what is absent is not known and estimated or taken as zero (CONTRACT section 1).
 
-    `odometer_scale` is true distance over odometer distance.
+    `odometer_scale` is true distance over odometer distance. The limits are far beyond any train: they find
+    millimetres and milliseconds.
     """
 
-    gnss_antenna_ahead_m: float = 0.0
-    antenna_height_m: float = 0.0
+    gnss_antenna_ahead_m: Annotated[Number, Field(ge=-3000, le=3000)] = 0.0
+    antenna_height_m: Annotated[Number, Field(ge=-20, le=20)] = 0.0
     odometer_scale: Positive | None = None
-    odometer_scale_sigma: NonNegative | None = None
-    gnss_latency_s: float | None = None
-    gnss_latency_sigma_s: NonNegative | None = None
+    odometer_scale_sigma: Annotated[Number, Field(ge=0, lt=1)] | None = None
+    gnss_latency_s: Annotated[Number, Field(ge=-10, le=10)] | None = None
+    gnss_latency_sigma_s: Annotated[Number, Field(ge=0, le=10)] | None = None
 
 
 S = TypeVar("S", bound=Settings)
@@ -245,10 +264,16 @@ def settings_from(data: Mapping[str, object], kind: type[S], place: str) -> S:
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        breaches = [
-            f"{'.'.join(str(part) for part in breach['loc']) or '(file)'}: {breach['msg']}" for breach in error.errors()
-        ]
+        breaches = [_told(breach) for breach in error.errors()]
         raise ConfigError("; ".join(breaches), place=place, remedy="See the configuration reference.") from None
+
+
+def _told(breach: ErrorDetails) -> str:
+    """One breach with its path, and what was found where that is a single value."""
+    key = ".".join(str(part) for part in breach["loc"]) or "(file)"
+    found, unknown = breach["input"], breach["type"] == "extra_forbidden"
+    single = isinstance(found, str | int | float) and not unknown
+    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {found!r}" if single else "")
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:

@@ -97,15 +97,17 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
     return judged(by_doppler - by_odometer, factor * np.sqrt(variance), reasons)
 
 
-def channel_monitor(epochs: pl.DataFrame, other: pl.DataFrame | None, factor: float) -> pl.DataFrame:
+def channel_monitor(
+    epochs: pl.DataFrame, other: pl.DataFrame | None, factor: float, absent: str = NO_OTHER_SOLUTION
+) -> pl.DataFrame:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
     `other`: `t, path_m, sigma_along_m, fix_valid, on_track` of the other solution, on the same path; at an epoch its
     last position since the epoch before counts, against this solution's at that time (`paired`). Errors that both share
-    (troposphere) make the threshold larger than it need be.
+    (troposphere) make the threshold larger than it need be. `absent`: the reason where there is none.
     """
     if other is None:
-        return blind_monitor(epochs.height, NO_OTHER_SOLUTION)
+        return blind_monitor(epochs.height, absent)
     usable = other.filter("fix_valid", "on_track")
     placed = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
     pairs = paired(epochs.select("t", path_m=placed), usable)

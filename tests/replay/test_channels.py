@@ -60,6 +60,13 @@ def test_fault_of_one_solution_is_found_by_both_architectures():
     assert found["galileo", COMPOSITE]["availability"] < 0.75
 
 
+def test_comparison_with_a_solution_that_the_run_lacks_says_so():
+    one, site = journey(OFFSET)
+    epochs = replay(one, site, VEHICLE, with_reference("egnos")).epochs
+    assert epochs["channel_state"].unique().to_list() == ["not_evaluated"]
+    assert epochs["channel_reason"].unique().to_list() == ["the run has no solution 'egnos' to compare with"]
+
+
 def test_fault_common_to_both_solutions_only_the_diagnosis_finds():
     one, site = journey(OFFSET)
     other, _ = journey(OFFSET, seed=9)

@@ -52,6 +52,39 @@ def test_allowed_times_to_detect_of_the_papers():
     assert safety.allowed_time_to_detect_s("horizontal_sis") == pytest.approx(100.5, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("stage", "key", "value", "message"),
+    [
+        pytest.param("monitors", "ewma_alphas", [0.1, 0.01, 0.0], r"ewma_alphas\.2.*found 0\.0", id="never averages"),
+        pytest.param("monitors", "ewma_alphas", [0.001, 0.01, 0.1], "the fastest average first", id="slowest first"),
+        pytest.param("monitors", "ewma_alphas", [0.1, 0.1, 0.01], "three falling weights", id="the same twice"),
+        pytest.param("monitors", "disabled", ["along-raw"], "no monitor is called along-raw", id="no such monitor"),
+        pytest.param("lds", "ci_limit_m", True, "valid number, found True", id="truth for a number"),
+        pytest.param("lds", "ci_limit_m", "14", "valid number, found '14'", id="text for a number"),
+        pytest.param("lds", "ci_limit_m", -1.0, "greater than 0, found -1.0", id="out of range"),
+    ],
+)
+def test_settings_that_would_blind_or_mislead_are_refused(stage: str, key: str, value: object, message: str):
+    with pytest.raises(ConfigError, match=message):
+        settings_from({stage: {key: value}}, Configuration, "my.toml")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("gnss_latency_s", 83.0),
+        ("gnss_latency_sigma_s", 20.0),
+        ("gnss_antenna_ahead_m", 12500.0),
+        ("antenna_height_m", 4100.0),
+        ("odometer_scale_sigma", 1.0),
+    ],
+)
+def test_vehicle_in_other_units_is_refused(key: str, value: float):
+    with pytest.raises(ConfigError, match=rf"train\.toml.*{key}.*found {value}"):
+        settings_from({key: value}, Vehicle, "train.toml")
+    assert getattr(settings_from({key: value / 1000.0}, Vehicle, "train.toml"), key) == value / 1000.0
+
+
 def test_unknown_keys_are_refused_with_their_path():
     with pytest.raises(ConfigError, match=r"my\.toml.*lds\.recovery_sec") as caught:
         settings_from({"lds": {"recovery_sec": 3.0}, "foo": 1}, Configuration, "my.toml")
