@@ -10,7 +10,7 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes, undiagnosed_notes
-from pipeline.hazards import HazardResult, classify, establish_truth, places_between, with_unoffered
+from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import run_lds
 from pipeline.matching import Match, match
@@ -120,9 +120,11 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     reference = _reference_on_path(context, found, aligned)
     reads = None if telegrams is None else telegrams.drop_nulls("path_m")
     truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
-    between = _between(run, config, aligned, truth, reference, reads)
+    between = _between(context, aligned, truth, reference, reads)
     passages = with_unoffered(lds.passages, monitored, truth, balises, config.lds, solution, between)
-    result = classify(solution, monitored, truth, passages, balises, run.faults, found.path.locate, config, between)
+    locate = found.path.locate
+    case = Case(solution, monitored, truth, passages, balises, run.faults, locate, config, between)
+    result = classify(case)
     epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
     results = SolutionResults(
         solution=solution,
@@ -201,19 +203,18 @@ def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -
 
 
 def _between(
-    run: RunLog,
-    config: Configuration,
+    context: _Context,
     aligned: pl.DataFrame,
     truth: pl.DataFrame,
     reference: pl.DataFrame | None,
     reads: pl.DataFrame | None,
 ) -> pl.DataFrame | None:
     """Places inside gaps of the positions, by the streams that go on there."""
-    odometer = run.odometer
+    odometer = context.run.odometer
 
     def counted(times: pl.Series) -> pl.Series:
         unknown = pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
-        return unknown if odometer is None else odometer_at(times, aligned, odometer, config)
+        return unknown if odometer is None else odometer_at(times, aligned, odometer, context.config)
 
     return places_between(aligned, truth, reference, reads, odometer, counted)
 

@@ -1,8 +1,9 @@
 """Hazards after the fact: evidence, episodes, classes, verdicts on alarms, suspects (DOMAIN section 5)."""
 
 from pipeline.hazards.between import places_between
-from pipeline.hazards.classify import HazardResult, Locate, classify
+from pipeline.hazards.case import Case
+from pipeline.hazards.classify import HazardResult, classify
 from pipeline.hazards.truth import establish_truth
 from pipeline.hazards.unoffered import with_unoffered
 
-__all__ = ["HazardResult", "Locate", "classify", "establish_truth", "places_between", "with_unoffered"]
+__all__ = ["Case", "HazardResult", "classify", "establish_truth", "places_between", "with_unoffered"]

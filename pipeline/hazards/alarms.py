@@ -9,6 +9,7 @@ import polars as pl
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints
 from pipeline.hazards.arrays import runs_of
+from pipeline.hazards.case import Case
 from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
@@ -20,22 +21,15 @@ from schemas.tables import Alarms
 _BLIND_S = 1.0
 
 
-def alarms_table(
-    fails: Fails,
-    judged: list[Judged],
-    solution: str,
-    witnesses: Witnesses,
-    epochs: pl.DataFrame,
-    config: HazardConfig,
-) -> pl.DataFrame:
+def alarms_table(case: Case, judged: list[Judged]) -> pl.DataFrame:
     """One row per alarm episode in order of time; its place is that of the position at its first fail."""
     rows: list[dict[str, Any]] = []
-    for number, span in enumerate(fails.alarms):
-        row = {"solution": solution, "alarm_id": number, **_row(span, judged, witnesses, config)}
-        if row["verdict"] == Verdict.FALSE.value and number and _rings_on(fails, number):
+    for number, span in enumerate(case.fails.alarms):
+        row = {"solution": case.solution, "alarm_id": number, **_row(span, judged, case)}
+        if row["verdict"] == Verdict.FALSE.value and number and _rings_on(case.fails, number):
             row["suspect"] = rows[-1]["suspect"]
         rows.append(row)
-    places = epochs.select("netelement_id", "measure_m")[[span.first for span in fails.alarms]]
+    places = case.epochs.select("netelement_id", "measure_m")[[span.first for span in case.fails.alarms]]
     table = pl.DataFrame(rows, schema=schema_of(Alarms)).drop(places.columns)
     return table.hstack(places).select(Alarms.column_names())
 
@@ -46,13 +40,13 @@ def _rings_on(fails: Fails, number: int) -> bool:
     return bool(fails.negated[between].all())
 
 
-def _row(span: AlarmSpan, judged: list[Judged], witnesses: Witnesses, config: HazardConfig) -> dict[str, Any]:
+def _row(span: AlarmSpan, judged: list[Judged], case: Case) -> dict[str, Any]:
     hazard_id = hazard_of(span, judged)
-    verdict = Verdict.TRUE if hazard_id is not None else verdict_of(span, witnesses, config)
+    verdict = Verdict.TRUE if hazard_id is not None else verdict_of(span, case.witnesses, case.config.hazards)
     if hazard_id is not None:
         suspect = judged[hazard_id].suspect
     else:
-        suspect = suspect_of_alarm(witnesses, span.first, span.last, span.monitors, verdict)
+        suspect = suspect_of_alarm(case.witnesses, span.first, span.last, span.monitors, verdict)
     return {
         "t_start": span.start_ns,
         "t_end": span.end_ns,

@@ -2,41 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Bools, Floats, flags, times_ns
+from pipeline.columns import flags, times_ns
 from pipeline.hazards.alarms import alarms_table
+from pipeline.hazards.case import Case
 from pipeline.hazards.crossings import beacons_by_leg
 from pipeline.hazards.episodes import Draft, find_episodes
 from pipeline.hazards.excursions import faulty_spans
-from pipeline.hazards.fails import Fails, fails_of
-from pipeline.hazards.passages import (
-    Links,
-    beyond_window,
-    judge_passages,
-    link_passages,
-    link_unoffered,
-    location_errors,
-    positions_at,
-    speeds_at,
-    suspicious_passages,
-    within_spans,
-    wrongly_offered,
-)
-from pipeline.hazards.passing import TruePassings, true_passings
-from pipeline.hazards.rows import Judged, Locate, hazards_table
-from pipeline.hazards.series import Series, series_of
-from pipeline.hazards.states import contradicted, errors_of, lds_states
-from pipeline.hazards.suspect import Witnesses, suspect_of_error, witnesses_of
+from pipeline.hazards.passages import beyond_window, judge_passages, link_passages, within_spans
+from pipeline.hazards.rows import Judged, hazards_table
+from pipeline.hazards.states import contradicted, lds_states
+from pipeline.hazards.suspect import suspect_of_error
 from pipeline.hazards.timing import Timing, time_hazard
-from pipeline.timeline import linking_gap_s
-from schemas.config import Configuration
 from schemas.enums import PassageStatus, Suspect
-
-__all__ = ["HazardResult", "Locate", "classify"]
 
 
 @dataclass(frozen=True)
@@ -51,101 +33,45 @@ class HazardResult:
     epochs_columns: pl.DataFrame
 
 
-def classify(
-    solution: str,
-    epochs: pl.DataFrame,
-    truth: pl.DataFrame,
-    passages: pl.DataFrame,
-    balises: pl.DataFrame,
-    faults: pl.DataFrame | None,
-    locate: Locate,
-    config: Configuration,
-    between: pl.DataFrame | None = None,
-) -> HazardResult:
-    """Judge one solution after the fact.
-
-    `epochs`: matched, aligned and monitored, with the LDS columns; `truth`: from `establish_truth`, row by
-    row; `passages`: of the LDS; `balises`: `leg, balise_id, kind, path_m` on the path; `faults`: what was
-    injected, where known; `locate(leg, path_m)`: net element and measure; `between`: from `places_between`.
-    """
-    errors = errors_of(epochs, truth)
-    series = series_of(epochs, truth, config.lds)
-    fails = fails_of(epochs, config.lds.recovery_s)
-    witnesses = witnesses_of(epochs, truth, errors, config)
-    drafts, jumps = find_episodes(series, beacons_by_leg(balises), config.hazards)
+def classify(case: Case) -> HazardResult:
+    """Judge one solution after the fact."""
+    drafts, jumps = find_episodes(case.series, beacons_by_leg(case.balises), case.config.hazards)
     judged = []
     for draft in drafts:
-        timing = time_hazard(draft, series, jumps, fails, faults, config.hazards)
-        judged += _judge(draft, timing, series, fails, witnesses, truth, passages)
-    hazards = hazards_table(judged, solution, epochs, series, locate, config.budget_s)
-    alarms = alarms_table(fails, judged, solution, witnesses, epochs, config.hazards)
-    spans = faulty_spans(series, judged, jumps, fails, faults, config.hazards)
-    passings = true_passings(epochs, truth, balises, between)
-    seen = _passages(series, judged, spans, epochs, truth, passages, passings, config)
-    return HazardResult(hazards, alarms, seen, _epochs(epochs, truth, passages, errors, spans, config))
+        judged += _judge(draft, time_hazard(draft, jumps, case), case)
+    spans = faulty_spans(case, judged, jumps)
+    return HazardResult(
+        hazards=hazards_table(case, judged),
+        alarms=alarms_table(case, judged),
+        passages=judge_passages(case, judged, spans),
+        epochs_columns=_epochs(case, spans),
+    )
 
 
-def _judge(
-    draft: Draft,
-    timing: Timing,
-    series: Series,
-    fails: Fails,
-    witnesses: Witnesses,
-    truth: pl.DataFrame,
-    passages: pl.DataFrame,
-) -> list[Judged]:
+def _judge(draft: Draft, timing: Timing, case: Case) -> list[Judged]:
     """The hazard with its suspect; none where the odometer that carries the truth is held to be at fault."""
-    first, last = int(series.row[timing.onset_epoch]), int(series.row[min(draft.end, series.size - 1)])
-    first, last = min(first, last), max(first, last)
-    suspect = suspect_of_error(witnesses, first, last, fails.failed_in(first, last))
+    row, size = case.series.row, case.series.size
+    first, last = sorted((int(row[timing.onset_epoch]), int(row[min(draft.end, size - 1)])))
+    suspect = suspect_of_error(case.witnesses, first, last, case.fails.failed_in(first, last))
     if suspect is Suspect.ODOMETER:
         return []
-    evidence = str(truth["evidence"][int(series.row[draft.first_epoch])])
-    return [_with_passages(draft, timing, evidence, suspect, passages, series)]
+    evidence = str(case.truth["evidence"][int(row[draft.first_epoch])])
+    return [_with_passages(Judged(draft, timing, evidence, suspect, False, ()), case)]
 
 
-def _with_passages(
-    draft: Draft, timing: Timing, evidence: str, suspect: Suspect, passages: pl.DataFrame, series: Series
-) -> Judged:
-    alone = Judged(draft, timing, evidence, suspect, False, ())
-    own = link_passages(passages, [alone], series).hazard == 0
+def _with_passages(judged: Judged, case: Case) -> Judged:
+    passages = case.passages
+    own = link_passages(passages, [judged], case.series).hazard == 0
     accepted = passages.filter(own & (passages["status"] == PassageStatus.ACCEPTED.value).to_numpy())
     late = bool((beyond_window(passages) & own).any())
-    return Judged(draft, timing, evidence, suspect, late, tuple(accepted["balise_id"].to_list()))
+    return replace(judged, beyond_window=late, accepted=tuple(accepted["balise_id"].to_list()))
 
 
-def _passages(
-    series: Series,
-    judged: list[Judged],
-    spans: list[tuple[int, int]],
-    epochs: pl.DataFrame,
-    truth: pl.DataFrame,
-    passages: pl.DataFrame,
-    passings: TruePassings,
-    config: Configuration,
-) -> pl.DataFrame:
-    t_true = passings.assign(passages)
-    links: Links = link_unoffered(passages, t_true, judged, link_passages(passages, judged, series))
-    suspicious: Bools = suspicious_passages(passages, spans)
-    gap_s = linking_gap_s(series.period_s, config.lds.crossing_gap_s)
-    positioned = positions_at(epochs, t_true, gap_s)
-    error = location_errors(passages, epochs, truth, gap_s, config.hazards.failure_limit_m)
-    wrong = wrongly_offered(passages, error, epochs, truth, config.hazards)
-    speed = speeds_at(passages, t_true, epochs, gap_s)
-    return judge_passages(passages, error, wrong, t_true, links, suspicious, positioned, speed)
-
-
-def _epochs(
-    epochs: pl.DataFrame,
-    truth: pl.DataFrame,
-    passages: pl.DataFrame,
-    errors: dict[str, Floats],
-    spans: list[tuple[int, int]],
-    config: Configuration,
-) -> pl.DataFrame:
-    hidden = contradicted(errors["along"], truth, config.hazards.failure_limit_m)
-    told = errors | {"along": np.where(hidden, np.nan, errors["along"])}
+def _epochs(case: Case, spans: list[tuple[int, int]]) -> pl.DataFrame:
+    along = case.errors["along"]
+    hidden = contradicted(along, case.truth, case.config.hazards.failure_limit_m)
+    told = case.errors | {"along": np.where(hidden, np.nan, along)}
     columns = [pl.Series(f"error_{axis}_m", values, nan_to_null=True) for axis, values in told.items()]
-    state = lds_states(epochs, truth, passages, errors["along"], config.hazards, config.lds)
-    suspicious = pl.Series("suspect_after_the_fact", flags(epochs, "tvb") & within_spans(times_ns(epochs), spans))
-    return pl.DataFrame([*columns, state, suspicious])
+    tvb, t_ns = flags(case.epochs, "tvb"), times_ns(case.epochs)
+    suspicious = pl.Series("suspect_after_the_fact", tvb & within_spans(t_ns, spans))
+    return pl.DataFrame([*columns, lds_states(case), suspicious])

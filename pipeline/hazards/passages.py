@@ -9,10 +9,12 @@ import polars as pl
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from pipeline.hazards.arrays import interpolate_known
+from pipeline.hazards.case import Case
 from pipeline.hazards.rows import Judged
 from pipeline.hazards.series import Series, direction_of
 from pipeline.hazards.states import contradicted
 from pipeline.hazards.truth import valid_ns
+from pipeline.timeline import linking_gap_s
 from schemas.config import HazardConfig
 from schemas.enums import BaliseKind, Cause, FailureMode, PassageStatus
 from schemas.tables import Passages
@@ -29,30 +31,52 @@ class Links:
     jumped: Bools
 
 
-def judge_passages(
-    passages: pl.DataFrame,
-    error: Floats,
-    wrong: Bools,
-    t_true: list[int | None],
-    links: Links,
-    suspicious: Bools,
-    positioned: Bools,
-    speed_mps: Floats,
-) -> pl.DataFrame:
-    """Passages with the columns of the truth filled in.
+@dataclass(frozen=True)
+class Findings:
+    """What the truth says about each passage, row by row.
 
     `wrong`: offered early or late beyond the limit; `positioned`: a position was there when the train passed;
-    `speed_mps`: from `speeds_at`.
+    `suspicious`: accepted between a fault's onset and its detection. A NaN is a value that is not known.
     """
-    mode, cause = _modes(passages, wrong, error, links, positioned)
+
+    t_true: list[int | None]
+    error_m: Floats
+    wrong: Bools
+    positioned: Bools
+    speed_mps: Floats
+    links: Links
+    suspicious: Bools
+
+
+def judge_passages(case: Case, judged: list[Judged], spans: list[tuple[int, int]]) -> pl.DataFrame:
+    """Passages with the columns of the truth filled in; `spans`: from `faulty_spans`."""
+    passages, epochs, truth, hazards = case.passages, case.epochs, case.truth, case.config.hazards
+    t_true = case.passings.assign(passages)
+    gap_s = linking_gap_s(case.series.period_s, case.config.lds.crossing_gap_s)
+    error = location_errors(passages, epochs, truth, gap_s, hazards.failure_limit_m)
+    found = Findings(
+        t_true=t_true,
+        error_m=error,
+        wrong=wrongly_offered(passages, error, epochs, truth, hazards),
+        positioned=positions_at(epochs, t_true, gap_s),
+        speed_mps=speeds_at(passages, t_true, epochs, gap_s),
+        links=link_unoffered(passages, t_true, judged, link_passages(passages, judged, case.series)),
+        suspicious=suspicious_passages(passages, spans),
+    )
+    return _filled(passages, found)
+
+
+def _filled(passages: pl.DataFrame, found: Findings) -> pl.DataFrame:
+    mode, cause = _modes(passages, found)
+    hazard = [None if number < 0 else number for number in found.links.hazard.tolist()]
     filled = passages.with_columns(
-        pl.Series("t_true", t_true, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
-        pl.Series("location_error_m", error, nan_to_null=True),
+        pl.Series("t_true", found.t_true, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
+        pl.Series("location_error_m", found.error_m, nan_to_null=True),
         pl.Series("failure_mode", mode, dtype=_MODES),
         pl.Series("cause", cause, dtype=_CAUSES),
-        pl.Series("suspect_after_the_fact", suspicious),
-        pl.Series("hazard_id", [None if h < 0 else h for h in links.hazard.tolist()], dtype=pl.Int64),
-        pl.Series("speed_mps", speed_mps, nan_to_null=True),
+        pl.Series("suspect_after_the_fact", found.suspicious),
+        pl.Series("hazard_id", hazard, dtype=pl.Int64),
+        pl.Series("speed_mps", found.speed_mps, nan_to_null=True),
     )
     return filled.select(Passages.column_names())
 
@@ -174,9 +198,7 @@ def positions_at(epochs: pl.DataFrame, t_true: list[int | None], gap_s: float) -
     return result
 
 
-def _modes(
-    passages: pl.DataFrame, wrong: Bools, error: Floats, links: Links, positioned: Bools
-) -> tuple[list[str], list[str]]:
+def _modes(passages: pl.DataFrame, found: Findings) -> tuple[list[str], list[str]]:
     """ETCS failure mode and its cause: insertion where offered early or by a jump, deletion where not
     offered inside its window or before it.
     """
@@ -186,15 +208,15 @@ def _modes(
     modes, causes = [], []
     for row in range(passages.height):
         mode, cause = FailureMode.NONE, Cause.NONE
-        if links.jumped[row] or (wrong[row] and error[row] > 0):
+        if found.links.jumped[row] or (found.wrong[row] and found.error_m[row] > 0):
             mode, cause = FailureMode.INSERTION, Cause.POSITION
         elif status[row] == PassageStatus.NOT_AVAILABLE.value:
             mode, cause = FailureMode.DELETION, Cause.NO_POSITION
         elif not offered[row]:
             mode = FailureMode.DELETION
-            cause = Cause.POSITION if positioned[row] else Cause.NO_POSITION
+            cause = Cause.POSITION if found.positioned[row] else Cause.NO_POSITION
         elif late[row]:
-            mode, cause = FailureMode.DELETION, Cause.POSITION if wrong[row] else Cause.NONE
+            mode, cause = FailureMode.DELETION, Cause.POSITION if found.wrong[row] else Cause.NONE
         modes.append(mode.value)
         causes.append(cause.value)
     return modes, causes

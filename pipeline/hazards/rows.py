@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import dataframely as dy
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Floats
+from pipeline.columns import NS_PER_S
+from pipeline.hazards.case import Case
 from pipeline.hazards.crossings import Crossing
 from pipeline.hazards.episodes import Draft
 from pipeline.hazards.series import Series
@@ -19,9 +18,6 @@ from pipeline.hazards.timing import Timing
 from schemas.enums import Evidence, FailureMode, Hazard, Suspect
 from schemas.enums import Timing as Early
 from schemas.tables import Hazards
-
-Locate = Callable[[npt.ArrayLike, npt.ArrayLike], tuple[npt.NDArray[np.object_], Floats]]
-"""Net elements and measures of path positions: `locate(leg, path_m)`, as `TravelledPath.locate`."""
 
 
 def schema_of(table: type[dy.Schema]) -> pl.Schema:
@@ -41,9 +37,7 @@ class Judged:
     accepted: tuple[str, ...]
 
 
-def hazards_table(
-    judged: list[Judged], solution: str, epochs: pl.DataFrame, series: Series, locate: Locate, budget_s: float
-) -> pl.DataFrame:
+def hazards_table(case: Case, judged: list[Judged]) -> pl.DataFrame:
     """Rows in order of time; `hazard_id` is the position in `judged`."""
     ids = {id(item.draft): number for number, item in enumerate(judged)}
     rows = []
@@ -51,14 +45,14 @@ def hazards_table(
         cause = item.draft.caused_by
         rows.append(
             {
-                "solution": solution,
+                "solution": case.solution,
                 "hazard_id": number,
                 "caused_by": None if cause is None else ids.get(id(cause)),
                 **_kind(item),
                 **_instants(item.timing),
-                **_verdict(item.timing, budget_s),
-                **_size(item, series),
-                **_place(item.draft, epochs, series, locate),
+                **_verdict(item.timing, case.config.budget_s),
+                **_size(item, case.series),
+                **_place(item.draft, case),
             }
         )
     return pl.DataFrame(rows, schema=schema_of(Hazards))
@@ -153,16 +147,16 @@ def _rate(timing: Timing, draft: Draft, series: Series) -> float | None:
     return float(slope)
 
 
-def _place(draft: Draft, epochs: pl.DataFrame, series: Series, locate: Locate) -> dict[str, Any]:
+def _place(draft: Draft, case: Case) -> dict[str, Any]:
     """Time and place of the hazard; the place is the train's own, not the one offered."""
-    epoch = draft.first_epoch
-    speed = epochs["speed_mps"][int(series.row[epoch])]
+    epoch, series = draft.first_epoch, case.series
+    speed = case.epochs["speed_mps"][int(series.row[epoch])]
     if draft.jump is not None:
         t_ns, place = int(series.t_ns[epoch]), float(series.truth_m[epoch])
     else:
         hit = draft.hits[0]
         t_ns, place = hit.t_ns, hit.path_m - hit.error_m * float(series.direction[epoch])
-    elements, measures = locate([int(series.leg[epoch])], [place])
+    elements, measures = case.locate([int(series.leg[epoch])], [place])
     measure = float(measures[0])
     return {
         "t_hazard": t_ns,

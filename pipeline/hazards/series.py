@@ -79,6 +79,21 @@ def series_of(epochs: pl.DataFrame, truth: pl.DataFrame, lds: LdsConfig) -> Seri
     )
 
 
+def errors_of(epochs: pl.DataFrame, truth: pl.DataFrame) -> dict[str, Floats]:
+    """Position by GNSS minus truth per axis [m]; along in the direction of travel, across left of
+    growing path; NaN where either is missing.
+    """
+    along = (floats(epochs, "path_m") - floats(truth, "truth_path_m")) * direction_of(epochs)
+    fixed = flags(epochs, "fix_valid")
+    cross = floats(epochs, "cross_track_m") - floats(truth, "truth_cross_m")
+    up = floats(epochs, "vertical_m") - floats(truth, "truth_up_m")
+    return {
+        "along": np.where(fixed, along, np.nan),
+        "cross": np.where(fixed, cross, np.nan),
+        "up": np.where(fixed, up, np.nan),
+    }
+
+
 def direction_of(epochs: pl.DataFrame) -> Floats:
     """Direction of travel per epoch, +1 or -1; held where it is not known, growing path where it never is."""
     series = epochs["direction"]

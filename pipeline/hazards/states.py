@@ -1,4 +1,4 @@
-"""Errors per epoch, and the state of the reactive LDS (DOMAIN section 4; TVB section 4)."""
+"""The state of the reactive LDS per epoch (DOMAIN section 4; TVB section 4)."""
 
 from __future__ import annotations
 
@@ -7,26 +7,10 @@ import polars as pl
 
 from pipeline.columns import Bools, Floats, flags, floats, times_ns, truths
 from pipeline.hazards.arrays import words
-from pipeline.hazards.series import direction_of
-from schemas.config import HazardConfig, LdsConfig
+from pipeline.hazards.case import Case
 from schemas.enums import BaliseKind, LdsState, PassageStatus
 
 _STATES = [member.value for member in LdsState]
-
-
-def errors_of(epochs: pl.DataFrame, truth: pl.DataFrame) -> dict[str, Floats]:
-    """Position by GNSS minus truth per axis [m]; along in the direction of travel, across left of
-    growing path; NaN where either is missing.
-    """
-    along = (floats(epochs, "path_m") - floats(truth, "truth_path_m")) * direction_of(epochs)
-    fixed = flags(epochs, "fix_valid")
-    cross = floats(epochs, "cross_track_m") - floats(truth, "truth_cross_m")
-    up = floats(epochs, "vertical_m") - floats(truth, "truth_up_m")
-    return {
-        "along": np.where(fixed, along, np.nan),
-        "cross": np.where(fixed, cross, np.nan),
-        "up": np.where(fixed, up, np.nan),
-    }
 
 
 def contradicted(error_along_m: Floats, truth: pl.DataFrame, limit_m: float) -> Bools:
@@ -37,26 +21,20 @@ def contradicted(error_along_m: Floats, truth: pl.DataFrame, limit_m: float) -> 
     return hidden
 
 
-def lds_states(
-    epochs: pl.DataFrame,
-    truth: pl.DataFrame,
-    passages: pl.DataFrame,
-    error_along_m: Floats,
-    config: HazardConfig,
-    lds: LdsConfig,
-) -> pl.Series:
+def lds_states(case: Case) -> pl.Series:
     """P2 negated; P3 diagnosis faulty; P1 error beyond the failure limit; P0.
 
     Null without a truth, and where an error beyond the limit is less than the evidence can resolve, or one within it
     may be beyond it (`contradicted`).
     """
-    size, bound = np.abs(error_along_m), floats(truth, "truth_bound_m")
+    epochs, limit_m = case.epochs, case.config.hazards.failure_limit_m
+    size, bound = np.abs(case.errors["along"]), floats(case.truth, "truth_bound_m")
     with np.errstate(invalid="ignore"):
-        failed = size > config.failure_limit_m
-        unresolved = (failed & (size <= bound)) | contradicted(error_along_m, truth, config.failure_limit_m)
+        failed = size > limit_m
+        unresolved = (failed & (size <= bound)) | contradicted(case.errors["along"], case.truth, limit_m)
     state = np.where(failed, _code(LdsState.P1), _code(LdsState.P0))
     state[unresolved | ~np.isfinite(size)] = -1
-    faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(epochs, truth, passages, lds)
+    faulty = flags(epochs, "diagnosis_faulty") | odometer_beyond_confidence(case)
     state[faulty] = _code(LdsState.P3)
     state[flags(epochs, "negated")] = _code(LdsState.P2)
     return words(_STATES, state).alias("lds_state")
@@ -66,16 +44,14 @@ def _code(state: LdsState) -> int:
     return list(LdsState).index(state)
 
 
-def odometer_beyond_confidence(
-    epochs: pl.DataFrame, truth: pl.DataFrame, passages: pl.DataFrame, lds: LdsConfig
-) -> Bools:
+def odometer_beyond_confidence(case: Case) -> Bools:
     """The distance counted since the LRVB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
 
     Only a reference or balise reads can say so; false where they are missing.
     """
-    t_ns = times_ns(epochs)
-    travelled, place = floats(epochs, "odometer_m"), floats(truth, "truth_path_m")
-    virtual = passages.filter(passages["kind"] == BaliseKind.VIRTUAL.value)
+    t_ns, truth, lds = times_ns(case.epochs), case.truth, case.config.lds
+    travelled, place = floats(case.epochs, "odometer_m"), floats(truth, "truth_path_m")
+    virtual = case.passages.filter(case.passages["kind"] == BaliseKind.VIRTUAL.value)
     accepted = virtual.filter(virtual["status"] == PassageStatus.ACCEPTED.value).drop_nulls("t_offered")
     accepted = accepted.sort("t_offered")
     beyond = np.zeros(t_ns.size, dtype=np.bool_)

@@ -9,8 +9,8 @@ import polars as pl
 
 from pipeline.columns import NS_PER_S
 from pipeline.hazards.arrays import runs_of
+from pipeline.hazards.case import Case
 from pipeline.hazards.episodes import Draft
-from pipeline.hazards.fails import Fails
 from pipeline.hazards.jumps import Jump
 from pipeline.hazards.series import Series
 from schemas.config import HazardConfig
@@ -36,15 +36,9 @@ class Timing:
     alarm_before_onset: bool
 
 
-def time_hazard(
-    draft: Draft,
-    series: Series,
-    jumps: list[Jump],
-    fails: Fails,
-    faults: pl.DataFrame | None,
-    config: HazardConfig,
-) -> Timing:
+def time_hazard(draft: Draft, jumps: list[Jump], case: Case) -> Timing:
     """Onset, failure, detection and negation of one hazard."""
+    series, config = case.series, case.config.hazards
     begun_by_own_jump = draft.jump is not None and not draft.returns
     step = draft.jump if begun_by_own_jump else _step_of_shift(draft, series, jumps, config)
     if step is not None:
@@ -52,9 +46,9 @@ def time_hazard(
     else:
         failure = _sustained_failure(draft.floor + 1, draft.end, series, config)
         onset = _drift_onset(draft, failure, series)
-    onset_ns = _onset_ns(draft, step, onset, series, fails, faults, config)
+    onset_ns = _onset_ns(draft, step, onset, case)
     end_ns = int(series.t_ns[min(draft.end, series.size - 1)])
-    detected = _detection(draft, onset_ns, end_ns, series, fails, config)
+    detected = _detection(draft, onset_ns, end_ns, case)
     reaction_s = series.period_s if config.reaction_s is None else config.reaction_s
     negated = None if detected.t_ns is None else detected.t_ns + round(reaction_s * NS_PER_S)
     return Timing(
@@ -113,27 +107,20 @@ def _made_the_error(jump: Jump, series: Series, config: HazardConfig) -> bool:
     return abs(jump.error_before_m) <= healthy and abs(jump.error_after_m) > config.failure_limit_m
 
 
-def _onset_ns(
-    draft: Draft,
-    step: Jump | None,
-    onset: int,
-    series: Series,
-    fails: Fails,
-    faults: pl.DataFrame | None,
-    config: HazardConfig,
-) -> int:
+def _onset_ns(draft: Draft, step: Jump | None, onset: int, case: Case) -> int:
+    series = case.series
     by_error = int(series.t_ns[onset])
     if draft.caused_by is not None:
         return by_error
     latest = max(by_error, int(series.t_ns[draft.first_epoch]))
-    named = _named_onset(faults, by_error, latest)
+    named = _named_onset(case.faults, by_error, latest)
     if named is not None:
         return named
     if step is not None:
         return by_error
-    lead_ns = round(config.alarm_lead_s * NS_PER_S)
+    lead_ns = round(case.config.hazards.alarm_lead_s * NS_PER_S)
     floor_ns = int(series.t_ns[draft.floor]) if draft.floor >= 0 and _ended_at(draft, series) else 0
-    alarm = fails.start_within(max(by_error - lead_ns, floor_ns), by_error)
+    alarm = case.fails.start_within(max(by_error - lead_ns, floor_ns), by_error)
     return by_error if alarm is None else alarm
 
 
@@ -166,14 +153,13 @@ class _Detection:
     standing: bool
 
 
-def _detection(
-    draft: Draft, onset_ns: int, end_ns: int, series: Series, fails: Fails, config: HazardConfig
-) -> _Detection:
+def _detection(draft: Draft, onset_ns: int, end_ns: int, case: Case) -> _Detection:
     """First fail from onset to the episode's end; an alarm that stands already detects at once.
 
     The epoch of a jump back is no part of the episode: a monitor that sees only the way back did not
     see the fault. The row of the jump back itself lasts until the calm after it is proved.
     """
+    series, fails = case.series, case.fails
     standing = fails.standing_at(onset_ns)
     if standing is not None:
         return _Detection(onset_ns, standing, True)
@@ -181,6 +167,6 @@ def _detection(
     if draft.jump is not None:
         until = max(until, int(series.t_ns[draft.jump.last]) + 1)
     if draft.caused_by is not None:
-        until = max(until, onset_ns + round(config.episode_end_s * NS_PER_S))
+        until = max(until, onset_ns + round(case.config.hazards.episode_end_s * NS_PER_S))
     found = fails.first_in(onset_ns, until)
     return _Detection(found[0], found[1], False) if found else _Detection(None, None, False)

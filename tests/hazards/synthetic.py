@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import polars as pl
 
-from pipeline.hazards import HazardResult, classify, establish_truth
+from pipeline.hazards import Case, HazardResult, classify, establish_truth
 from schemas.config import Configuration, HazardConfig
 from schemas.tables import MONITORS, Passages
 
@@ -219,7 +219,9 @@ def judge(journey, passages=None, config=None) -> HazardResult:
     config = config or Configuration()
     rows = journey.passages() if passages is None else passages
     truth = truth_of(journey, rows, config)
-    return classify("primary", journey.epochs(), truth, rows, journey.balises(), journey.faults_frame(), locate, config)
+    return classify(
+        Case("primary", journey.epochs(), truth, rows, journey.balises(), journey.faults_frame(), locate, config)
+    )
 
 
 def with_hazards(**settings):

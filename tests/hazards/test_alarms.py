@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.hazards import classify, establish_truth
+from pipeline.hazards import Case, classify, establish_truth
 from schemas.config import Configuration
 from tests.hazards.synthetic import Journey, judge, locate, seconds, truth_of
 
@@ -68,7 +68,7 @@ def judge_without_odometer(journey):
     passages = journey.passages()
     reference = journey.reference_frame() if journey.reference else None
     truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
-    return classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    return classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
 
 
 def test_without_odometer_hazards_are_still_judged_by_the_reference():
@@ -98,7 +98,7 @@ def test_ambiguous_track_is_suspected():
         gate_probability=pl.when(pl.Series(doubtful)).then(0.6).otherwise(pl.col("gate_probability"))
     )
     result = classify(
-        "primary", epochs, truth_of(journey), journey.passages(), journey.balises(), None, locate, Configuration()
+        Case("primary", epochs, truth_of(journey), journey.passages(), journey.balises(), None, locate, Configuration())
     )
     assert result.alarms["suspect"].to_list() == ["track"]
 
@@ -111,7 +111,7 @@ def test_truth_that_is_missing_for_longer_than_a_second_leaves_the_verdict_open(
     for first_s, verdict in ((0.5, "false"), (3.0, "unknown")):
         reference = journey.reference_frame().slice(round(first_s * 20))
         truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
-        result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+        result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
         assert result.alarms["verdict"].to_list() == [verdict]
 
 
@@ -136,7 +136,7 @@ def test_error_across_says_nothing_of_an_alarm_along():
         cross_track_m=pl.when(pl.Series(epochs_wrong_across.within(((50.0, 51.0),)))).then(4.0).otherwise(0.0)
     )
     arguments = (truth_of(epochs_wrong_across), epochs_wrong_across.passages(), epochs_wrong_across.balises(), None)
-    result = classify("primary", frame, *arguments, locate, Configuration())
+    result = classify(Case("primary", frame, *arguments, locate, Configuration()))
     assert result.alarms["suspect"].to_list() == ["unknown"]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.hazards import classify, establish_truth
+from pipeline.hazards import Case, classify, establish_truth
 from schemas.config import Configuration
 from schemas.tables import Alarms, Hazards, Passages
 from tests.hazards.synthetic import Journey, locate, seconds
@@ -19,7 +19,7 @@ def judge_epochs(journey, epochs, balises=None, reference=True):
     given = journey.reference_frame() if reference else None
     truth = establish_truth(epochs, given, None, passages, config.hazards, config.lds)
     found = journey.balises() if balises is None else balises
-    return classify("primary", epochs, truth, passages, found, None, locate, config)
+    return classify(Case("primary", epochs, truth, passages, found, None, locate, config))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -64,7 +64,7 @@ def test_truth_that_is_missing_over_the_step_still_shows_the_offset_after_it():
     config = Configuration()
     passages = journey.passages([])
     truth = establish_truth(epochs, journey.reference_frame().filter(~hole), None, passages, config.hazards, config.lds)
-    result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     (row,) = result.hazards.to_dicts()
     assert (row["hazard"], row["balise_ids"][0]) == ("VB_SHIFT", "V4")
     assert seconds(row["t_onset"]) == pytest.approx(40.1)
@@ -88,7 +88,7 @@ def test_reversal_under_a_constant_offset_is_no_jump():
         {"t": epochs["t"], "path_m": place, "cross_track_m": place * 0, "vertical_m": place * 0, "sigma_m": place * 0}
     )
     truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
-    result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     assert result.hazards.height == 0
     error = result.epochs_columns["error_along_m"]
     assert error[300] == pytest.approx(10.0)

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.hazards import classify, establish_truth
+from pipeline.hazards import Case, classify, establish_truth
 from schemas.config import Configuration, HazardConfig
 from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of, with_hazards
 
@@ -72,7 +72,7 @@ def test_truth_is_interpolated_to_the_time_of_validity():
     config = Configuration()
     passages = journey.passages([{"balise_id": "V3", "t_offered": 35.2}])
     truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
-    result = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     known = result.epochs_columns["error_along_m"].drop_nulls()
     assert known.abs().max() == pytest.approx(0.0, abs=1e-6)
     (row,) = result.passages.to_dicts()
@@ -261,7 +261,9 @@ def test_doppler_along_a_track_that_heads_elsewhere_hides_no_jump():
         truth = establish_truth(epochs, None, given, journey.passages(), config.hazards, config.lds)
         error = (epochs["path_m"] - truth["truth_path_m"]).to_numpy()
         assert np.abs(error - journey.error_m()).max() < 1.0
-        found = classify("primary", epochs, truth, journey.passages(), journey.balises(), None, locate, config).hazards
+        found = classify(
+            Case("primary", epochs, truth, journey.passages(), journey.balises(), None, locate, config)
+        ).hazards
         first = found.row(0, named=True)
         assert (seconds(first["t_hazard"]), first["suspect"]) == (31.0, "gnss")
         assert first["size_m"] == pytest.approx(-700.0, abs=1.0)
@@ -277,7 +279,7 @@ def test_how_far_a_healthy_position_strays_from_doppler_is_the_margin_of_false_a
     truth = establish_truth(epochs, None, None, passages, config.hazards, config.lds)
     error_m = (epochs["path_m"] - truth["truth_path_m"])[-1]
     assert error_m == pytest.approx(evidence_error_m, abs=0.1)
-    (alarm,) = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config).alarms.iter_rows(
-        named=True
-    )
+    (alarm,) = classify(
+        Case("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    ).alarms.iter_rows(named=True)
     assert alarm["suspect"] == ("odometer" if margin_m == 5.0 else "gnss")

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from pipeline.hazards import classify, establish_truth
+from pipeline.hazards import Case, classify, establish_truth
 from schemas.config import Configuration
 from schemas.tables import Alarms, Hazards, Passages
 from tests.hazards.synthetic import Journey, judge, locate
@@ -85,7 +85,7 @@ def test_adding_a_constant_to_all_times_changes_nothing_else(journey, shift_ns):
     config = Configuration()
     epochs, moved = shifted(journey.epochs()), shifted(passages)
     truth = establish_truth(epochs, shifted(journey.reference_frame()), None, moved, config.hazards, config.lds)
-    after = classify("primary", epochs, truth, moved, journey.balises(), None, locate, config)
+    after = classify(Case("primary", epochs, truth, moved, journey.balises(), None, locate, config))
     for name in ("hazards", "alarms", "passages", "epochs_columns"):
         wanted = shifted(getattr(before, name))
         assert_frame_equal(getattr(after, name), wanted, abs_tol=1e-6, rel_tol=0.0)
@@ -154,7 +154,9 @@ def test_row_order_of_passages_and_balises_does_not_matter(journey):
     config = Configuration()
     epochs = journey.epochs()
     truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
-    forward = classify("primary", epochs, truth, passages, journey.balises(), None, locate, config)
-    backward = classify("primary", epochs, truth, passages.reverse(), journey.balises().reverse(), None, locate, config)
+    forward = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
+    backward = classify(
+        Case("primary", epochs, truth, passages.reverse(), journey.balises().reverse(), None, locate, config)
+    )
     assert backward.hazards.equals(forward.hazards)
     assert backward.passages.reverse().equals(forward.passages)

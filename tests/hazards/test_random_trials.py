@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from pipeline.hazards import classify, establish_truth
+from pipeline.hazards import Case, classify, establish_truth
 from schemas.config import Configuration
 from tests.hazards.synthetic import Journey, locate, seconds
 
@@ -119,7 +119,9 @@ def replay(journey, rng):
     epochs = epochs.with_columns(path_m=epochs["path_m"] + noise)
     passages = journey.passages()
     truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
-    return classify("primary", epochs, truth, passages, journey.balises(), None, locate, config).hazards.to_dicts()
+    return classify(
+        Case("primary", epochs, truth, passages, journey.balises(), None, locate, config)
+    ).hazards.to_dicts()
 
 
 @pytest.mark.parametrize("block", range(10))
