@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from schemas.errors import InputError
@@ -15,14 +16,25 @@ _KEYS: dict[Stream, list[str]] = {
     "satellites": ["solution", "t", "sv"],
     "balise_reads": ["t", "balise_id"],
 }
+Bools = npt.NDArray[np.bool_]
+_PLACE = ("latitude_deg", "longitude_deg")
+_DAY_NS = 86_400_000_000_000
+# Share of positions with a wrong date that may be left out.
+_FEW = 0.1
 
 
 @dataclass(frozen=True)
 class StreamCounts:
-    """Rows dropped because their key stands twice, and rows that came before an earlier one."""
+    """Rows dropped because their key stands twice, and rows that came before an earlier one.
+
+    Of GNSS also `contradicting`, how many of those dropped are of another place than the one that stays, and `far_off`,
+    how many were dropped for a time of another day.
+    """
 
     duplicates: int = 0
     out_of_order: int = 0
+    contradicting: int = 0
+    far_off: int = 0
 
 
 @dataclass(frozen=True)
@@ -36,9 +48,13 @@ class CleanCounts:
 def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
+    A few positions more than a day from the others (a receiver that did not know the date yet) are left out.
     Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
     nothing can be replayed.
     """
+    stray = _strays(run.gnss)
+    far = run.gnss.filter(stray)
+    run = run.with_streams(gnss=run.gnss.filter(~stray)) if far.height else run
     streams: dict[str, pl.DataFrame | None] = {}
     counts: dict[str, StreamCounts] = {}
     for name in STREAMS:
@@ -46,8 +62,8 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
         if frame is None or name == "faults":
             continue
         streams[name], counts[name] = _in_order(frame, _KEYS.get(name, ["t"]))
-    recorded = run.gnss.select("solution", "t").partition_by("solution", maintain_order=True)
-    solutions = {part["solution"][0]: _in_order(part, ["t"])[1] for part in recorded}
+    recorded = run.gnss.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
+    solutions = {part["solution"][0]: _of_solution(part, far) for part in recorded}
     gnss = streams["gnss"]
     parts = [] if gnss is None else gnss.select("solution").partition_by("solution", maintain_order=True)
     if parts and all(part.height < 2 for part in parts):
@@ -57,6 +73,54 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
         require_two_times(odometer, f"{run.run_id}: odometer")
         _require_common_time(run.run_id, gnss, odometer)
     return run.with_streams(**streams), CleanCounts(solutions, counts)
+
+
+def _strays(gnss: pl.DataFrame) -> Bools:
+    """Positions that more than a day parts from most of their solution, where they are few."""
+    t_ns = gnss["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
+    stray = np.zeros(gnss.height, dtype=np.bool_)
+    if gnss.is_empty() or t_ns.max() - t_ns.min() <= _DAY_NS:
+        return stray
+    solutions = gnss["solution"].to_numpy()
+    for name in gnss["solution"].unique().sort():
+        rows = np.flatnonzero(solutions == name)
+        far = _far_from_most(t_ns[rows])
+        stray[rows] = far & (far.sum() <= _FEW * rows.size)
+    return stray
+
+
+def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
+    """Times outside the largest group without a gap of more than a day."""
+    order = np.argsort(t_ns, kind="stable")
+    group = np.concatenate(([0], np.cumsum(np.diff(t_ns[order]) > _DAY_NS)))
+    far = np.zeros(t_ns.size, dtype=np.bool_)
+    far[order] = group != np.bincount(group).argmax()
+    return far
+
+
+def require_one_journey(fixes: pl.DataFrame, place: str) -> None:
+    """Refuse a cleaned solution that a gap of more than a day parts: no train is on the way for so long unseen."""
+    gaps = np.diff(fixes["t"].to_physical().to_numpy()) > _DAY_NS
+    if gaps.any():
+        row = int(gaps.argmax())
+        raise InputError(
+            "holds positions more than a day apart",
+            place=f"{place}, column t",
+            found=f"{fixes['t'][row]} and {fixes['t'][row + 1]}",
+            expected="the times of one journey",
+            remedy="Split the recording, or correct its times.",
+        )
+
+
+def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
+    counts = _in_order(part, ["t"])[1]
+    contradicting = 0
+    if counts.duplicates:
+        first = [pl.col(name).first().over("t") for name in _PLACE]
+        elsewhere = [(pl.col(name) != kept).fill_null(False) for name, kept in zip(_PLACE, first, strict=True)]
+        contradicting = int(part.select(pl.any_horizontal(elsewhere).sum()).item())
+    far_off = far.filter(pl.col("solution") == part["solution"][0]).height
+    return replace(counts, contradicting=contradicting, far_off=far_off)
 
 
 def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:

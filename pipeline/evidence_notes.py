@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.alignment.align import INTERRUPTED, NO_ODOMETER
+from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 _BALISE = (
@@ -104,5 +104,5 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> tuple[str
         epochs.select("t", "along_raw_reason"), left_on="t_offered", right_on="t", strategy="forward"
     )
     reasons = judged["along_raw_reason"]
-    counts = [(reason, (reasons == reason).sum()) for reason in (NO_ODOMETER, INTERRUPTED)]
+    counts = [(reason, (reasons == reason).sum()) for reason in (NO_ODOMETER, BEYOND_SPAN, INTERRUPTED)]
     return tuple(_UNDIAGNOSED.format(reason=reason, count=count) for reason, count in counts if count)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import polars as pl
 
+from pipeline.clean import StreamCounts
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
@@ -15,10 +16,13 @@ from schemas.run import RunLog
 _SAME_TIME_NS = 1_000_000_000  # ends of streams that are no farther apart need no remark
 
 
-def run_notes(run: RunLog, fixes: pl.DataFrame, found: Match, lds: LdsResult, vehicle: Vehicle) -> tuple[str, ...]:
-    """Notes on what went in and what matching and the LDS made of it; `fixes`: the GNSS of this solution."""
+def run_notes(
+    run: RunLog, counts: StreamCounts, fixes: pl.DataFrame, found: Match, lds: LdsResult, vehicle: Vehicle
+) -> tuple[str, ...]:
+    """Notes on what went in and what matching and the LDS made of it; `counts`, `fixes`: the GNSS of this solution."""
     return (
         *_injected(run),
+        *_stamps(counts),
         *_extents(run),
         *_positions(fixes, found, vehicle),
         *_ambiguous(found),
@@ -31,6 +35,17 @@ def _injected(run: RunLog) -> Iterator[str]:
         yield "faults were injected: " + ", ".join(sorted(set(run.faults["kind"].to_list())))
 
 
+def _stamps(counts: StreamCounts) -> Iterator[str]:
+    """Positions that were left out for their time."""
+    if counts.far_off:
+        yield f"positions more than a day from the others, left out: {counts.far_off}"
+    if counts.contradicting:
+        yield (
+            f"positions of a time that another position has, elsewhere: {counts.contradicting}; the first recorded one "
+            "counts. Receivers on one topic need a solution each"
+        )
+
+
 def _extents(run: RunLog) -> Iterator[str]:
     """Where GNSS and odometer do not cover the same time."""
     if run.odometer is None:
@@ -38,6 +53,8 @@ def _extents(run: RunLog) -> Iterator[str]:
     (gnss_begin, gnss_end), (odometer_begin, odometer_end) = _extent_ns(run.gnss), _extent_ns(run.odometer)
     if gnss_end > odometer_end + _SAME_TIME_NS:
         yield "the odometer ends before the GNSS"
+    if odometer_begin > gnss_begin + _SAME_TIME_NS:
+        yield "the odometer begins after the GNSS"
     if odometer_end > gnss_end + _SAME_TIME_NS:
         yield "the GNSS ends before the odometer"
     if gnss_begin > odometer_begin + _SAME_TIME_NS:

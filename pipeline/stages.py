@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
 from pipeline.channels import on_path_of
-from pipeline.clean import CleanCounts, clean, require_two_times
+from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.evidence_notes import evidence_notes, return_notes, undiagnosed_notes
 from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
@@ -88,6 +88,7 @@ def _match(context: _Context, solution: str) -> Match:
     run = context.run
     fixes = run.gnss.filter(pl.col("solution") == solution)
     require_two_times(fixes, "gnss", f" of solution {solution!r}")
+    require_one_journey(fixes, f"gnss of solution {solution!r}")
     return match(
         fixes,
         run.odometer,
@@ -138,7 +139,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
         ingest=run.notes,
         ambiguous_stretches=found.ambiguous.height,
         notes=(
-            *run_notes(run, fixes, found, lds, vehicle),
+            *run_notes(run, context.counts.solutions[solution], fixes, found, lds, vehicle),
             *evidence_notes(aligned, truth, config.hazards.failure_limit_m),
             *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
             *undiagnosed_notes(epochs, result.passages),

@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.clean import StreamCounts, clean
+from pipeline.clean import StreamCounts, clean, require_one_journey
 from schemas.errors import InputError
 from schemas.run import RunLog
 
@@ -17,6 +17,7 @@ def gnss(times, solution="primary", latitudes=None):
             "t": pl.Series(times, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
             "solution": [solution] * len(times),
             "latitude_deg": pl.Series(latitudes or [50.0] * len(times), dtype=pl.Float64),
+            "longitude_deg": pl.Series([4.0] * len(times), dtype=pl.Float64),
         }
     )
 
@@ -25,7 +26,7 @@ def test_order_is_restored_and_the_first_of_a_double_stays():
     run = RunLog("r", gnss([1, 3, 2, 3, 5], latitudes=[50.1, 50.3, 50.2, 50.9, 50.5]))
     cleaned, counts = clean(run)
     assert cleaned.gnss["latitude_deg"].to_list() == [50.1, 50.2, 50.3, 50.5]
-    assert counts.solutions == {"primary": StreamCounts(duplicates=1, out_of_order=1)}
+    assert counts.solutions == {"primary": StreamCounts(duplicates=1, out_of_order=1, contradicting=1)}
 
 
 def test_solutions_share_times_without_being_doubles():
@@ -64,3 +65,37 @@ def test_an_odometer_of_another_day_is_refused(shift):
 
 def test_an_odometer_that_meets_the_gnss_at_one_time_is_kept():
     assert clean(RunLog("r", gnss([10, 12]), gnss([12, 20]).select("t")))[0].odometer is not None
+
+
+DAY_NS = 86_400_000_000_000
+NOW_NS = 20_000 * DAY_NS
+
+
+def test_positions_with_another_date_are_left_out_and_counted():
+    # The date of 1024 weeks before, and none at all: a receiver that does not know the week yet.
+    times = [0, NOW_NS - 7168 * DAY_NS, *range(NOW_NS, NOW_NS + 30)]
+    other = list(range(NOW_NS, NOW_NS + 30))
+    cleaned, counts = clean(RunLog("r", pl.concat([gnss(times), gnss(other, "gps")])))
+    assert cleaned.gnss.filter(pl.col("solution") == "primary")["t"].to_physical().to_list() == times[2:]
+    assert counts.solutions == {"primary": StreamCounts(far_off=2), "gps": StreamCounts()}
+
+
+def test_a_journey_of_several_days_is_whole():
+    times = [NOW_NS + hour * DAY_NS // 24 for hour in range(72)]
+    cleaned, counts = clean(RunLog("r", gnss(times)))
+    assert (cleaned.gnss.height, counts.solutions["primary"]) == (72, StreamCounts())
+    require_one_journey(cleaned.gnss, "gnss")
+
+
+def test_two_journeys_in_one_recording_are_refused():
+    cleaned, counts = clean(
+        RunLog("r", gnss([*range(NOW_NS, NOW_NS + 30), *range(NOW_NS + 3 * DAY_NS, NOW_NS + 3 * DAY_NS + 20)]))
+    )
+    assert counts.solutions["primary"].far_off == 0
+    with pytest.raises(InputError, match=r"more than a day apart.*2024-10-04.* and 2024-10-07.*Split"):
+        require_one_journey(cleaned.gnss, "gnss")
+
+
+def test_doubles_of_the_same_place_do_not_contradict():
+    run = RunLog("r", gnss([1, 2, 2, 2, 3], latitudes=[50.0, 50.1, 50.1, 50.2, 50.3]))
+    assert clean(run)[1].solutions == {"primary": StreamCounts(duplicates=2, contradicting=1)}

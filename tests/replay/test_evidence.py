@@ -84,6 +84,29 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_told():
     )
     assert inside.height > 0
     assert f"{undiagnosed}{inside.height} (odometer interrupted or slipping); a jump" in paused.runs["notes"].item()
+    middle = begin + timedelta(seconds=100)
+    for kept, word in ((pl.col("t") < middle, "ends before"), (pl.col("t") > middle, "begins after")):
+        part = replay(run.with_streams(odometer=run.odometer.filter(kept)), site, VEHICLE)
+        unseen = part.passages.filter(
+            (pl.col("kind") == "virtual") & (pl.col("status") == "accepted"),
+            (pl.col("t_offered") >= middle) if "ends" in word else (pl.col("t_offered") <= middle),
+        )
+        assert unseen.height > 0
+        notes = part.runs["notes"].item()
+        assert f"{undiagnosed}{unseen.height} (outside the odometer's time span); a jump" in notes
+        assert f"the odometer {word} the GNSS" in notes
+
+
+def test_positions_left_out_for_their_time_are_told():
+    run, site = journey(OFFSET)
+    undated = run.gnss.head(3).with_columns((pl.col("t") - timedelta(weeks=1024)).cast(run.gnss["t"].dtype))
+    doubled = run.gnss[500:510].with_columns(pl.col("latitude_deg") + 0.001)
+    both = run.with_streams(gnss=pl.concat([undated, run.gnss, doubled]))
+    told, plain = replay(both, site, VEHICLE).runs, replay(run, site, VEHICLE).runs
+    assert "positions more than a day from the others, left out: 3" in told["notes"].item()
+    assert "positions of a time that another position has, elsewhere: 10;" in told["notes"].item()
+    assert told["duration_s"].item() == plain["duration_s"].item()
+    assert told["distance_m"].item() == plain["distance_m"].item()
 
 
 @pytest.mark.parametrize("kind", ["reference", "balise", "odometer"])
