@@ -50,7 +50,8 @@ def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -
         raise InputError(
             "no epoch with a time and a position",
             place=", ".join(str(log) for log in logs),
-            expected="UBX NAV-PVT, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, or a mapped CSV",
+            expected="UBX NAV-PVT or NAV-SOL, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
+            "or a mapped CSV",
             remedy="Let the receiver record one of these messages." + _reasons(dropped),
         )
     return Converted(RunLog(run_id, joined.pop("gnss")).with_streams(**joined), dict(dropped))

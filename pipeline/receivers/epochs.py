@@ -17,30 +17,66 @@ from schemas.enums import Fix
 from schemas.inputs import Gnss, Satellites
 from schemas.run import Stream
 
+# A message may come so many epochs after its own: what a receiver works out for a second at 20 Hz.
+_LATEST_MESSAGE = 32
+
 
 @dataclass
 class Epoch:
     """What is known of one epoch: `gnss` columns and satellite rows. Without a time it yields nothing."""
 
+    key: Hashable
+    number: int
     t_ns: int | None = None
     gnss: dict[str, Any] = field(default_factory=dict)
     satellites: list[dict[str, Any]] = field(default_factory=list)
+    positions: dict[str, bytes] = field(default_factory=dict)
+    _ranks: dict[str, int] = field(default_factory=dict)
 
     @property
     def has_fix(self) -> bool:
-        """Whether a message said when the epoch was and what kind of fix it has (also: none)."""
-        return self.t_ns is not None and "fix" in self.gnss
+        """Whether messages said what kind of fix the epoch has and where, or that it has none."""
+        return "fix" in self.gnss and (bool(self.positions) or self.gnss["fix"] == Fix.NONE)
+
+    def tell(self, what: str, rank: int, columns: dict[str, Any]) -> None:
+        """Columns that several messages give: those of the highest rank stay, whichever comes first."""
+        if rank >= self._ranks.get(what, rank):
+            self._ranks[what] = rank
+            self.gnss |= columns
+
+    def tell_time(self, rank: int, t_ns: int) -> None:
+        """As `tell`, the time [ns since 1970]."""
+        if rank >= self._ranks.get("time", rank):
+            self._ranks["time"] = rank
+            self.t_ns = t_ns
 
 
 @dataclass
 class Gathered:
-    """Epochs by key in order of first sight; counts of what could not be used, by reason."""
+    """Epochs in order of first sight; counts of what could not be used, by reason."""
 
-    epochs: dict[Hashable, Epoch] = field(default_factory=dict)
+    epochs: list[Epoch] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
+    _latest: dict[Hashable, Epoch] = field(default_factory=dict)
 
-    def at(self, key: Hashable) -> Epoch:
-        return self.epochs.setdefault(key, Epoch())
+    def at(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
+        """The epoch of this key that a message belongs to.
+
+        `position`: name of the message where it is one that tells a position, with its `content`. Another one than the
+        epoch already has is of another epoch with the same key, and so is what comes long after: a clock went back,
+        logs were joined, or stamps are coarser than the rate. They are neither mixed nor lost.
+        """
+        epoch = self._latest.get(key)
+        if (
+            epoch is None
+            or epoch.positions.get(position, content) != content
+            or len(self.epochs) - epoch.number > _LATEST_MESSAGE
+        ):
+            epoch = self._latest[key] = Epoch(key, len(self.epochs))
+            self.epochs.append(epoch)
+        if position:
+            epoch.positions[position] = content
+        return epoch
 
     def drop(self, reason: str, count: int = 1) -> None:
         if count:
@@ -48,10 +84,12 @@ class Gathered:
 
     def settled(self) -> Epochs:
         """The epochs whose time and kind of fix are known; the others are counted."""
-        told = [epoch for epoch in self.epochs.values() if epoch.gnss or epoch.satellites]
+        told = [epoch for epoch in self.epochs if epoch.gnss or epoch.satellites]
         known = [epoch for epoch in told if epoch.has_fix]
         self.drop("epoch without its position message", len(told) - len(known))
-        return Epochs(known)
+        timed = [epoch for epoch in known if epoch.t_ns is not None]
+        self.drop("time not valid", len(known) - len(timed))
+        return Epochs(timed)
 
 
 @dataclass(frozen=True)

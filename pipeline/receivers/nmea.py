@@ -48,16 +48,16 @@ class NmeaDecoder:
         self._day: date | None = None
         self._latest: time | None = None
 
-    def decode(self, gathered: Gathered, message: Any, _raw: bytes) -> None:
+    def decode(self, gathered: Gathered, message: Any, raw: bytes) -> None:
         """Add what this sentence says to its epoch."""
         if not isinstance(message.time, time):
             gathered.drop("time not valid")
             return
         self._follow(message)
-        epoch = gathered.at((self._day, message.time))
+        position = message.identity if message.msgID in _POSITIONS else ""
+        epoch = gathered.at((self._day, message.time), position, raw)
         if self._day is not None:
-            moment = datetime.combine(self._day, message.time, tzinfo=UTC)
-            epoch.t_ns = int(moment.replace(microsecond=0).timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+            epoch.t_ns = _time_ns(self._day, message.time)
         _DECODERS[message.msgID](epoch, message)
 
     def _follow(self, message: Any) -> None:
@@ -73,16 +73,47 @@ class NmeaDecoder:
 
 
 def settle_first_day(gathered: Gathered) -> None:
-    """Sentences before the first date belong to the epoch of the same time that has one, or are dropped."""
-    dated = {key[1]: epoch for key, epoch in gathered.epochs.items() if isinstance(key, tuple) and key[0] is not None}
-    for key in [key for key in gathered.epochs if isinstance(key, tuple) and key[0] is None]:
-        early = gathered.epochs.pop(key)
-        same = dated.get(key[1])
-        if same is None:
+    """Give the positions before the first date their day, counted back from it.
+
+    Sentences of the same epoch as the first dated ones join them. A time with neither date nor position may be that of
+    a receiver just switched on, whose clock is not set yet: it is dropped.
+    """
+    undated = [epoch for epoch in gathered.epochs if _key_of(epoch)[0] is None]
+    gathered.epochs = [epoch for epoch in gathered.epochs if _key_of(epoch)[0] is not None]
+    if not gathered.epochs:
+        gathered.drop("time without a date", len(undated))
+        return
+    first = gathered.epochs[0]
+    day, following = _key_of(first)
+    kept: list[Epoch] = []
+    for early in reversed(undated):
+        _, moment = _key_of(early)
+        if moment == following and not early.positions.keys() & first.positions.keys():
+            _join(first, early)
+        elif early.gnss.get("fix", Fix.NONE.value) == Fix.NONE.value:
             gathered.drop("time without a date")
         else:
-            # What GGA and GNS say goes before what an RMC says.
-            same.gnss = same.gnss | early.gnss if "satellites" in early.gnss else early.gnss | same.gnss
+            day -= timedelta(days=1) if _seconds(moment) - _seconds(following) > _HALF_DAY_S else timedelta(0)
+            early.t_ns, following = _time_ns(day, moment), moment
+            kept.append(early)
+    gathered.epochs = kept[::-1] + gathered.epochs
+
+
+def _join(dated: Epoch, early: Epoch) -> None:
+    """What GGA and GNS say goes before what an RMC says."""
+    dated.gnss = dated.gnss | early.gnss if "satellites" in early.gnss else early.gnss | dated.gnss
+    dated.positions |= early.positions
+
+
+def _key_of(epoch: Epoch) -> Any:
+    """Day (none before the first date) and time of day."""
+    return epoch.key
+
+
+def _time_ns(day: date, moment: time) -> int:
+    """UTC [ns since 1970]."""
+    whole = datetime.combine(day, moment.replace(microsecond=0), tzinfo=UTC)
+    return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
 
 
 def _seconds(moment: time) -> int:
@@ -153,6 +184,7 @@ def _nothing(_epoch: Epoch, _m: Any) -> None:
     """ZDA gives only the date."""
 
 
+_POSITIONS = ("GGA", "GNS", "RMC")
 _WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA")
 _DECODERS = {
     "GGA": _position,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import struct
-from functools import cache
 from typing import Any
 
 import numpy as np
-from pyproj import Transformer
 
 from pipeline.ingest.timescale import utc_from_gps
+from pipeline.receivers.earth_fixed import east_north_up, geodetic, local_velocity
 from pipeline.receivers.epochs import Epoch, Gathered
 from schemas.enums import Fix
 
@@ -47,7 +46,8 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     if tow_ms == _NO_TOW or week == _NO_WEEK:
         gathered.drop("time not valid")
         return
-    epoch = gathered.at((week, tow_ms))
+    position = message.identity if message.identity in _POSITIONS else ""
+    epoch = gathered.at((week, tow_ms), position, raw)
     gps_ns = (_GPS_EPOCH_S * 1000 + week * _WEEK_MS + tow_ms) * 1_000_000
     epoch.t_ns = int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0])
     decoder(epoch, message)
@@ -73,11 +73,10 @@ def _geodetic(epoch: Epoch, m: Any) -> None:
 def _cartesian(epoch: Epoch, m: Any) -> None:
     if not _solution(epoch, m) or m.X == _DO_NOT_USE:
         return
-    longitude, latitude, height = _to_geodetic().transform(m.X, m.Y, m.Z)
-    epoch.gnss |= {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
+    place = geodetic(m.X, m.Y, m.Z)
+    epoch.gnss |= place
     if m.Vx != _DO_NOT_USE:
-        east, north, up = _east_north_up(latitude, longitude) @ np.array([m.Vx, m.Vy, m.Vz])
-        epoch.gnss |= {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
+        epoch.gnss |= local_velocity(place["latitude_deg"], place["longitude_deg"], (m.Vx, m.Vy, m.Vz))
 
 
 def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
@@ -90,7 +89,7 @@ def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
     latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
     if latitude is None or longitude is None or m.Cov_xx == _DO_NOT_USE:
         return
-    turn = _east_north_up(latitude, longitude)
+    turn = east_north_up(latitude, longitude)
     xx, yy, zz, xy, xz, yz = m.Cov_xx, m.Cov_yy, m.Cov_zz, m.Cov_xy, m.Cov_xz, m.Cov_yz
     local = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
     _put_covariance(epoch, (local[0, 0], local[0, 1], local[0, 2], local[1, 1], local[1, 2], local[2, 2]))
@@ -110,24 +109,8 @@ def _known(values: dict[str, float]) -> dict[str, float]:
     return {name: value for name, value in values.items() if value != _DO_NOT_USE}
 
 
-@cache
-def _to_geodetic() -> Transformer:
-    return Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-
-
-def _east_north_up(latitude_deg: float, longitude_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Rotation from earth-fixed axes to east, north, up."""
-    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
-    return np.array(
-        [
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
-        ]
-    )
-
-
 _BLOCK_NUMBER = 0x1FFF  # the other bits of the id are the revision
+_POSITIONS = ("PVTGeodetic", "PVTCartesian")
 _WANTED = (4001, 4006, 4007, 5905, 5906)
 _DECODERS = {
     "PVTGeodetic": _geodetic,

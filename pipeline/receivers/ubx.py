@@ -1,17 +1,21 @@
-"""u-blox UBX: NAV-PVT or NAV-PVAT with NAV-COV, NAV-PL, NAV-SBAS, NAV-SAT and NAV-HPPOSLLH, gathered by iTOW."""
+"""u-blox UBX, gathered by iTOW: NAV-PVT or NAV-PVAT with NAV-COV, NAV-PL, NAV-SBAS, NAV-SAT and NAV-HPPOSLLH.
+
+What older receivers send in place of NAV-PVT is read by `ubx_early`.
+"""
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Any
 
+from pipeline.receivers import ubx_early
 from pipeline.receivers.epochs import Epoch, Gathered, satellite_name
+from pipeline.receivers.ubx_fields import accuracy, calendar_ns, covariance, fix_of, place, velocity
 from schemas.enums import Fix
 
 _SYSTEMS = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
 _SYSTEMS_BY_NAME = {"GPS": "G", "SBAS": "S", "Galileo": "E", "BeiDou": "C", "QZSS": "J", "GLONASS": "R", "NavIC": "I"}
-_NO_FIX, _DEAD_RECKONING, _TIME_ONLY = 0, 1, 5
-_RTK_FLOAT, _RTK_FIXED = 1, 2
+_PVT = ubx_early.HIGHEST_RANK + 1
+_REFINED = _PVT + 1
 
 
 def parse(raw: bytes) -> Any:
@@ -28,78 +32,53 @@ class UbxDecoder:
         self._week = 0
         self._latest_ms = 0
 
-    def decode(self, gathered: Gathered, message: Any, _raw: bytes) -> None:
+    def decode(self, gathered: Gathered, message: Any, raw: bytes) -> None:
         """Add what this message says to its epoch."""
         if self._latest_ms - message.iTOW > _HALF_WEEK_MS:
             self._week += 1
         self._latest_ms = message.iTOW
-        t_ns = _time_ns(message) if message.identity in _POSITIONS else None
-        epoch = gathered.at((self._week, message.iTOW))
-        if epoch.t_ns is not None and t_ns is not None and t_ns != epoch.t_ns:
+        told = _time_ns(message)
+        position = message.identity if message.identity in _POSITIONS else ""
+        epoch = gathered.at((self._week, message.iTOW), position, raw)
+        if epoch.t_ns is not None and told is not None and abs(told[1] - epoch.t_ns) > _SAME_MOMENT_NS:
             # The same moment of another week: the log was interrupted, or several were joined.
             self._week += 1
-            epoch = gathered.at((self._week, message.iTOW))
-        if message.identity in _POSITIONS:
-            if t_ns is None:
-                gathered.drop("time not valid")
-                return
-            epoch.t_ns = t_ns
-        _DECODERS[message.identity](gathered, epoch, message)
+            epoch = gathered.at((self._week, message.iTOW), position, raw)
+        if told is not None:
+            epoch.tell_time(*told)
+        if message.identity in _DECODERS:
+            _DECODERS[message.identity](gathered, epoch, message)
 
 
-def _time_ns(m: Any) -> int | None:
-    """UTC as the receiver states it, none before it knows [ns since 1970]."""
+def _time_ns(m: Any) -> tuple[int, int] | None:
+    """Rank of the message's time, and UTC as the receiver states it [ns since 1970]; none before it knows."""
+    if m.identity not in ("NAV-PVT", "NAV-PVAT"):
+        return ubx_early.time_ns(m)
     if not (m.validDate and m.validTime):
         return None
-    try:
-        minute = datetime(m.year, m.month, m.day, m.hour, m.min, tzinfo=UTC)
-    except ValueError:
-        return None
-    second = m.second if hasattr(m, "second") else m.sec
-    return (int(minute.timestamp()) + int(second)) * _NS_PER_S + int(m.nano)
+    t_ns = calendar_ns(m, int(m.second if hasattr(m, "second") else m.sec))
+    return None if t_ns is None else (_PVT, t_ns)
 
 
 def _position(_: Gathered, epoch: Epoch, m: Any) -> None:
     """NAV-PVT and NAV-PVAT: position [deg, mm], velocity [mm/s], accuracy [mm], kind of fix."""
-    fix = Fix.NONE if getattr(m, "invalidLlh", False) else _fix(m)
-    epoch.gnss |= {"fix": fix.value, "satellites": m.numSV}
-    if fix is Fix.NONE:
-        return
-    high_precision = epoch.gnss.get("latitude_deg") is not None
-    if not high_precision:
-        epoch.gnss |= {"latitude_deg": m.lat, "longitude_deg": m.lon, "height_m": m.height / 1e3}
-    epoch.gnss |= {"vel_e_mps": m.velE / 1e3, "vel_n_mps": m.velN / 1e3, "vel_u_mps": -m.velD / 1e3}
-    if "cov_ee_m2" not in epoch.gnss:
-        # hAcc is the standard deviation in the plane: half of its variance on each axis.
-        plane, up = 0.5 * (m.hAcc / 1e3) ** 2, (m.vAcc / 1e3) ** 2
-        epoch.gnss |= _covariance(plane, 0.0, 0.0, plane, 0.0, up)
-
-
-def _fix(m: Any) -> Fix:
     good = m.gnssFixOk if hasattr(m, "gnssFixOk") else m.gnssFixOK
-    if not good or m.fixType in (_NO_FIX, _TIME_ONLY):
-        return Fix.NONE
-    if m.fixType == _DEAD_RECKONING:
-        return Fix.ESTIMATED
-    if m.carrSoln in (_RTK_FLOAT, _RTK_FIXED):
-        return Fix.RTK_FIXED if m.carrSoln == _RTK_FIXED else Fix.RTK_FLOAT
-    return Fix.DIFFERENTIAL if m.diffSoln else Fix.AUTONOMOUS
+    fix = Fix.NONE if getattr(m, "invalidLlh", False) else fix_of(m.fixType, good, m.diffSoln, m.carrSoln)
+    epoch.tell("fix", _PVT, {"fix": fix.value, "satellites": m.numSV})
+    epoch.tell("place", _PVT, place(m))
+    epoch.tell("velocity", _PVT, velocity(m.velE / 1e3, m.velN / 1e3, m.velD / 1e3))
+    epoch.tell("accuracy", _PVT, accuracy(m.hAcc / 1e3, m.vAcc / 1e3))
 
 
 def _precise(_: Gathered, epoch: Epoch, m: Any) -> None:
     if not m.invalidLlh:
-        epoch.gnss |= {"latitude_deg": m.lat, "longitude_deg": m.lon, "height_m": m.height / 1e3}
+        epoch.tell("place", _REFINED, place(m))
 
 
 def _covariances(_: Gathered, epoch: Epoch, m: Any) -> None:
     if m.posCovValid:
         values = (m.posCovEE, m.posCovNE, -m.posCovED, m.posCovNN, -m.posCovND, m.posCovDD)
-        epoch.gnss |= _covariance(*values)
-
-
-def _covariance(ee: float, en: float, eu: float, nn: float, nu: float, uu: float) -> dict[str, float]:
-    names = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
-    return dict(zip(names, (ee, en, eu, nn, nu, uu), strict=True))
+        epoch.tell("accuracy", _REFINED, covariance(*values))
 
 
 def _protection(gathered: Gathered, epoch: Epoch, m: Any) -> None:
@@ -134,11 +113,10 @@ def _satellites(_: Gathered, epoch: Epoch, m: Any) -> None:
 
 _HORIZON_TO_ZENITH_DEG = 90.0
 _HALF_WEEK_MS = 302_400_000
-_NS_PER_S = 1_000_000_000
-_POSITIONS = ("NAV-PVT", "NAV-PVAT")
-# Class and id of the messages below.
-_WANTED = (b"\x01\x07", b"\x01\x17", b"\x01\x14", b"\x01\x36", b"\x01\x62", b"\x01\x32", b"\x01\x35")
+# Messages of one epoch may round its time, and know another number of leap seconds before they have been received.
+_SAME_MOMENT_NS = 60_000_000_000
 _SATELLITE_FIELDS = ("gnssId", "svId", "azim", "elev", "prRes", "svUsed")
+_POSITIONS = ("NAV-PVT", "NAV-PVAT", "NAV-SOL", "NAV-POSLLH")
 _DECODERS = {
     "NAV-PVT": _position,
     "NAV-PVAT": _position,
@@ -147,4 +125,14 @@ _DECODERS = {
     "NAV-PL": _protection,
     "NAV-SBAS": _sbas,
     "NAV-SAT": _satellites,
+    "NAV-SOL": ubx_early.solution,
+    "NAV-STATUS": ubx_early.status,
+    "NAV-POSLLH": ubx_early.position,
+    "NAV-VELNED": ubx_early.motion,
+    "NAV-SVINFO": ubx_early.satellites,
 }
+# Class and id of the messages above, and of NAV-TIMEGPS and NAV-TIMEUTC.
+_WANTED = frozenset(
+    b"\x01" + bytes([number])
+    for number in (0x02, 0x03, 0x06, 0x07, 0x12, 0x14, 0x17, 0x20, 0x21, 0x30, 0x32, 0x35, 0x36, 0x62)
+)

@@ -184,6 +184,37 @@ def test_the_first_gga_before_any_date_belongs_to_its_rmc(converted):
     assert (row["fix"], row["sbas_prn"], row["sbas_age_s"], row["height_m"]) == ("sbas", 123, 3.0, 100.0)
 
 
+def test_positions_before_the_first_date_get_their_day(converted):
+    before = [gga("235958.00"), gga("235959.00", quality="0"), gga("000000.00"), gga("000001.00")]
+    found = converted(*before, sentence("GPZDA,000002.00,01,06,2025,00,00"), gga("000002.00"))
+    assert iso(found.run.gnss) == [
+        "2025-05-31T23:59:58", "2025-06-01T00:00:00", "2025-06-01T00:00:01", "2025-06-01T00:00:02",
+    ]  # fmt: skip
+    assert found.dropped == {"time without a date": 1}
+
+
+def test_a_clock_that_goes_back_mixes_no_epochs_and_loses_none(converted):
+    def at(second: int, minute: str) -> list[bytes]:
+        place = [part.replace(b"5030.", f"{minute}.".encode()) for part in (rmc(f"1200{second:02d}.00"),
+                                                                           gga(f"1200{second:02d}.00"))]  # fmt: skip
+        return [sentence(part[1:].split(b"*")[0].decode()) for part in place]
+
+    forth = [part for second in range(40) for part in at(second, "5030")]
+    again = [part for second in (38, 39, 2, 3) for part in at(second, "5031")]
+    fixes = converted(*forth, *again).run.gnss
+    assert fixes.height == 44
+    assert fixes["latitude_deg"].round(6).to_list() == [50.5] * 40 + [round(50 + 31 / 60, 6)] * 4
+
+
+def test_the_same_message_twice_is_one_epoch_and_another_of_its_time_is_not(converted):
+    assert converted(rmc("120000.00"), gga("120000.00"), gga("120000.00")).run.gnss.height == 1
+    other = nav_pvt(1000, fix=2)
+    assert converted(nav_pvt(1000), nav_pvt(1000), other).run.gnss.height == 2
+    assert converted(pvt_geodetic(0), pvt_geodetic(0), pvt_geodetic(0, 4)).run.gnss["fix"].to_list() == [
+        "sbas", "rtk_fixed",
+    ]  # fmt: skip
+
+
 def test_any_talker_is_read(converted):
     assert converted(rmc("120000.00", talker="BD"), gga("120000.00", talker="BD")).run.gnss.height == 1
 

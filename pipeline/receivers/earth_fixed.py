@@ -1,0 +1,43 @@
+"""Earth-centred, earth-fixed coordinates (WGS 84) as receivers give them, turned into geodetic and local ones."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pyproj import Transformer
+
+Array = npt.NDArray[np.float64]
+
+
+def geodetic(x_m: float, y_m: float, z_m: float) -> dict[str, Any]:
+    """The `gnss` columns of a place."""
+    longitude, latitude, height = _transformer().transform(x_m, y_m, z_m)
+    return {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
+
+
+def local_velocity(
+    latitude_deg: float, longitude_deg: float, velocity_mps: tuple[float, float, float]
+) -> dict[str, Any]:
+    """The `gnss` columns of an earth-fixed velocity at a place."""
+    east, north, up = east_north_up(latitude_deg, longitude_deg) @ np.array(velocity_mps)
+    return {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
+
+
+def east_north_up(latitude_deg: float, longitude_deg: float) -> Array:
+    """Rotation from earth-fixed axes to east, north, up; shape (3, 3)."""
+    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
+    return np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+
+
+@cache
+def _transformer() -> Transformer:
+    return Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)

@@ -1,0 +1,103 @@
+"""UBX messages of receivers that have no NAV-PVT (generations 4 to 6), and that later ones still send.
+
+NAV-SOL tells time, kind of fix, place and velocity of an epoch, in earth-fixed coordinates to the centimetre.
+NAV-POSLLH and NAV-VELNED tell place and velocity better, NAV-STATUS the kind of fix, NAV-TIMEUTC and NAV-TIMEGPS the
+time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.receivers.earth_fixed import geodetic, local_velocity
+from pipeline.receivers.epochs import Epoch, Gathered, satellite_name
+from pipeline.receivers.ubx_fields import accuracy, calendar_ns, fix_of, place, velocity
+
+# What each tells gives way to what a message of higher rank tells of the same epoch; NAV-PVT is above all of these.
+_STATUS, _SOL, _SINGLE, HIGHEST_RANK = 0, 1, 2, 2
+_WEEK_NS = 604_800_000_000_000
+_CM = 1e-2
+# Numbers of satellites in NAV-SVINFO: first of the system, last, letter, number of the first.
+_SVIDS = (
+    (1, 32, "G", 1),
+    (33, 64, "C", 6),
+    (65, 96, "R", 1),
+    (120, 158, "S", 20),
+    (159, 163, "C", 1),
+    (193, 202, "J", 1),
+    (211, 246, "E", 1),
+)
+
+
+def time_ns(m: Any) -> tuple[int, int] | None:
+    """Rank of the message's time, and UTC [ns since 1970]; none where it has no time or does not know it."""
+    if m.identity == "NAV-TIMEUTC":
+        t_ns = calendar_ns(m, m.sec) if m.validUTC else None
+        return None if t_ns is None else (_SINGLE, t_ns)
+    if m.identity == "NAV-SOL":
+        return (_SOL, _from_gps(m)) if m.wknSet and m.towSet else None
+    if m.identity == "NAV-TIMEGPS":
+        return (_SOL, _from_gps(m)) if m.towValid and m.weekValid else None
+    return None
+
+
+def _from_gps(m: Any) -> int:
+    gps_ns = GPS_EPOCH_NS + m.week * _WEEK_NS + m.iTOW * 1_000_000 + m.fTOW
+    return int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0])
+
+
+def solution(_: Gathered, epoch: Epoch, m: Any) -> None:
+    """NAV-SOL: kind of fix, place [cm], velocity [cm/s]; its accuracy is of all three axes together and not used."""
+    fix = fix_of(m.gpsFix, m.gpsfixOK, m.diffSoln)
+    epoch.tell("fix", _SOL, {"fix": fix.value, "satellites": m.numSV})
+    if not (m.ecefX or m.ecefY or m.ecefZ):
+        return
+    where = geodetic(m.ecefX * _CM, m.ecefY * _CM, m.ecefZ * _CM)
+    speeds = (m.ecefVX * _CM, m.ecefVY * _CM, m.ecefVZ * _CM)
+    epoch.tell("place", _SOL, where)
+    epoch.tell("velocity", _SOL, local_velocity(where["latitude_deg"], where["longitude_deg"], speeds))
+
+
+def status(_: Gathered, epoch: Epoch, m: Any) -> None:
+    """NAV-STATUS: kind of fix."""
+    epoch.tell("fix", _STATUS, {"fix": fix_of(m.gpsFix, m.gpsFixOk, m.diffSoln).value})
+
+
+def position(_: Gathered, epoch: Epoch, m: Any) -> None:
+    """NAV-POSLLH: place, accuracy [mm]."""
+    epoch.tell("place", _SINGLE, place(m))
+    epoch.tell("accuracy", _SINGLE, accuracy(m.hAcc / 1e3, m.vAcc / 1e3))
+
+
+def motion(_: Gathered, epoch: Epoch, m: Any) -> None:
+    """NAV-VELNED: velocity [cm/s]."""
+    epoch.tell("velocity", _SINGLE, velocity(m.velE * _CM, m.velN * _CM, m.velD * _CM))
+
+
+def satellites(_: Gathered, epoch: Epoch, m: Any) -> None:
+    """NAV-SVINFO: azimuth and elevation [deg], residual [cm]; NAV-SAT of the same epoch tells the same."""
+    if epoch.satellites:
+        return
+    for index in range(1, m.numCh + 1):
+        value = {name: getattr(m, f"{name}_{index:02d}") for name in ("svid", "azim", "elev", "prRes", "svUsed")}
+        name = _name(value["svid"])
+        if name is not None and abs(value["elev"]) <= 90:
+            epoch.satellites.append(
+                {
+                    "sv": name,
+                    "azimuth_deg": float(value["azim"]),
+                    "elevation_deg": float(value["elev"]),
+                    "residual_m": value["prRes"] * _CM if value["svUsed"] else None,
+                    "used": bool(value["svUsed"]),
+                }
+            )
+
+
+def _name(svid: int) -> str | None:
+    """None for a satellite whose number the receiver does not know (255)."""
+    return next(
+        (satellite_name(system, svid - low + first) for low, high, system, first in _SVIDS if low <= svid <= high), None
+    )
