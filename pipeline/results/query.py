@@ -18,6 +18,9 @@ from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
+# After comments and brackets, the words that a query begins with.
+_QUERY = re.compile(r"(\s|\(|--[^\n]*(\n|$)|/\*.*?\*/)*(select|with|explain|from|values)\b", re.IGNORECASE | re.DOTALL)
+
 
 def run_sql(out: Address, sql: str) -> pl.DataFrame:
     """The answer to one SELECT over the complete runs of a result.
@@ -25,6 +28,14 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
     Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, and those of the
     campaign where they are written. A condition on `run_id` reads the files of these runs only.
     """
+    if not _QUERY.match(sql):
+        raise UsageError(
+            "is no query",
+            place="SQL",
+            found=sql.strip()[:80] or "nothing",
+            expected="one SELECT (WITH ... SELECT, EXPLAIN SELECT); results are only read",
+            remedy="`balise dictionary` lists the tables and their columns.",
+        )
     tables = _tables(out, sql)
     try:
         with catalogue.patient():

@@ -254,3 +254,25 @@ def test_configuration_comes_back(tmp_path: Path) -> None:
     config = Configuration.model_validate({"lds": {"ci_limit_m": 12.5}, "safety": {"demands_per_hour": 64.0}})
     store.write_config(tmp_path, config)
     assert store.read_config(tmp_path) == config
+
+
+@pytest.mark.parametrize(
+    "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show tables", "", "-- x"]
+)
+def test_results_are_only_read(tmp_path: Path, sql: str) -> None:
+    store.write_run(tables_of("r1"), tmp_path, METADATA)
+    with pytest.raises(UsageError, match=r"is no query.*found.*SELECT"):
+        run_sql(tmp_path, sql)
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "  -- all\n/* of\nthem */ SELECT run_id FROM runs",
+        "with a as (select run_id from runs) select run_id from a",
+        "(select run_id from runs)",
+    ],
+)
+def test_queries_in_any_dress_are_answered(tmp_path: Path, sql: str) -> None:
+    store.write_run(tables_of("r1"), tmp_path, METADATA)
+    assert run_sql(tmp_path, sql).rows() == [("r1",)]
