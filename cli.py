@@ -224,7 +224,7 @@ def convert(
     config: ConfigFile = None,
 ) -> None:
     """Make a run of receiver logs."""
-    from datasets.samples import known_recording
+    from datasets.recordings import known_recording
     from datasets.trial import write_run_as
     from pipeline.receivers import convert as convert_logs
 

@@ -7,8 +7,8 @@ import numpy as np
 import polars as pl
 import pytest
 
+from datasets.comma2k19 import comma2k19_run
 from datasets.demo import demo_scenario
-from datasets.samples import comma2k19_run
 from datasets.trial import build_run, build_site
 from pipeline.calibrate import calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit

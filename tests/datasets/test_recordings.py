@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import cli
-from datasets.samples import comma2k19_run, infrabel_run, known_recording
+from datasets.comma2k19 import comma2k19_run
+from datasets.infrabel import infrabel_run
+from datasets.recordings import known_recording
 from pipeline.ingest import read_run
 from schemas.config import IngestConfig
 from schemas.errors import InputError

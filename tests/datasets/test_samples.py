@@ -8,9 +8,10 @@ import numpy as np
 import polars as pl
 import pytest
 
+from datasets.comma2k19 import comma2k19_run
 from datasets.faults import FaultSpec
+from datasets.infrabel import infrabel_run, infrabel_site
 from datasets.inject import inject
-from datasets.samples import comma2k19_run, infrabel_run, infrabel_site
 from pipeline.geodesy import distances_m, earth_centred_m
 from pipeline.matching import match
 from pipeline.stages import replay

@@ -9,9 +9,9 @@ from typing import Any
 import polars as pl
 import pytest
 
+from datasets.comma2k19 import comma2k19_run
 from datasets.faults import FaultSpec
 from datasets.inject import inject_all
-from datasets.samples import comma2k19_run
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.stages import replay
