@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import traceback
@@ -29,11 +30,28 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+_NEW_RUN = "The run to write: a folder, or a file *.mcap."
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
+
+
+def _here(value: Any) -> Any:
+    """Refuse addresses where a path is meant: `s3://bucket/run` would become a folder called `s3:`."""
+    for path in value if isinstance(value, list | tuple) else [value]:
+        if path is not None and _ADDRESS.match(str(path)):
+            from pipeline.storage.address import redacted
+            from schemas.errors import UsageError
+
+            place = redacted(str(path).replace(":/", "://", 1))
+            raise UsageError("is an address", place=place, expected="a path on this machine")
+    return value
+
+
 Site = Annotated[str, typer.Option("--site", help="Folder with track, links, balises, route.")]
 Out = Annotated[str, typer.Option("--out", help="Where the tables go: a folder or an address.")]
-OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write.")]
-VehicleFile = Annotated[Path | None, typer.Option("--vehicle", help="Vehicle file (TOML).")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).")]
+OutFolder = Annotated[Path, typer.Option("--out", callback=_here, help="Folder to write.")]
+VehicleFile = Annotated[Path | None, typer.Option("--vehicle", callback=_here, help="Vehicle file (TOML).")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", callback=_here, help="Configuration file (TOML).")]
+ResultFolder = Annotated[Path, typer.Argument(callback=_here, help="A result of `balise replay`.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="The result as JSON on standard output.")]
 
@@ -117,7 +135,11 @@ def dictionary(
 
 
 @app.command()
-def demo(out: OutFolder = Path("demo-out"), seed: int | None = None, quiet: Quiet = False) -> None:
+def demo(
+    out: OutFolder = Path("demo-out"),
+    seed: Annotated[int | None, typer.Option(help="Another trial than the usual one.")] = None,
+    quiet: Quiet = False,
+) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
     from datasets.demo import write_demo
@@ -133,7 +155,9 @@ def demo(out: OutFolder = Path("demo-out"), seed: int | None = None, quiet: Quie
 
 @app.command()
 def synth(
-    scenario: Annotated[Path, typer.Argument(help="Scenario (TOML).")], out: OutFolder, quiet: Quiet = False
+    scenario: Annotated[Path, typer.Argument(callback=_here, help="Scenario (TOML).")],
+    out: OutFolder,
+    quiet: Quiet = False,
 ) -> None:
     """Write a synthetic trial: site, runs and the faults injected into them."""
     from datasets.scenario import load_scenario
@@ -194,8 +218,8 @@ def inspect(
 @app.command()
 def inject(
     run: Annotated[str, typer.Argument(help="A recorded run.")],
-    fault: Annotated[Path, typer.Option("--fault", help="Fault file (TOML).")],
-    out: Annotated[Path, typer.Option("--out", help="The run to write: a folder, or a file *.mcap.")],
+    fault: Annotated[Path, typer.Option("--fault", callback=_here, help="Fault file (TOML).")],
+    out: Annotated[Path, typer.Option("--out", callback=_here, help=_NEW_RUN)],
     site: Annotated[str | None, typer.Option("--site", help="Site, for faults along its track.")] = None,
     config: ConfigFile = None,
 ) -> None:
@@ -218,9 +242,10 @@ def inject(
 @app.command()
 def convert(
     logs: Annotated[
-        list[Path], typer.Argument(help="UBX, SBF, NMEA, CSV with a mapping in --config, or a public recording.")
+        list[Path],
+        typer.Argument(callback=_here, help="UBX, SBF, NMEA, CSV with a mapping in --config, or a public recording."),
     ],
-    to: Annotated[Path, typer.Option("--to", help="The run to write: a folder, or a file *.mcap.")],
+    to: Annotated[Path, typer.Option("--to", callback=_here, help=_NEW_RUN)],
     config: ConfigFile = None,
 ) -> None:
     """Make a run of receiver logs."""
@@ -242,7 +267,7 @@ def convert(
 def calibrate(
     runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, globs.")],
     site: Site,
-    out: Annotated[Path, typer.Option("--out", help="Vehicle file to write.")],
+    out: Annotated[Path, typer.Option("--out", callback=_here, help="Vehicle file to write.")],
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     solution: Annotated[str, typer.Option(help="Solution of the runs to measure on.")] = "primary",
@@ -277,10 +302,11 @@ def experiment(
     name: Annotated[str, typer.Argument(help="`list` shows the names.")],
     out: OutFolder = Path("experiment-out"),
     repetitions: Annotated[int | None, typer.Option(min=1, help="Instead of the published number.")] = None,
-    seed: int = 1,
+    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 1,
     jobs: Annotated[int, typer.Option(min=0, help="Processes; 0 takes one per core.")] = 0,
     config: Annotated[
-        Path | None, typer.Option("--config", help="The bank to judge: `rare`, `bank`, `catalogue`.")
+        Path | None,
+        typer.Option("--config", callback=_here, help="The bank to judge: `rare`, `bank`, `catalogue`."),
     ] = None,
 ) -> None:
     """Run a published experiment again, at its own size."""
@@ -316,7 +342,7 @@ def sql(
 
 @app.command()
 def report(
-    out: Annotated[Path, typer.Argument(help="A result of `balise replay`.")],
+    out: ResultFolder,
     site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
     jobs: Annotated[int, typer.Option(min=0, help="Pages at once; 0 takes one per core where there are many.")] = 0,
     quiet: Quiet = False,
@@ -337,9 +363,11 @@ def report(
 
 @app.command()
 def export(
-    out: Annotated[Path, typer.Argument(help="A result of `balise replay`.")],
+    out: ResultFolder,
     run: Annotated[str, typer.Argument(help="Id of the run.")],
-    to: Annotated[Path, typer.Option("--to", help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    to: Annotated[
+        Path, typer.Option("--to", callback=_here, help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")
+    ],
     site: Annotated[str | None, typer.Option("--site", help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, typer.Option("--log", help="The recorded run, for its raw positions.")] = None,
     ros: Annotated[bool, typer.Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
@@ -454,6 +482,7 @@ def _status_of(summary: Summary) -> int:
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
     from pipeline.campaign.tally import outcome_rows, summary_line
     from pipeline.present import show_table
+    from schemas.enums import RunStatus
 
     rows = outcome_rows(summary)
     if as_json:
@@ -463,6 +492,8 @@ def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> Non
         shown = rows if rows.height <= _SHOWN_RUNS else rows.filter(rows["status"] != "ok").head(_SHOWN_RUNS)
         if shown.height:
             show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))
+        if (more := summary.planned - summary.left - summary.count(RunStatus.OK) - shown.height) > 0:
+            print(f"{more} more that are not ok: see replay.log beside the tables.")
         print(f"{summary_line(summary)}. Tables are in {out}.")
 
 

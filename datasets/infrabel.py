@@ -42,7 +42,9 @@ def infrabel_recording(log: Path) -> Converted:
     """
     try:
         table, cut = read_log_table(log.read_bytes(), infer=False)
-    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
+    except (ValueError, pl.exceptions.PolarsError) as error:
         raise InputError(f"is no CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
     missing = set(COLUMNS) - set(table.columns)
     if missing:

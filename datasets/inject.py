@@ -46,7 +46,7 @@ class FaultFile(Settings):
 
 def load_faults(path: Path) -> tuple[FaultSpec, ...]:
     """The faults of a TOML file; breaches of its contract are one `ConfigError`."""
-    found = settings_from(read_toml(path), FaultFile, str(path)).faults
+    found = settings_from(read_toml(path), FaultFile, str(path), "docs/scenarios.md lists every key.").faults
     if not found:
         raise ConfigError("holds no fault", place=str(path), expected="[[faults]] tables")
     return found

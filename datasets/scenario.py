@@ -210,7 +210,7 @@ class Scenario(Settings):
 
 def load_scenario(path: Path) -> Scenario:
     """A scenario file; breaches of its contract are one `ConfigError`."""
-    return settings_from(read_toml(path), Scenario, str(path))
+    return settings_from(read_toml(path), Scenario, str(path), "docs/scenarios.md lists every key.")
 
 
 def with_seed(scenario: Scenario, seed: int) -> Scenario:

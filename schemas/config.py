@@ -259,13 +259,15 @@ class Vehicle(Settings):
 S = TypeVar("S", bound=Settings)
 
 
-def settings_from(data: Mapping[str, object], kind: type[S], place: str) -> S:
-    """Validate a mapping; every breach is listed with its path, as one error."""
+def settings_from(
+    data: Mapping[str, object], kind: type[S], place: str, remedy: str = "`balise dictionary` lists every key."
+) -> S:
+    """Validate a mapping; every breach is listed with its path, as one `ConfigError`."""
     try:
         return kind.model_validate(data)
     except ValidationError as error:
         breaches = [_told(breach) for breach in error.errors()]
-        raise ConfigError("; ".join(breaches), place=place, remedy="See the configuration reference.") from None
+        raise ConfigError("; ".join(breaches), place=place, remedy=remedy) from None
 
 
 def _told(breach: ErrorDetails) -> str:

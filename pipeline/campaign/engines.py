@@ -28,7 +28,7 @@ class Engine(Protocol):
         """Whether the run is under way; a worker that is still starting does not use up the time limit."""
 
     def kill(self, result: Result) -> None:
-        """End the run at once; its future then holds a `BrokenExecutor`."""
+        """End the run at once, with its worker; its future then holds an error or is cancelled."""
 
     def is_lost_worker(self, error: BaseException) -> bool:
         """Whether the error means that the worker died, not that the run failed."""

@@ -61,7 +61,7 @@ class ChangedError(InputError):
 
 def changed(address: Address) -> ChangedError:
     """The error of a log that somebody writes to."""
-    return ChangedError(f"{address}: changed while it was read. Replay it again when it is complete.")
+    return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
 def overdue(limit_s: float) -> str:

@@ -49,7 +49,7 @@ def _check_run(out: Path, run_id: str) -> None:
     known = run_ids(out)
     if run_id not in known:
         shown = ", ".join(known[:10]) or "no complete run"
-        raise UsageError("has no such run", place=str(out), found=run_id, expected=shown)
+        raise UsageError(f"has no run {run_id!r}", place=str(out), found=shown)
 
 
 def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:

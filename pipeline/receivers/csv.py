@@ -33,7 +33,9 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
     """
     try:
         table, cut = read_log_table(path.read_bytes(), infer=True)
-    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", place=str(path)) from None
+    except (ValueError, pl.exceptions.PolarsError) as error:
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(path)) from None
     streams: dict[Stream, pl.DataFrame] = {}
     for name in STREAMS:
