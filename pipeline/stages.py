@@ -12,7 +12,7 @@ from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_
 from pipeline.evidence_notes import evidence_notes, return_notes, undiagnosed_notes
 from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.lds.run import run_lds
+from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
@@ -49,6 +49,24 @@ class _Context:
     config: Configuration
     counts: CleanCounts
     factor: float
+
+
+@dataclass(frozen=True)
+class _Ride:
+    """One solution on its way, before anything is known of the truth.
+
+    `balises`: those on the path; `aligned`: epochs before the monitors; `monitored`: with their columns and those of
+    the LDS; `telegrams`: reads of physical balises, none where the run has no such stream.
+    """
+
+    solution: str
+    fixes: pl.DataFrame
+    found: Match
+    balises: pl.DataFrame
+    aligned: pl.DataFrame
+    monitored: pl.DataFrame
+    telegrams: pl.DataFrame | None
+    lds: LdsResult
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
@@ -109,7 +127,29 @@ def _failed(context: _Context, solution: str, error: InputError) -> _Solution:
 
 
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Solution:
-    run, config, vehicle, found = context.run, context.config, context.vehicle, matches[solution]
+    ride = _ride(context, solution, matches)
+    case = _case(context, ride)
+    result = classify(case)
+    epochs = pl.concat([ride.monitored, result.epochs_columns], how="horizontal")
+    results = SolutionResults(
+        solution=solution,
+        epochs=epochs,
+        passages=result.passages,
+        hazards=result.hazards,
+        alarms=result.alarms,
+        evidence=_evidence(case.truth),
+        alignment=_alignment(ride.aligned),
+        counts=context.counts.solutions[solution],
+        ingest=context.run.notes,
+        ambiguous_stretches=ride.found.ambiguous.height,
+        notes=_notes(context, ride, case.truth, result, epochs),
+    )
+    made = provenance(context.run, context.site, context.vehicle, context.config)
+    return _Solution(epochs, result, summarise(results, context.config, made))
+
+
+def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
+    run, config, found = context.run, context.config, matches[solution]
     balises = found.path.balises(context.site.balises)
     fixes = run.gnss.filter(pl.col("solution") == solution)
     matched = found.epochs.with_columns(fixes["hpl_m"])
@@ -118,34 +158,44 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    reference = _reference_on_path(context, found, aligned)
-    reads = None if telegrams is None else telegrams.drop_nulls("path_m")
-    truth = establish_truth(monitored, reference, reads, lds.passages, config.hazards, config.lds)
-    between = _between(context, aligned, truth, reference, reads)
-    passages = with_unoffered(lds.passages, monitored, truth, balises, config.lds, solution, between)
-    locate = found.path.locate
-    case = Case(solution, monitored, truth, passages, balises, run.faults, locate, config, between)
-    result = classify(case)
-    epochs = pl.concat([monitored, result.epochs_columns], how="horizontal")
-    results = SolutionResults(
-        solution=solution,
-        epochs=epochs,
-        passages=result.passages,
-        hazards=result.hazards,
-        alarms=result.alarms,
-        evidence=_evidence(truth),
-        alignment=_alignment(aligned),
-        counts=context.counts.solutions[solution],
-        ingest=run.notes,
-        ambiguous_stretches=found.ambiguous.height,
-        notes=(
-            *run_notes(run, context.counts.solutions[solution], fixes, found, lds, vehicle),
-            *evidence_notes(aligned, truth, config.hazards.failure_limit_m),
-            *return_notes(epochs, result.hazards, config.hazards.failure_limit_m),
-            *undiagnosed_notes(epochs, result.passages),
-        ),
+    return _Ride(solution, fixes, found, balises, aligned, monitored, telegrams, lds)
+
+
+def _case(context: _Context, ride: _Ride) -> Case:
+    """The ride with the truth beside it, and with what the train passed unoffered."""
+    config = context.config
+    reference = _reference_on_path(context, ride.found, ride.aligned)
+    reads = None if ride.telegrams is None else ride.telegrams.drop_nulls("path_m")
+    truth = establish_truth(ride.monitored, reference, reads, ride.lds.passages, config.hazards, config.lds)
+    between = _between(context, ride.aligned, truth, reference, reads)
+    passages = with_unoffered(
+        ride.lds.passages, ride.monitored, truth, ride.balises, config.lds, ride.solution, between
     )
-    return _Solution(epochs, result, summarise(results, config, provenance(context.run, context.site, vehicle, config)))
+    return Case(
+        solution=ride.solution,
+        epochs=ride.monitored,
+        truth=truth,
+        passages=passages,
+        balises=ride.balises,
+        faults=context.run.faults,
+        locate=ride.found.path.locate,
+        config=config,
+        between=between,
+    )
+
+
+def _notes(
+    context: _Context, ride: _Ride, truth: pl.DataFrame, result: HazardResult, epochs: pl.DataFrame
+) -> tuple[str, ...]:
+    """What the reader should know beside the figures."""
+    limit_m = context.config.hazards.failure_limit_m
+    counts = context.counts.solutions[ride.solution]
+    return (
+        *run_notes(context.run, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
+        *evidence_notes(ride.aligned, truth, limit_m),
+        *return_notes(epochs, result.hazards, limit_m),
+        *undiagnosed_notes(epochs, result.passages),
+    )
 
 
 def _evidence(truth: pl.DataFrame) -> Evidence | None:
