@@ -35,11 +35,10 @@ bench: install
 dictionary: install
 	$(BIN)/python -m schemas.dictionary > docs/dictionary.md
 
-# Pins every dependency with its hashes, for every extra; names no index.
+# Pins every dependency with its hashes, for every extra, Python version and system; names no index.
 lock:
-	env -u PIP_FIND_LINKS CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --all-extras \
-		--generate-hashes --allow-unsafe --strip-extras --no-emit-index-url --no-emit-find-links \
-		--no-emit-trusted-host --output-file requirements.txt pyproject.toml
+	env -u PIP_FIND_LINKS $(BIN)/uv pip compile --quiet --universal --all-extras --generate-hashes --no-config \
+		--fork-strategy fewest --custom-compile-command "make lock" --output-file requirements.txt pyproject.toml
 
 clean:
 	rm -rf build dist demo-out bench-out experiment-out .hypothesis .pytest_cache .mypy_cache .ruff_cache *.egg-info
