@@ -179,7 +179,8 @@ def _to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.Dat
         row = frame.filter(outside).row(0, named=True)
         breaches.append(
             f"{raw.file}: latitude {row['latitude_deg']:g}, longitude {row['longitude_deg']:g} in EPSG:{raw.epsg} "
-            "is no place on earth; latitude and longitude may be swapped, or the file does not name its EPSG code"
+            "is no place on earth; latitude and longitude may be swapped, or the file does not name its EPSG code "
+            "(a column or Parquet metadata `epsg`, a first line `# epsg: 31370` of CSV, `crs` of GeoJSON)"
         )
     return frame
 

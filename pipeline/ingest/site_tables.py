@@ -96,7 +96,7 @@ def _parquet(file: str, data: bytes) -> RawTable:
     import pyarrow.parquet
 
     metadata = pyarrow.parquet.read_schema(io.BytesIO(data)).metadata or {}
-    named = metadata.get(b"epsg")
+    named = {key.lower(): value for key, value in metadata.items()}.get(b"epsg")
     return _with_epsg(file, pl.read_parquet(io.BytesIO(data)), named.decode() if named else None)
 
 
