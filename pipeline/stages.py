@@ -166,7 +166,7 @@ def _case(context: _Context, ride: _Ride) -> Case:
     config = context.config
     reference = _reference_on_path(context, ride.found, ride.aligned)
     reads = None if ride.telegrams is None else ride.telegrams.drop_nulls("path_m")
-    truth = establish_truth(ride.monitored, reference, reads, ride.lds.passages, config.hazards, config.lds)
+    truth = establish_truth(ride.monitored, reference, reads, ride.lds.passages, config)
     between = _between(context, ride.aligned, truth, reference, reads)
     passages = with_unoffered(
         ride.lds.passages, ride.monitored, truth, ride.balises, config.lds, ride.solution, between

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.hazards.arrays import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
 from pipeline.timeline import linking_gap_s, nominal_period_s
 from schemas.config import LdsConfig
 
-# Two-sided Gaussian 1e-7, as of the monitors (DOMAIN section 3).
-_FACTOR = 5.3267
 # Sigmas of its own noise by which a slip between two anchors may be larger than it shows.
 _WIDENED = 3.0
 
@@ -145,7 +144,7 @@ def _between(
 
     difference = np.where(both, np.nan_to_num(forward[0]) - np.nan_to_num(backward[0]), 0.0)
     noise = np.hypot(np.sqrt(_white_m2(reader, before, travel)), np.sqrt(2.0) * anchor_sigma_m)
-    allowed = np.minimum(_FACTOR * noise, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]))
+    allowed = np.minimum(SURE_SIGMAS * noise, np.nan_to_num(forward[2]) + np.nan_to_num(backward[2]))
     widened = difference + np.sign(difference) * _WIDENED * noise
     return Carried(
         path_m=blend(forward[0], backward[0]),

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats
+from pipeline.hazards.arrays import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
 
 Matrix = npt.NDArray[np.float64]
@@ -22,7 +23,6 @@ _NODE_S = 1.0
 # A position error correlated over tau tells as much in a second as a white one of variance 2 tau sigma^2
 # (DIAG Table 1: user error, 100 s).
 _CORRELATION_S = 100.0
-_OUTLIER_SIGMAS = 5.3267
 _LEAST_SCALE_SIGMA = 1e-4
 
 
@@ -116,7 +116,7 @@ def _updated(x: Floats, p: Matrix, offset_m: float, sigma_m: float) -> tuple[Flo
     if not (np.isfinite(offset_m) and np.isfinite(sigma_m)):
         return x, p
     innovation = offset_m - x[0]
-    if abs(innovation) > _OUTLIER_SIGMAS * np.sqrt(p[0, 0] + sigma_m**2):
+    if abs(innovation) > SURE_SIGMAS * np.sqrt(p[0, 0] + sigma_m**2):
         return x, p
     gain = p[:, 0] / (p[0, 0] + sigma_m**2 * 2.0 * _CORRELATION_S / _NODE_S)
     return x + gain * innovation, p - np.outer(gain, p[0])

@@ -14,11 +14,11 @@ import polars as pl
 from pipeline.columns import NS_PER_S, Floats, Ints, flags, floats, times_ns
 from pipeline.hazards.anchors import Anchors, Carried, carry
 from pipeline.hazards.arrays import interpolate_known, words
-from pipeline.hazards.slip import repaired_by_doppler
+from pipeline.hazards.slip import Doppler, repaired_by_doppler
 from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel
 from pipeline.timeline import linking_gap_s, nominal_period_s
-from schemas.config import HazardConfig, LdsConfig
+from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 
 # A learned latency is no chance of the noise beyond so many of its sigmas, or where so little of the doubt is left.
@@ -48,8 +48,7 @@ def establish_truth(
     reference: pl.DataFrame | None,
     balise_reads: pl.DataFrame | None,
     passages: pl.DataFrame | None,
-    config: HazardConfig,
-    lds: LdsConfig,
+    config: Configuration,
 ) -> pl.DataFrame:
     """Truth of one solution's epochs, at the time that each position is of: `t - latency`, as known in the end.
 
@@ -64,7 +63,7 @@ def establish_truth(
     it is called a hazard, `truth_slip_m` by how much two balise reads around the epoch say that the odometer counted
     too far along growing path between them (0: no contradiction), differences of `truth_travel_m` within one
     `truth_stretch` are true movements free of the steps that a new anchor makes; `truth_smoothed` marks the
-    post-processed truth of `config.smoothed_reference`, which steps in where there is neither reference nor balise
+    post-processed truth of `hazards.smoothed_reference`, which steps in where there is neither reference nor balise
     read.
     """
     at_ns = valid_ns(epochs)
@@ -74,19 +73,20 @@ def establish_truth(
         rungs.append(_reference_rung(at_ns, reference))
         if np.isfinite(rungs[0].path_m).all():
             return _ladder(epochs["t"], rungs, travel)
-    velocity_mps = floats(epochs, "velocity_along_mps")
-    travel = repaired_by_doppler(travel, positions(epochs), velocity_mps, config.false_alarm_margin_m)
+    hazards = config.hazards
+    doppler = Doppler(floats(epochs, "velocity_along_mps"), config.monitors.doppler_sigma_mps)
+    travel = repaired_by_doppler(travel, positions(epochs), doppler, hazards.false_alarm_margin_m)
     if balise_reads is not None and balise_reads.height:
         counted = floats(balise_reads, "odometer_m") if "odometer_m" in balise_reads.columns else None
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"), counted)
-        sigma_m = config.balise_read_sigma_m
-        carried = carry(anchors, travel, travel.at_ns, lds, both_ways=True, anchor_sigma_m=sigma_m)
+        sigma_m = hazards.balise_read_sigma_m
+        carried = carry(anchors, travel, travel.at_ns, config.lds, both_ways=True, anchor_sigma_m=sigma_m)
         # Carried to when the odometer counted; how far the train goes from there to the instant of the position.
         since_m = np.nan_to_num(floats(epochs, "speed_mps")) * (at_ns - travel.at_ns) / NS_PER_S
-        rungs.append(_balise_rung(carried, since_m, positions(epochs), config))
-    if config.smoothed_reference:
-        rungs.append(_smoothed_rung(epochs, travel, config))
-    rungs.append(_odometer_rung(epochs, passages, travel, lds))
+        rungs.append(_balise_rung(carried, since_m, positions(epochs), hazards))
+    if hazards.smoothed_reference:
+        rungs.append(_smoothed_rung(epochs, travel, hazards))
+    rungs.append(_odometer_rung(epochs, passages, travel, config.lds))
     return _ladder(epochs["t"], rungs, travel)
 
 

@@ -210,8 +210,7 @@ def truth_of(journey, passages=None, config=None):
         journey.reference_frame() if journey.reference else None,
         journey.reads_frame() if journey.reads else None,
         journey.passages() if passages is None else passages,
-        config.hazards,
-        config.lds,
+        config,
     )
 
 

@@ -67,7 +67,7 @@ def judge_without_odometer(journey):
     epochs = journey.epochs().with_columns(odometer_m=nothing, scale_sigma=nothing, odometer_white_m2_per_s=nothing)
     passages = journey.passages()
     reference = journey.reference_frame() if journey.reference else None
-    truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, reference, None, passages, config)
     return classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
 
 
@@ -110,7 +110,7 @@ def test_truth_that_is_missing_for_longer_than_a_second_leaves_the_verdict_open(
     epochs = journey.epochs().with_columns(odometer_m=nothing)
     for first_s, verdict in ((0.5, "false"), (3.0, "unknown")):
         reference = journey.reference_frame().slice(round(first_s * 20))
-        truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
+        truth = establish_truth(epochs, reference, None, passages, config)
         result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
         assert result.alarms["verdict"].to_list() == [verdict]
 

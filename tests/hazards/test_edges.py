@@ -17,7 +17,7 @@ def judge_epochs(journey, epochs, balises=None, reference=True):
     config = Configuration()
     passages = journey.passages([])
     given = journey.reference_frame() if reference else None
-    truth = establish_truth(epochs, given, None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, given, None, passages, config)
     found = journey.balises() if balises is None else balises
     return classify(Case("primary", epochs, truth, passages, found, None, locate, config))
 
@@ -63,7 +63,7 @@ def test_truth_that_is_missing_over_the_step_still_shows_the_offset_after_it():
     hole = (t - t[0]).is_between(29 * 10**9, 40 * 10**9)
     config = Configuration()
     passages = journey.passages([])
-    truth = establish_truth(epochs, journey.reference_frame().filter(~hole), None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, journey.reference_frame().filter(~hole), None, passages, config)
     result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     (row,) = result.hazards.to_dicts()
     assert (row["hazard"], row["balise_ids"][0]) == ("VB_SHIFT", "V4")
@@ -87,7 +87,7 @@ def test_reversal_under_a_constant_offset_is_no_jump():
     reference = pl.DataFrame(
         {"t": epochs["t"], "path_m": place, "cross_track_m": place * 0, "vertical_m": place * 0, "sigma_m": place * 0}
     )
-    truth = establish_truth(epochs, reference, None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, reference, None, passages, config)
     result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     assert result.hazards.height == 0
     error = result.epochs_columns["error_along_m"]

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.hazards import Case, classify, establish_truth
-from schemas.config import Configuration, HazardConfig
+from schemas.config import Configuration, HazardConfig, MonitorConfig
 from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of, with_hazards
 
 READS = tuple(np.arange(50.0, 2400.0, 500.0))
@@ -71,7 +71,7 @@ def test_truth_is_interpolated_to_the_time_of_validity():
     epochs = journey.epochs().with_columns(latency_s=pl.lit(0.2))
     config = Configuration()
     passages = journey.passages([{"balise_id": "V3", "t_offered": 35.2}])
-    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config)
     result = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     known = result.epochs_columns["error_along_m"].drop_nulls()
     assert known.abs().max() == pytest.approx(0.0, abs=1e-6)
@@ -88,9 +88,7 @@ def test_gap_in_the_reference_falls_down_the_ladder():
         )
     )
     config = Configuration()
-    truth = establish_truth(
-        journey.epochs(), reference, journey.reads_frame(), journey.passages(), config.hazards, config.lds
-    )
+    truth = establish_truth(journey.epochs(), reference, journey.reads_frame(), journey.passages(), config)
     evidence = truth["evidence"].to_list()
     assert (evidence[199], evidence[250], evidence[301]) == ("reference", "balise", "reference")
     assert truth["truth_path_m"].to_numpy() == pytest.approx(journey.truth_m(), abs=1e-6)
@@ -161,7 +159,7 @@ def test_without_reference_and_odometer_there_is_no_truth():
     nothing = pl.lit(None, pl.Float64)
     epochs = journey.epochs().with_columns(odometer_m=nothing, scale_sigma=nothing, odometer_white_m2_per_s=nothing)
     config = Configuration()
-    truth = establish_truth(epochs, None, None, journey.passages(), config.hazards, config.lds)
+    truth = establish_truth(epochs, None, None, journey.passages(), config)
     assert truth["evidence"].null_count() == truth.height
     assert truth["truth_path_m"].null_count() == truth.height
 
@@ -197,7 +195,7 @@ def test_smoothed_truth_stays_within_its_own_sigma():
     noise = rng.normal(0.0, 1.0, journey.t_s().size)
     epochs = journey.epochs().with_columns(pl.col("path_m") + pl.Series(noise), scale_sigma=pl.lit(0.01))
     config = with_hazards(smoothed_reference=True)
-    truth = establish_truth(epochs, None, None, journey.passages(), config.hazards, config.lds)
+    truth = establish_truth(epochs, None, None, journey.passages(), config)
     error = truth["truth_path_m"].to_numpy() - journey.truth_m()
     assert np.abs(error).max() < 1.0
     assert np.all(np.abs(error) < 3.0 * truth["truth_sigma_m"].to_numpy())
@@ -209,7 +207,7 @@ def test_errors_are_judged_with_the_latency_that_is_known_in_the_end():
     late = np.where(journey.t_s() < 60.0, 0.0, 0.1)
     epochs = journey.epochs().with_columns(path_m=pl.Series(journey.truth_m() - 2.0), latency_s=pl.Series(late))
     config = Configuration()
-    truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config.hazards, config.lds)
+    truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config)
     error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
     assert error.abs().max() == pytest.approx(0.0, abs=1e-6)
     assert error.len() > 1000
@@ -225,7 +223,7 @@ def test_a_latency_that_the_run_cannot_prove_is_noise():
     config = Configuration()
     for reference in (journey.reference_frame(), None):
         reads = journey.reads_frame().with_columns(odometer_m=pl.Series(journey.reads))
-        truth = establish_truth(epochs, reference, reads, journey.passages(), config.hazards, config.lds)
+        truth = establish_truth(epochs, reference, reads, journey.passages(), config)
         error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
         assert error.len() > 1000
         assert error.abs().max() < 0.01
@@ -242,7 +240,7 @@ def test_a_learned_latency_counts_where_the_run_halved_the_doubt(sigma_s, error_
         latency_sigma_s=pl.Series(np.where(known, sigma_s, 0.2)),
     )
     config = Configuration()
-    truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config.hazards, config.lds)
+    truth = establish_truth(epochs, journey.reference_frame(), None, journey.passages(), config)
     error = (epochs["path_m"] - truth["truth_path_m"]).drop_nulls()
     assert error.median() == pytest.approx(-error_m, abs=1e-6)
 
@@ -258,7 +256,7 @@ def test_doppler_along_a_track_that_heads_elsewhere_hides_no_jump():
     epochs = journey.epochs().with_columns(elsewhere)
     config = Configuration()
     for given in (None, journey.but(reads=reads).reads_frame()):
-        truth = establish_truth(epochs, None, given, journey.passages(), config.hazards, config.lds)
+        truth = establish_truth(epochs, None, given, journey.passages(), config)
         error = (epochs["path_m"] - truth["truth_path_m"]).to_numpy()
         assert np.abs(error - journey.error_m()).max() < 1.0
         found = classify(
@@ -276,10 +274,20 @@ def test_how_far_a_healthy_position_strays_from_doppler_is_the_margin_of_false_a
     journey = Journey(steps=wavers, slip=(50.0, 51.0, 6.0), doppler=True, fails={"along_raw": ((50.5, 51.0),)})
     config = Configuration(hazards=HazardConfig(false_alarm_margin_m=margin_m))
     epochs, passages = journey.epochs(), journey.passages()
-    truth = establish_truth(epochs, None, None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, None, None, passages, config)
     error_m = (epochs["path_m"] - truth["truth_path_m"])[-1]
     assert error_m == pytest.approx(evidence_error_m, abs=0.1)
     (alarm,) = classify(
         Case("primary", epochs, truth, passages, journey.balises(), None, locate, config)
     ).alarms.iter_rows(named=True)
     assert alarm["suspect"] == ("odometer" if margin_m == 5.0 else "gnss")
+
+
+@pytest.mark.parametrize(("doppler_sigma_mps", "reached_m"), [(0.1, 0.0), (2.0, -6.0)])
+def test_a_slip_is_told_from_the_noise_that_the_velocity_is_known_to_have(doppler_sigma_mps, reached_m):
+    """6 m that the odometer slips within a second: the sum of a velocity with 2 m/s of noise tells nothing of them."""
+    journey = Journey(slip=(50.0, 51.0, 6.0), doppler=True)
+    config = Configuration(monitors=MonitorConfig(doppler_sigma_mps=doppler_sigma_mps))
+    epochs = journey.epochs()
+    truth = establish_truth(epochs, None, None, journey.passages(), config)
+    assert (epochs["path_m"] - truth["truth_path_m"])[-1] == pytest.approx(reached_m, abs=0.1)

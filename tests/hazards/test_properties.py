@@ -84,7 +84,7 @@ def test_adding_a_constant_to_all_times_changes_nothing_else(journey, shift_ns):
     before = judge(journey, passages)
     config = Configuration()
     epochs, moved = shifted(journey.epochs()), shifted(passages)
-    truth = establish_truth(epochs, shifted(journey.reference_frame()), None, moved, config.hazards, config.lds)
+    truth = establish_truth(epochs, shifted(journey.reference_frame()), None, moved, config)
     after = classify(Case("primary", epochs, truth, moved, journey.balises(), None, locate, config))
     for name in ("hazards", "alarms", "passages", "epochs_columns"):
         wanted = shifted(getattr(before, name))
@@ -153,7 +153,7 @@ def test_row_order_of_passages_and_balises_does_not_matter(journey):
     passages = journey.passages(accepted_all(journey))
     config = Configuration()
     epochs = journey.epochs()
-    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config)
     forward = classify(Case("primary", epochs, truth, passages, journey.balises(), None, locate, config))
     backward = classify(
         Case("primary", epochs, truth, passages.reverse(), journey.balises().reverse(), None, locate, config)

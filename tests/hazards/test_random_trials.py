@@ -118,7 +118,7 @@ def replay(journey, rng):
     noise = rng.normal(0.0, NOISE_M, epochs.height)
     epochs = epochs.with_columns(path_m=epochs["path_m"] + noise)
     passages = journey.passages()
-    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config.hazards, config.lds)
+    truth = establish_truth(epochs, journey.reference_frame(), None, passages, config)
     return classify(
         Case("primary", epochs, truth, passages, journey.balises(), None, locate, config)
     ).hazards.to_dicts()

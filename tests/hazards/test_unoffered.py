@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from pipeline.hazards import establish_truth, with_unoffered
-from schemas.config import HazardConfig, LdsConfig
+from schemas.config import Configuration, LdsConfig
 from tests.hazards.synthetic import UTC, Journey, seconds, stamps, truth_of
 
 
@@ -74,7 +74,7 @@ def test_beside_a_balise_at_the_start_noise_decides():
 def truth_by_reads(journey: Journey, reads: dict[float, float]) -> pl.DataFrame:
     """Truth by balise reads alone: place by second."""
     frame = pl.DataFrame({"t": stamps(reads), "path_m": list(reads.values())})
-    return establish_truth(journey.epochs(), None, frame, None, HazardConfig(), LdsConfig())
+    return establish_truth(journey.epochs(), None, frame, None, Configuration())
 
 
 @pytest.mark.parametrize(
