@@ -7,21 +7,30 @@ from collections.abc import Iterator
 import polars as pl
 
 from pipeline.clean import StreamCounts
+from pipeline.ingest.site_checks import BALISE_PLACE
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
 from schemas.config import Vehicle
-from schemas.run import RunLog
+from schemas.run import RunLog, Site
 
+_SHOWN = 5
 _SAME_TIME_NS = 1_000_000_000  # ends of streams that are no farther apart need no remark
 
 
 def run_notes(
-    run: RunLog, counts: StreamCounts, fixes: pl.DataFrame, found: Match, lds: LdsResult, vehicle: Vehicle
+    run: RunLog,
+    site: Site,
+    counts: StreamCounts,
+    fixes: pl.DataFrame,
+    found: Match,
+    lds: LdsResult,
+    vehicle: Vehicle,
 ) -> tuple[str, ...]:
     """Notes on what went in and what matching and the LDS made of it; `counts`, `fixes`: the GNSS of this solution."""
     return (
         *_injected(run),
+        *_off_the_track(site),
         *_stamps(counts),
         *_extents(run),
         *_positions(fixes, found, vehicle),
@@ -33,6 +42,15 @@ def run_notes(
 def _injected(run: RunLog) -> Iterator[str]:
     if run.faults is not None and run.faults.height:
         yield "faults were injected: " + ", ".join(sorted(set(run.faults["kind"].to_list())))
+
+
+def _off_the_track(site: Site) -> Iterator[str]:
+    """Balises that the site places where there is no track."""
+    names = [item.place.removeprefix(BALISE_PLACE) for item in site.findings if item.severity == "error"]
+    if names:
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        few = ", ".join(names[:_SHOWN]) + more
+        yield f"balises off their net element, which no run passes: {few}; `balise inspect` of the site says why"
 
 
 def _stamps(counts: StreamCounts) -> Iterator[str]:

@@ -191,7 +191,7 @@ def _notes(
     limit_m = context.config.hazards.failure_limit_m
     counts = context.counts.solutions[ride.solution]
     return (
-        *run_notes(context.run, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
+        *run_notes(context.run, context.site, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
         *evidence_notes(ride.aligned, truth, limit_m),
         *return_notes(epochs, result.hazards, limit_m),
         *undiagnosed_notes(epochs, result.passages),

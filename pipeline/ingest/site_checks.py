@@ -24,6 +24,8 @@ SHORT_ELEMENT_M = 1.0
 LENGTH_TOLERANCE = 1e-3
 LENGTH_TOLERANCE_M = 0.5
 CHORD_ERROR_M = 0.25
+# Of a finding about one balise: this and its id.
+BALISE_PLACE = "balises: "
 MEASURE_TOLERANCE_M = 0.5
 # An end's direction is that of its last metres: single vertices may lie a centimetre apart.
 END_REACH_M = 20.0
@@ -209,17 +211,26 @@ def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
         found.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} stand there twice")
-    for name, element, measure in balises.select("balise_id", "netelement_id", "measure_m").iter_rows():
-        place = f"balises: {name}"
-        if element not in track.index:
-            text = f"lies on element {element}, which is not in the track: no run will pass it"
-            found.findings.append(Finding("error", place, text, "Mend netelement_id."))
-            continue
-        part = track.vertices(track.index[element])
-        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
-        if not low - MEASURE_TOLERANCE_M <= measure <= high + MEASURE_TOLERANCE_M:
-            text = f"measure {measure:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"
-            found.findings.append(Finding("error", place, text, "Mend measure_m."))
+    off = [
+        Finding("error", f"{BALISE_PLACE}{name}", *what)
+        for name, element, measure in balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
+        if (what := _off_the_track(track, element, measure)) is not None
+    ]
+    found.findings += off
+    if off and len(off) == balises.height:
+        found.breaches.append(f"balises: none lies on a net element of the track; {off[0].place} {off[0].message}")
+
+
+def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, str] | None:
+    """Why no run will pass a balise, and what to mend."""
+    if element not in track.index:
+        return f"lies on element {element}, which is not in the track: no run will pass it", "Mend netelement_id."
+    part = track.vertices(track.index[element])
+    low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+    if low - MEASURE_TOLERANCE_M <= measure_m <= high + MEASURE_TOLERANCE_M:
+        return None
+    text = f"measure {measure_m:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"
+    return text, "Mend measure_m."
 
 
 def _check_route(track: Track, route: pl.DataFrame, found: Remarks) -> None:

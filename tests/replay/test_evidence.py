@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from datetime import timedelta
 
 import polars as pl
 import pytest
 
 from pipeline.stages import replay
+from schemas.run import Finding
 from tests.replay.journeys import VEHICLE, journey
 
 JUMP = {"kind": "step", "size_m": 850.0, "start_s": 150.0, "duration_s": 6.0}
@@ -234,3 +236,11 @@ def test_a_balise_read_inside_an_outage_is_placed_by_the_odometer_of_then():
     assert tables.hazards.height == 0
     assert tables.runs["share_p1"].item() == 0.0
     assert tables.epochs["error_along_m"].abs().max() < 6.0
+
+
+def test_balises_that_lie_off_their_net_element_are_told():
+    run, site = journey(OFFSET)
+    assert "off their net element" not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
+    finding = Finding("error", "balises: VB9", "measure 99999.0 m is off element A", "Mend measure_m.")
+    notes = replay(run, dataclasses.replace(site, findings=(finding,)), VEHICLE).runs["notes"].item()
+    assert "balises off their net element, which no run passes: VB9; `balise inspect`" in notes

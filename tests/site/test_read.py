@@ -128,6 +128,7 @@ def test_findings_name_what_is_odd(tmp_path: Path) -> None:
         [builders.links(), pl.DataFrame([("c", 1, "nowhere", 0, "both")], schema=builders.links().schema, orient="row")]
     )
     balises = builders.balises(measure_m=[500.0, 20.0], netelement_id=["a", "missing"])
+    balises = pl.concat([balises, balises.head(1).with_columns(balise_id=pl.lit("v3"), measure_m=pl.lit(20.0))])
     track = pl.concat([far, short, near], how="diagonal")
     site = read_site(builders.write(tmp_path, track=track, links=lost, balises=balises))
     said = {(finding.severity, finding.place): finding.message for finding in site.findings}
@@ -310,3 +311,12 @@ def test_an_address_that_cannot_be_read_is_told_without_its_credentials(address:
         read_site(address)
     assert "secret" not in str(caught.value)
     assert "://" in str(caught.value)
+
+
+def test_balise_list_of_another_network_is_refused(tmp_path: Path) -> None:
+    builders.write(tmp_path, track=builders.track(), links=builders.links(), balises=builders.balises())
+    read_site(tmp_path)
+    strange = builders.balises().with_columns(netelement_id=pl.lit("elsewhere"))
+    text = messages(builders.write(tmp_path, balises=strange))
+    assert "balises: none lies on a net element of the track" in text
+    assert "lies on element elsewhere" in text
