@@ -87,7 +87,7 @@ def replay(
     from pipeline.campaign import Interrupted, make_plan, run_campaign
     from pipeline.campaign.progress import watches
 
-    settings, train = _settings(config, vehicle)
+    settings, train = _configuration(config), _vehicle(vehicle)
     plan = make_plan(runs, site, out, settings, train)
     try:
         summary = run_campaign(
@@ -181,7 +181,7 @@ def safety(
     from pipeline.present import show_table
     from pipeline.safety import safety_tables
 
-    settings, _ = _settings(config, None)
+    settings = _configuration(config)
     tables = safety_tables(settings.safety)
     if as_json:
         _print_json(tables)
@@ -204,7 +204,7 @@ def inspect(
     from pipeline.inspection import inspect_path
     from pipeline.present import show_table
 
-    settings, _ = _settings(config, None)
+    settings = _configuration(config)
     tables = inspect_path(path, settings.ingest, result)
     if as_json:
         _print_json(tables)
@@ -230,7 +230,7 @@ def inject(
     from pipeline.ingest.site import read_site
     from schemas.errors import UsageError
 
-    settings, _ = _settings(config, None)
+    settings = _configuration(config)
     faults = load_faults(fault)
     if out.resolve() == Path(run).resolve():
         raise UsageError("is the recording itself", place=str(out), remedy="Name another place with --out.")
@@ -253,7 +253,7 @@ def convert(
     from datasets.trial import write_run_as
     from pipeline.receivers import convert as convert_logs
 
-    settings, _ = _settings(config, None)
+    settings = _configuration(config)
     converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
     if converted is None:
         converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
@@ -282,7 +282,7 @@ def calibrate(
     from pipeline.storage import write_bytes
     from schemas.config import to_toml
 
-    settings, train = _settings(config, vehicle)
+    settings, train = _configuration(config), _vehicle(vehicle)
     logs = [read_run(address, settings.ingest, with_digest=False) for address in find_runs(runs).values()]
     found = measure(logs, read_site(site), train, settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
@@ -318,7 +318,7 @@ def experiment(
         return
     if name not in EXPERIMENTS:
         raise UsageError("is no experiment", place=name, expected=", ".join(EXPERIMENTS))
-    bank = None if config is None else _settings(config, None)[0]
+    bank = None if config is None else _configuration(config)
     for path in EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank):
         print(path)
 
@@ -378,7 +378,7 @@ def export(
     from pipeline.ingest.run import read_run
     from pipeline.ingest.site import read_site
 
-    settings, _ = _settings(config, None)
+    settings = _configuration(config)
     ground = None if site is None else read_site(site)
     recorded = None if log is None else read_run(log, settings.ingest)
     files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
@@ -440,10 +440,16 @@ def _complain(text: str, debug: bool) -> None:
     print(f"balise: {text}", file=sys.stderr)
 
 
-def _settings(config: Path | None, vehicle: Path | None) -> tuple[Configuration, Vehicle]:
-    from schemas.config import Configuration, Vehicle, load_settings
+def _configuration(file: Path | None) -> Configuration:
+    from schemas.config import Configuration, load_settings
 
-    return load_settings(config, Configuration), load_settings(vehicle, Vehicle)
+    return load_settings(file, Configuration)
+
+
+def _vehicle(file: Path | None) -> Vehicle:
+    from schemas.config import Vehicle, load_settings
+
+    return load_settings(file, Vehicle)
 
 
 def _say(text: str) -> None:
@@ -460,7 +466,7 @@ def _assess(out: str, config: Path | None, as_json: bool) -> None:
     from pipeline.assessment import assess, for_reading
     from pipeline.present import show_table
 
-    settings = None if config is None else _settings(config, None)[0]
+    settings = None if config is None else _configuration(config)
     found = assess(out, settings)
     if as_json:
         _print_json({"statements": found.statements, **found.tables})

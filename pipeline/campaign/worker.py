@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def replay_one(job: RunJob) -> RunOutcome:
         return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
     metadata = _metadata(job, files_digest, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
-    return outcome_of(job, tables.runs, sum(entry[1] for entry in before), time.monotonic() - begun)
+    return outcome_of(job, tables.runs, sum(file.size_bytes for file in before), time.monotonic() - begun)
 
 
 def fail_run(
@@ -126,7 +127,7 @@ def _same_software(job: RunJob) -> None:
         )
 
 
-def _signature(path: Path) -> tuple[tuple[str, int, int, int], ...]:
+def _signature(path: Path) -> tuple[storage.FileState, ...]:
     with _as_input_error(path):
         return storage.signature(path)
 
@@ -167,8 +168,7 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 def _earlier(job: RunJob) -> RunOutcome:
     """The outcome of a run that is complete already."""
     runs = store.read_table(job.out, "runs", job.run_id).collect()
-    outcome = outcome_of(job, runs, 0, 0.0)
-    return RunOutcome(**{**outcome.__dict__, "skipped": True})
+    return replace(outcome_of(job, runs, 0, 0.0), skipped=True)
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:

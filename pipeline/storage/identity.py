@@ -7,7 +7,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.fetching import folders_in
@@ -86,8 +86,17 @@ def _file_digest(file: Path) -> str:
     return digest.hexdigest()
 
 
-def signature(path: Path) -> tuple[tuple[str, int, int, int], ...]:
-    """What changes when somebody writes to a file while it is read: size, time of change, identity."""
+class FileState(NamedTuple):
+    """What changes when somebody writes to a file."""
+
+    name: str
+    size_bytes: int
+    changed_ns: int
+    inode: int
+
+
+def signature(path: Path) -> tuple[FileState, ...]:
+    """The state of a file, or of each file directly in a folder."""
     files = sorted(entry for entry in path.iterdir() if entry.is_file()) if path.is_dir() else [path]
     stats = [(file.name, file.stat()) for file in files]
-    return tuple((name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in stats)
+    return tuple(FileState(name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in stats)
