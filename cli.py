@@ -486,7 +486,7 @@ def _status_of(summary: Summary) -> int:
 
 
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.tally import outcome_rows, summary_line
+    from pipeline.campaign.tally import outcome_line, outcome_rows, summary_line
     from pipeline.present import show_table
     from schemas.enums import RunStatus
 
@@ -494,7 +494,11 @@ def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> Non
     if as_json:
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
         _print_json({**figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
-    elif not quiet:
+    elif quiet:
+        for outcome in summary.outcomes:
+            if outcome.status is not RunStatus.OK:
+                print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
+    else:
         shown = rows if rows.height <= _SHOWN_RUNS else rows.filter(rows["status"] != "ok").head(_SHOWN_RUNS)
         if shown.height:
             show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))

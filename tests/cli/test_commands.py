@@ -65,6 +65,16 @@ def test_replay_one_run(balise: Balise, small_trial: SmallTrial, tmp_path: Path)
     assert (quiet.status, quiet.out, quiet.err) == (0, "", "")
 
 
+def test_quiet_says_what_failed_and_nothing_else(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"")
+    given = (tmp_path / "bad.mcap", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path / "out")
+    said = balise("replay", *given, "--quiet")
+    assert (said.status, said.out) == (1, "")
+    (line,) = said.err.splitlines()
+    assert line.startswith("balise: bad: failed")
+    assert "bad.mcap" in line
+
+
 def test_replay_as_json(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"")
     said = balise(
