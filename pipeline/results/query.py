@@ -8,18 +8,23 @@ are plain Hive-partitioned Parquet, so DuckDB reads them from outside all the sa
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from pathlib import Path
 
 import polars as pl
 
+from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.storage.address import Address, is_url, join
-from pipeline.storage.files import exists
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
 # After comments and brackets, the words that a query begins with.
 _QUERY = re.compile(r"(\s|\(|--[^\n]*(\n|$)|/\*.*?\*/)*(select|with|explain|from|values)\b", re.IGNORECASE | re.DOTALL)
+
+_EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
+_REMEDY = "`balise dictionary` lists the columns of each table."
 
 
 def run_sql(out: Address, sql: str) -> pl.DataFrame:
@@ -33,8 +38,8 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
             "is no query",
             place="SQL",
             found=sql.strip()[:80] or "nothing",
-            expected="one SELECT (WITH ... SELECT, EXPLAIN SELECT); results are only read",
-            remedy="`balise dictionary` lists the tables and their columns.",
+            expected=f"{_EXPECTED} (WITH ... SELECT, EXPLAIN SELECT); results are only read",
+            remedy=_REMEDY,
         )
     tables = _tables(out, sql)
     try:
@@ -46,16 +51,19 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
         raise UsageError(
             f"cannot be answered: {_first_line(error)}",
             place="SQL",
-            expected="a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES]),
-            remedy="`balise dictionary` lists the columns of each table.",
+            expected=_EXPECTED,
+            remedy=_REMEDY,
         ) from None
 
 
 def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
+    """What the query may name: ten thousand addresses take their time, remote tables their transfer."""
     runs = store.complete_runs(out)
-    # Only what the query may name: ten thousand addresses take their time, remote tables their transfer.
-    named = [name for name in TABLES if re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
-    return {name: _scan(out, name, runs) for name in named} | _campaign_tables(out)
+
+    def named(names: Iterable[str]) -> list[str]:
+        return [name for name in names if re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
+
+    return {name: _scan(out, name, runs) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
 
 
 def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
@@ -65,12 +73,15 @@ def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
     return store.read_table(out, table) if is_url(out) else catalogue.scan(out, table, runs)
 
 
-def _campaign_tables(out: Address) -> dict[str, pl.LazyFrame]:
-    """`campaign/runs.parquet` as `campaign_runs`, and so on."""
-    addresses = {
-        name: join(join(out, "campaign"), f"{name.removeprefix('campaign_')}.parquet") for name in CAMPAIGN_TABLES
-    }
-    return {name: pl.scan_parquet(address, glob=False) for name, address in addresses.items() if exists(address)}
+def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFrame]:
+    """`campaign/runs.parquet` as `campaign_runs`, and so on; those that are not there are left out."""
+    addresses = {name: join(join(out, "campaign"), f"{name.removeprefix('campaign_')}.parquet") for name in names}
+    if not is_url(out):
+        found = {name: Path(address) for name, address in addresses.items() if Path(address).exists()}
+        return {name: pl.scan_parquet(file, glob=False) for name, file in found.items()}
+    contents = storage.read_many([str(address) for address in addresses.values()])
+    there = {name: contents.get(str(address)) for name, address in addresses.items()}
+    return {name: pl.read_parquet(content).lazy() for name, content in there.items() if content is not None}
 
 
 def _first_line(error: Exception) -> str:

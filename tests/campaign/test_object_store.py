@@ -119,6 +119,7 @@ def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
     for count in (1, 2):
         run_campaign(make_plan([str(path) for path in small_trial.paths[:count]], small_trial.site, out))
         assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [count]
+        assert run_sql(out, "SELECT COUNT(DISTINCT run_id) AS n FROM campaign_runs")["n"].to_list() == [count]
         assert catalogue.fresh(out, "passages") is not None
     place = str(store.table_address(out, "passages", "run0"))
     storage.write_bytes(place, storage.read_many([place])[place] + b"more")

@@ -161,7 +161,7 @@ def test_without_site_and_log_the_file_says_what_it_lacks(result: Result, tmp_pa
 
 
 def test_refusals(result: Result, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such run"):
+    with pytest.raises(UsageError, match="has no run 'other'"):
         export_run(result.out, "other", tmp_path / "a.mcap")
     with pytest.raises(UsageError, match="suffix"):
         export_run(result.out, "jump_two", tmp_path / "a.kml")
