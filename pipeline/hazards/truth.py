@@ -6,41 +6,22 @@ odometer smoothed; else the odometer since the LRVB, where only what exceeds its
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import polars as pl
 
 from pipeline.columns import NS_PER_S, Floats, Ints, flags, floats, times_ns
 from pipeline.hazards.anchors import Anchors, Carried, carry
-from pipeline.hazards.arrays import interpolate_known, words
+from pipeline.hazards.arrays import words
+from pipeline.hazards.reference import Rung, Samples, dense_rung, sparse_rungs
 from pipeline.hazards.slip import Doppler, repaired_by_doppler
 from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel
-from pipeline.timeline import linking_gap_s, nominal_period_s
 from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 
 # A learned latency is no chance of the noise beyond so many of its sigmas, or where so little of the doubt is left.
 _PROVEN_SIGMAS, _PROVEN_SHARE = 3.0, 0.5
 _NAMES = [member.value for member in Evidence]
-
-
-@dataclass(frozen=True)
-class Rung:
-    """One kind of evidence per epoch; NaN where it does not reach. `bound_m` must be exceeded by a hazard.
-
-    `slip_m`: as of `Carried`.
-    """
-
-    evidence: Evidence
-    path_m: Floats
-    sigma_m: Floats
-    bound_m: Floats
-    slip_m: Floats
-    cross_m: Floats
-    up_m: Floats
-    smoothed: bool = False
 
 
 def establish_truth(
@@ -70,19 +51,22 @@ def establish_truth(
     travel = odometer_travel(epochs, counted_ns(epochs))
     rungs = []
     if reference is not None and reference.height:
-        rungs.append(_reference_rung(at_ns, reference))
+        samples = Samples.at(at_ns, reference)
+        rungs.append(dense_rung(samples))
         if np.isfinite(rungs[0].path_m).all():
             return _ladder(epochs["t"], rungs, travel)
     hazards = config.hazards
     doppler = Doppler(floats(epochs, "velocity_along_mps"), config.monitors.doppler_sigma_mps)
     travel = repaired_by_doppler(travel, positions(epochs), doppler, hazards.false_alarm_margin_m)
+    # Carried to when the odometer counted; how far the train goes from there to the instant of the position.
+    since_m = np.nan_to_num(floats(epochs, "speed_mps")) * (at_ns - travel.at_ns) / NS_PER_S
+    if reference is not None and reference.height:
+        rungs += sparse_rungs(samples, reference, travel, since_m, config.lds)
     if balise_reads is not None and balise_reads.height:
         counted = floats(balise_reads, "odometer_m") if "odometer_m" in balise_reads.columns else None
         anchors = Anchors.of(times_ns(balise_reads), floats(balise_reads, "path_m"), counted)
         sigma_m = hazards.balise_read_sigma_m
         carried = carry(anchors, travel, travel.at_ns, config.lds, both_ways=True, anchor_sigma_m=sigma_m)
-        # Carried to when the odometer counted; how far the train goes from there to the instant of the position.
-        since_m = np.nan_to_num(floats(epochs, "speed_mps")) * (at_ns - travel.at_ns) / NS_PER_S
         rungs.append(_balise_rung(carried, since_m, positions(epochs), hazards))
     if hazards.smoothed_reference:
         rungs.append(_smoothed_rung(epochs, travel, hazards))
@@ -116,22 +100,6 @@ def counted_ns(epochs: pl.DataFrame) -> Ints:
 def positions(epochs: pl.DataFrame) -> Floats:
     """Path positions of valid fixes; NaN elsewhere."""
     return np.where(flags(epochs, "fix_valid"), floats(epochs, "path_m"), np.nan)
-
-
-def _reference_rung(at_ns: Ints, reference: pl.DataFrame) -> Rung:
-    stamps = times_ns(reference)
-    origin = stamps[0]
-    x, at = (stamps - origin) / NS_PER_S, (at_ns - origin) / NS_PER_S
-    gap = linking_gap_s(nominal_period_s(stamps))
-
-    def column(name: str) -> Floats:
-        return interpolate_known(at, x, floats(reference, name), gap)
-
-    path = column("path_m")
-    sigma = np.nan_to_num(column("sigma_m"))
-    cross, up = column("cross_track_m"), column("vertical_m")
-    nothing = np.zeros(path.size)
-    return Rung(Evidence.REFERENCE, path, sigma, nothing, nothing, cross, up)
 
 
 def _balise_rung(carried: Carried, since_m: Floats, position_m: Floats, config: HazardConfig) -> Rung:

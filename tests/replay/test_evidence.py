@@ -244,3 +244,46 @@ def test_balises_that_lie_off_their_net_element_are_told():
     finding = Finding("error", "balises: VB9", "measure 99999.0 m is off element A", "Mend measure_m.")
     notes = replay(run, dataclasses.replace(site, findings=(finding,)), VEHICLE).runs["notes"].item()
     assert "balises off their net element, which no run passes: VB9; `balise inspect`" in notes
+
+
+STOPPING = {
+    "start_m": 200.0,
+    "phases": [
+        {"speed_mps": 30.0, "acceleration_mps2": 0.8},
+        {"stop_at_m": 2200.0, "acceleration_mps2": 0.8},
+        {"speed_mps": 30.0, "acceleration_mps2": 0.8},
+        {"stop_at_m": 4800.0, "acceleration_mps2": 0.8},
+        {"speed_mps": 20.0, "acceleration_mps2": 0.8},
+        {"stop_at_m": 7500.0, "acceleration_mps2": 0.8},
+    ],
+}
+
+
+def thinned(run, period_s):
+    """The run with a reference sample each `period_s` only."""
+    reference = run.reference
+    step = (reference["t"][1] - reference["t"][0]).total_seconds()
+    return run.with_streams(reference=reference.gather_every(round(period_s / step)))
+
+
+@pytest.mark.parametrize("period_s", [5.0, 10.0, 30.0])
+def test_errors_are_the_same_by_a_reference_of_few_samples(period_s):
+    # The train starts and brakes; a straight line over 10 s is up to 9 m off, over 30 s up to 80 m.
+    run, site = journey(motion=STOPPING)
+    dense, sparse = (replay(log, site, VEHICLE) for log in (run, thinned(run, period_s)))
+    assert sparse.hazards.is_empty()
+    judged = sparse.epochs.select("t", "error_along_m").drop_nulls().join(dense.epochs, on="t", suffix="_dense")
+    assert judged.height > 0.8 * run.gnss.height
+    assert (judged["error_along_m"] - judged["error_along_m_dense"]).abs().max() < 1.0
+    assert sparse.runs["unsafe_accepted"].item() == 0
+
+
+@pytest.mark.parametrize("odometer", [True, False])
+def test_offset_is_found_by_a_reference_of_few_samples(odometer):
+    run, site = journey({**OFFSET, "size_m": 60.0})
+    run = run if odometer else run.with_streams(odometer=None)
+    dense, sparse = (replay(log, site, VEHICLE).hazards for log in (run, thinned(run, 5.0)))
+    told = ("hazard", "failure_mode", "timing", "evidence", "balise_ids", "accepted_ids", "detected")
+    assert dense.select(told).rows() == sparse.select(told).rows() != []
+    assert sparse["evidence"].unique().to_list() == ["reference"]
+    assert sparse["size_m"][0] == pytest.approx(60.0, abs=5.0)
