@@ -21,6 +21,7 @@ from pipeline.alignment.odometer_filter import (
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import Array, AxisState
 from pipeline.statistics import threshold_factor
+from pipeline.timeline import gap_limit_s
 from schemas.config import Configuration, Vehicle
 
 # Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
@@ -46,7 +47,8 @@ class _Learner:
 
     Estimates in use at an epoch come from epochs before it. From the first failing epoch on they stand still until
     the raw and fastest monitors have been quiet for `recovery_s` and GNSS minus odometer is back where it was
-    before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale.
+    before the alarm (DOMAIN section 3 and 4); a fault that persists is never learned as scale. Nor is an offset that
+    a position brings back from a break or an alarm, or its decay: see `ScaleLatencyFilter.resume`.
     """
 
     def __init__(
@@ -69,6 +71,10 @@ class _Learner:
         self._stretch = track.stretch_at(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
+        self._limit_m = config.hazards.failure_limit_m
+        gap_s = gap_limit_s(float(np.median(np.diff(arrays.t_s))), config.align.gap_reset_s)
+        self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
+        self._outages = _gaps_before(self._t_s, arrays.t_s[arrays.usable], gap_s)
         self._scale_known = vehicle.odometer_scale is not None
         self._latency_known = vehicle.gnss_latency_s is not None
 
@@ -88,7 +94,7 @@ class _Learner:
                 break
             position = self._hold(state.estimate(), alarm)
             if position < self._rows.size:
-                state = self._filter.restart(state, *self._observation(position))
+                state = self._filter.restart(state, *self._observation(position), self._limit_m**2)
 
     def _observation(self, position: int) -> tuple[float, float]:
         """Time [s] and GNSS path position [m] at a position."""
@@ -122,20 +128,27 @@ class _Learner:
         """The filter's last state in these positions; from where each of its states may be used; the joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
-        lost = self._stretch[before] != self._stretch[due]
-        broken = lost | (self._t_s[due] - self._t_s[before] > self._config.align.gap_reset_s)
+        broken = (self._stretch[before] != self._stretch[due]) | (self._breaks[before] != self._breaks[due])
         joints = np.empty((due.size, *state.joint.shape))
         for first, last in pairwise((0, *np.flatnonzero(broken).tolist(), due.size)):
             if first == last:
                 continue
             if broken[first]:
-                state = self._filter.restart(state, *self._observation(due[first]))
+                state = self._beyond_break(state, int(before[first]), int(due[first]))
             part = due[first:last]
             observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
             joints[first:last] = self._filter.run(state, *observed, self._arrays.jitter_s)
-            state = state._replace(joint=joints[last - 1], t_s=float(self._t_s[part[-1]]))
+            state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
         use_from = np.searchsorted(self._t_s, self._t_s[due] + SPEED_SPAN_S)
         return state, np.maximum(use_from, due + 1), joints
+
+    def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
+        """The state at the first position after a break; where the odometer lost its way, nothing tells of a move."""
+        if self._stretch[before] == self._stretch[position]:
+            observed = *self._observation(position), float(self._sigma_m[position]), self._arrays.jitter_s
+            return self._filter.resume(state, *observed, self._limit_m)
+        away = self._outages[before] != self._outages[position]
+        return self._filter.restart(state, *self._observation(position), self._limit_m**2 if away else 0.0)
 
     def _due(self, last_s: float, begin: int, end: int) -> Index:
         """Positions of the updates: the first a filter period after the last one, and so on."""
@@ -187,6 +200,12 @@ class _Learner:
         may_return = self._factor * spread <= config.hazards.failure_limit_m
         back = np.flatnonzero(quiet & near & may_return)
         return begin + int(back[0]) if back.size else self._rows.size
+
+
+def _gaps_before(at_s: Array, t_s: Array, gap_s: float) -> Index:
+    """How many gaps of a series of times end up to each of these times."""
+    ends = t_s[1:][np.diff(t_s) > gap_s]
+    return np.searchsorted(ends, at_s, side="right")
 
 
 def _in_use(use_from: Index, position: int) -> int:

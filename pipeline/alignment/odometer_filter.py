@@ -6,10 +6,14 @@ Observed is the GNSS path position against the odometer's distance at the time o
 
 with unit first-order Gauss-Markov errors e_j of the monitor bank's own model, so that the estimate's covariance
 tells what the data really say about scale and latency; the offset walks with the odometer's white noise.
+
+After a break a position may come back beside its place, and return to it or stay there, by no more than the monitors
+let pass. So the offset may have moved over the break, and walks on until a position has settled.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -31,6 +35,10 @@ _WHITE_SHARE = 0.01
 # speed tell the latency. A speed over less time has noise that would pass for such changes: at constant speed the
 # filter would grow sure of any latency.
 SPEED_SPAN_S = 2.0
+# Before it is seen, a position is rather thought to come back from a break beside its place: to be sure of a wrong
+# scale is worse than to learn it more slowly.
+_MOVED_PROBABILITY = 0.8
+_CERTAIN = 100.0
 
 
 class Estimate(NamedTuple):
@@ -45,12 +53,14 @@ class Estimate(NamedTuple):
 class FilterState(NamedTuple):
     """State of (offset, scale error, latency, e_j...) at a time and from an odometer origin.
 
-    `joint` holds the covariance and, as its last column, the mean: shape (states, states + 1).
+    `joint` holds the covariance and, as its last column, the mean: shape (states, states + 1). `unsettled_m2`: the
+    variance that the offset has still to walk until a position that came back has settled.
     """
 
     joint: Array
     t_s: float
     origin_m: float
+    unsettled_m2: float = 0.0
 
     def estimate(self) -> Estimate:
         ((scale, scale_sigma, latency_s, latency_sigma_s),) = estimates_of(self.joint[None]).tolist()
@@ -80,12 +90,33 @@ class ScaleLatencyFilter:
         covariance = np.diag(np.concatenate([variances, np.ones(errors)]))
         return FilterState(np.column_stack([covariance, mean]), t_s, origin_m)
 
-    def restart(self, state: FilterState, t_s: float, path_m: float) -> FilterState:
+    def restart(self, state: FilterState, t_s: float, path_m: float, unsettled_m2: float = 0.0) -> FilterState:
         """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
         fresh = self.start(state.estimate(), t_s, path_m)
         kept = slice(_SCALE, _ERRORS)
         fresh.joint[kept, kept] = state.joint[kept, kept]
-        return fresh
+        return fresh._replace(unsettled_m2=max(unsettled_m2, self._unsettled_m2(state, t_s)))
+
+    def resume(
+        self, state: FilterState, t_s: float, path_m: float, sigma_m: float, jitter_s: float, limit_m: float
+    ) -> FilterState:
+        """The state at the first position after a break, before anything is learned from it.
+
+        Whether it came back beside its place, by up to about `limit_m`, it tells itself, as far as the odometer does.
+        The offset may have moved so far, and may move so far again while the position settles.
+        """
+        joint, row = np.empty_like(state.joint), self._rows(np.array([sigma_m]))[0]
+        left_m2 = self._unsettled_m2(state, t_s)
+        self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
+        seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
+        variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + (jitter_s * speed_mps) ** 2
+        moved_m2 = _moved_m2(seen.item(-1), variance_m2, limit_m)
+        joint[_OFFSET, _OFFSET] += moved_m2
+        return FilterState(joint, t_s, state.origin_m, left_m2 + moved_m2)
+
+    def after(self, state: FilterState, joint: Array, t_s: float) -> FilterState:
+        """The state that has become `joint` by a later time."""
+        return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
     def run(self, state: FilterState, t_s: Array, path_m: Array, sigma_m: Array, jitter_s: float) -> Array:
         """The joint state after each of these epochs, shape (epochs, states, states + 1).
@@ -93,29 +124,56 @@ class ScaleLatencyFilter:
         Times [s], GNSS path positions and their sigmas, shapes (epochs,); `jitter_s`: how the stamps scatter.
         """
         joints = np.empty((t_s.size, *state.joint.shape))
-        steps_ns = np.rint(np.diff(t_s, prepend=state.t_s) * 1e9).astype(np.int64).tolist()
-        # By how much each state moves the position; what follows from the odometer comes in epoch by epoch.
-        rows = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
-        rows[:, _OFFSET] = 1.0
+        times_s, rows = t_s.tolist(), self._rows(sigma_m)
+        steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
+        unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self._settling_s)
+        settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
         white_m2 = (_WHITE_SHARE * sigma_m**2).tolist()
         before = state.joint
-        epochs = zip(joints, rows, t_s.tolist(), path_m.tolist(), white_m2, steps_ns, strict=True)
-        for joint, row, now_s, place_m, own_m2, step_ns in epochs:
-            decay, noise = self._transition(step_ns)
-            np.multiply(before, decay, out=joint)
-            joint += noise
-            scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
-            way_m, speed_mps = self._odometer_at(now_s - latency_s, state.origin_m)
-            row[_SCALE], row[_LATENCY] = way_m, -scale * speed_mps
-            # Covariance of the states with what is observed and, as its last, how far the states miss it: all but the
-            # latency, about whose mean the distance was read, and the scale's own way.
-            seen = row.dot(joint)
-            seen[-1] += way_m + scale * speed_mps * latency_s - place_m
+        epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)
+        for joint, row, now_s, place_m, own_m2, step_ns, walked_m2 in epochs:
+            self._predict(before, step_ns, walked_m2, joint)
+            seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
             spread = seen[:-1]
             variance_m2 = row.dot(spread).item() + own_m2 + (jitter_s * speed_mps) ** 2
             joint -= (spread / variance_m2)[:, None] * seen
             before = joint
         return joints
+
+    def _rows(self, sigma_m: Array) -> Array:
+        """By how much each state moves the position; what follows from the odometer comes in epoch by epoch."""
+        rows: Array = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
+        rows[:, _OFFSET] = 1.0
+        return rows
+
+    def _predict(self, before: Array, step_ns: int, settled_m2: float, joint: Array) -> None:
+        """Write to `joint` what a joint state becomes over a step in which so much of the offset settles."""
+        decay, noise = self._transition(step_ns)
+        np.multiply(before, decay, out=joint)
+        joint += noise
+        joint[_OFFSET, _OFFSET] += settled_m2
+
+    def _seen(self, joint: Array, row: Array, now_s: float, place_m: float, origin_m: float) -> tuple[Array, float]:
+        """Covariance of the states with what is observed and, as its last, how far the states miss it; the speed.
+
+        Completes `row`. The miss is all but the latency, about whose mean the distance was read, and the scale's own
+        way.
+        """
+        scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
+        way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
+        row[_SCALE], row[_LATENCY] = way_m, -scale * speed_mps
+        seen: Array = row.dot(joint)
+        seen[-1] += way_m + scale * speed_mps * latency_s - place_m
+        return seen, speed_mps
+
+    def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
+        """What the offset has still to walk at a later time."""
+        return state.unsettled_m2 * math.exp((state.t_s - t_s) / self._settling_s)
+
+    @cached_property
+    def _settling_s(self) -> float:
+        """Time constant of a settling position's variance: that of the GNSS error with the shortest memory."""
+        return 0.5 * float(self.taus_s.min())
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
         """Way from the origin [m] and speed [m/s].
@@ -140,6 +198,22 @@ class ScaleLatencyFilter:
         noise = 1.0 - decay * decay
         noise[_OFFSET] = self.track.white_rate_m2_per_s * dt_s
         return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
+
+
+def _moved_m2(beside_m: float, variance_m2: float, limit_m: float) -> float:
+    """Mean square of what a position moved by over a break, given how far it was seen beside its place.
+
+    Before it was seen it had moved with `_MOVED_PROBABILITY`, and then by a normal deviation of `limit_m` (Bayes). A
+    short break, over which little variance gathers, is so told from a tunnel.
+    """
+    gain = limit_m**2 / (limit_m**2 + variance_m2)
+    evidence = math.exp(min(0.5 * gain * beside_m**2 / variance_m2, _CERTAIN))
+    odds = _MOVED_PROBABILITY / (1.0 - _MOVED_PROBABILITY) * math.sqrt(1.0 - gain) * evidence
+    return odds / (1.0 + odds) * gain * (gain * beside_m**2 + variance_m2)
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * 1e9)
 
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
