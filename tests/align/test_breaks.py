@@ -1,0 +1,167 @@
+"""What a position brings back from a break is never learned as odometer scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.alignment.align import align
+from pipeline.alignment.odometer import odometer_track
+from pipeline.alignment.odometer_filter import ScaleLatencyFilter, error_model, prior_of
+from schemas.config import Configuration, Vehicle
+from tests.align.straight import Straight, distance, odometer_of, run
+
+CONFIG = Configuration()
+REAL = Straight(duration_s=900.0, period_s=1.0, scale=1.004, latency_s=0.08)
+SEEDS = range(12)
+LEARNED = ("odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s")
+
+
+def seconds(epochs):
+    return epochs["t"].dt.timestamp("ns").to_numpy() * 1e-9
+
+
+def learned(seed, missing=(), fault=None, plan=REAL, vehicle=None):
+    """Aligned epochs of a run without positions between these times [s]."""
+    epochs, odometer = run(plan, seed, fault)
+    t_s = seconds(epochs)
+    kept = ~np.any([(t_s > begin) & (t_s < end) for begin, end in missing], axis=0) if missing else t_s >= 0.0
+    return align(epochs.filter(pl.Series(kept)), odometer, vehicle or Vehicle(), CONFIG)
+
+
+def away(aligned, from_s, scale=REAL.scale):
+    """Largest error of the learned scale over its own sigma from this time on."""
+    later = aligned.filter(pl.Series(seconds(aligned) >= from_s))
+    return float(((later["odometer_scale"] - scale) / later["scale_sigma"]).abs().max())
+
+
+def after_each(tunnels, size_m, decay_s):
+    """An offset that each tunnel but the first brings with the other sign, and how it decays."""
+
+    def fault(t_s):
+        offset = np.zeros_like(t_s)
+        for index, (_, end) in enumerate(tunnels):
+            since_s = t_s - end
+            brought = (-1.0) ** index * size_m * np.exp(-np.maximum(since_s, 0.0) / decay_s)
+            offset = np.where(since_s >= 0.0, brought, offset)
+        return offset
+
+    return fault
+
+
+ONCE, OFTEN = ((120.0, 210.0),), tuple((120.0 + 240.0 * k, 190.0 + 240.0 * k) for k in range(3))
+SHORT = ((300.0, 350.0),)
+
+
+@pytest.mark.parametrize(
+    ("tunnels", "size_m", "decay_s"),
+    [
+        (ONCE, 6.0, 60.0),
+        (ONCE, 12.0, 60.0),
+        (OFTEN, 6.0, 60.0),
+        (OFTEN, 12.0, 60.0),
+        (SHORT, 3.0, np.inf),
+        (SHORT, 4.0, np.inf),
+    ],
+)
+def test_an_offset_out_of_a_tunnel_is_not_learned_as_scale(tunnels, size_m, decay_s):
+    fault = after_each(tunnels, size_m, decay_s)
+    worst = [away(learned(seed, tunnels, fault), tunnels[0][1]) for seed in SEEDS]
+    assert max(worst) < 4.5
+    assert np.sqrt(np.mean(np.square(worst))) < 2.4
+
+
+@pytest.mark.parametrize("tunnels", [ONCE, OFTEN, SHORT])
+def test_a_tunnel_that_brings_nothing_costs_the_learning_little(tunnels):
+    pairs = [(learned(seed, tunnels)["scale_sigma"][-1], learned(seed)["scale_sigma"][-1]) for seed in SEEDS]
+    assert np.median([with_tunnel / without for with_tunnel, without in pairs]) < 1.6
+    worst = [away(learned(seed, tunnels), tunnels[0][1]) for seed in SEEDS]
+    assert max(worst) < 4.5
+
+
+def test_single_missing_epochs_cost_the_learning_little():
+    missing = tuple((float(t), t + 2.0) for t in range(50, 890, 15))
+    ratios = [learned(seed, missing)["scale_sigma"][-1] / learned(seed)["scale_sigma"][-1] for seed in SEEDS]
+    assert np.median(ratios) < 1.2
+
+
+def test_what_the_odometer_loses_while_positions_go_on_is_no_break_of_theirs():
+    epochs, odometer = run(REAL, 3)
+    slip = pl.Series("slip", (seconds(odometer) > 400.0) & (seconds(odometer) < 403.0))
+    slipped = align(epochs, odometer.with_columns(slip), Vehicle(), CONFIG)
+    plain = align(epochs, odometer, Vehicle(), CONFIG)
+    assert slipped["scale_sigma"][-1] < 1.6 * plain["scale_sigma"][-1]
+    outage = (seconds(epochs) > 390.0) & (seconds(epochs) < 410.0)
+    both = align(epochs.filter(pl.Series(~outage)), odometer.with_columns(slip), Vehicle(), CONFIG)
+    assert both["scale_sigma"][-1] > 1.2 * slipped["scale_sigma"][-1]
+
+
+def test_a_known_scale_and_latency_stay_through_a_tunnel():
+    known = Vehicle(odometer_scale=1.004, odometer_scale_sigma=2e-4)
+    aligned = learned(1, ONCE, after_each(ONCE, 12.0, 60.0), vehicle=known)
+    assert aligned["odometer_scale"].unique().to_list() == [1.004]
+    assert aligned["scale_sigma"].unique().to_list() == [2e-4]
+
+
+def test_learning_over_tunnels_uses_the_past_only():
+    tunnels, fault = OFTEN, after_each(OFTEN, 6.0, 60.0)
+    epochs, odometer = run(REAL, 5, fault)
+    t_s = seconds(epochs)
+    epochs = epochs.filter(pl.Series(~np.any([(t_s > begin) & (t_s < end) for begin, end in tunnels], axis=0)))
+    whole = align(epochs, odometer, Vehicle(), CONFIG)
+    for cut_s in (195.0, 300.0, 440.0, 700.0):
+        before = epochs.filter(pl.Series(seconds(epochs) <= cut_s))
+        part = align(before, odometer.filter(pl.Series(seconds(odometer) <= cut_s)), Vehicle(), CONFIG)
+        assert part.select(LEARNED).equals(whole[: part.height].select(LEARNED))
+
+
+def filter_at_rest():
+    """A filter that has seen five minutes without error, its state, and the odometer's distance after `gap_s`."""
+    t_s = np.arange(0.0, 500.0, 0.5)
+    track = odometer_track(odometer_of(t_s, distance(t_s)), 1.0, 0.05)
+    learner = ScaleLatencyFilter(*error_model(CONFIG.monitors), track)
+    at_s = np.arange(20.0, 320.0)
+    path_m = track.distance_at(at_s)
+    state = learner.start(prior_of(Vehicle(), CONFIG.align), 20.0, float(path_m[0]))
+    joints = learner.run(state, at_s, path_m, np.ones(at_s.size), 0.0)
+    return learner, learner.after(state, joints[-1], float(at_s[-1])), track
+
+
+def resumed(gap_s, beside_m):
+    learner, state, track = filter_at_rest()
+    t_s = state.t_s + gap_s
+    path_m = float(track.distance_at(np.array([t_s]))[0]) + beside_m
+    return learner, state, learner.resume(state, t_s, path_m, 1.0, 0.0, 20.0)
+
+
+def test_what_a_break_brought_is_judged_by_its_length_and_by_how_far_the_position_came_back():
+    unsettled_m2 = {
+        (gap_s, beside_m): resumed(gap_s, beside_m)[2].unsettled_m2
+        for gap_s in (2.0, 90.0)
+        for beside_m in (0.0, 1.0, 3.0, 12.0)
+    }
+    assert unsettled_m2[2.0, 0.0] < 0.01
+    assert unsettled_m2[90.0, 0.0] < 2.0
+    assert 9.0 < unsettled_m2[2.0, 3.0] < 10.0
+    for gap_s in (2.0, 90.0):
+        values = [unsettled_m2[gap_s, beside_m] for beside_m in (0.0, 1.0, 3.0, 12.0)]
+        assert values == sorted(values)
+        assert values[-1] == pytest.approx(144.0, rel=0.05)
+    assert unsettled_m2[90.0, 1.0] > unsettled_m2[2.0, 0.0]
+
+
+def test_a_position_settles_as_the_error_with_the_shortest_memory_forgets():
+    learner, before, after = resumed(90.0, 12.0)
+    later = learner.after(after, after.joint, after.t_s + CONFIG.monitors.user_tau_s)
+    assert before.unsettled_m2 == 0.0
+    assert later.unsettled_m2 == pytest.approx(after.unsettled_m2 * np.exp(-2.0))
+
+
+def test_a_position_far_beside_its_place_says_nothing_of_the_scale():
+    learner, before, after = resumed(90.0, 12.0)
+    place_m = float(learner.track.distance_at(np.array([after.t_s]))[0]) + 12.0
+    joints = learner.run(after, np.array([after.t_s]), np.array([place_m]), np.ones(1), 0.0)
+    told = learner.after(after, joints[-1], after.t_s).estimate()
+    assert abs(told.scale - before.estimate().scale) < 0.5 * before.estimate().scale_sigma
+    assert told.scale_sigma > 0.95 * before.estimate().scale_sigma
