@@ -39,6 +39,9 @@ SPEED_SPAN_S = 2.0
 # scale is worse than to learn it more slowly.
 _MOVED_PROBABILITY = 0.8
 _CERTAIN = 100.0
+# Variance that has still to settle fades with this time constant. Positions that settle over 10 to 60 s are followed;
+# longer, and a drift that begins meanwhile would be learned as scale the sooner.
+_SETTLING_S = 25.0
 
 
 class Estimate(NamedTuple):
@@ -126,7 +129,7 @@ class ScaleLatencyFilter:
         joints = np.empty((t_s.size, *state.joint.shape))
         times_s, rows = t_s.tolist(), self._rows(sigma_m)
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
-        unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self._settling_s)
+        unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / _SETTLING_S)
         settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
         white_m2 = (_WHITE_SHARE * sigma_m**2).tolist()
         before = state.joint
@@ -168,12 +171,7 @@ class ScaleLatencyFilter:
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
         """What the offset has still to walk at a later time."""
-        return state.unsettled_m2 * math.exp((state.t_s - t_s) / self._settling_s)
-
-    @cached_property
-    def _settling_s(self) -> float:
-        """Time constant of a settling position's variance: that of the GNSS error with the shortest memory."""
-        return 0.5 * float(self.taus_s.min())
+        return state.unsettled_m2 * math.exp((state.t_s - t_s) / _SETTLING_S)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
         """Way from the origin [m] and speed [m/s].
