@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import polars as pl
 import pytest
@@ -14,7 +16,7 @@ from tests.align.straight import Straight, distance, odometer_of, run
 
 CONFIG = Configuration()
 REAL = Straight(duration_s=900.0, period_s=1.0, scale=1.004, latency_s=0.08)
-SEEDS = range(12)
+SEEDS = range(10)
 LEARNED = ("odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s")
 
 
@@ -28,6 +30,12 @@ def learned(seed, missing=(), fault=None, plan=REAL, vehicle=None):
     t_s = seconds(epochs)
     kept = ~np.any([(t_s > begin) & (t_s < end) for begin, end in missing], axis=0) if missing else t_s >= 0.0
     return align(epochs.filter(pl.Series(kept)), odometer, vehicle or Vehicle(), CONFIG)
+
+
+@cache
+def plain_sigma(seed):
+    """Sigma of the scale at the end of a run that lacks nothing."""
+    return learned(seed)["scale_sigma"][-1]
 
 
 def away(aligned, from_s, scale=REAL.scale):
@@ -74,15 +82,15 @@ def test_an_offset_out_of_a_tunnel_is_not_learned_as_scale(tunnels, size_m, deca
 
 @pytest.mark.parametrize("tunnels", [ONCE, OFTEN, SHORT])
 def test_a_tunnel_that_brings_nothing_costs_the_learning_little(tunnels):
-    pairs = [(learned(seed, tunnels)["scale_sigma"][-1], learned(seed)["scale_sigma"][-1]) for seed in SEEDS]
-    assert np.median([with_tunnel / without for with_tunnel, without in pairs]) < 1.6
-    worst = [away(learned(seed, tunnels), tunnels[0][1]) for seed in SEEDS]
-    assert max(worst) < 4.5
+    runs = [learned(seed, tunnels) for seed in SEEDS]
+    ratios = [aligned["scale_sigma"][-1] / plain_sigma(seed) for seed, aligned in zip(SEEDS, runs, strict=True)]
+    assert np.median(ratios) < 1.6
+    assert max(away(aligned, tunnels[0][1]) for aligned in runs) < 4.5
 
 
 def test_single_missing_epochs_cost_the_learning_little():
     missing = tuple((float(t), t + 2.0) for t in range(50, 890, 15))
-    ratios = [learned(seed, missing)["scale_sigma"][-1] / learned(seed)["scale_sigma"][-1] for seed in SEEDS]
+    ratios = [learned(seed, missing)["scale_sigma"][-1] / plain_sigma(seed) for seed in SEEDS]
     assert np.median(ratios) < 1.2
 
 
