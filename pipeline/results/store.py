@@ -198,14 +198,15 @@ def metadata_of(source: Path | bytes) -> dict[str, str]:
 
 
 def sweep(out: Address) -> None:
-    """Remove what interrupted runs left: tables without a marker, and unfinished files."""
+    """Remove what interrupted campaigns left: tables without a marker, and unfinished files."""
     complete = {_partition(run) for run in run_ids(out)}
     for table in TABLES:
         for folder in storage.folders_in(join(out, table)):
             if folder.startswith("run_id=") and folder not in complete:
                 storage.remove_folder(join(join(out, table), folder))
     if not is_url(out):
-        _remove_unfinished(Path(out).glob("*/run_id=*/.*.tmp"))
+        for folder in ("", "*/", "*/run_id=*/"):
+            _remove_unfinished(Path(out).glob(folder + storage.UNFINISHED))
 
 
 def sweep_run(out: Path, run_id: str) -> None:
@@ -214,7 +215,7 @@ def sweep_run(out: Path, run_id: str) -> None:
     for table in TABLES:
         folder = Path(table_address(out, table, run_id)).parent
         if complete:
-            _remove_unfinished(folder.glob(".*.tmp"))
+            _remove_unfinished(folder.glob(storage.UNFINISHED))
         else:
             storage.remove_folder(folder)
 

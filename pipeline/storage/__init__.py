@@ -8,6 +8,7 @@ patience with those that fail.
 from pipeline.storage.fetching import content_of, folders_in, glob_remote, local_copy, reach, read_many
 from pipeline.storage.identity import FileState, content_digest, signature, version, version_of, versions
 from pipeline.storage.writing import (
+    UNFINISHED,
     SweptError,
     absolute,
     as_output_error,
@@ -20,6 +21,7 @@ from pipeline.storage.writing import (
 )
 
 __all__ = [
+    "UNFINISHED",
     "FileState",
     "SweptError",
     "absolute",

@@ -18,6 +18,10 @@ from pipeline.storage.address import Address, is_url, redacted
 from pipeline.storage.object_store import on_store
 from schemas.errors import OutputError
 
+# The names, beside their final ones, of files that are being written; what a killed process leaves is found by it.
+_RANDOM_BYTES = 6
+UNFINISHED = f".*.{'[0-9a-f]' * 2 * _RANDOM_BYTES}.tmp"
+
 
 def absolute(address: Address) -> str:
     """The address as a worker with another working directory understands it."""
@@ -35,7 +39,7 @@ def stage(address: Address, content: bytes) -> tuple[Address, Address]:
         on_store(address, lambda store, path: store.pipe_file(path, content))
         return address, address
     final = Path(address)
-    temporary = final.with_name(f".{final.name}.{secrets.token_hex(6)}.tmp")
+    temporary = final.with_name(f".{final.name}.{secrets.token_hex(_RANDOM_BYTES)}.tmp")
     with as_output_error(address):
         final.parent.mkdir(parents=True, exist_ok=True)
         try:

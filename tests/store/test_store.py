@@ -105,12 +105,18 @@ def test_run_without_marker_does_not_count(tmp_path: Path) -> None:
     for run_id in ("a", "b"):
         store.write_run(tables_of(run_id), tmp_path, METADATA)
     (tmp_path / "runs/run_id=b/runs.parquet").unlink()
-    leftover = tmp_path / "epochs/run_id=a/.epochs.parquet.0123.tmp"
-    leftover.write_bytes(b"cut short")
+    folders = ("epochs/run_id=a/.epochs.parquet", "campaign/.runs.parquet", ".catalogue/.runs", ".config.toml")
+    leftovers = [tmp_path / f"{name}.0123456789ab.tmp" for name in folders]
+    for leftover in leftovers:
+        leftover.parent.mkdir(exist_ok=True)
+        leftover.write_bytes(b"cut short")
+    of_somebody = tmp_path / ".notes.tmp"
+    of_somebody.touch()
     assert store.run_ids(tmp_path) == ["a"]
     store.sweep(tmp_path)
     assert not any("run_id=b" in name for name in files_in(tmp_path) if not name.startswith("runs"))
-    assert not leftover.exists()
+    assert not any(leftover.exists() for leftover in leftovers)
+    of_somebody.unlink()
     assert len(files_in(tmp_path)) == len(TABLES)
 
 
@@ -119,7 +125,7 @@ def test_sweep_of_one_run_leaves_the_others(tmp_path: Path) -> None:
         store.write_run(tables_of(run_id), tmp_path, METADATA)
     whole = {name: data for name, data in files_in(tmp_path).items() if "run_id=a" not in name}
     (tmp_path / "runs/run_id=a/runs.parquet").unlink()
-    (tmp_path / "runs/run_id=b/.runs.parquet.12.tmp").touch()
+    (tmp_path / "runs/run_id=b/.runs.parquet.0123456789ab.tmp").touch()
     for run_id in ("a", "b"):
         store.sweep_run(tmp_path, run_id)
     assert files_in(tmp_path) == whole
