@@ -8,7 +8,7 @@ from pipeline.export.gis import run_geojson, run_gpx
 from pipeline.export.layout import layout_json
 from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
 from pipeline.provenance import input_digest
-from pipeline.results.store import check_site, metadata_of, read_run, run_ids, table_address
+from pipeline.results.store import check_site, metadata_of, read_run, table_address
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog, RunTables, Site
 
@@ -31,7 +31,6 @@ def export_run(
     """
     if to.suffix.lower() not in SUFFIXES:
         raise UsageError("cannot be told by its suffix", place=str(to), expected=" or ".join(SUFFIXES))
-    _check_run(out, run_id)
     tables = read_run(out, run_id)
     _check(out, tables, site, log)
     to.parent.mkdir(parents=True, exist_ok=True)
@@ -43,13 +42,6 @@ def export_run(
         )
     make = run_geojson if to.suffix.lower() == ".geojson" else run_gpx
     return [_write_text(to, make(tables, site))], []
-
-
-def _check_run(out: Path, run_id: str) -> None:
-    known = run_ids(out)
-    if run_id not in known:
-        shown = ", ".join(known[:10]) or "no complete run"
-        raise UsageError(f"has no run {run_id!r}", place=str(out), found=shown)
 
 
 def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:

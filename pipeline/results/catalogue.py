@@ -17,7 +17,7 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.results import store
-from pipeline.storage.files import Address, is_url, join
+from pipeline.storage.address import Address, is_url, join
 from schemas.conform import dtypes
 from schemas.tables import TABLES
 

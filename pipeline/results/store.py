@@ -12,7 +12,8 @@ from urllib.parse import quote, unquote
 import polars as pl
 
 from pipeline import storage
-from pipeline.storage.files import Address, exists, is_url, join, read_bytes, redacted, shown
+from pipeline.storage.address import Address, is_url, join, redacted, shown
+from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, settings_from, to_toml
 from schemas.conform import conform, dtypes
 from schemas.errors import UsageError
@@ -93,14 +94,14 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     schema = {"run_id": pl.String(), **dtypes(TABLES[table])}
     if not runs:
         return pl.LazyFrame(schema=schema)
+    if run_id is not None and not exists(table_address(out, _MARKER, run_id)):
+        known = ", ".join(run_ids(out)[:10]) or "no complete run"
+        raise UsageError(f"has no run {run_id!r}", place=shown(out), found=known)
     paths = [table_address(out, table, run) for run in runs]
     if is_url(out):
         return _read_remote(table, [str(path) for path in paths], runs).select(list(schema))
-    if run_id is not None and not Path(paths[0]).exists():
-        raise UsageError("has no such run", place=shown(out), found=run_id)
-    files = [Path(path) for path in paths]
-    for file, run in zip(files, runs, strict=True):
-        _check_columns(table, run, _schema_of(table, run, file))
+    for path, run in zip(paths, runs, strict=True):
+        _check_columns(table, run, _schema_of(table, run, Path(path)))
     return scan_runs(out, table, runs).select(list(schema))
 
 
@@ -131,11 +132,15 @@ def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]
         with file.open("rb") as source:
             return pl.read_parquet_schema(source)
     except (pl.exceptions.PolarsError, OSError) as error:
-        raise UsageError(
-            f"cannot be read: {str(error).strip().splitlines()[0]}",
-            place=f"run {run_id}, table `{table}`",
-            remedy="Replay this run again with --force.",
-        ) from None
+        raise _unreadable(table, run_id, str(error).strip().splitlines()[0]) from None
+
+
+def _unreadable(table: str, run_id: str, reason: str) -> UsageError:
+    return UsageError(
+        f"cannot be read: {reason}",
+        place=f"run {run_id}, table `{table}`",
+        remedy="Replay this run again with --force.",
+    )
 
 
 def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) -> None:
@@ -246,10 +251,9 @@ def _read_remote(table: str, paths: list[str], runs: list[str]) -> pl.LazyFrame:
     contents = storage.read_many(paths)
     frames = []
     for path, run in zip(paths, runs, strict=True):
-        if path in contents:
-            frame = pl.read_parquet(contents[path])
-            _check_columns(table, run, frame.schema)
-            frames.append(frame.lazy().with_columns(run_id=pl.lit(run)))
-    if not frames:
-        raise UsageError("has no such run", found=", ".join(runs[:5]))
+        if path not in contents:
+            raise _unreadable(table, run, "no such object")
+        frame = pl.read_parquet(contents[path])
+        _check_columns(table, run, frame.schema)
+        frames.append(frame.lazy().with_columns(run_id=pl.lit(run)))
     return pl.concat(frames, how="diagonal")

@@ -9,27 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from pipeline.storage.address import Address, is_url, join, name_of, redacted, shown, stem_of
+from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.fetching import local_copy
 from pipeline.storage.object_store import on_store
 from schemas.errors import InputError
-
-# Those of `address` for the modules that still look for them here.
-__all__ = [
-    "Address",
-    "exists",
-    "is_dir",
-    "is_url",
-    "join",
-    "list_dir",
-    "name_of",
-    "open_binary",
-    "read_bytes",
-    "redacted",
-    "shown",
-    "size_of",
-    "stem_of",
-]
 
 T = TypeVar("T")
 

@@ -194,8 +194,19 @@ def test_unknown_names(tmp_path: Path) -> None:
     store.write_run(tables_of("r"), tmp_path, METADATA)
     with pytest.raises(UsageError, match="no table"):
         store.read_table(tmp_path, "epoch")
-    with pytest.raises(UsageError, match="no such run"):
+    with pytest.raises(UsageError, match=r"has no run 'other'; found r$"):
         store.read_table(tmp_path, "epochs", "other")
+    with pytest.raises(UsageError, match="has no run 'r'; found no complete run"):
+        store.read_table("memory://nowhere", "epochs", "r")
+
+
+def test_a_table_that_is_gone_from_a_complete_run_is_missed_and_not_left_out(tmp_path: Path) -> None:
+    for out in (tmp_path, "memory://lost-table/out"):
+        for run_id in ("a", "b"):
+            store.write_run(tables_of(run_id), out, METADATA)
+        storage.remove(store.table_address(out, "hazards", "a"))
+        with pytest.raises(UsageError, match="run a, table `hazards`: cannot be read"):
+            store.read_table(out, "hazards")
 
 
 def test_config_is_written_resolved(tmp_path: Path) -> None:
