@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import inspect
 import os
 import time
 from collections.abc import Awaitable, Callable
@@ -112,9 +113,9 @@ class _Watched:
 
     def __getattr__(self, name: str) -> Any:
         ours = getattr(self._store, f"_{name}", None)
-        if name == "cat" and asyncio.iscoroutinefunction(ours):
+        if name == "cat" and inspect.iscoroutinefunction(ours):
             ours = partial(type(self._store)._cat, self)  # which asks for each file through `_cat_file` below
-        if not asyncio.iscoroutinefunction(ours):
+        if not inspect.iscoroutinefunction(ours):
             return getattr(self._store, name)
         from fsspec.asyn import sync
 
