@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import polars as pl
 
+from pipeline.alignment.odometer import STRAIGHT_S, leaps
 from pipeline.clean import StreamCounts
+from pipeline.columns import NS_PER_S, floats, times_ns
 from pipeline.ingest.site_checks import BALISE_PLACE
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
@@ -33,6 +36,7 @@ def run_notes(
         *_off_the_track(site),
         *_stamps(counts),
         *_extents(run),
+        *_odometer(run),
         *_positions(fixes, found, vehicle),
         *_ambiguous(found),
         *_linking(lds),
@@ -77,6 +81,25 @@ def _extents(run: RunLog) -> Iterator[str]:
         yield "the GNSS ends before the odometer"
     if gnss_begin > odometer_begin + _SAME_TIME_NS:
         yield "the GNSS begins after the odometer"
+
+
+def _odometer(run: RunLog) -> Iterator[str]:
+    """What the odometer's rows cannot tell."""
+    if run.odometer is None:
+        return
+    dt_s = np.diff(times_ns(run.odometer)) / NS_PER_S
+    leap = leaps(np.diff(floats(run.odometer, "distance_m")), dt_s)
+    if leap.any():
+        first = run.odometer["t"][int(leap.argmax()) + 1]
+        yield (
+            f"the odometer's distance leaps by more than a train can drive, {int(leap.sum())} times, first at "
+            f"{first:%H:%M:%S}: its speed counts there, or where it has none the way is lost"
+        )
+    if (period_s := float(np.median(dt_s))) > STRAIGHT_S:
+        yield (
+            f"the odometer has a row every {period_s:.3g} s only: where the speed changes in between, alarms along the "
+            "track may be its own"
+        )
 
 
 def _extent_ns(stream: pl.DataFrame) -> tuple[int, int]:

@@ -18,6 +18,12 @@ _NS = 1e-9
 _GAP_IN_PERIODS = 2.5
 _SPEED_WINDOW_S = 1.0
 _POLARITY_STARTS = 40
+# No train is faster: a counter that gains more was reset, ran over or lied. Stamps that come in bunches take so much.
+_FASTEST_MPS = 200.0
+_BUNCHED_M = 20.0
+# Between rows no farther apart a straight line is within 0.5 m of a train that brakes; the finer step is within 0.1 m.
+STRAIGHT_S = 1.5
+_FINE_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -79,8 +85,10 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows.
     A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry: the speeds before and after
     it give the best guess, good for an expectation window, but a new `stretch` begins. A cumulative distance carries
-    over it, also where rows are by turns. Slip that the odometer itself reports loses the way too. `sigma_mps` is the
-    white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample to sample, replaces it.
+    over it, also where rows are by turns. Slip that the odometer itself reports loses the way too, and so does a leap
+    of the distance (`leaps`) where no speed tells the way. Rows far apart are filled in by what the speeds at both
+    tell. `sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample
+    to sample, replaces it.
     """
     t_ns = odometer["t"].dt.timestamp("ns").to_numpy()
     epoch_ns = int(t_ns[0])
@@ -97,7 +105,7 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     step[unknown] = 0.0
     declared = odometer["sigma_speed_mps"].median()
     declared_rate = float(declared) ** 2 * period if isinstance(declared, float) else 0.0
-    return OdometerTrack(
+    track = OdometerTrack(
         epoch_ns=epoch_ns,
         t_s=t_s,
         distance_m=_sums(step),
@@ -105,6 +113,56 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
         pause=pause,
         slip=slip,
         white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
+    )
+    apart = (dt > STRAIGHT_S) & ~pause & ~lost & ~slip[:-1]
+    return _filled_in(track, speed, np.flatnonzero(apart)) if apart.any() else track
+
+
+def leaps(way_m: Array, dt_s: Array) -> Mask:
+    """Ways between rows, in these times, that are longer than any train can drive."""
+    leap: Mask = np.abs(way_m) > _FASTEST_MPS * dt_s + _BUNCHED_M
+    return leap
+
+
+def _without_spikes(t_s: Array, distance_m: Array) -> Array:
+    """The distance without single rows from which it leaps back to where it was."""
+    leap = leaps(np.diff(distance_m), np.diff(t_s))
+    if not leap.any():
+        return distance_m
+    over = leap[1:] & leap[:-1] & ~leaps(distance_m[2:] - distance_m[:-2], t_s[2:] - t_s[:-2])
+    cleaned = distance_m.copy()
+    cleaned[1:-1][over] = np.nan
+    return cleaned
+
+
+def _filled_in(track: OdometerTrack, speed_mps: Array, rows: npt.NDArray[np.int64]) -> OdometerTrack:
+    """The track with samples between these rows and the next, on cubic curves.
+
+    Their slopes at the rows are the speeds, else those of a curve through the distances that keeps its direction
+    (PCHIP), and never so steep that the train would turn back in between.
+    """
+    from scipy.interpolate import PchipInterpolator  # hardly a log needs it, and it takes long to load
+
+    t_s, distance = track.t_s, track.distance_m
+    slopes = np.where(np.isfinite(speed_mps), speed_mps, PchipInterpolator(t_s, distance).derivative()(t_s))
+    span, way = t_s[rows + 1] - t_s[rows], distance[rows + 1] - distance[rows]
+    low, high = np.minimum(0.0, 3.0 * way), np.maximum(0.0, 3.0 * way)
+    start, end = (np.clip(slopes[at] * span, low, high) for at in (rows, rows + 1))
+    fine = np.ceil(span / _FINE_S).astype(np.int64)
+    which = np.repeat(np.arange(rows.size), fine - 1)
+    part = np.concatenate([np.arange(1, count) / count for count in fine.tolist()])
+    rest = 1.0 - part
+    curve = part**2 * (3.0 - 2.0 * part) * way[which] + part * rest * (rest * start[which] - part * end[which])
+    at_s = np.concatenate([t_s, t_s[rows][which] + part * span[which]])
+    order = np.argsort(at_s, kind="stable")
+    source = np.concatenate([np.arange(t_s.size), rows[which]])[order]
+    return replace(
+        track,
+        t_s=at_s[order],
+        distance_m=np.concatenate([distance, distance[rows][which] + curve])[order],
+        stretch=track.stretch[source],
+        pause=track.pause[source[:-1]],
+        slip=track.slip[source],
     )
 
 
@@ -117,17 +175,23 @@ def _sums(steps: npt.NDArray[Number]) -> npt.NDArray[Number]:
 
 def _ways(t_s: Array, dt_s: Array, distance_m: Array, speed_mps: Array, limit_s: float) -> tuple[Array, Mask]:
     """Way from each row to the next [m], NaN where not known, and whether it is by the recorded distance."""
-    recorded, driven = np.diff(distance_m), _driven(speed_mps, dt_s)
+    distance_m = _without_spikes(t_s, distance_m)
+    recorded, driven = _drivable(np.diff(distance_m), dt_s), _driven(speed_mps, dt_s)
     counted = ~np.isnan(recorded)
     step = np.where(counted, recorded, driven)
     unknown = np.isnan(step)
     if not unknown.any():
         return step, counted
-    recorded = np.where(unknown, np.diff(_carried(t_s, distance_m, limit_s)), recorded)
+    recorded = np.where(unknown, _drivable(np.diff(_carried(t_s, distance_m, limit_s)), dt_s), recorded)
     driven = _driven(_carried(t_s, speed_mps, limit_s), dt_s)
     recorded = _over_pauses(distance_m, recorded, driven, dt_s > limit_s)
     counted = ~np.isnan(recorded)
     return np.where(counted, recorded, driven), counted
+
+
+def _drivable(way_m: Array, dt_s: Array) -> Array:
+    """Ways that a train can drive, NaN for others."""
+    return np.where(leaps(way_m, dt_s), np.nan, way_m)
 
 
 def _driven(speed_mps: Array, dt_s: Array) -> Array:

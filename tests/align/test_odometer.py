@@ -100,3 +100,83 @@ def test_a_leap_in_the_first_metres_does_not_turn_the_odometer_round():
     track = odometer_track(odometer_of(t, distance_m=5.0 * t), 1.0, 0.05)
     path = 5.0 * t - np.where((t > 3.9) & (t < 4.2), 300.0, 0.0)
     assert polarity(track, t, path, 20.0) == 1
+
+
+@pytest.mark.parametrize("speed", [None, 10.0])
+@pytest.mark.parametrize(
+    ("reads", "leap"),
+    [
+        ([1000.0, 1005.0, 1010.0, 0.0, 5.0, 10.0], 3),  # reset
+        ([4085.0, 4090.0, 4095.0, 4.0, 9.0, 14.0], 3),  # run over
+        ([0.0, -5.0, -10.0, 985.0, 980.0, 975.0], 3),  # reset in reverse
+    ],
+)
+def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed):
+    forth = 1.0 if reads[1] > reads[0] else -1.0
+    t = 0.5 * np.arange(6.0)
+    speeds = None if speed is None else [forth * speed] * 6
+    track = odometer_track(odometer_of(t, distance_m=reads, speed_mps=speeds), 1.0, 0.05)
+    known = track.known_at(t[:-1] + 0.25)
+    if speed is None:
+        assert track.stretch.tolist() == [0] * leap + [1] * (6 - leap)
+        assert known.tolist() == [index != leap - 1 for index in range(5)]
+    else:
+        np.testing.assert_allclose(track.distance_m, forth * 5.0 * np.arange(6.0))
+        assert (track.stretch == 0).all()
+        assert known.all()
+
+
+def test_a_spike_of_the_counter_is_passed_over():
+    t = 0.5 * np.arange(7.0)
+    reads = 5.0 * np.arange(7.0)
+    for row in (1, 3, 5):
+        spiked = reads + 500.0 * (np.arange(7) == row)
+        track = odometer_track(odometer_of(t, distance_m=spiked), 1.0, 0.05)
+        np.testing.assert_allclose(track.distance_m, reads)
+        assert (track.stretch == 0).all()
+        assert track.known_at(t).all()
+
+
+def test_what_a_fast_train_drives_over_gaps_and_bunched_stamps_is_no_leap():
+    t = np.array([0.0, 0.5, 0.501, 0.502, 1.5, 21.5, 22.0])
+    reads = np.array([0.0, 50.0, 60.0, 70.0, 150.0, 2150.0, 2200.0])
+    np.testing.assert_allclose(odometer_track(odometer_of(t, distance_m=reads), 1.0, 0.05).distance_m, reads)
+
+
+@pytest.mark.parametrize("with_speed", [False, True])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_between_rows_far_apart_the_way_follows_the_speeds(sign, with_speed):
+    """A train that gathers 1 m/s2 from standstill, then runs on at 20 m/s, with a row every 4 s."""
+
+    def way(at):
+        return sign * np.where(at < 20.0, 0.5 * at**2, 200.0 + 20.0 * (at - 20.0))
+
+    t = np.arange(0.0, 41.0, 4.0)
+    speeds = sign * np.minimum(t, 20.0) if with_speed else None
+    track = odometer_track(odometer_of(t, distance_m=way(t), speed_mps=speeds), 1.0, 0.05)
+    at = np.arange(0.0, 40.0, 0.1)
+    assert track.known_at(at).all()
+    np.testing.assert_allclose(track.distance_at(t), way(t), atol=1e-9)
+    off = np.abs(track.distance_at(at) - way(at)).max()
+    straight = np.abs(np.interp(at, t, way(t)) - way(at)).max()
+    assert straight == pytest.approx(2.0, abs=0.01)
+    assert off < (0.05 if with_speed else 0.7)
+    assert (np.diff(sign * track.distance_m) >= 0.0).all()
+
+
+def test_a_standstill_between_rows_far_apart_stays_one():
+    track = odometer_track(
+        odometer_of([0.0, 4.0, 8.0, 12.0], distance_m=[0.0, 30.0, 30.0, 60.0], speed_mps=[9.0, 2.0, 2.0, 9.0]),
+        1.0,
+        0.05,
+    )
+    np.testing.assert_allclose(track.distance_at(np.arange(4.0, 8.1, 0.25)), 30.0)
+
+
+def test_nothing_is_filled_in_where_the_way_is_lost():
+    frame = odometer_of(
+        [0.0, 2.0, 4.0, 6.0, 26.0, 28.0], speed_mps=[10.0] * 6, slip=[False, False, True, False, False, False]
+    )
+    track = odometer_track(frame, 1.0, 0.05)
+    assert track.known_at(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
+    assert track.stretch_at(np.array([1.0, 5.0, 27.0])).tolist() == [0, 1, 2]

@@ -287,3 +287,26 @@ def test_offset_is_found_by_a_reference_of_few_samples(odometer):
     assert dense.select(told).rows() == sparse.select(told).rows() != []
     assert sparse["evidence"].unique().to_list() == ["reference"]
     assert sparse["size_m"][0] == pytest.approx(60.0, abs=5.0)
+
+
+def test_a_counter_that_is_reset_costs_nothing_and_is_told():
+    run, site = journey()
+    row = pl.int_range(pl.len())
+    reset = pl.col("distance_m") - pl.when(row >= 4000).then(2000.0).otherwise(0.0)
+    plain, found = (
+        replay(logs, site, VEHICLE) for logs in (run, run.with_streams(odometer=run.odometer.with_columns(reset)))
+    )
+    same = ("balises_accepted", "balises_rejected", "balises_missed", "alarms")
+    assert found.runs.select(same).row(0) == plain.runs.select(same).row(0)
+    assert found.passages["status"].unique().to_list() == ["accepted"]
+    assert found.runs["distance_m"].item() == pytest.approx(plain.runs["distance_m"].item(), abs=5.0)
+    assert "the odometer's distance leaps by more than a train can drive, 1 times" in found.runs["notes"].item()
+
+
+def test_an_odometer_with_a_row_every_five_seconds_raises_no_alarm():
+    run, site = journey()
+    sparse = run.with_streams(odometer=run.odometer.gather_every(100))
+    found = replay(sparse, site, VEHICLE)
+    assert found.runs["alarms"].item() == 0
+    assert found.passages["status"].unique().to_list() == ["accepted"]
+    assert "the odometer has a row every 5 s only" in found.runs["notes"].item()
