@@ -26,6 +26,8 @@ from schemas.config import Configuration, Vehicle
 
 # Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
 _FIRST_BLOCK, _BLOCK = 2048, 8192
+# Stamps that scatter make no gap by themselves: the first position after one that they made is always late.
+_SCATTERED = 3.0
 
 
 def learn(arrays: EpochArrays, track: OdometerTrack, vehicle: Vehicle, config: Configuration) -> Learned:
@@ -72,7 +74,8 @@ class _Learner:
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
         self._limit_m = config.hazards.failure_limit_m
-        gap_s = gap_limit_s(float(np.median(np.diff(arrays.t_s))), config.align.gap_reset_s)
+        period_s = float(np.median(np.diff(arrays.t_s)))
+        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + _SCATTERED * arrays.jitter_s
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
         self._outages = _gaps_before(self._t_s, arrays.t_s[arrays.usable], gap_s)
         self._scale_known = vehicle.odometer_scale is not None
@@ -92,9 +95,9 @@ class _Learner:
             state, alarm = self._learn_until_alarm(state, position)
             if alarm >= self._rows.size:
                 break
-            position = self._hold(state.estimate(), alarm)
+            position, unsettled_m2 = self._hold(state.estimate(), alarm)
             if position < self._rows.size:
-                state = self._filter.restart(state, *self._observation(position), self._limit_m**2)
+                state = self._filter.restart(state, *self._observation(position), unsettled_m2)
 
     def _observation(self, position: int) -> tuple[float, float]:
         """Time [s] and GNSS path position [m] at a position."""
@@ -120,7 +123,8 @@ class _Learner:
                 alarm = position + int(failing[0])
                 held = joints[_in_use(use_from, alarm)]
                 self._put(np.array([alarm]), held[None])
-                return state._replace(joint=held), alarm
+                # Of what the block's last state has still to settle the alarm knows nothing: it may lie behind it.
+                return FilterState(held, self._times[alarm], state.origin_m), alarm
             position, block = end, min(2 * block, _BLOCK)
         return state, position
 
@@ -176,8 +180,11 @@ class _Learner:
         series = along_series(rows, self._arrays, self._track, self._learned, self._config)
         return series.between(begin - first, rows.size)
 
-    def _hold(self, estimate: Estimate, alarm: int) -> int:
-        """Position from which learning goes on after the alarm at `alarm`; the number of positions if never."""
+    def _hold(self, estimate: Estimate, alarm: int) -> tuple[int, float]:
+        """Position from which learning goes on after the alarm at `alarm`, and what it has still to settle [m2].
+
+        The number of positions if it never goes on. What may settle is how far the position is from its place then.
+        """
         begin = max(alarm - 1, 0)
         config, rows = self._config, self._rows[begin:]
         t_s, path_m, sigma_m = self._t_s[begin:], self._path_m[begin:], self._sigma_m[begin:]
@@ -199,7 +206,10 @@ class _Learner:
         near = np.abs(away) <= np.minimum(config.hazards.failure_limit_m, self._factor * spread)
         may_return = self._factor * spread <= config.hazards.failure_limit_m
         back = np.flatnonzero(quiet & near & may_return)
-        return begin + int(back[0]) if back.size else self._rows.size
+        if not back.size:
+            return self._rows.size, 0.0
+        first = int(back[0])
+        return begin + first, float(away[first] ** 2 + spread[first] ** 2)
 
 
 def _gaps_before(at_s: Array, t_s: Array, gap_s: float) -> Index:

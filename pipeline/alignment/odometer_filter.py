@@ -35,9 +35,12 @@ _WHITE_SHARE = 0.01
 # speed tell the latency. A speed over less time has noise that would pass for such changes: at constant speed the
 # filter would grow sure of any latency.
 SPEED_SPAN_S = 2.0
-# Before it is seen, a position is rather thought to come back from a break beside its place: to be sure of a wrong
-# scale is worse than to learn it more slowly.
+# Before it is seen, a position is rather thought to come back from a long break beside its place: to be sure of a wrong
+# scale is worse than to learn it more slowly. A receiver coasts over seconds and starts anew after half a minute or so:
+# were single missing epochs thought the same of, a noisy position with many of them would teach next to nothing.
 _MOVED_PROBABILITY = 0.8
+_MOVING_S = 30.0
+# Half the square of so many sigmas that no doubt is left; beyond it the exponential would overflow.
 _CERTAIN = 100.0
 # Variance that has still to settle fades with this time constant. Positions that settle over 10 to 60 s are followed;
 # longer, and a drift that begins meanwhile would be learned as scale the sooner.
@@ -113,9 +116,11 @@ class ScaleLatencyFilter:
         self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
         variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + (jitter_s * speed_mps) ** 2
-        moved_m2 = _moved_m2(seen.item(-1), variance_m2, limit_m)
-        joint[_OFFSET, _OFFSET] += moved_m2
-        return FilterState(joint, t_s, state.origin_m, left_m2 + moved_m2)
+        probability = _MOVED_PROBABILITY * -math.expm1((state.t_s - t_s) / _MOVING_S)
+        # More than the offset's own prior would say no more, and leave no digits for the position's noise.
+        brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
+        joint[_OFFSET, _OFFSET] += brought_m2
+        return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
 
     def after(self, state: FilterState, joint: Array, t_s: float) -> FilterState:
         """The state that has become `joint` by a later time."""
@@ -198,15 +203,14 @@ class ScaleLatencyFilter:
         return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
 
 
-def _moved_m2(beside_m: float, variance_m2: float, limit_m: float) -> float:
+def moved_m2(beside_m: float, variance_m2: float, limit_m: float, probability: float) -> float:
     """Mean square of what a position moved by over a break, given how far it was seen beside its place.
 
-    Before it was seen it had moved with `_MOVED_PROBABILITY`, and then by a normal deviation of `limit_m` (Bayes). A
-    short break, over which little variance gathers, is so told from a tunnel.
+    Before it was seen it had moved with this probability, and then by a normal deviation of `limit_m` (Bayes).
     """
     gain = limit_m**2 / (limit_m**2 + variance_m2)
     evidence = math.exp(min(0.5 * gain * beside_m**2 / variance_m2, _CERTAIN))
-    odds = _MOVED_PROBABILITY / (1.0 - _MOVED_PROBABILITY) * math.sqrt(1.0 - gain) * evidence
+    odds = probability / (1.0 - probability) * math.sqrt(1.0 - gain) * evidence
     return odds / (1.0 + odds) * gain * (gain * beside_m**2 + variance_m2)
 
 
