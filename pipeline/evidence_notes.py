@@ -29,6 +29,19 @@ _UNDIAGNOSED = (
     "seen there"
 )
 
+_READING = (
+    "the odometer's rows scatter by {sigma_m:.2f} m (coarse counts, or stamps on receipt): the thresholds along the "
+    "track allow for it"
+)
+# Less than the positions themselves scatter is not worth a word.
+_WORTH_M = 0.1
+
+
+def reading_notes(epochs: pl.DataFrame) -> tuple[str, ...]:
+    """What the odometer's own rows add to the thresholds, where that is much; `epochs`: aligned."""
+    sigma_m = epochs["odometer_reading_m"].max()
+    return (_READING.format(sigma_m=sigma_m),) if isinstance(sigma_m, float) and sigma_m > _WORTH_M else ()
+
 
 def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame, failure_limit_m: float) -> tuple[str, ...]:
     """Notes on what stands behind the errors of one solution; none where the reference covers all positions.

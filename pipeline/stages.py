@@ -9,7 +9,7 @@ import polars as pl
 from pipeline.alignment.align import align, odometer_at
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_times
-from pipeline.evidence_notes import evidence_notes, return_notes, undiagnosed_notes
+from pipeline.evidence_notes import evidence_notes, reading_notes, return_notes, undiagnosed_notes
 from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
@@ -192,6 +192,7 @@ def _notes(
     counts = context.counts.solutions[ride.solution]
     return (
         *run_notes(context.run, context.site, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
+        *reading_notes(ride.aligned),
         *evidence_notes(ride.aligned, truth, limit_m),
         *return_notes(epochs, result.hazards, limit_m),
         *undiagnosed_notes(epochs, result.passages),

@@ -1,7 +1,8 @@
 """Alignment: the odometer at each GNSS epoch's time of validity, scale and latency known or learned causally.
 
 Adds to the matched epochs: `along_m, odometer_m, odometer_reason, odometer_stretch, speed_mps, direction,
-odometer_scale, scale_sigma, latency_s, latency_sigma_s, stamp_jitter_s, odometer_white_m2_per_s`. A reason says why
+odometer_scale, scale_sigma, latency_s, latency_sigma_s, stamp_jitter_s, odometer_white_m2_per_s, odometer_reading_m,
+odometer_period_s`. A reason says why
 an epoch has no odometer.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.increments import EpochArrays, Learned, Mask, odometer_steps, stamp_jitter_s
+from pipeline.alignment.increments import EpochArrays, Learned, Mask, odometer_steps, reading_of, stamp_jitter_s
 from pipeline.alignment.learning import learn
 from pipeline.alignment.odometer import OdometerTrack, odometer_track, polarity
 from pipeline.columns import floats
@@ -93,6 +94,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     step = np.full(known.size, np.nan)
     step[known] = steps.distance_m
     speed = np.where(known, learned.scale * track.speed_at(at), np.nan)
+    reading = reading_of(track, at)
     total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
@@ -100,6 +102,8 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
         pl.Series("odometer_stretch", track.stretch_at(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, arrays.jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, track.white_rate_m2_per_s)),
+        pl.Series("odometer_reading_m", np.zeros(known.size) if reading is None else reading.sigma_m),
+        pl.Series("odometer_period_s", np.full(known.size, track.period_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),
         pl.Series("direction", _direction(speed, config.matching.deadband_mps)),
         pl.Series("odometer_scale", learned.scale),
@@ -133,6 +137,8 @@ def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configurat
         odometer_stretch=pl.lit(0, pl.Int64),
         stamp_jitter_s=nothing,
         odometer_white_m2_per_s=nothing,
+        odometer_reading_m=nothing,
+        odometer_period_s=nothing,
         speed_mps=pl.Series(speed, nan_to_null=True),
         direction=_direction(speed, config.matching.deadband_mps),
         odometer_scale=nothing,

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from pipeline.alignment.odometer import OdometerTrack
 from pipeline.alignment.odometer_filter import Estimate, error_model
-from pipeline.monitors.axis import AlongSteps, AxisSeries, along_axis
+from pipeline.monitors.axis import AlongSteps, AxisSeries, Reading, along_axis
 from pipeline.monitors.recursion import Array
 from schemas.config import Configuration
 
@@ -87,6 +87,13 @@ def odometer_steps(rows: Index, t_s: Array, track: OdometerTrack, learned: Learn
     return OdometerSteps(distance, speed)
 
 
+def reading_of(track: OdometerTrack, at_s: Array) -> Reading | None:
+    """Noise of the odometer's rows at these times; none where they have none."""
+    if not track.reading:
+        return None
+    return Reading(np.sqrt(track.reading.variance_m2(track.speed_at(at_s))), track.period_s)
+
+
 def along_series(
     rows: Index, arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration
 ) -> AxisSeries:
@@ -107,5 +114,6 @@ def along_series(
         white_m2_per_s=track.white_rate_m2_per_s,
         scale_sigma=learned.scale_sigma[rows],
         latency_sigma_s=learned.latency_sigma_s[rows],
+        reading=reading_of(track, t - learned.latency_s[rows]),
     )
     return along_axis(rows, fresh, along, *error_model(config.monitors))

@@ -105,7 +105,7 @@ class _Learner:
 
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
-        bank = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
+        bank: AxisState | None = None
         use_from, joints = np.array([begin]), state.joint[None]
         position, block = begin, _FIRST_BLOCK
         while position < self._rows.size:
@@ -191,8 +191,7 @@ class _Learner:
         steps = odometer_steps(rows, self._arrays.t_s, self._track, self._learned)
         away = path_m - path_m[0] - np.cumsum(steps.distance_m)
         series = self._series(begin, self._rows.size, begin)
-        state = AxisState.at_restart(self._alphas.size, self._filter.shares.size + 1)
-        result, _ = run_axis(series, self._alphas, state)
+        result, _ = run_axis(series, self._alphas)
         beyond = ~(np.abs(result.value[:, :2]) <= self._factor * result.sigma[:, :2])
         fast = beyond.any(axis=1) | (np.arange(rows.size) <= 1)
         last_fail = np.maximum.accumulate(np.where(fast, t_s, -np.inf))

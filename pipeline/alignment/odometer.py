@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+
+from pipeline.alignment.reading import ReadingNoise, reading_noise
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -32,7 +34,8 @@ class OdometerTrack:
 
     `stretch` counts, sample by sample, how often the distance was lost before: two times can be compared only
     where the count is the same. `pause[i]` marks a pause of the recording between samples i and i+1, inside which
-    nothing is interpolated. `white_rate_m2_per_s` is the variance that distance gathers in a second.
+    nothing is interpolated. `white_rate_m2_per_s` is the variance that distance gathers in a second, `reading` the
+    noise of single rows beside it, `period_s` the time between recorded rows.
     """
 
     epoch_ns: int
@@ -42,6 +45,8 @@ class OdometerTrack:
     pause: Mask
     slip: Mask
     white_rate_m2_per_s: float
+    reading: ReadingNoise = field(default_factory=ReadingNoise)
+    period_s: float = 0.0
 
     def oriented(self, sign: int) -> OdometerTrack:
         """The same odometer, growing with the path."""
@@ -113,7 +118,11 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
         pause=pause,
         slip=slip,
         white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
+        period_s=period,
     )
+    if counted.any():
+        whole = counted & ~lost & ~pause
+        track = replace(track, reading=reading_noise(t_s, track.distance_m, whole, track.white_rate_m2_per_s))
     apart = (dt > STRAIGHT_S) & ~pause & ~lost & ~slip[:-1]
     return _filled_in(track, speed, np.flatnonzero(apart)) if apart.any() else track
 

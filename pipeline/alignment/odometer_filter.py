@@ -115,7 +115,7 @@ class ScaleLatencyFilter:
         left_m2 = self._unsettled_m2(state, t_s)
         self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
-        variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + (jitter_s * speed_mps) ** 2
+        variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
         probability = _MOVED_PROBABILITY * -math.expm1((state.t_s - t_s) / _MOVING_S)
         # More than the offset's own prior would say no more, and leave no digits for the position's noise.
         brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
@@ -143,7 +143,7 @@ class ScaleLatencyFilter:
             self._predict(before, step_ns, walked_m2, joint)
             seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
             spread = seen[:-1]
-            variance_m2 = row.dot(spread).item() + own_m2 + (jitter_s * speed_mps) ** 2
+            variance_m2 = row.dot(spread).item() + own_m2 + self._scatter_m2(jitter_s, speed_mps)
             joint -= (spread / variance_m2)[:, None] * seen
             before = joint
         return joints
@@ -173,6 +173,10 @@ class ScaleLatencyFilter:
         seen: Array = row.dot(joint)
         seen[-1] += way_m + scale * speed_mps * latency_s - place_m
         return seen, speed_mps
+
+    def _scatter_m2(self, jitter_s: float, speed_mps: float) -> float:
+        """Variance of stamps and of the odometer's rows, both without memory [m^2]."""
+        return self.track.reading.still_m2 + (jitter_s**2 + self.track.reading.moving_s2) * speed_mps**2
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
         """What the offset has still to walk at a later time."""

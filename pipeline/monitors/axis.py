@@ -69,20 +69,36 @@ def with_memory(sigma_m: Array, decorrelation: Array) -> dict[str, Array]:
     return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
 
 
-def along_errors(sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, taus_s: Array) -> dict[str, Array]:
-    """Error fields of the along-track axis: the Gauss-Markov errors, and stamps that scatter.
+def along_errors(
+    sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, taus_s: Array, reading: Reading | None = None
+) -> dict[str, Array]:
+    """Error fields of the along-track axis: the Gauss-Markov errors, stamps that scatter, rows of the odometer that do.
 
     `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
     """
-    return with_memory(
-        np.vstack([np.outer(np.sqrt(shares), sigma_m), np.abs(jitter_m)]).T,
-        np.vstack([decorrelation_of(dt_s, taus_s), np.ones(dt_s.size)]).T,
-    )
+    sigmas = [np.outer(np.sqrt(shares), sigma_m), np.abs(jitter_m)]
+    decorrelations = [decorrelation_of(dt_s, taus_s), np.ones(dt_s.size)]
+    if reading is not None:
+        sigmas.append(reading.sigma_m)
+        decorrelations.append(reading.decorrelation(dt_s))
+    return with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T)
 
 
 def calibrated(sigma_m: Array, config: MonitorConfig) -> Array:
     """Position sigma that the monitors count with [m]: `calibrate` may have fitted a + b sigma."""
     return config.sigma_intercept_m + config.sigma_slope * sigma_m
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Noise of the odometer's rows: its deviation at each epoch [m], shape (m,), and the time between rows [s]."""
+
+    sigma_m: Array
+    period_s: float
+
+    def decorrelation(self, dt_s: Array) -> Array:
+        """1 - phi over these steps: none is left from row to row; between rows, on straight lines, little changes."""
+        return np.minimum(dt_s / max(self.period_s, 1e-9), 1.0) ** 2
 
 
 @dataclass(frozen=True)
@@ -102,6 +118,7 @@ class AlongSteps:
     white_m2_per_s: Array | float
     scale_sigma: Array
     latency_sigma_s: Array
+    reading: Reading | None = None
 
 
 def along_axis(
@@ -115,7 +132,7 @@ def along_axis(
         border=np.zeros(dt.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(steps.path_m - steps.odometer_m) / dt,
-        **along_errors(steps.sigma_m, steps.jitter_s * steps.odometer_m / dt, dt, shares, taus_s),
+        **along_errors(steps.sigma_m, steps.jitter_s * steps.odometer_m / dt, dt, shares, taus_s, steps.reading),
         white_m2=steps.white_m2_per_s * dt,
         border_m2=np.zeros(dt.size),
         steady_mps=steps.scale_sigma * steps.odometer_m / dt,
@@ -128,8 +145,9 @@ def decorrelation_of(dt_s: Array, taus_s: Array) -> Array:
     return -np.expm1(-dt_s / taus_s[:, None])
 
 
-def run_axis(series: AxisSeries, alphas: Array, state: AxisState) -> tuple[AxisResult, AxisState]:
-    """Values and sigmas of the axis from `state` on, and the state to carry on with."""
+def run_axis(series: AxisSeries, alphas: Array, state: AxisState | None = None) -> tuple[AxisResult, AxisState]:
+    """Values and sigmas of the axis from `state`, or from a restart, on, and the state to carry on with."""
+    state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
     moving = ~series.fresh
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
     keep = (1.0 - weight) * moving[:, None]

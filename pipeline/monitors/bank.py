@@ -36,10 +36,7 @@ class _AxisBank:
         self._series = axis.series
         self._done = 0
         self._block = _BLOCK
-        self._carry = self._zero()
-
-    def _zero(self) -> AxisState:
-        return AxisState.at_restart(self._alphas.size, self._series.sigma_m.shape[1])
+        self._carry: AxisState | None = None
 
     def advance(self, epoch: int) -> int:
         """Evaluate up to this epoch at least; returns the last epoch that is evaluated now."""
@@ -67,7 +64,7 @@ class _AxisBank:
             fresh[row] = True
             self._series = replace(self._series, fresh=fresh)
         self._done = row
-        self._carry = self._zero()
+        self._carry = None
         self._block = _FIRST_BLOCK
 
     def columns(self) -> list[pl.Series]:

@@ -9,7 +9,16 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.alignment.odometer_filter import error_model
-from pipeline.monitors.axis import AlongSteps, AxisSeries, Mask, along_axis, calibrated, decorrelation_of, with_memory
+from pipeline.monitors.axis import (
+    AlongSteps,
+    AxisSeries,
+    Mask,
+    Reading,
+    along_axis,
+    calibrated,
+    decorrelation_of,
+    with_memory,
+)
 from pipeline.monitors.recursion import Array
 from schemas.config import Configuration
 
@@ -103,8 +112,14 @@ class _Builder:
             white_m2_per_s=self._column("odometer_white_m2_per_s", rows),
             scale_sigma=self._column("scale_sigma", rows),
             latency_sigma_s=self._column("latency_sigma_s", rows),
+            reading=self._reading(rows),
         )
         return along_axis(rows, fresh, steps, self._shares, self._taus_s)
+
+    def _reading(self, rows: npt.NDArray[np.int64]) -> Reading | None:
+        """Noise of the odometer's rows, where they have some."""
+        sigma_m = self._column("odometer_reading_m", rows)
+        return Reading(sigma_m, float(self._epochs["odometer_period_s"][0])) if sigma_m.any() else None
 
     def across(self, reasons: pl.Series, position: str, sigma: str) -> AxisSeries:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""

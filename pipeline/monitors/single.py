@@ -80,6 +80,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
     variance = (
         config.monitors.doppler_sigma_mps**2
         + floats(epochs, "odometer_white_m2_per_s") / span
+        + 2.0 * (floats(epochs, "odometer_reading_m") / span) ** 2
         + (floats(epochs, "scale_sigma") * speed) ** 2
         + ((floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))) * change / span) ** 2
     )

@@ -1,0 +1,101 @@
+"""Noise of single rows of an odometer's distance, measured from the rows themselves.
+
+A counter of whole metres, a recorder that stamps on receipt, or noise of the reading: the distance of a row is off by
+some of it, the next by something else, and nothing adds up. At 10 Hz a counter of half metres so seems to change its
+speed by metres per second from epoch to epoch. Only the odometer is looked at, never a position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+# Over so long, or over so many rows where that is longer, the way of a train is a curve of third degree.
+_SPAN_S = 2.0
+_MOST_ROWS, _FEWEST_ROWS = 16, 8
+_DEGREE = 3
+# Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
+_FARTHEST_S = 1.5
+# Enough for the median, however long the run is; with fewer it is chance.
+_STRETCHES, _FEWEST_STRETCHES = 400, 8
+_MOVED_M = 1.0
+# By how much the higher half of the speeds has to be above the lower one.
+_APART = 1.5
+# Scatter is noise of the rows where it is beyond so many times what the increments' white noise makes of them.
+_BEYOND = 2.0
+
+
+@dataclass(frozen=True)
+class ReadingNoise:
+    """Variance [m^2] of a row at standstill, and by how much it grows with the square of the speed [s^2]."""
+
+    still_m2: float = 0.0
+    moving_s2: float = 0.0
+
+    def variance_m2(self, speed_mps: Array) -> Array:
+        return self.still_m2 + self.moving_s2 * speed_mps**2
+
+    def __bool__(self) -> bool:
+        return self.still_m2 > 0.0 or self.moving_s2 > 0.0
+
+
+def reading_noise(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: float) -> ReadingNoise:
+    """What rows scatter about smooth curves beyond what white noise of the increments explains.
+
+    `whole` (rows - 1,): ways between rows that are recorded. Medians over stretches in which the train moves, so that
+    slips do not count; of lower and higher speeds where these differ enough to tell stamps from counts. Noise that is
+    less than what the white noise makes of the same rows counts as none.
+    """
+    rows = _moving_stretches(t_s, distance_m, whole)
+    if len(rows) < _FEWEST_STRETCHES:
+        return ReadingNoise()
+    since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
+    found, explained = _scatter(since_s, ways, white_m2_per_s)
+    speeds = np.abs(ways[:, -1]) / since_s[:, -1]
+    fast = speeds > np.median(speeds)
+    low_mps, high_mps = (float(np.median(speeds[part])) if part.any() else 0.0 for part in (~fast, fast))
+    if fast.sum() < _FEWEST_STRETCHES or high_mps < _APART * low_mps:
+        return ReadingNoise(_beyond(found, explained))
+    low_m2, high_m2 = (_beyond(found[part], explained[part]) for part in (~fast, fast))
+    moving_s2 = max(high_m2 - low_m2, 0.0) / (high_mps**2 - low_mps**2)
+    return ReadingNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
+
+
+def _moving_stretches(t_s: Array, distance_m: Array, whole: Mask) -> npt.NDArray[np.int64]:
+    """Rows of stretches without a gap in which the train moves, spread over the run; shape (stretches, rows)."""
+    period_s = float(np.median(np.diff(t_s)))
+    if period_s > _FARTHEST_S or period_s <= 0.0:
+        return np.zeros((0, 1), dtype=np.int64)
+    count = int(np.clip(np.ceil(_SPAN_S / period_s) + 1, _FEWEST_ROWS, _MOST_ROWS))
+    stride = max(1, round(_SPAN_S / period_s / (count - 1)))
+    length = (count - 1) * stride
+    starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _STRETCHES))
+    broken = np.concatenate([[0], np.cumsum(~whole)])
+    moves = np.abs(distance_m[starts + length] - distance_m[starts]) > _MOVED_M
+    starts = starts[moves & (broken[starts + length] == broken[starts])]
+    chosen: npt.NDArray[np.int64] = starts[:, None] + stride * np.arange(count)
+    return chosen
+
+
+def _scatter(since_s: Array, way_m: Array, white_m2_per_s: float) -> tuple[Array, Array]:
+    """Variance about the curves [m^2] of each stretch, and what white noise of the increments makes of it."""
+    count = since_s.shape[1]
+    powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
+    curves, _ = np.linalg.qr(powers)
+    fitted = curves @ (curves.transpose(0, 2, 1) @ way_m[:, :, None])
+    found = ((way_m - fitted[:, :, 0]) ** 2).sum(axis=1)
+    walk = np.minimum(since_s[:, :, None], since_s[:, None, :])
+    left = since_s.sum(axis=1) - (curves * (walk @ curves)).sum(axis=(1, 2))
+    free = count - _DEGREE - 1
+    return found / free, white_m2_per_s * left / free
+
+
+def _beyond(found_m2: Array, explained_m2: Array) -> float:
+    """The median of what is found where it is not explained [m^2], else none."""
+    found, explained = float(np.median(found_m2)), float(np.median(explained_m2))
+    return found - explained if found > _BEYOND * explained else 0.0

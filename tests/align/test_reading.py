@@ -1,0 +1,103 @@
+"""Noise of single odometer rows, measured from rows of known noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.alignment.odometer import odometer_track
+from pipeline.alignment.reading import ReadingNoise
+from pipeline.stages import replay
+from tests.align.straight import odometer_of
+from tests.replay.journeys import VEHICLE, journey
+
+WHITE_MPS = 0.05
+
+
+def way(at_s):
+    """A train at 10 m/s for 200 s, then at 1 m/s2 to 30 m/s, on for 200 s, and standing from then on."""
+    at = np.asarray(at_s)
+    driven = np.where(at < 200.0, 10.0 * at, 2000.0 + 10.0 * (at - 200.0) + 0.5 * (at - 200.0) ** 2)
+    driven = np.where(at > 220.0, 2400.0 + 30.0 * (at - 220.0), driven)
+    return np.minimum(driven, 2400.0 + 30.0 * 200.0)
+
+
+def noise_of(t_s, distance_m, **columns):
+    return odometer_track(odometer_of(t_s, distance_m=distance_m, **columns), 1.0, WHITE_MPS).reading
+
+
+def walk(t_s, seed=1):
+    rng = np.random.default_rng(seed)
+    return np.cumsum(rng.normal(0.0, WHITE_MPS * np.sqrt(np.diff(t_s, prepend=t_s[0] - 0.05))))
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0, 100.0])
+def test_white_noise_of_the_increments_is_no_noise_of_the_rows(rate_hz):
+    t = np.arange(0.0, 500.0, 1.0 / rate_hz)
+    assert not noise_of(t, way(t))
+    assert not noise_of(t, way(t) + walk(t))
+    assert not noise_of(t, None, speed_mps=np.round(np.gradient(way(t), t)))
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 10.0, 50.0])
+@pytest.mark.parametrize("step_m", [0.5, 1.0, 2.0])
+def test_counts_scatter_by_their_step_over_root_twelve(step_m, rate_hz):
+    t = np.arange(0.0, 500.0, 1.0 / rate_hz)
+    found = noise_of(t, np.floor((way(t) + walk(t)) / step_m) * step_m)
+    for speed_mps in (10.0, 30.0):
+        assert np.sqrt(found.variance_m2(speed_mps)) == pytest.approx(step_m / np.sqrt(12.0), rel=0.35)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_the_reading_is_found_whatever_the_speed(seed):
+    t = np.arange(0.0, 500.0, 0.05)
+    rng = np.random.default_rng(seed)
+    found = noise_of(t, way(t) + walk(t, seed) + rng.normal(0.0, 0.2, t.size))
+    for speed_mps in (0.0, 10.0, 30.0):
+        assert np.sqrt(found.variance_m2(speed_mps)) == pytest.approx(0.2, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stamps_that_scatter_weigh_with_the_speed(seed):
+    true_s = np.arange(0.0, 500.0, 0.1)
+    stamps = true_s + np.random.default_rng(seed).uniform(-0.02, 0.02, true_s.size)
+    found = noise_of(stamps, way(true_s))
+    assert np.sqrt(found.moving_s2) == pytest.approx(0.04 / np.sqrt(12.0), rel=0.15)
+    assert found.still_m2 < 0.1**2
+
+
+def test_slips_and_standstill_do_not_count():
+    t = np.arange(0.0, 500.0, 0.05)
+    slips = sum(3.0 * np.clip(t - begin, 0.0, 1.0) for begin in (30.0, 90.0, 170.0, 260.0, 330.0))
+    assert not noise_of(t, way(t) + slips)
+    standing = np.arange(0.0, 500.0, 0.05)
+    assert not noise_of(standing, np.random.default_rng(1).normal(0.0, 0.2, standing.size) * 0.01)
+
+
+def test_too_few_rows_or_rows_too_far_apart_tell_nothing():
+    short = np.arange(0.0, 12.0, 0.05)
+    assert noise_of(short, np.floor(20.0 * short)) == ReadingNoise()
+    sparse = np.arange(0.0, 500.0, 2.0)
+    assert noise_of(sparse, np.floor(way(sparse))) == ReadingNoise()
+
+
+@pytest.mark.parametrize("step_m", [0.5, 1.0, 2.0])
+def test_a_coarse_counter_raises_no_alarm_and_hides_no_leap(step_m):
+    def coarse(run):
+        counts = (run.odometer["distance_m"] / step_m).floor() * step_m
+        return run.with_streams(odometer=run.odometer.with_columns(counts.alias("distance_m")))
+
+    run, site = journey()
+    healthy = replay(coarse(run), site, VEHICLE)
+    assert healthy.runs["alarms"].item() == 0
+    assert healthy.passages["status"].unique().to_list() == ["accepted"]
+    assert "the odometer's rows scatter by" in healthy.runs["notes"].item()
+    assert "scatter" not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
+    leap = {"kind": "step", "size_m": 850.0, "start_s": 150.0, "duration_s": 6.0}
+    drift = {"kind": "ramp", "rate_mps": 2.5, "at_m": 3450.0, "duration_s": 30.0}
+    for fault in (leap, drift):
+        faulty, _ = journey(fault)
+        plain, found = (replay(logs, site, VEHICLE).hazards for logs in (faulty, coarse(faulty)))
+        assert found["detected"].all()
+        assert found["hazard"].to_list() == plain["hazard"].to_list()
+        assert found["time_to_detect_s"].max() < plain["time_to_detect_s"].max() + 4.0
