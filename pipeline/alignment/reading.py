@@ -7,7 +7,7 @@ speed by metres per second from epoch to epoch. Only the odometer is looked at, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,8 @@ _STRETCHES, _FEWEST_STRETCHES = 400, 8
 _MOVED_M = 1.0
 # By how much the higher half of the speeds has to be above the lower one.
 _APART = 1.5
+# Finer counters are no worse than their white noise; how far a way may be from a multiple of the step, in steps.
+_LEAST_STEP_M, _STEP_TOLERANCE = 0.05, 0.02
 # Scatter is noise of the rows where it is beyond so many times what the increments' white noise makes of them.
 _BEYOND = 2.0
 
@@ -49,8 +51,30 @@ def reading_noise(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: fl
 
     `whole` (rows - 1,): ways between rows that are recorded. Medians over stretches in which the train moves, so that
     slips do not count; of lower and higher speeds where these differ enough to tell stamps from counts. Noise that is
-    less than what the white noise makes of the same rows counts as none.
+    less than what the white noise makes of the same rows counts as none. A counter has the noise of its step at least:
+    at a speed at which each row gains as many steps as the last it does not show, until it does.
     """
+    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s)
+    return replace(scatter, still_m2=max(scatter.still_m2, count_step_m(distance_m, whole) ** 2 / 12.0))
+
+
+def count_step_m(distance_m: Array, whole: Mask) -> float:
+    """The step of a counter: what all recorded ways are multiples of, now of more and now of less [m].
+
+    0 where they are of no step worth a word, or always of as many: so a smooth way at one speed looks too.
+    """
+    ways = np.abs(np.diff(distance_m)[whole])
+    gained = ways[ways > _LEAST_STEP_M * _STEP_TOLERANCE]
+    if not gained.size or (step_m := float(gained.min())) < _LEAST_STEP_M:
+        return 0.0
+    counts = ways / step_m
+    steps = np.rint(counts)
+    multiples = (np.abs(counts - steps) < _STEP_TOLERANCE).all()
+    return step_m if multiples and np.count_nonzero(np.diff(steps)) >= _FEWEST_STRETCHES else 0.0
+
+
+def _scatter_beyond(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: float) -> ReadingNoise:
+    """What the rows show of their noise."""
     rows = _moving_stretches(t_s, distance_m, whole)
     if len(rows) < _FEWEST_STRETCHES:
         return ReadingNoise()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.alignment.odometer import odometer_track
-from pipeline.alignment.reading import ReadingNoise
+from pipeline.alignment.reading import ReadingNoise, count_step_m
 from pipeline.stages import replay
 from tests.align.straight import odometer_of
 from tests.replay.journeys import VEHICLE, journey
@@ -46,6 +46,24 @@ def test_counts_scatter_by_their_step_over_root_twelve(step_m, rate_hz):
     found = noise_of(t, np.floor((way(t) + walk(t)) / step_m) * step_m)
     for speed_mps in (10.0, 30.0):
         assert np.sqrt(found.variance_m2(speed_mps)) == pytest.approx(step_m / np.sqrt(12.0), rel=0.35)
+
+
+def test_a_counter_is_known_by_its_step():
+    ways = np.concatenate([[0.0], np.cumsum(0.5 * np.tile([3, 1, 0, 3, 2, 5], 4))])
+    whole = np.ones(ways.size - 1, dtype=bool)
+    assert count_step_m(ways, whole) == 0.5
+    assert count_step_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways), whole) == pytest.approx(0.5, rel=1e-5)
+    assert count_step_m(ways / 50.0, whole) == 0.0
+    assert count_step_m(ways + 0.1 * np.sin(ways), whole) == 0.0
+    lost = ways + 0.2 * (np.arange(ways.size) > 7)
+    assert count_step_m(lost, whole) == 0.0
+    assert count_step_m(lost, whole & (np.arange(whole.size) != 7)) == 0.5
+
+
+def test_a_smooth_way_at_few_speeds_is_no_counter():
+    t = np.arange(0.0, 400.0, 0.1)
+    assert not noise_of(t, np.where(t < 200.0, 10.0 * t, 2000.0 + 20.0 * (t - 200.0)))
+    assert not noise_of(t, np.zeros(t.size))
 
 
 @pytest.mark.parametrize("seed", range(5))
