@@ -5,6 +5,8 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
+from pipeline.alignment.increments import most_reading_m
+from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 _BALISE = (
@@ -33,14 +35,20 @@ _READING = (
     "the odometer's rows scatter by {sigma_m:.2f} m (coarse counts, or stamps on receipt): the thresholds along the "
     "track allow for it"
 )
+_SCATTERED = (
+    "the odometer's rows scatter by more than {most_m:.1f} m (coarse counts, or stamps on receipt): alarms along the "
+    "track may be its own, for thresholds that allow for it all would let failures pass"
+)
 # Less than the positions themselves scatter is not worth a word.
 _WORTH_M = 0.1
 
 
-def reading_notes(epochs: pl.DataFrame) -> tuple[str, ...]:
+def reading_notes(epochs: pl.DataFrame, config: Configuration) -> tuple[str, ...]:
     """What the odometer's own rows add to the thresholds, where that is much; `epochs`: aligned."""
-    sigma_m = epochs["odometer_reading_m"].max()
-    return (_READING.format(sigma_m=sigma_m),) if isinstance(sigma_m, float) and sigma_m > _WORTH_M else ()
+    sigma_m, most_m = epochs["odometer_reading_m"].max(), most_reading_m(config)
+    if not isinstance(sigma_m, float) or sigma_m <= _WORTH_M:
+        return ()
+    return (_READING.format(sigma_m=sigma_m) if sigma_m < most_m else _SCATTERED.format(most_m=most_m),)
 
 
 def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame, failure_limit_m: float) -> tuple[str, ...]:

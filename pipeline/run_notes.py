@@ -93,7 +93,7 @@ def _odometer(run: RunLog) -> Iterator[str]:
         first = run.odometer["t"][int(leap.argmax()) + 1]
         yield (
             f"the odometer's distance leaps by more than a train can drive, {int(leap.sum())} times, first at "
-            f"{first:%H:%M:%S}: its speed counts there, or where it has none the way is lost"
+            f"{first:%H:%M:%S}: its speed counts there, or where none agrees with the distance, the way is lost"
         )
     if (period_s := float(np.median(dt_s))) > STRAIGHT_S:
         yield (

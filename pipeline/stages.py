@@ -192,7 +192,7 @@ def _notes(
     counts = context.counts.solutions[ride.solution]
     return (
         *run_notes(context.run, context.site, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
-        *reading_notes(ride.aligned),
+        *reading_notes(ride.aligned, context.config),
         *evidence_notes(ride.aligned, truth, limit_m),
         *return_notes(epochs, result.hazards, limit_m),
         *undiagnosed_notes(epochs, result.passages),

@@ -94,7 +94,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     step = np.full(known.size, np.nan)
     step[known] = steps.distance_m
     speed = np.where(known, learned.scale * track.speed_at(at), np.nan)
-    reading = reading_of(track, at)
+    reading = reading_of(track, at, config)
     total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
     return [
         pl.Series("odometer_m", total, nan_to_null=True),

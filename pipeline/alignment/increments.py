@@ -11,6 +11,7 @@ from pipeline.alignment.odometer import OdometerTrack
 from pipeline.alignment.odometer_filter import Estimate, error_model
 from pipeline.monitors.axis import AlongSteps, AxisSeries, Reading, along_axis
 from pipeline.monitors.recursion import Array
+from pipeline.statistics import threshold_factor
 from schemas.config import Configuration
 
 Index = npt.NDArray[np.int64]
@@ -87,11 +88,22 @@ def odometer_steps(rows: Index, t_s: Array, track: OdometerTrack, learned: Learn
     return OdometerSteps(distance, speed)
 
 
-def reading_of(track: OdometerTrack, at_s: Array) -> Reading | None:
-    """Noise of the odometer's rows at these times; none where they have none."""
+def most_reading_m(config: Configuration) -> float:
+    """The largest deviation of an odometer's row that the thresholds allow for [m].
+
+    With more, a position that leaves its place by the failure limit would be no more than rows of the odometer make of
+    it. Alarms of an odometer that scatters by more are its own, but no failure passes.
+    """
+    factor = threshold_factor(config.monitors.false_alarm_probability)
+    return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))
+
+
+def reading_of(track: OdometerTrack, at_s: Array, config: Configuration) -> Reading | None:
+    """Noise of the odometer's rows at these times, as far as thresholds allow for it; none where they have none."""
     if not track.reading:
         return None
-    return Reading(np.sqrt(track.reading.variance_m2(track.speed_at(at_s))), track.period_s)
+    sigma_m = np.sqrt(track.reading.variance_m2(track.speed_at(at_s)))
+    return Reading(np.minimum(sigma_m, most_reading_m(config)), track.period_s)
 
 
 def along_series(
@@ -114,6 +126,6 @@ def along_series(
         white_m2_per_s=track.white_rate_m2_per_s,
         scale_sigma=learned.scale_sigma[rows],
         latency_sigma_s=learned.latency_sigma_s[rows],
-        reading=reading_of(track, t - learned.latency_s[rows]),
+        reading=reading_of(track, t - learned.latency_s[rows], config),
     )
     return along_axis(rows, fresh, along, *error_model(config.monitors))

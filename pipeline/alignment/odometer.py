@@ -26,6 +26,9 @@ _BUNCHED_M = 20.0
 # Between rows no farther apart a straight line is within 0.5 m of a train that brakes; the finer step is within 0.1 m.
 STRAIGHT_S = 1.5
 _FINE_S = 0.5
+_BRAKES_MPS2 = 1.8
+# By which part of all that was driven a speed may differ from the distance and yet tell of a way that the latter lost.
+_AGREE = 0.2
 
 
 @dataclass(frozen=True)
@@ -91,9 +94,9 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     A pause longer than `gap_s` (and than 2.5 periods) loses the way of speed-only odometry: the speeds before and after
     it give the best guess, good for an expectation window, but a new `stretch` begins. A cumulative distance carries
     over it, also where rows are by turns. Slip that the odometer itself reports loses the way too, and so does a leap
-    of the distance (`leaps`) where no speed tells the way. Rows far apart are filled in by what the speeds at both
-    tell. `sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from sample
-    to sample, replaces it.
+    of the distance (`leaps`) where no speed that agrees with it elsewhere tells the way. Rows far apart are filled in
+    by what the speeds at both tell. `sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken
+    as independent from sample to sample, replaces it.
     """
     t_ns = odometer["t"].dt.timestamp("ns").to_numpy()
     epoch_ns = int(t_ns[0])
@@ -147,16 +150,20 @@ def _without_spikes(t_s: Array, distance_m: Array) -> Array:
 def _filled_in(track: OdometerTrack, speed_mps: Array, rows: npt.NDArray[np.int64]) -> OdometerTrack:
     """The track with samples between these rows and the next, on cubic curves.
 
-    Their slopes at the rows are the speeds, else those of a curve through the distances that keeps its direction
-    (PCHIP), and never so steep that the train would turn back in between.
+    Their slopes at the rows are the speeds where these make about the way between (a unit, a sign or a sensor may be
+    wrong), else those of a curve through the distances that keeps its direction (PCHIP), and never so steep that the
+    train would turn back in between.
     """
     from scipy.interpolate import PchipInterpolator  # hardly a log needs it, and it takes long to load
 
     t_s, distance = track.t_s, track.distance_m
-    slopes = np.where(np.isfinite(speed_mps), speed_mps, PchipInterpolator(t_s, distance).derivative()(t_s))
+    smooth = PchipInterpolator(t_s, distance).derivative()(t_s)
+    slopes = np.where(np.isfinite(speed_mps), speed_mps, smooth)
     span, way = t_s[rows + 1] - t_s[rows], distance[rows + 1] - distance[rows]
+    # Whatever a train does that gathers speed or brakes no harder, the mean of two speeds is no farther from its way.
+    true = np.abs(0.5 * (slopes[rows] + slopes[rows + 1]) * span - way) <= 0.25 * _BRAKES_MPS2 * span**2
     low, high = np.minimum(0.0, 3.0 * way), np.maximum(0.0, 3.0 * way)
-    start, end = (np.clip(slopes[at] * span, low, high) for at in (rows, rows + 1))
+    start, end = (np.clip(np.where(true, slopes[at], smooth[at]) * span, low, high) for at in (rows, rows + 1))
     fine = np.ceil(span / _FINE_S).astype(np.int64)
     which = np.repeat(np.arange(rows.size), fine - 1)
     part = np.concatenate([np.arange(1, count) / count for count in fine.tolist()])
@@ -185,17 +192,33 @@ def _sums(steps: npt.NDArray[Number]) -> npt.NDArray[Number]:
 def _ways(t_s: Array, dt_s: Array, distance_m: Array, speed_mps: Array, limit_s: float) -> tuple[Array, Mask]:
     """Way from each row to the next [m], NaN where not known, and whether it is by the recorded distance."""
     distance_m = _without_spikes(t_s, distance_m)
-    recorded, driven = _drivable(np.diff(distance_m), dt_s), _driven(speed_mps, dt_s)
+    way_m = np.diff(distance_m)
+    recorded = _drivable(way_m, dt_s)
+    driven = _trusted(_driven(speed_mps, dt_s), recorded, leaps(way_m, dt_s))
     counted = ~np.isnan(recorded)
     step = np.where(counted, recorded, driven)
     unknown = np.isnan(step)
     if not unknown.any():
         return step, counted
-    recorded = np.where(unknown, _drivable(np.diff(_carried(t_s, distance_m, limit_s)), dt_s), recorded)
-    driven = _driven(_carried(t_s, speed_mps, limit_s), dt_s)
+    way_m = np.diff(_carried(t_s, distance_m, limit_s))
+    recorded = np.where(unknown, _drivable(way_m, dt_s), recorded)
+    driven = _trusted(_driven(_carried(t_s, speed_mps, limit_s), dt_s), recorded, leaps(way_m, dt_s))
     recorded = _over_pauses(distance_m, recorded, driven, dt_s > limit_s)
     counted = ~np.isnan(recorded)
     return np.where(counted, recorded, driven), counted
+
+
+def _trusted(driven_m: Array, recorded_m: Array, leap: Mask) -> Array:
+    """Ways by the speeds; none over leaps where they do not agree with what the counter tells elsewhere.
+
+    A unit, a sign or the sensor may be wrong.
+    """
+    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
+    if not leap.any() or not both.any():
+        return driven_m
+    recorded, driven = recorded_m[both], driven_m[both]
+    apart_m, most_m = abs(recorded.sum() - driven.sum()), _AGREE * np.abs(recorded).sum()
+    return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
 
 
 def _drivable(way_m: Array, dt_s: Array) -> Array:

@@ -20,6 +20,9 @@ from schemas.config import MonitorConfig
 
 Mask = npt.NDArray[np.bool_]
 
+# Half of the fastest average's memory: so the variance of all averages is that of rows up to 5 s apart, or above it.
+_LASTS_S = 5.0
+
 
 @dataclass(frozen=True)
 class AxisSeries:
@@ -97,8 +100,14 @@ class Reading:
     period_s: float
 
     def decorrelation(self, dt_s: Array) -> Array:
-        """1 - phi over these steps: none is left from row to row; between rows, on straight lines, little changes."""
-        return np.minimum(dt_s / max(self.period_s, 1e-9), 1.0) ** 2
+        """1 - phi over these steps: none is left from row to row; between rows, on straight lines, little changes.
+
+        The square is what a step changes on a straight line. Errors that change so little and at random would last for
+        `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than `_LASTS_S`.
+        """
+        changed = np.minimum(dt_s / max(self.period_s, 1e-9), 1.0) ** 2
+        lost: Array = np.maximum(changed, np.minimum(dt_s / _LASTS_S, 1.0))
+        return lost
 
 
 @dataclass(frozen=True)

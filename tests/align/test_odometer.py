@@ -164,6 +164,40 @@ def test_between_rows_far_apart_the_way_follows_the_speeds(sign, with_speed):
     assert (np.diff(sign * track.distance_m) >= 0.0).all()
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [lambda speeds: 3.6 * speeds, np.abs, np.zeros_like, np.negative, lambda speeds: np.full_like(speeds, 20.0)],
+    ids=["km/h", "unsigned", "stuck at zero", "turned round", "stuck at speed"],
+)
+@pytest.mark.parametrize("period_s", [2.0, 5.0])
+def test_speeds_that_contradict_the_way_fill_in_nothing(period_s, wrong):
+    """A train that drives 300 m ahead, stands, and drives back."""
+    fine = np.arange(0.0, 100.0, 0.01)
+    speed = np.interp(
+        fine, [0.0, 20.0, 30.0, 45.0, 60.0, 75.0, 85.0, 100.0], [0.0, 15.0, 15.0, 0.0, 0.0, -12.0, -12.0, 0.0]
+    )
+    way = np.cumsum(speed) * 0.01
+    t = np.arange(0.0, 99.0, period_s)
+    reads, speeds = np.interp(t, fine, way), np.interp(t, fine, speed)
+    frames = (odometer_of(t, distance_m=reads, speed_mps=given) for given in (None, speeds, wrong(speeds)))
+    inside = fine <= t[-1]
+    without, right, misled = (
+        np.abs(odometer_track(frame, 1.0, 0.05).distance_at(fine) - way)[inside].max() for frame in frames
+    )
+    straight = np.abs(np.interp(fine, t, reads) - way)[inside].max()
+    assert right < without < straight
+    assert misled < straight
+
+
+@pytest.mark.parametrize("factor", [3.6, 0.0, -1.0])
+def test_a_speed_of_another_unit_or_sign_tells_no_way_over_a_leap(factor):
+    t = 0.5 * np.arange(40.0)
+    reads = np.where(t < 10.0, 1000.0 + 10.0 * t, 10.0 * (t - 10.0))
+    for noisy, lost in ((1.1, 0), (factor, 1)):
+        track = odometer_track(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40), 1.0, 0.05)
+        assert track.stretch[-1] == lost
+
+
 def test_a_standstill_between_rows_far_apart_stays_one():
     track = odometer_track(
         odometer_of([0.0, 4.0, 8.0, 12.0], distance_m=[0.0, 30.0, 30.0, 60.0], speed_mps=[9.0, 2.0, 2.0, 9.0]),

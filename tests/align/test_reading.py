@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
 
+from pipeline.alignment.increments import most_reading_m, reading_of
 from pipeline.alignment.odometer import odometer_track
 from pipeline.alignment.reading import ReadingNoise, count_step_m
+from pipeline.monitors.axis import AlongSteps, Reading, along_axis, run_axis
 from pipeline.stages import replay
+from pipeline.statistics import threshold_factor
+from schemas.config import Configuration
 from tests.align.straight import odometer_of
 from tests.replay.journeys import VEHICLE, journey
 
@@ -119,3 +124,50 @@ def test_a_coarse_counter_raises_no_alarm_and_hides_no_leap(step_m):
         assert found["detected"].all()
         assert found["hazard"].to_list() == plain["hazard"].to_list()
         assert found["time_to_detect_s"].max() < plain["time_to_detect_s"].max() + 4.0
+
+
+@pytest.mark.parametrize("rate_mps", [0.5, 2.0])
+def test_a_counter_too_coarse_for_the_failure_limit_hides_no_drift(rate_mps):
+    """With counts of 20 m in the thresholds, the drifts were seen at 28 to 56 m."""
+    faulty, site = journey({"kind": "ramp", "rate_mps": rate_mps, "start_s": 90.0, "duration_s": 80.0 / rate_mps})
+    counts = (faulty.odometer["distance_m"] / 20.0).floor() * 20.0
+    tables = replay(
+        faulty.with_streams(odometer=faulty.odometer.with_columns(counts.alias("distance_m"))), site, VEHICLE
+    )
+    states = [name for name in tables.epochs.columns if name.startswith("along_") and name.endswith("_state")]
+    since = (pl.col("t") - pl.col("t").first()).dt.total_seconds(fractional=True) - 90.0
+    fails = tables.epochs.filter((since > 0.0) & pl.any_horizontal(pl.col(name) == "fail" for name in states))
+    seen_s = (fails["t"][0] - tables.epochs["t"][0]).total_seconds() - 90.0
+    assert rate_mps * seen_s < 20.0
+    assert tables.runs["unsafe_accepted"].item() == 0
+    assert "scatter by more than 2.7 m" in tables.runs["notes"].item()
+
+
+def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():
+    config = Configuration()
+    most_m = most_reading_m(config)
+    assert threshold_factor(1e-7) * np.sqrt(2.0) * most_m == pytest.approx(config.hazards.failure_limit_m)
+    t = np.arange(0.0, 500.0, 0.1)
+    for step_m, expected_m in ((5.0, 5.0 / np.sqrt(12.0)), (20.0, most_m)):
+        track = odometer_track(odometer_of(t, distance_m=np.floor(way(t) / step_m) * step_m), 1.0, WHITE_MPS)
+        found = reading_of(track, np.array([100.0, 400.0]), config)
+        assert found is not None
+        assert found.sigma_m == pytest.approx(expected_m, rel=0.35 if step_m == 5.0 else 1e-9)
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.13, 0.5, 1.0, 1.4, 5.0])
+@pytest.mark.parametrize("step_s", [0.05, 0.1, 1.0])
+def test_no_statistic_has_more_noise_of_the_rows_than_its_sigma(step_s, period_s):
+    count = 60_000
+    rows = np.arange(0.0, count * step_s + 2.0 * period_s, period_s)
+    at = np.arange(count) * step_s
+    errors = np.interp(at, rows, np.random.default_rng(1).normal(0.0, 1.0, rows.size))
+    steps_s, zero, one = np.full(count, step_s), np.zeros(count), np.ones(count)
+    reading = Reading(one, period_s)
+    steps = AlongSteps(steps_s, np.diff(errors, prepend=errors[0]), *[zero] * 7, reading=reading)
+    series = along_axis(np.arange(count), at == 0.0, steps, np.ones(1), np.ones(1))
+    result, _ = run_axis(series, np.array(Configuration().monitors.ewma_alphas[:2]))
+    spread = result.value[count // 5 :].std(axis=0) / result.sigma[-1]
+    assert (spread < 1.06).all()
+    # As far as the odometer is no slower than an epoch it is exact, but for straight lines between rows.
+    assert (spread[1:] > 0.7).all()
