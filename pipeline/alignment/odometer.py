@@ -203,7 +203,7 @@ def _ways(t_s: Array, dt_s: Array, distance_m: Array, speed_mps: Array, limit_s:
     way_m = np.diff(_carried(t_s, distance_m, limit_s))
     recorded = np.where(unknown, _drivable(way_m, dt_s), recorded)
     driven = _trusted(_driven(_carried(t_s, speed_mps, limit_s), dt_s), recorded, leaps(way_m, dt_s))
-    recorded = _over_pauses(distance_m, recorded, driven, dt_s > limit_s)
+    recorded = _over_pauses(t_s, distance_m, recorded, driven, dt_s > limit_s)
     counted = ~np.isnan(recorded)
     return np.where(counted, recorded, driven), counted
 
@@ -244,11 +244,12 @@ def _carried(t_s: Array, values: Array, limit_s: float) -> Array:
     )
 
 
-def _over_pauses(distance_m: Array, recorded_m: Array, driven_m: Array, pause: Mask) -> Array:
+def _over_pauses(t_s: Array, distance_m: Array, recorded_m: Array, driven_m: Array, pause: Mask) -> Array:
     """Recorded steps, and over a pause between rows without a distance what the counter gained around it.
 
     The counter's last row before the pause and its first after it tell, less the steps to and from the pause. A
-    missing distance beside a speed is no pause: there the counter may have been set to zero.
+    missing distance beside a speed is no pause: there the counter may have been set to zero. Nor does it tell where it
+    was reset in the pause itself.
     """
     known = np.flatnonzero(np.isfinite(distance_m))
     steps = np.where(np.isnan(recorded_m), driven_m, recorded_m)
@@ -257,8 +258,8 @@ def _over_pauses(distance_m: Array, recorded_m: Array, driven_m: Array, pause: M
         after = int(np.searchsorted(known, gap, side="right"))
         if 0 < after < known.size:
             begin, end = int(known[after - 1]), int(known[after])
-            beside = np.delete(steps[begin:end], gap - begin)
-            result[gap] = distance_m[end] - distance_m[begin] - beside.sum()
+            beside, gained = np.delete(steps[begin:end], gap - begin), distance_m[end] - distance_m[begin]
+            result[gap] = _drivable(gained, t_s[end] - t_s[begin]) - beside.sum()
     return result
 
 

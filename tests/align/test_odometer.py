@@ -126,6 +126,19 @@ def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed)
         assert known.all()
 
 
+@pytest.mark.parametrize("speed", [None, "by turns", "always"])
+def test_a_counter_that_is_reset_in_a_pause_loses_the_way(speed):
+    t = np.concatenate([np.arange(0.0, 10.0, 0.5), np.arange(15.0, 25.0, 0.5)])
+    reads = np.where(t < 12.0, 5000.0 + 10.0 * t, 10.0 * (t - 15.0))
+    turns = np.arange(t.size) % 2 == 1
+    speeds = np.full(t.size, 10.0) if speed else None
+    if speed == "by turns":
+        reads, speeds = np.where(turns, np.nan, reads), np.where(turns, speeds, np.nan)
+    track = odometer_track(odometer_of(t, distance_m=reads, speed_mps=speeds), 1.0, 0.05)
+    assert track.stretch.tolist() == [0] * 20 + [1] * 20
+    assert np.diff(track.distance_m).min() >= 0.0
+
+
 def test_a_spike_of_the_counter_is_passed_over():
     t = 0.5 * np.arange(7.0)
     reads = 5.0 * np.arange(7.0)
@@ -140,7 +153,9 @@ def test_a_spike_of_the_counter_is_passed_over():
 def test_what_a_fast_train_drives_over_gaps_and_bunched_stamps_is_no_leap():
     t = np.array([0.0, 0.5, 0.501, 0.502, 1.5, 21.5, 22.0])
     reads = np.array([0.0, 50.0, 60.0, 70.0, 150.0, 2150.0, 2200.0])
-    np.testing.assert_allclose(odometer_track(odometer_of(t, distance_m=reads), 1.0, 0.05).distance_m, reads)
+    track = odometer_track(odometer_of(t, distance_m=reads), 1.0, 0.05)
+    np.testing.assert_allclose(track.distance_m, reads)
+    assert (track.stretch == 0).all()
 
 
 @pytest.mark.parametrize("with_speed", [False, True])

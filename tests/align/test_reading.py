@@ -89,6 +89,35 @@ def test_stamps_that_scatter_weigh_with_the_speed(seed):
     assert found.still_m2 < 0.1**2
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_the_white_noise_explains_is_left_out(seed):
+    t = np.arange(0.0, 500.0, 0.05)
+    rng = np.random.default_rng(seed)
+    walked = np.cumsum(rng.normal(0.0, 0.45 * np.sqrt(0.05), t.size))
+    frame = odometer_of(t, distance_m=way(t) + walked + rng.normal(0.0, 0.2, t.size))
+    found = odometer_track(frame, 1.0, 0.45).reading
+    assert np.sqrt(found.variance_m2(10.0)) == pytest.approx(0.2, rel=0.12)
+
+
+def test_rows_of_a_run_that_mostly_stands_are_judged_where_it_moves():
+    t = np.arange(0.0, 2000.0, 0.05)
+    noise = np.random.default_rng(1).normal(0.0, 0.2, t.size) * (t < 420.0)
+    found = noise_of(t, way(t) + noise)
+    assert np.sqrt(found.variance_m2(10.0)) == pytest.approx(0.2, rel=0.15)
+
+
+@pytest.mark.parametrize("period_s", [0.1, 0.5, 2.0])
+def test_a_train_that_gathers_speed_and_brakes_all_the_time_scatters_not(period_s):
+    t = np.arange(0.0, 1000.0, period_s)
+    assert not noise_of(t, 8.0 * t + 3.0 * np.sin(0.6 * t))
+
+
+def test_ways_that_are_lost_do_not_count():
+    t = np.arange(0.0, 420.0, 0.05)
+    slips = np.arange(t.size) % 60 == 59
+    assert not noise_of(t, way(t) + np.cumsum(slips), slip=slips.tolist())
+
+
 def test_slips_and_standstill_do_not_count():
     t = np.arange(0.0, 500.0, 0.05)
     slips = sum(3.0 * np.clip(t - begin, 0.0, 1.0) for begin in (30.0, 90.0, 170.0, 260.0, 330.0))
