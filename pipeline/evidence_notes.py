@@ -39,16 +39,28 @@ _SCATTERED = (
     "the odometer's rows scatter by more than {most_m:.1f} m (coarse counts, or stamps on receipt): alarms along the "
     "track may be its own, for thresholds that allow for it all would let failures pass"
 )
+_DIGITS = (
+    "positions are written down so coarsely that they scatter by {sigma_m:.2f} m (few decimals, single precision): the "
+    "thresholds allow for it"
+)
 # Less than the positions themselves scatter is not worth a word.
 _WORTH_M = 0.1
 
 
 def reading_notes(epochs: pl.DataFrame, config: Configuration) -> tuple[str, ...]:
-    """What the odometer's own rows add to the thresholds, where that is much; `epochs`: aligned."""
-    sigma_m, most_m = epochs["odometer_reading_m"].max(), most_reading_m(config)
-    if not isinstance(sigma_m, float) or sigma_m <= _WORTH_M:
-        return ()
-    return (_READING.format(sigma_m=sigma_m) if sigma_m < most_m else _SCATTERED.format(most_m=most_m),)
+    """What the recorder's digits and the odometer's rows add to the thresholds, where that is much.
+
+    `epochs`: aligned.
+    """
+    most_m = most_reading_m(config)
+    digits_m = epochs.select(pl.max_horizontal(pl.col(r"^digits_(along|cross|up)_m$").max())).item()
+    texts = {_READING: epochs["odometer_reading_m"].max(), _DIGITS: digits_m}
+    notes = []
+    for text, sigma_m in texts.items():
+        if isinstance(sigma_m, float) and sigma_m > _WORTH_M:
+            beyond = text is _READING and sigma_m >= most_m
+            notes.append(_SCATTERED.format(most_m=most_m) if beyond else text.format(sigma_m=sigma_m))
+    return tuple(notes)
 
 
 def evidence_notes(epochs: pl.DataFrame, truth: pl.DataFrame, failure_limit_m: float) -> tuple[str, ...]:

@@ -37,7 +37,8 @@ def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle,
     track = track.oriented(sign)
     along_m = unrolled(epochs, matched)
     sigma_m = calibrated(floats(epochs, "sigma_along_m"), config.monitors)
-    arrays = EpochArrays(t_s, along_m, sigma_m, matched, stamp_jitter_s(t_s))
+    digits_m = floats(epochs, "digits_along_m")
+    arrays = EpochArrays(t_s, along_m, np.hypot(sigma_m, digits_m), matched, stamp_jitter_s(t_s), digits_m)
     learned = learn(arrays, track, vehicle, config)
     return epochs.with_columns(
         *_columns(arrays, track, learned, config), pl.Series("along_m", along_m, nan_to_null=True)

@@ -24,7 +24,8 @@ _REGULAR_PERIODS = 3
 class EpochArrays:
     """What alignment reads of the matched epochs: times [s] on the odometer's scale, positions, usability.
 
-    `jitter_s`: by how much the stamps scatter about the receiver's regular times (see `stamp_jitter_s`).
+    `jitter_s`: by how much the stamps scatter about the receiver's regular times (see `stamp_jitter_s`); `digits_m`:
+    how coarsely the positions are written down.
     """
 
     t_s: Array
@@ -32,6 +33,7 @@ class EpochArrays:
     sigma_m: Array
     usable: Mask
     jitter_s: float
+    digits_m: Array
 
 
 def stamp_jitter_s(t_s: Array) -> float:
@@ -126,6 +128,7 @@ def along_series(
         white_m2_per_s=track.white_rate_m2_per_s,
         scale_sigma=learned.scale_sigma[rows],
         latency_sigma_s=learned.latency_sigma_s[rows],
+        digits_m=arrays.digits_m[rows],
         reading=reading_of(track, t - learned.latency_s[rows], config),
     )
     return along_axis(rows, fresh, along, *error_model(config.monitors))

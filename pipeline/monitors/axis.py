@@ -115,7 +115,8 @@ class AlongSteps:
     """Steps along the track from one usable epoch to the next, shapes (m,), and the errors at their ends.
 
     `path_m` by GNSS, `odometer_m` and the change of speed `speed_mps` by the corrected odometer; `jitter_s`: how the
-    stamps scatter; `white_m2_per_s`: variance that the odometer's distance gathers in a second.
+    stamps scatter; `digits_m`: how coarsely positions are written down; `white_m2_per_s`: variance that the odometer's
+    distance gathers in a second; `reading`: what its rows scatter beside.
     """
 
     dt_s: Array
@@ -127,6 +128,7 @@ class AlongSteps:
     white_m2_per_s: Array | float
     scale_sigma: Array
     latency_sigma_s: Array
+    digits_m: Array
     reading: Reading | None = None
 
 
@@ -135,13 +137,14 @@ def along_axis(
 ) -> AxisSeries:
     """Increments of GNSS minus odometer (DIAG eq. 1-3), with what scale and latency leave uncertain."""
     dt = steps.dt_s
+    memoryless_m = np.hypot(steps.jitter_s * steps.odometer_m / dt, steps.digits_m)
     return AxisSeries(
         epoch=epoch,
         fresh=fresh,
         border=np.zeros(dt.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(steps.path_m - steps.odometer_m) / dt,
-        **along_errors(steps.sigma_m, steps.jitter_s * steps.odometer_m / dt, dt, shares, taus_s, steps.reading),
+        **along_errors(steps.sigma_m, memoryless_m, dt, shares, taus_s, steps.reading),
         white_m2=steps.white_m2_per_s * dt,
         border_m2=np.zeros(dt.size),
         steady_mps=steps.scale_sigma * steps.odometer_m / dt,

@@ -50,8 +50,8 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     builder = _Builder(epochs, t_s, config)
     return (
         Axis("along", builder.along(along_reasons), along_reasons),
-        Axis("cross", builder.across(matched, "cross_track_m", "sigma_cross_m"), matched),
-        Axis("up", builder.across(up_reasons, "vertical_m", "sigma_up_m"), up_reasons),
+        Axis("cross", builder.across(matched, "cross_track_m", "sigma_cross_m", "digits_cross_m"), matched),
+        Axis("up", builder.across(up_reasons, "vertical_m", "sigma_up_m", "digits_up_m"), up_reasons),
     )
 
 
@@ -112,6 +112,7 @@ class _Builder:
             white_m2_per_s=self._column("odometer_white_m2_per_s", rows),
             scale_sigma=self._column("scale_sigma", rows),
             latency_sigma_s=self._column("latency_sigma_s", rows),
+            digits_m=self._column("digits_along_m", rows),
             reading=self._reading(rows),
         )
         return along_axis(rows, fresh, steps, self._shares, self._taus_s)
@@ -121,7 +122,7 @@ class _Builder:
         sigma_m = self._column("odometer_reading_m", rows)
         return Reading(sigma_m, float(self._epochs["odometer_period_s"][0])) if sigma_m.any() else None
 
-    def across(self, reasons: pl.Series, position: str, sigma: str) -> AxisSeries:
+    def across(self, reasons: pl.Series, position: str, sigma: str, digits: str) -> AxisSeries:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""
         rows = np.flatnonzero(reasons.is_null().to_numpy())
         if rows.size == 0:
@@ -131,8 +132,9 @@ class _Builder:
         survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
         sigmas = [*np.outer(np.sqrt(self._shares), self._sigma(sigma, rows))]
         decorrelations = [*decorrelation_of(dt, self._taus_s)]
-        for error, decorrelation in (self._chord_error(rows), self._wander(rows)):
-            if error.any():  # surveys mostly know at most one of them
+        coarse = self._column(digits, rows), np.ones(rows.size)
+        for error, decorrelation in (self._chord_error(rows), self._wander(rows), coarse):
+            if error.any():  # mostly there is at most one of them
                 sigmas.append(error)
                 decorrelations.append(decorrelation)
         zero = np.zeros(rows.size)

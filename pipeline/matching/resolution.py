@@ -1,0 +1,67 @@
+"""How coarsely a recorder wrote positions down, and what that adds to their noise.
+
+A log of five decimals of a degree, NMEA of four decimals of a minute, or single precision moves each position by up to
+half a step, the next one by something else. At 10 Hz half a metre of that looks like metres per second. Only the
+digits are looked at, so no fault of the position can pass for it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.columns import floats
+
+Array = npt.NDArray[np.float64]
+
+_EARTH_RADIUS_M = 6_371_000.0
+# Finer steps drown in the noise of any receiver; how far a difference may be from a multiple, in steps.
+_LEAST_STEP_M, _STEP_TOLERANCE = 0.02, 0.02
+# Decimal numbers are not whole in binary: less is no change.
+_ROUNDED_M = 1e-4
+# Fewer changes are chance.
+_FEWEST_CHANGES = 8
+
+
+def digit_noise(fixes: pl.DataFrame, heading_deg: Array) -> list[pl.Series]:
+    """Columns `digits_along_m`, `digits_cross_m`, `digits_up_m`: deviation by the steps of the recorded coordinates.
+
+    `fixes`: those of one solution, row for row with `heading_deg`, the direction of growing path.
+    """
+    latitude = floats(fixes, "latitude_deg")
+    known = latitude[np.isfinite(latitude)]
+    north_per_deg = np.radians(1.0) * _EARTH_RADIUS_M
+    east_per_deg = north_per_deg * np.cos(np.radians(known.mean())) if known.size else north_per_deg
+    north, east, up = (
+        step_m(values[np.isfinite(values)], scale) / np.sqrt(12.0)
+        for values, scale in (
+            (latitude, north_per_deg),
+            (floats(fixes, "longitude_deg"), east_per_deg),
+            (floats(fixes, "height_m"), 1.0),
+        )
+    )
+    turned = np.radians(np.nan_to_num(heading_deg))
+    along = np.hypot(north * np.cos(turned), east * np.sin(turned))
+    cross = np.hypot(north * np.sin(turned), east * np.cos(turned))
+    return [
+        pl.Series("digits_along_m", along),
+        pl.Series("digits_cross_m", cross),
+        pl.Series("digits_up_m", np.full(turned.size, up)),
+    ]
+
+
+def step_m(values: Array, metres: float) -> float:
+    """The step that all changes of a coordinate are multiples of [m], 0 where there is none to speak of.
+
+    `metres`: of one unit of the coordinate. The least change of the change from epoch to epoch is the step, where there
+    is one: at speed the changes themselves are many steps each.
+    """
+    changes = np.diff(values)
+    bends = np.abs(np.diff(changes))
+    bends = bends[bends * metres > _ROUNDED_M]
+    if bends.size < _FEWEST_CHANGES or (step := float(bends.min())) * metres < _LEAST_STEP_M:
+        return 0.0
+    counts = changes / step
+    multiples = (np.abs(counts - np.rint(counts)) < _STEP_TOLERANCE).all()
+    return step * metres if multiples else 0.0
