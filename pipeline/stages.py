@@ -9,13 +9,11 @@ import polars as pl
 from pipeline.alignment.align import align, odometer_at
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_times
-from pipeline.columns import floats
 from pipeline.evidence_notes import evidence_notes, reading_notes, return_notes, undiagnosed_notes
 from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
-from pipeline.matching.resolution import digit_noise
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
@@ -154,8 +152,7 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     run, config, found = context.run, context.config, matches[solution]
     balises = found.path.balises(context.site.balises)
     fixes = run.gnss.filter(pl.col("solution") == solution)
-    digits = digit_noise(fixes, floats(found.epochs, "heading_deg"))
-    matched = found.epochs.with_columns(fixes["hpl_m"], *digits)
+    matched = found.epochs.with_columns(fixes["hpl_m"])
     aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
     telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)

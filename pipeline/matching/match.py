@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.odometer import odometer_track, polarity
+from pipeline.columns import floats
 from pipeline.geodesy import Ints
 from pipeline.matching.chain import path_on_chain, whole_chain
 from pipeline.matching.doubt import no_doubt
@@ -19,6 +20,7 @@ from pipeline.matching.leg import leg_of
 from pipeline.matching.network import network_of
 from pipeline.matching.path import TravelledPath
 from pipeline.matching.residuals import biases
+from pipeline.matching.resolution import digit_noise
 from pipeline.matching.route import network_along, visits_of
 from pipeline.matching.steps import ODOMETER_GAP_S
 from pipeline.track import Track, track_of
@@ -67,6 +69,7 @@ def match(
     if vehicle.gnss_antenna_ahead_m and _begins_reversing(arrays, epochs, odometer, config):
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
+    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
     return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m)
 
 

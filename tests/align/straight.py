@@ -86,6 +86,7 @@ def epochs_of(t_s, path_m, sigma_m=1.0, **columns):
             "interpolation_error_m": np.zeros(n),
             "curvature_per_m": np.zeros(n),
             "velocity_along_mps": pl.Series([None] * n, dtype=pl.Float64),
+            **{f"digits_{axis}_m": np.zeros(n) for axis in ("along", "cross", "up")},
         }
     )
     return frame.with_columns(**{name: pl.Series(values) for name, values in columns.items()})
