@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
-from pipeline.alignment.increments import most_reading_m
+from pipeline.alignment.increments import most_scatter_m
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
@@ -52,7 +52,7 @@ def reading_notes(epochs: pl.DataFrame, config: Configuration) -> tuple[str, ...
 
     `epochs`: aligned.
     """
-    most_m = most_reading_m(config)
+    most_m = most_scatter_m(config)
     digits_m = epochs.select(pl.max_horizontal(pl.col(r"^digits_(along|cross|up)_m$").max())).item()
     texts = {_READING: epochs["odometer_reading_m"].max(), _DIGITS: digits_m}
     notes = []

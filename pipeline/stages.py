@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
+from pipeline.alignment.increments import most_scatter_m
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.evidence_notes import evidence_notes, reading_notes, return_notes, undiagnosed_notes
@@ -152,7 +153,8 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     run, config, found = context.run, context.config, matches[solution]
     balises = found.path.balises(context.site.balises)
     fixes = run.gnss.filter(pl.col("solution") == solution)
-    matched = found.epochs.with_columns(fixes["hpl_m"])
+    digits = pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=most_scatter_m(config))
+    matched = found.epochs.with_columns(fixes["hpl_m"], digits)
     aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
     telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)

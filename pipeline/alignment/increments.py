@@ -90,11 +90,11 @@ def odometer_steps(rows: Index, t_s: Array, track: OdometerTrack, learned: Learn
     return OdometerSteps(distance, speed)
 
 
-def most_reading_m(config: Configuration) -> float:
-    """The largest deviation of an odometer's row that the thresholds allow for [m].
+def most_scatter_m(config: Configuration) -> float:
+    """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m].
 
-    With more, a position that leaves its place by the failure limit would be no more than rows of the odometer make of
-    it. Alarms of an odometer that scatters by more are its own, but no failure passes.
+    With more, a position that leaves its place by the failure limit would be no more than rows of the odometer, or the
+    digits, make of it. Alarms of a record that scatters by more are its own, but no failure passes.
     """
     factor = threshold_factor(config.monitors.false_alarm_probability)
     return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))
@@ -105,7 +105,7 @@ def reading_of(track: OdometerTrack, at_s: Array, config: Configuration) -> Read
     if not track.reading:
         return None
     sigma_m = np.sqrt(track.reading.variance_m2(track.speed_at(at_s)))
-    return Reading(np.minimum(sigma_m, most_reading_m(config)), track.period_s)
+    return Reading(np.minimum(sigma_m, most_scatter_m(config)), track.period_s)
 
 
 def along_series(

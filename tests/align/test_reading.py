@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.alignment.increments import most_reading_m, reading_of
+from pipeline.alignment.increments import most_scatter_m, reading_of
 from pipeline.alignment.odometer import odometer_track
 from pipeline.alignment.reading import ReadingNoise, count_step_m
 from pipeline.monitors.axis import AlongSteps, Reading, along_axis, run_axis
@@ -174,7 +174,7 @@ def test_a_counter_too_coarse_for_the_failure_limit_hides_no_drift(rate_mps):
 
 def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():
     config = Configuration()
-    most_m = most_reading_m(config)
+    most_m = most_scatter_m(config)
     assert threshold_factor(1e-7) * np.sqrt(2.0) * most_m == pytest.approx(config.hazards.failure_limit_m)
     t = np.arange(0.0, 500.0, 0.1)
     for step_m, expected_m in ((5.0, 5.0 / np.sqrt(12.0)), (20.0, most_m)):
