@@ -193,7 +193,7 @@ def test_no_statistic_has_more_noise_of_the_rows_than_its_sigma(step_s, period_s
     errors = np.interp(at, rows, np.random.default_rng(1).normal(0.0, 1.0, rows.size))
     steps_s, zero, one = np.full(count, step_s), np.zeros(count), np.ones(count)
     reading = Reading(one, period_s)
-    steps = AlongSteps(steps_s, np.diff(errors, prepend=errors[0]), *[zero] * 7, reading=reading)
+    steps = AlongSteps(steps_s, np.diff(errors, prepend=errors[0]), *[zero] * 8, reading=reading)
     series = along_axis(np.arange(count), at == 0.0, steps, np.ones(1), np.ones(1))
     result, _ = run_axis(series, np.array(Configuration().monitors.ewma_alphas[:2]))
     spread = result.value[count // 5 :].std(axis=0) / result.sigma[-1]
