@@ -200,3 +200,44 @@ def test_no_statistic_has_more_noise_of_the_rows_than_its_sigma(step_s, period_s
     assert (spread < 1.06).all()
     # As far as the odometer is no slower than an epoch it is exact, but for straight lines between rows.
     assert (spread[1:] > 0.7).all()
+
+
+STOPS = {
+    "start_m": 200.0,
+    "phases": [
+        {"speed_mps": 20.0, "acceleration_mps2": 1.0},
+        {"stop_at_m": 1710.0, "acceleration_mps2": 1.0, "hold_s": 5.0},
+        {"speed_mps": 30.0},
+        {"stop_at_m": 4310.0, "acceleration_mps2": 0.8, "hold_s": 5.0},
+        {"speed_mps": 25.0},
+        {"stop_at_m": 8000.0},
+    ],
+}
+
+
+def counted(run, _):
+    return run.odometer.with_columns((pl.col("distance_m") / 2.0).floor() * 2.0)
+
+
+def stamped(run, seed):
+    stamps = run.odometer["t"].to_physical().to_numpy()
+    late = np.random.default_rng(seed).uniform(-0.03, 0.03, stamps.size) * 1e9
+    stamps = pl.Series("t", np.sort(stamps + late.astype(np.int64))).cast(pl.Datetime("ns", "UTC"))
+    return run.odometer.with_columns(stamps)
+
+
+@pytest.mark.parametrize("recorded", [counted, stamped])
+def test_the_scale_is_learned_with_rows_that_scatter_and_no_surer_than_it_is(recorded):
+    gnss = {"sigma_east_m": 0.3, "sigma_north_m": 0.3}
+    off = []
+    for seed in range(6):
+        run, site = journey(seed=seed, odometer={"scale": 1.003}, motion=STOPS, gnss=gnss)
+        learned = replay(run.with_streams(odometer=recorded(run, seed)), site).runs.row(0, named=True)
+        assert learned["odometer_scale_sigma"] < 0.001
+        off.append((learned["odometer_scale"] - 1.003) / learned["odometer_scale_sigma"])
+    assert np.sqrt(np.mean(np.square(off))) < 1.3
+
+
+def test_between_rows_a_straight_line_changes_with_the_square_of_the_step():
+    changed = Reading(np.ones(4), 1.0).decorrelation(np.array([0.1, 0.5, 1.0, 3.0]))
+    np.testing.assert_allclose(changed, [0.02, 0.25, 1.0, 1.0])
