@@ -40,12 +40,7 @@ def infrabel_recording(log: Path) -> Converted:
     Its naive local times are taken as UTC, and NovAtel's position types (each with any number behind) as kinds of fix;
     without a computed solution, or without a type, there is none. Half a row at the end is left out.
     """
-    try:
-        table, cut = read_log_table(log.read_bytes(), infer=False)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
-    except (ValueError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"is no CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
+    table, cut = read_log_table(log, infer=False)
     missing = set(COLUMNS) - set(table.columns)
     if missing:
         raise InputError("lacks columns of an Infrabel log", place=str(log), found=f"no {', '.join(sorted(missing))}")

@@ -2,8 +2,7 @@
 
 Adds to the matched epochs: `along_m, odometer_m, odometer_reason, odometer_stretch, speed_mps, direction,
 odometer_scale, scale_sigma, latency_s, latency_sigma_s, stamp_jitter_s, odometer_white_m2_per_s, odometer_reading_m,
-odometer_period_s`. A reason says why
-an epoch has no odometer.
+odometer_period_s`. A reason says why an epoch has no odometer.
 """
 
 from __future__ import annotations

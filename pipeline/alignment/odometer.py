@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -32,13 +33,22 @@ _AGREE = 0.2
 
 
 @dataclass(frozen=True)
+class CountedRows:
+    """Rows as recorded: times [s], distance [m], and which ways to the next row are by the recorded distance."""
+
+    t_s: Array
+    distance_m: Array
+    whole: Mask
+
+
+@dataclass(frozen=True)
 class OdometerTrack:
     """Uncorrected odometer distance [m] over time [s since `epoch_ns`].
 
     `stretch` counts, sample by sample, how often the distance was lost before: two times can be compared only
     where the count is the same. `pause[i]` marks a pause of the recording between samples i and i+1, inside which
-    nothing is interpolated. `white_rate_m2_per_s` is the variance that distance gathers in a second, `reading` the
-    noise of single rows beside it, `period_s` the time between recorded rows.
+    nothing is interpolated. `white_rate_m2_per_s` is the variance that distance gathers in a second, `period_s` the
+    time between recorded rows, `counted` those rows before others were filled in.
     """
 
     epoch_ns: int
@@ -48,8 +58,16 @@ class OdometerTrack:
     pause: Mask
     slip: Mask
     white_rate_m2_per_s: float
-    reading: ReadingNoise = field(default_factory=ReadingNoise)
     period_s: float = 0.0
+    counted: CountedRows | None = None
+
+    @cached_property
+    def reading(self) -> ReadingNoise:
+        """Noise of single recorded rows; none where the way is by speeds alone."""
+        rows = self.counted
+        if rows is None:
+            return ReadingNoise()
+        return reading_noise(rows.t_s, rows.distance_m, rows.whole, self.white_rate_m2_per_s)
 
     def oriented(self, sign: int) -> OdometerTrack:
         """The same odometer, growing with the path."""
@@ -113,19 +131,18 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     step[unknown] = 0.0
     declared = odometer["sigma_speed_mps"].median()
     declared_rate = float(declared) ** 2 * period if isinstance(declared, float) else 0.0
+    distance_m = _sums(step)
     track = OdometerTrack(
         epoch_ns=epoch_ns,
         t_s=t_s,
-        distance_m=_sums(step),
+        distance_m=distance_m,
         stretch=_sums(lost.astype(np.int64)),
         pause=pause,
         slip=slip,
         white_rate_m2_per_s=max(sigma_mps**2, declared_rate),
         period_s=period,
+        counted=CountedRows(t_s, distance_m, counted & ~lost & ~pause) if counted.any() else None,
     )
-    if counted.any():
-        whole = counted & ~lost & ~pause
-        track = replace(track, reading=reading_noise(t_s, track.distance_m, whole, track.white_rate_m2_per_s))
     apart = (dt > STRAIGHT_S) & ~pause & ~lost & ~slip[:-1]
     return _filled_in(track, speed, np.flatnonzero(apart)) if apart.any() else track
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.written_steps import step_of
+
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
@@ -26,8 +28,8 @@ _STRETCHES, _FEWEST_STRETCHES = 400, 8
 _MOVED_M = 1.0
 # By how much the higher half of the speeds has to be above the lower one.
 _APART = 1.5
-# Finer counters are no worse than their white noise; how far a way may be from a multiple of the step, in steps.
-_LEAST_STEP_M, _STEP_TOLERANCE = 0.05, 0.02
+# Finer counters are no worse than their white noise; less than the other is rounding.
+_LEAST_STEP_M, _ROUNDED_M = 0.05, 1e-3
 # Scatter is noise of the rows where it is beyond so many times what the increments' white noise makes of them.
 _BEYOND = 2.0
 
@@ -59,18 +61,9 @@ def reading_noise(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: fl
 
 
 def count_step_m(distance_m: Array, whole: Mask) -> float:
-    """The step of a counter: what all recorded ways are multiples of, now of more and now of less [m].
-
-    0 where they are of no step worth a word, or always of as many: so a smooth way at one speed looks too.
-    """
+    """The step of a counter [m], 0 where there is none worth a word."""
     ways = np.abs(np.diff(distance_m)[whole])
-    gained = ways[ways > _LEAST_STEP_M * _STEP_TOLERANCE]
-    if not gained.size or (step_m := float(gained.min())) < _LEAST_STEP_M:
-        return 0.0
-    counts = ways / step_m
-    steps = np.rint(counts)
-    multiples = (np.abs(counts - steps) < _STEP_TOLERANCE).all()
-    return step_m if multiples and np.count_nonzero(np.diff(steps)) >= _FEWEST_STRETCHES else 0.0
+    return step_of(ways, ways, _LEAST_STEP_M, _ROUNDED_M)
 
 
 def _scatter_beyond(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: float) -> ReadingNoise:

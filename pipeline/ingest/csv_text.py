@@ -5,8 +5,11 @@ from __future__ import annotations
 import codecs
 import io
 import re
+from pathlib import Path
 
 import polars as pl
+
+from schemas.errors import InputError
 
 _SEPARATORS = (",", ";", "\t")
 _MOST_COMMENTS = 50
@@ -22,11 +25,21 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
     return _table(_lines(data), infer)
 
 
-def read_log_table(data: bytes, infer: bool) -> tuple[pl.DataFrame, int]:
-    """As `read_table`, without a last row that breaks off, and the number of such rows (0 or 1).
+def read_log_table(log: Path, infer: bool) -> tuple[pl.DataFrame, int]:
+    """`read_table` of a log, without a last row that breaks off, and the number of such rows (0 or 1).
 
-    A recorder that lost power leaves half a row: without a line end, and with fewer fields than the header.
+    A recorder that lost power leaves half a row: without a line end, and with fewer fields than the header. Raises
+    `InputError` where the file cannot be read or holds no table.
     """
+    try:
+        return _whole_rows(log.read_bytes(), infer)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
+    except (ValueError, pl.exceptions.PolarsError) as error:
+        raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
+
+
+def _whole_rows(data: bytes, infer: bool) -> tuple[pl.DataFrame, int]:
     lines = _lines(data)
     separator = _separator(lines)
     header = next((line for line in lines if line.strip()), "")

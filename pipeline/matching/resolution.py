@@ -12,16 +12,13 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.columns import floats
+from pipeline.written_steps import step_of
 
 Array = npt.NDArray[np.float64]
 
 _EARTH_RADIUS_M = 6_371_000.0
-# Finer steps drown in the noise of any receiver; how far a difference may be from a multiple, in steps.
-_LEAST_STEP_M, _STEP_TOLERANCE = 0.02, 0.02
-# Decimal numbers are not whole in binary: less is no change.
-_ROUNDED_M = 1e-4
-# Fewer changes are chance.
-_FEWEST_CHANGES = 8
+# Finer steps drown in the noise of any receiver; less than the other is rounding.
+_LEAST_STEP_M, _ROUNDED_M = 0.02, 1e-4
 
 
 def digit_noise(fixes: pl.DataFrame, heading_deg: Array) -> list[pl.Series]:
@@ -52,16 +49,7 @@ def digit_noise(fixes: pl.DataFrame, heading_deg: Array) -> list[pl.Series]:
 
 
 def step_m(values: Array, metres: float) -> float:
-    """The step that all changes of a coordinate are multiples of [m], 0 where there is none to speak of.
-
-    `metres`: of one unit of the coordinate. The least change of the change from epoch to epoch is the step, where there
-    is one: at speed the changes themselves are many steps each.
-    """
+    """The step of a recorded coordinate [m], 0 where there is none to speak of; `metres`: of one unit of it."""
     changes = np.diff(values)
-    bends = np.abs(np.diff(changes))
-    bends = bends[bends * metres > _ROUNDED_M]
-    if bends.size < _FEWEST_CHANGES or (step := float(bends.min())) * metres < _LEAST_STEP_M:
-        return 0.0
-    counts = changes / step
-    multiples = (np.abs(counts - np.rint(counts)) < _STEP_TOLERANCE).all()
-    return step * metres if multiples else 0.0
+    # At speed the changes themselves are many steps each, but the change of the change is one at times.
+    return metres * step_of(changes, np.diff(changes), _LEAST_STEP_M / metres, _ROUNDED_M / metres)

@@ -31,12 +31,7 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
     """Streams of a CSV file, each mapping whose `topic` is the file's name, its stem or `*` makes one; what was left
     out, reason to number.
     """
-    try:
-        table, cut = read_log_table(path.read_bytes(), infer=True)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", place=str(path)) from None
-    except (ValueError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(path)) from None
+    table, cut = read_log_table(path, infer=True)
     streams: dict[Stream, pl.DataFrame] = {}
     for name in STREAMS:
         for mapping in mappings_of(config, name):

@@ -14,7 +14,7 @@ from pipeline.stages import replay
 from pipeline.statistics import threshold_factor
 from schemas.config import Configuration
 from tests.align.straight import odometer_of
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, hides_no_fault, journey
 
 WHITE_MPS = 0.05
 
@@ -145,14 +145,7 @@ def test_a_coarse_counter_raises_no_alarm_and_hides_no_leap(step_m):
     assert healthy.passages["status"].unique().to_list() == ["accepted"]
     assert "the odometer's rows scatter by" in healthy.runs["notes"].item()
     assert "scatter" not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
-    leap = {"kind": "step", "size_m": 850.0, "start_s": 150.0, "duration_s": 6.0}
-    drift = {"kind": "ramp", "rate_mps": 2.5, "at_m": 3450.0, "duration_s": 30.0}
-    for fault in (leap, drift):
-        faulty, _ = journey(fault)
-        plain, found = (replay(logs, site, VEHICLE).hazards for logs in (faulty, coarse(faulty)))
-        assert found["detected"].all()
-        assert found["hazard"].to_list() == plain["hazard"].to_list()
-        assert found["time_to_detect_s"].max() < plain["time_to_detect_s"].max() + 4.0
+    hides_no_fault(coarse)
 
 
 @pytest.mark.parametrize("rate_mps", [0.5, 2.0])

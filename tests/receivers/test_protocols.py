@@ -26,16 +26,6 @@ from tests.receivers.messages import (
 )
 
 
-@pytest.fixture
-def converted(tmp_path):
-    def of(*parts: bytes):
-        path = tmp_path / "receiver.log"
-        path.write_bytes(b"".join(parts))
-        return convert([path], "r")
-
-    return of
-
-
 def iso(fixes):
     return fixes["t"].dt.to_string("%Y-%m-%dT%H:%M:%S%.f").to_list()
 

@@ -7,22 +7,11 @@ from itertools import permutations
 
 import pytest
 
-from pipeline.receivers import convert
 from tests.receivers.messages import nav_pvt, ubx
 
 # 2025-06-01T12:00:00 UTC is Sunday 12:00:18 of GPS week 2369.
 _WEEK, _NOON_MS = 2369, (12 * 3600 + 18) * 1000
 _COVARIANCE = ["cov_ee_m2", "cov_en_m2", "cov_nn_m2", "cov_uu_m2"]
-
-
-@pytest.fixture
-def converted(tmp_path):
-    def of(*parts: bytes):
-        path = tmp_path / "receiver.ubx"
-        path.write_bytes(b"".join(parts))
-        return convert([path], "r")
-
-    return of
 
 
 def nav_sol(itow_ms: int = _NOON_MS, *, fix: int = 3, flags: int = 0x0D, ns: int = 0, x_cm: int = 637_813_700) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import polars as pl
@@ -66,3 +67,16 @@ def seconds(tables: RunTables, column: str) -> list[float | None]:
     """A time column of the hazards in seconds after the run's first epoch."""
     since = (tables.hazards[column] - tables.epochs["t"][0]).dt.total_nanoseconds()
     return [None if value is None else value * 1e-9 for value in since]
+
+
+def hides_no_fault(changed: Callable[[RunLog], RunLog]) -> None:
+    """A leap and a drift are found in the changed run as in the plain one, the drift at most 4 s later."""
+    leap = {"kind": "step", "size_m": 850.0, "start_s": 150.0, "duration_s": 6.0}
+    drift = {"kind": "ramp", "rate_mps": 2.5, "at_m": 3450.0, "duration_s": 30.0}
+    for fault in (leap, drift):
+        run, site = journey(fault)
+        plain, found = (replay(logs, site, VEHICLE).hazards for logs in (run, changed(run)))
+        assert plain.height
+        assert found["detected"].all()
+        assert found["hazard"].to_list() == plain["hazard"].to_list()
+        assert found["time_to_detect_s"].max() < plain["time_to_detect_s"].max() + 4.0

@@ -1,0 +1,30 @@
+"""The step in which a recorder writes a quantity down: counts of an odometer, decimals of a coordinate."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+# How far a change may be from a multiple of the step, in steps.
+_TOLERANCE = 0.02
+# Fewer changes of the change are chance.
+_FEWEST_BENDS = 8
+
+
+def step_of(changes: Array, single: Array, least: float, rounded: float) -> float:
+    """The step that all these changes are multiples of, now of more and now of less; in the unit of the changes.
+
+    `single`: differences of which some are of one step. 0 where there is no step, none of at least `least`, or where
+    the change is always the same: so a smooth way at one speed looks too. Less than `rounded` is no difference: decimal
+    numbers are not whole in binary.
+    """
+    single = np.abs(single)
+    single = single[single > rounded]
+    if not single.size or (step := float(single.min())) < least:
+        return 0.0
+    counts = changes / step
+    steps = np.rint(counts)
+    multiples = (np.abs(counts - steps) < _TOLERANCE).all()
+    return step if multiples and np.count_nonzero(np.diff(steps)) >= _FEWEST_BENDS else 0.0
