@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -45,16 +46,20 @@ def command(trial: SmallTrial, out: Path | str, *arguments: str, runs: Sequence[
 
 
 def start(arguments: Sequence[str]) -> subprocess.Popen[str]:
-    """A campaign in a process group of its own, as a terminal starts it."""
-    return subprocess.Popen(
-        arguments,
-        cwd=ROOT,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        env={**os.environ, "NO_COLOR": "1"},
-    )
+    """A campaign in a process group of its own, as a terminal starts it, even where `nohup` started the tests."""
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        return subprocess.Popen(
+            arguments,
+            cwd=ROOT,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+            env={**os.environ, "NO_COLOR": "1"},
+        )
+    finally:
+        signal.signal(signal.SIGHUP, inherited)
 
 
 def run(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
