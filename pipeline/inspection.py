@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import polars as pl
 
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
-from pipeline.ingest.site import read_site
+from pipeline.ingest.site import is_geojson, read_site
 from pipeline.known_counts import known_counts
 from pipeline.matching.describe import describe_site
 from pipeline.matching.survey import survey_findings
@@ -36,7 +36,7 @@ def inspect_path(
     if not files.exists(path):
         raise UsageError("does not exist", place=redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()
-    if names & _SITE_FILES:
+    if names & _SITE_FILES or (is_geojson(path) and not names):
         return inspect_site(path, result)
     if result is not None:
         raise UsageError("is no site", place=redacted(str(path)), expected="a site, to hold a result against")
@@ -47,7 +47,7 @@ def inspect_path(
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
-        expected="RUN.mcap, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
+        expected="RUN.mcap, a site's .geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
 

@@ -21,7 +21,7 @@ from pipeline.ingest.site_tables import (
     load_table,
     typed_table,
 )
-from pipeline.storage.address import join, shown
+from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.track import geometric_measures_m, track_of
 from schemas.errors import InputError, SiteError
@@ -40,7 +40,7 @@ _DIRECTIONS = {
 
 
 def read_site(path: Path | str) -> Site:
-    """The site of a folder (CONTRACT section 2), positions in WGS 84.
+    """The site of a folder (CONTRACT section 2) or of one GeoJSON file with track and links, positions in WGS 84.
 
     `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its
     key-value metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON
@@ -74,9 +74,11 @@ def read_site(path: Path | str) -> Site:
 
 
 def _files(folder: Path | str) -> dict[str, bytes]:
-    """The site's files by name; of each table there is at most one."""
+    """The site's files by name; of each table there is at most one. A GeoJSON file is a site's only one."""
     names = [table + suffix for table in _NAMES for suffix in _SUFFIXES.get(table, _TABLES)]
     try:
+        if is_geojson(folder) and not is_dir(folder):
+            return {"track.geojson": read_bytes(folder)}
         if not is_dir(folder):
             raise SiteError("is not a folder", place=shown(folder), remedy="A site is a folder that holds a track.")
         present = [name for name in list_dir(folder) if name in names]
@@ -90,6 +92,11 @@ def _files(folder: Path | str) -> dict[str, bytes]:
         return {name: read_bytes(join(folder, name)) for name in present}
     except InputError as error:
         raise SiteError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
+
+
+def is_geojson(address: Path | str) -> bool:
+    """By its name: a network as registers of infrastructure export it, net elements and net relations in one file."""
+    return name_of(address).lower().endswith(".geojson")
 
 
 def _digest(files: dict[str, bytes]) -> str:

@@ -13,6 +13,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.ingest.site import read_site
+from pipeline.inspection import inspect_path
 from pipeline.matching.describe import describe_site
 from schemas.errors import BaliseError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
@@ -244,6 +245,22 @@ def test_files_that_are_not_what_they_seem(tmp_path: Path) -> None:
     one = builders.track().filter(pl.col("netelement_id") != "b")
     dot = pl.concat([one, builders.track()[3:4]])
     assert "element b has 1 distinct point" in messages(builders.write(tmp_path / "6", track=dot))
+
+
+def test_one_geojson_file_is_a_site(tmp_path: Path) -> None:
+    """As registers of infrastructure export it, under its own name."""
+    folder = builders.write(tmp_path / "site", track=builders.geojson())
+    export = tmp_path / "network.geojson"
+    export.write_bytes((folder / "track.geojson").read_bytes())
+    in_folder, alone = read_site(folder), read_site(export)
+    assert alone.digest == in_folder.digest
+    for table in ("track", "links"):
+        assert_frame_equal(getattr(alone, table), getattr(in_folder, table))
+    described = inspect_path(export)
+    assert described.keys() == inspect_path(folder).keys()
+    export.write_text("{}")
+    assert "is not a GeoJSON FeatureCollection" in messages(export)
+    assert str(tmp_path / "none.geojson") in messages(tmp_path / "none.geojson")
 
 
 def test_the_digest_follows_the_content_alone(tmp_path: Path) -> None:
