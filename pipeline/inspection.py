@@ -47,7 +47,7 @@ def inspect_path(
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
-        expected="RUN.mcap, a site's .geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
+        expected="RUN.mcap, SITE.geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
 
