@@ -45,6 +45,22 @@ ERRATA: tuple[Erratum, ...] = (
         "exp(-10 s / 3600 s); R(1 s)/R(0) = 0.9997 of the same row agrees with 3600 s",
     ),
     Erratum(
+        "DIAG",
+        "eq. 9 and 16, the set of averages",
+        "lost",
+        "",
+        "weights 1 (raw), 0.1, 0.01, 0.001",
+        "`monitors.ewma_alphas`; `balise experiment bank` compares others",
+    ),
+    Erratum(
+        "DIAG",
+        "noise of the odometer",
+        "open",
+        "0.05 m/s",
+        "white on increments",
+        "white on position is the other reading; `balise experiment diagnostics` has both",
+    ),
+    Erratum(
         "TVB",
         "Fig. 3b, transitions of the Markov model",
         "lost",

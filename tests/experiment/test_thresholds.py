@@ -61,13 +61,13 @@ def test_ratios_of_the_two_other_ways_are_near_one() -> None:
         assert np.abs(ratios - 1.0).max() < 0.25
 
 
-@pytest.mark.parametrize(("rate_hz", "hours"), [(1.0, 335.0), (10.0, 55.0)])
+@pytest.mark.parametrize(("rate_hz", "hours"), [(1.0, 413.0), (10.0, 75.0)])
 def test_alarms_per_hour_of_twelve_monitors(rate_hz: float, hours: float) -> None:
-    """About one in 335 h at 1 Hz and in 55 h at 10 Hz; other skies and correlated axes move it by less than two."""
+    """What the experiment finds with more runs: one alarm in so many hours."""
     spec = BankSpec(sensors="odometer_and_track", rate_hz=rate_hz, map_m=1e-6)
     row = alarm_rate(spec, runs=150)
     assert row["method"] == "importance_sampling"
-    assert hours / 2 < float(row["hours_between"]) < hours * 2  # type: ignore[arg-type]
+    assert hours / 1.3 < float(row["hours_between"]) < hours * 1.3  # type: ignore[arg-type]
     assert float(row["alarms_per_h_low"]) <= float(row["alarms_per_h"]) <= float(row["alarms_per_h_high"])  # type: ignore[arg-type]
 
 
