@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
 from pipeline.alignment.increments import most_scatter_m
+from pipeline.columns import NS_PER_S, times_ns
+from pipeline.motion import Motion
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
@@ -42,6 +45,18 @@ _SCATTERED = (
 _DIGITS = (
     "positions are written down so coarsely that they scatter by {sigma_m:.2f} m (few decimals, single precision): the "
     "thresholds allow for it"
+)
+_FROZEN = (
+    "the odometer stood still for {s:.0f} s in which the train drove {way_m:.0f} m, first at {first:%H:%M:%S}: it was "
+    "frozen; that time counts as moving, and the way as driven by the positions"
+)
+_UNDECIDED = (
+    "for {s:.0f} s, first at {first:%H:%M:%S}, the odometer stood still while positions moved on, {way_m:.0f} m in "
+    "all, and nothing tells which is right: availability counts that time as moving without a TVB"
+)
+_UNTOLD = (
+    "for {s:.0f} s neither odometer nor positions tell whether the train moved: availability counts that time as "
+    "moving without a TVB"
 )
 # Less than the positions themselves scatter is not worth a word.
 _WORTH_M = 0.1
@@ -139,3 +154,24 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> tuple[str
     reasons = judged["along_raw_reason"]
     counts = [(reason, (reasons == reason).sum()) for reason in (NO_ODOMETER, BEYOND_SPAN, INTERRUPTED)]
     return tuple(_UNDIAGNOSED.format(reason=reason, count=count) for reason, count in counts if count)
+
+
+def motion_notes(motion: Motion, epochs: pl.DataFrame) -> tuple[str, ...]:
+    """Where the odometer stood and positions moved on, and where nobody knows whether the train moved.
+
+    `epochs`: in order of time.
+    """
+    t_ns = times_ns(epochs)
+    notes = []
+    untold = ~motion.known[:-1]
+    for text, moved in ((_FROZEN, True), (_UNDECIDED, None)):
+        found = [one for one in motion.contradicted if one.moved is moved]
+        if found:
+            seconds = sum(float(t_ns[one.last + 1] - t_ns[one.first]) for one in found) / NS_PER_S
+            way_m = sum(abs(one.way_m) for one in found)
+            notes.append(text.format(s=seconds, way_m=way_m, first=epochs["t"][found[0].first]))
+        for one in found:
+            untold[one.first : one.last + 1] = False
+    if untold.any():
+        notes.append(_UNTOLD.format(s=float(np.diff(t_ns)[untold].sum()) / NS_PER_S))
+    return tuple(notes)

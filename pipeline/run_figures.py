@@ -8,11 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from pipeline.columns import floats
 from pipeline.epoch_clock import Clock, flags, trusted, usable
 from pipeline.hazards.independent import independent_episodes, missed_detection
+from pipeline.motion import Motion
 from pipeline.statistics import UNKNOWN, Estimate, poisson_rate
-from pipeline.timeline import availability, moved, outages_s, share_of_time, uptime
+from pipeline.timeline import availability, outages_s, share_of_time, uptime
 from schemas.config import Configuration, SafetyConfig
 from schemas.enums import (
     TRUTH,
@@ -35,16 +35,18 @@ CONTINUITY_S = 15.0
 _REJECTED = [status.value for status in PassageStatus if status.value.startswith("rejected_")]
 
 
-def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
-    """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8)."""
+def positions(epochs: pl.DataFrame, motion: Motion, clock: Clock, config: Configuration) -> Row:
+    """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
+
+    Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not.
+    """
     lost = outages_s(clock.t_ns, flags(epochs, usable()), clock.limit_s)
-    distance = floats(epochs, "odometer_m")
-    speed = floats(epochs, "speed_mps")
-    moving = moved(clock.t_ns, distance, speed, config.matching.deadband_mps)
+    valid = flags(epochs, pl.col("tvb")) & motion.known
+    share = availability(clock.t_ns, valid, motion.moving | ~motion.known, clock.limit_s)
     trust = uptime(clock.t_ns, flags(epochs, trusted(config)), clock.limit_s)
     mtbf_h = trust.mean_time_between_losses_h
     return {
-        "availability": availability(clock.t_ns, flags(epochs, pl.col("tvb")), moving, clock.limit_s),
+        "availability": share if (motion.moving & motion.known)[:-1].any() else None,
         "outages": len(lost),
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
         "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),

@@ -10,7 +10,7 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.alignment.increments import most_scatter_m
 from pipeline.channels import on_path_of
 from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_times
-from pipeline.evidence_notes import evidence_notes, reading_notes, return_notes, undiagnosed_notes
+from pipeline.evidence_notes import evidence_notes, motion_notes, reading_notes, return_notes, undiagnosed_notes
 from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
@@ -18,6 +18,7 @@ from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
+from pipeline.motion import Motion, motion_of
 from pipeline.provenance import provenance
 from pipeline.run_notes import run_notes
 from pipeline.statistics import threshold_factor
@@ -129,21 +130,22 @@ def _failed(context: _Context, solution: str, error: InputError) -> _Solution:
 
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Solution:
     ride = _ride(context, solution, matches)
-    case = _case(context, ride)
+    case, motion = _case(context, ride)
     result = classify(case)
-    epochs = pl.concat([ride.monitored, result.epochs_columns], how="horizontal")
+    epochs = pl.concat([case.epochs, result.epochs_columns], how="horizontal")
     results = SolutionResults(
         solution=solution,
         epochs=epochs,
         passages=result.passages,
         hazards=result.hazards,
         alarms=result.alarms,
+        motion=motion,
         evidence=_evidence(case.truth),
         alignment=_alignment(ride.aligned),
         counts=context.counts.solutions[solution],
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
-        notes=_notes(context, ride, case.truth, result, epochs),
+        notes=(*_notes(context, ride, case.truth, result, epochs), *motion_notes(motion, epochs)),
     )
     made = provenance(context.run, context.site, context.vehicle, context.config)
     return _Solution(epochs, result, summarise(results, context.config, made))
@@ -163,19 +165,19 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     return _Ride(solution, fixes, found, balises, aligned, monitored, telegrams, lds)
 
 
-def _case(context: _Context, ride: _Ride) -> Case:
-    """The ride with the truth beside it, and with what the train passed unoffered."""
+def _case(context: _Context, ride: _Ride) -> tuple[Case, Motion]:
+    """The ride with the truth beside it, how the train moved by it, and what it passed unoffered."""
     config = context.config
     reference = _reference_on_path(context, ride.found, ride.aligned)
     reads = None if ride.telegrams is None else ride.telegrams.drop_nulls("path_m")
     truth = establish_truth(ride.monitored, reference, reads, ride.lds.passages, config)
+    motion = motion_of(ride.monitored, truth, config)
+    epochs = ride.monitored.with_columns(motion.columns())
     between = _between(context, ride.aligned, truth, reference, reads)
-    passages = with_unoffered(
-        ride.lds.passages, ride.monitored, truth, ride.balises, config.lds, ride.solution, between
-    )
-    return Case(
+    passages = with_unoffered(ride.lds.passages, epochs, truth, ride.balises, config.lds, ride.solution, between)
+    case = Case(
         solution=ride.solution,
-        epochs=ride.monitored,
+        epochs=epochs,
         truth=truth,
         passages=passages,
         balises=ride.balises,
@@ -184,6 +186,7 @@ def _case(context: _Context, ride: _Ride) -> Case:
         config=config,
         between=between,
     )
+    return case, motion
 
 
 def _notes(

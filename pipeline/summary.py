@@ -11,6 +11,7 @@ import polars as pl
 from pipeline import run_figures as figures
 from pipeline.clean import StreamCounts
 from pipeline.epoch_clock import Clock
+from pipeline.motion import Motion
 from pipeline.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
@@ -40,6 +41,7 @@ class SolutionResults:
     passages: pl.DataFrame
     hazards: pl.DataFrame
     alarms: pl.DataFrame
+    motion: Motion
     evidence: Evidence | None = None
     alignment: Alignment = field(default_factory=Alignment)
     counts: StreamCounts = field(default_factory=StreamCounts)
@@ -53,8 +55,8 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     clock = Clock.of(results.epochs, config)
     row = (
         _identity(results)
-        | _extent(results.epochs, clock)
-        | figures.positions(results.epochs, clock, config)
+        | _extent(results.epochs, clock, results.motion.distance_m)
+        | figures.positions(results.epochs, results.motion, clock, config)
         | figures.accuracy(results.epochs)
         | figures.balise_counts(results.passages, results.evidence, config.hazards.failure_limit_m)
         | figures.hazard_counts(results.hazards)
@@ -117,32 +119,15 @@ def _ingest_remarks(ingest: IngestNotes) -> list[str]:
     return remarks
 
 
-def _extent(epochs: pl.DataFrame, clock: Clock) -> Row:
+def _extent(epochs: pl.DataFrame, clock: Clock, distance_m: float | None) -> Row:
     return {
         "t_start": epochs["t"].dt.timestamp("ns").first(),
         "t_end": epochs["t"].dt.timestamp("ns").last(),
         "duration_s": clock.duration_s,
-        "distance_m": _distance_m(epochs),
+        "distance_m": distance_m,
         "epochs": epochs.height,
         "gnss_rate_hz": 1.0 / clock.period_s if clock.period_s else None,
     }
-
-
-def _distance_m(epochs: pl.DataFrame) -> float | None:
-    """Distance travelled [m]: by the odometer; without one by the positions while they moved.
-
-    Positions count from first to last of each stretch in one direction, so that noise adds nothing.
-    """
-    odometer = epochs["odometer_m"].drop_nulls()
-    if odometer.len() > 1:
-        return float(odometer.diff().abs().sum())
-    moving = epochs.filter(pl.col("path_m").is_not_null() & (pl.col("direction").fill_null(0) != 0))
-    if moving.height < 2:
-        return None
-    stretches = moving.group_by(pl.col("direction").rle_id(), maintain_order=True).agg(
-        (pl.col("path_m").last() - pl.col("path_m").first()).abs()
-    )
-    return float(stretches["path_m"].sum())
 
 
 def _provenance(provenance: Provenance) -> Row:

@@ -147,7 +147,7 @@ class _EpochsBeforeMonitors(dy.Schema):
     on_track = flag("a net element of the path is within reach")
     path_probability = real("1", "posterior probability of the path (forward-backward)", min=0, max=1)
     odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
-    speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none")
+    speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none or it is frozen")
     sigma_along_m = real("m", "standard deviation of the position along the track", min=0)
     sigma_cross_m = real("m", "standard deviation of the position across the track", min=0)
     sigma_up_m = real("m", "standard deviation of the height", min=0)
@@ -178,6 +178,7 @@ class _EpochsAfterMonitors(dy.Schema):
     latency_s = real("s", "GNSS latency in use at this epoch")
     hpl_m = real("m", "horizontal protection level of the receiver", min=0)
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
+    moving = flag("the train moves from here to the next epoch; null where nobody knows", nullable=True)
 
 
 def _monitor_columns(monitor: str) -> dict[str, dy.Column]:

@@ -13,6 +13,7 @@ import polars as pl
 from pipeline.alignment.increments import EpochArrays, Learned, Mask, odometer_steps, reading_of, stamp_jitter_s
 from pipeline.alignment.learning import learn
 from pipeline.alignment.odometer import OdometerTrack, odometer_track, polarity
+from pipeline.alignment.scatter import play_m, with_play
 from pipeline.columns import floats
 from pipeline.monitors.axis import calibrated
 from pipeline.monitors.recursion import Array
@@ -96,6 +97,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     speed = np.where(known, learned.scale * track.speed_at(at), np.nan)
     reading = reading_of(track, at, config)
     total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
+    turning = speed if reading is None else speed_of_positions(at, with_play(total, play_m(reading.sigma_m)))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.select(reason.alias("odometer_reason")).to_series(),
@@ -105,7 +107,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
         pl.Series("odometer_reading_m", np.zeros(known.size) if reading is None else reading.sigma_m),
         pl.Series("odometer_period_s", np.full(known.size, track.period_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),
-        pl.Series("direction", _direction(speed, config.matching.deadband_mps)),
+        pl.Series("direction", _direction(turning, config.matching.deadband_mps)),
         pl.Series("odometer_scale", learned.scale),
         pl.Series("scale_sigma", learned.scale_sigma),
         pl.Series("latency_s", learned.latency_s),

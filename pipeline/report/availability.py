@@ -14,13 +14,15 @@ _PIECES = 400
 _STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
 
-def availability_pieces(epochs: pl.LazyFrame, deadband_mps: float) -> pl.DataFrame:
+def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
     """Per solution, net element and piece of it: epochs while moving, those with a valid TVB, alarms.
+
+    Where nobody knows whether the train moved, the epoch counts, and its TVB does not.
 
     Pieces have one length in a campaign, chosen so that there are some hundred of them.
     """
     moving = epochs.filter(
-        (pl.col("speed_mps").abs() > deadband_mps)
+        pl.col("moving").fill_null(value=True)
         & pl.col("netelement_id").is_not_null()
         & pl.col("measure_m").is_not_null()
     )
@@ -29,9 +31,14 @@ def availability_pieces(epochs: pl.LazyFrame, deadband_mps: float) -> pl.DataFra
     )
     total_m = float((extents["high"] - extents["low"]).sum() or 0.0)
     step_m = next((step for step in _STEPS_M if total_m / step <= _PIECES), max(_STEPS_M[-1], total_m / _PIECES))
+    valid = pl.col("tvb") & pl.col("moving").fill_null(value=False)
     return (
         moving.group_by("solution", "netelement_id", piece=(pl.col("measure_m") / step_m).floor())
-        .agg(epochs=pl.len(), tvb=pl.col("tvb").sum(), alarms=pl.col("alarm").sum())
+        .agg(
+            epochs=pl.len(),
+            tvb=valid.sum(),
+            alarms=pl.col("alarm").sum(),
+        )
         .with_columns(from_m=pl.col("piece") * step_m, to_m=(pl.col("piece") + 1.0) * step_m)
         .drop("piece")
         .collect()

@@ -128,13 +128,13 @@ def _made(out: Path, site: Site | None) -> Made:
 
 
 def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dict[Key, Tally]]) -> Campaign:
-    needed = ("solution", "netelement_id", "measure_m", "speed_mps", "tvb", "alarm")
+    needed = ("solution", "netelement_id", "measure_m", "moving", "tvb", "alarm")
     epochs = read_table(out, "epochs").select(pl.col(name) for name in needed)
     return Campaign(
         runs=read_table(out, "runs").collect(),
         hazards=read_table(out, "hazards").collect(),
         passages=read_table(out, "passages").collect(),
-        pieces=availability_pieces(epochs, made.config.matching.deadband_mps),
+        pieces=availability_pieces(epochs),
         hrefs=hrefs,
         architectures=over_all_runs(found),
         map=map_places(read_table(out, "alarms").collect()),

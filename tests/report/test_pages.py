@@ -162,7 +162,7 @@ def test_location_errors_are_all_counted(out: Path, replayed: dict[str, RunTable
 def test_availability_map_counts_moving_epochs(out: Path, replayed: dict[str, RunTables]) -> None:
     pieces = data_of(out, "index.html")["solutions"]["primary"]["map"]["pieces"]
     moving = pl.concat([tables.epochs for tables in replayed.values()]).filter(
-        (pl.col("speed_mps").abs() > 0.3) & pl.col("netelement_id").is_not_null()
+        pl.col("moving") & pl.col("netelement_id").is_not_null()
     )
     assert sum(piece["epochs"] for piece in pieces) == moving.height
     assert sum(piece["epochs"] * piece["share"] for piece in pieces) == pytest.approx(moving["tvb"].sum(), rel=1e-3)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.clean import StreamCounts
+from pipeline.motion import motion_by_odometer
 from pipeline.provenance import Provenance
 from pipeline.summary import Alignment, SolutionResults, failed_row, summarise
 from schemas.config import Configuration, HazardConfig, LdsConfig
@@ -23,7 +24,8 @@ CONFIG = Configuration()
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    empty = SolutionResults("primary", frame, passages(), hazards(), alarms(), evidence=Evidence.REFERENCE)
+    motion = motion_by_odometer(frame, CONFIG.matching.deadband_mps)
+    empty = SolutionResults("primary", frame, passages(), hazards(), alarms(), motion, evidence=Evidence.REFERENCE)
     return replace(empty, **fields)
 
 
