@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.alignment.reading import ReadingNoise, reading_noise
+from pipeline.alignment.reading import ReadingNoise, count_step_m, reading_noise
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -68,6 +68,12 @@ class OdometerTrack:
         if rows is None:
             return ReadingNoise()
         return reading_noise(rows.t_s, rows.distance_m, rows.whole, self.white_rate_m2_per_s)
+
+    @cached_property
+    def count_step_m(self) -> float:
+        """The step of a counter [m], 0 where there is none worth a word."""
+        rows = self.counted
+        return 0.0 if rows is None else count_step_m(rows.distance_m, rows.whole)
 
     def oriented(self, sign: int) -> OdometerTrack:
         """The same odometer, growing with the path."""

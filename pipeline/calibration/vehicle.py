@@ -108,13 +108,28 @@ def _thinned(t_s: Array) -> npt.NDArray[np.int64]:
 
 
 def _covariance(block: Observations, track: OdometerTrack, shares: Array, taus_s: Array) -> Array:
-    """Covariance of GNSS minus odometer [m^2]: Gauss-Markov sources, a white rest, the odometer's random walk."""
+    """Covariance of GNSS minus odometer [m^2]: Gauss-Markov sources, a white rest, the odometer's walk and rows."""
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     correlation = sum(share * np.exp(-lag / tau) for share, tau in zip(shares, taus_s, strict=True))
     gnss = np.outer(block.sigma_m, block.sigma_m) * correlation
     since = block.t_s - block.t_s[0]
     walk = track.white_rate_m2_per_s * np.minimum(since[:, None], since[None, :])
     result: Array = gnss + walk + np.diag(_WHITE_SHARE * block.sigma_m**2)
+    return result + _of_rows(track, block.t_s, block.t_s) if track.reading else result
+
+
+def _of_rows(track: OdometerTrack, one_s: Array, other_s: Array) -> Array:
+    """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`ReadingNoise`).
+
+    A counter is off by the same until it has counted on: while the train stands many rows tell no more than one. Other
+    noise is each row's own.
+    """
+    sigmas = [np.sqrt(track.reading.variance_m2(track.speed_at(at_s))) for at_s in (one_s, other_s)]
+    apart = np.abs(track.distance_at(one_s)[:, None] - track.distance_at(other_s)[None, :])
+    scale = track.count_step_m
+    if scale == 0.0:
+        apart, scale = np.abs(one_s[:, None] - other_s[None, :]), track.period_s
+    result: Array = np.outer(*sigmas) * np.maximum(1.0 - apart / scale, 0.0)
     return result
 
 
@@ -142,11 +157,17 @@ def _accumulate(
 def _chance_information(block: Observations, covariance: Array, track: OdometerTrack) -> float:
     """What the odometer's noise alone, taken for changes of speed, seems to tell of the latency [1/s^2], on average.
 
-    The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second.
+    The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second,
+    beside that of the rows at both ends.
     """
     span_s = 2.0 * _SPEED_SPAN_S
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     noise = track.white_rate_m2_per_s * np.maximum(span_s - lag, 0.0) / span_s**2
+    if track.reading:
+        begin_s, end_s = _span(block.t_s, track)
+        across = _of_rows(track, begin_s, end_s)
+        rows = _of_rows(track, begin_s, begin_s) + _of_rows(track, end_s, end_s) - across - across.T
+        noise = noise + rows / span_s**2
     solved = np.linalg.solve(covariance, np.column_stack([noise, np.ones(block.t_s.size)]))
     inverse_ones = solved[:, -1]
     return float(np.trace(solved[:, :-1]) - inverse_ones @ noise @ inverse_ones / inverse_ones.sum())
