@@ -121,14 +121,16 @@ def _covariance(block: Observations, track: OdometerTrack, shares: Array, taus_s
 def _of_rows(track: OdometerTrack, one_s: Array, other_s: Array) -> Array:
     """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`ReadingNoise`).
 
-    A counter is off by the same until it has counted on: while the train stands many rows tell no more than one. Other
-    noise is each row's own.
+    A counter is off by the same while the train stands, so that many rows tell no more than one; after a share x of its
+    step the correlation of what it leaves out is 1 - 6 x + 6 x^2, by the first terms. Other noise is each row's own.
     """
     sigmas = [np.sqrt(track.reading.variance_m2(track.speed_at(at_s))) for at_s in (one_s, other_s)]
-    apart = np.abs(track.distance_at(one_s)[:, None] - track.distance_at(other_s)[None, :])
-    scale = track.count_step_m
-    if scale == 0.0:
-        apart, scale = np.abs(one_s[:, None] - other_s[None, :]), track.period_s
+    ways, scale = (one_s, other_s), track.period_s
+    if track.count_step_m > 0.0:
+        counts = np.flatnonzero(np.diff(track.distance_m, prepend=np.nan) != 0)
+        at_s, at_m = track.t_s[counts], track.distance_m[counts]
+        ways, scale = (np.interp(one_s, at_s, at_m), np.interp(other_s, at_s, at_m)), track.count_step_m / 6.0
+    apart = np.abs(ways[0][:, None] - ways[1][None, :])
     result: Array = np.outer(*sigmas) * np.maximum(1.0 - apart / scale, 0.0)
     return result
 

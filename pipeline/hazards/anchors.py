@@ -86,12 +86,13 @@ class _AnchorReader:
     path_m: Floats
     distance_m: Floats
     stretch: Ints
+    reading_m2: Floats
 
     @classmethod
     def of(cls, anchors: Anchors, travel: Travel) -> _AnchorReader:
         known = np.flatnonzero(np.isfinite(travel.distance_m))
         if known.size == 0 or anchors.at_ns.size == 0:
-            return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
+            return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
         stamps = travel.at_ns[known]
         right = np.clip(np.searchsorted(stamps, anchors.at_ns), 0, known.size - 1)
         left = np.where(stamps[right] > anchors.at_ns, np.maximum(right - 1, 0), right)
@@ -100,7 +101,14 @@ class _AnchorReader:
         between_m = np.interp(anchors.at_ns, stamps, travel.distance_m[known])
         distance = np.where(counted, travel.distance_m[known[left]] + since_m, between_m)
         usable = counted | _interpolable(anchors.at_ns, stamps, left, right, travel.stretch[known])
-        return cls(anchors.at_ns[usable], anchors.path_m[usable], distance[usable], travel.stretch[known[left]][usable])
+        rows = known[left][usable]
+        return cls(
+            anchors.at_ns[usable],
+            anchors.path_m[usable],
+            distance[usable],
+            travel.stretch[rows],
+            travel.reading_m2[rows],
+        )
 
     def reach(self, index: Ints, travel: Travel, lds: LdsConfig) -> tuple[Floats, Floats, Floats]:
         """Position, its sigma and the odometer's confidence by the anchor `index` of each epoch."""
@@ -111,7 +119,8 @@ class _AnchorReader:
         reached: Bools = (index == safe) & (self.stretch[safe] == travel.stretch)
         moved = np.where(reached, travel.distance_m - self.distance_m[safe], np.nan)
         elapsed_s = np.abs(travel.at_ns - self.at_ns[safe]) / NS_PER_S
-        variance = travel.white_m2_per_s * elapsed_s + (travel.scale_sigma * moved) ** 2
+        readings_m2 = travel.reading_m2 + self.reading_m2[safe]
+        variance = travel.white_m2_per_s * elapsed_s + (travel.scale_sigma * moved) ** 2 + readings_m2
         confidence = lds.odometer_fixed_m + lds.odometer_share * np.abs(moved)
         return self.path_m[safe] + moved, np.sqrt(variance), confidence
 
@@ -157,12 +166,12 @@ def _between(
 
 
 def _white_m2(reader: _AnchorReader, before: Ints, travel: Travel) -> Floats:
-    """Variance that the odometer gains from the anchor before each epoch to the one behind [m2]."""
+    """Variance of the odometer's way from the anchor before each epoch to the one behind [m2]."""
     if reader.at_ns.size < 2:
         return np.zeros(before.size)
     a = np.clip(before, 0, reader.at_ns.size - 2)
     white: Floats = travel.white_m2_per_s * (reader.at_ns[a + 1] - reader.at_ns[a]) / NS_PER_S
-    return white
+    return white + reader.reading_m2[a] + reader.reading_m2[a + 1]
 
 
 def _share_of_way(reader: _AnchorReader, before: Ints, travel: Travel) -> Floats:

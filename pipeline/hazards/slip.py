@@ -62,7 +62,8 @@ def _odometer_alone(
     total = np.concatenate(([0.0], np.cumsum(apart)))
     slipped = total - total[begin]
     moved = travel.distance_m - travel.distance_m[begin]
-    noise = np.sqrt(white_m2_per_s * window_s + (travel.scale_sigma * moved) ** 2)
+    readings_m2 = travel.reading_m2 + travel.reading_m2[begin]
+    noise = np.sqrt(white_m2_per_s * window_s + (travel.scale_sigma * moved) ** 2 + readings_m2)
     follows = position_m - position_m[begin] - moved
     with np.errstate(invalid="ignore"):
         found = (np.abs(slipped) > np.maximum(_LEAST_M, SURE_SIGMAS * noise)) & (

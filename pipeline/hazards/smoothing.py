@@ -53,7 +53,7 @@ def smoothed_truth(epochs: pl.DataFrame, travel: Travel, position_m: Floats, lea
     """
     trusted = np.isfinite(position_m) & ~_under_alarm(epochs, travel.at_ns, lead_s)
     offset = np.where(trusted, position_m - travel.distance_m, np.nan)
-    sigma = np.nan_to_num(floats(epochs, "sigma_along_m"), nan=np.inf)
+    sigma = np.nan_to_num(np.hypot(floats(epochs, "sigma_along_m"), np.sqrt(travel.reading_m2)), nan=np.inf)
     path, spread = np.full(offset.size, np.nan), np.full(offset.size, np.nan)
     counted = np.isfinite(travel.distance_m)
     for stretch in np.unique(travel.stretch[counted]):

@@ -48,6 +48,7 @@ class Witnesses:
     stretch: Ints
     scale_sigma: Floats
     white_m2_per_s: Floats
+    reading_m2: Floats
     velocity_mps: Floats
     by_reference: Bools
     by_odometer: Bools
@@ -88,6 +89,7 @@ def witnesses_of(
         stretch=ints(epochs["odometer_stretch"]),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         white_m2_per_s=np.nan_to_num(floats(epochs, "odometer_white_m2_per_s")),
+        reading_m2=np.nan_to_num(floats(epochs, "odometer_reading_m")) ** 2,
         velocity_mps=floats(epochs, "velocity_along_mps"),
         by_reference=truths(truth["evidence"] == Evidence.REFERENCE.value),
         by_odometer=truths(truth["evidence"] == Evidence.ODOMETER.value),
@@ -184,7 +186,8 @@ def _odometer_variance(w: Witnesses, rows: Ints) -> Floats:
     """Variance of the odometer's distance from the first of the rows on [m2]."""
     elapsed_s = (w.t_ns[rows] - w.t_ns[rows[0]]) / NS_PER_S
     moved = w.odometer_m[rows] - w.odometer_m[rows[0]]
-    variance: Floats = w.white_m2_per_s[rows] * elapsed_s + (w.scale_sigma[rows] * moved) ** 2
+    readings_m2 = w.reading_m2[rows] + w.reading_m2[rows[0]]
+    variance: Floats = w.white_m2_per_s[rows] * elapsed_s + (w.scale_sigma[rows] * moved) ** 2 + readings_m2
     return variance
 
 

@@ -13,8 +13,8 @@ from pipeline.columns import Floats, Ints, floats, ints
 @dataclass(frozen=True)
 class Travel:
     """Per epoch: instant, distance along growing path (NaN = not known), stretch of unbroken counting,
-    sigma of the scale, and variance that the distance gains per second. `odometer_m`: the odometer's own
-    distance, which `distance_m` is but for repairs.
+    sigma of the scale, variance that the distance gains per second, and that of a single reading [m2]. `odometer_m`:
+    the odometer's own distance, which `distance_m` is but for repairs.
     """
 
     at_ns: Ints
@@ -23,6 +23,7 @@ class Travel:
     stretch: Ints
     scale_sigma: Floats
     white_m2_per_s: Floats
+    reading_m2: Floats
 
     def joined_with(self, reference_m: Floats) -> tuple[Floats, Ints]:
         """Distance and stretch whose steps come from the reference where both ends of a step have it.
@@ -51,4 +52,5 @@ def odometer_travel(epochs: pl.DataFrame, at_ns: Ints) -> Travel:
         stretch=ints(epochs["odometer_stretch"]),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         white_m2_per_s=np.nan_to_num(white),
+        reading_m2=np.nan_to_num(floats(epochs, "odometer_reading_m")) ** 2,
     )

@@ -1,9 +1,11 @@
 """Scale and latency against known truth, with honest uncertainty; pooling worked by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pipeline.alignment.odometer import OdometerTrack
+from pipeline.alignment.odometer import CountedRows, OdometerTrack
 from pipeline.alignment.odometer_filter import error_model
 from pipeline.calibration.vehicle import Observations, estimate_run, pooled
 from schemas.config import MonitorConfig
@@ -105,3 +107,40 @@ def test_pooling_by_hand() -> None:
     assert differ.sigma == pytest.approx(np.sqrt((0.01 + 1.99) / 2.0 + 1.99))
     alone = pooled(np.array([3.0]), np.array([0.4]))
     assert (alone.value, alone.sigma) == (pytest.approx(3.0), pytest.approx(0.4))
+
+
+def with_rows(track: OdometerTrack, kind: str, size_m: float, seed: int) -> OdometerTrack:
+    """The track by counts of this size, or with noise of it in every row."""
+    noise = np.random.default_rng(seed).normal(0.0, size_m, track.t_s.size)
+    rows = np.floor(track.distance_m / size_m) * size_m if kind == "counts" else track.distance_m + noise
+    counted = CountedRows(track.t_s, rows, np.ones(rows.size - 1, dtype=bool))
+    return replace(track, distance_m=rows, period_s=0.1, counted=counted)
+
+
+ROWS = [("counts", 5.0), ("noise", 0.5)]
+
+
+@pytest.mark.parametrize(("kind", "size_m"), ROWS)
+def test_rows_that_scatter_are_no_misfit_of_the_position(kind: str, size_m: float) -> None:
+    """They neither widen what a run tells by much nor make it surer than it is."""
+    runs = [simulated_run(seed, 600) for seed in range(8)]
+    found = [estimate_run(seen, with_rows(track, kind, size_m, 50), SHARES, TAUS_S) for seen, track in runs]
+    fine = [estimate_run(seen, track, SHARES, TAUS_S) for seen, track in runs]
+    results = [(one, other) for one, other in zip(found, fine, strict=True) if one is not None and other is not None]
+    assert len(results) == 8
+    assert 0.6 < np.mean([one.misfit for one, _ in results]) < 1.15
+    assert np.mean([one.scale_sigma / other.scale_sigma for one, other in results]) < 1.3
+    scale = np.array([(one.scale - SCALE) / one.scale_sigma for one, _ in results])
+    latency = np.array([(one.latency_s - LATENCY_S) / one.latency_sigma_s for one, _ in results])
+    for standardised in (scale, latency):
+        assert np.sqrt(np.mean(standardised**2)) < 1.7
+
+
+@pytest.mark.parametrize(("kind", "size_m"), ROWS)
+def test_rows_that_scatter_tell_no_latency_at_constant_speed(kind: str, size_m: float) -> None:
+    for seed in range(2):
+        seen, track = simulated_run(seed, 420, moving=False)
+        one = estimate_run(seen, with_rows(track, kind, size_m, seed), SHARES, TAUS_S)
+        assert one is not None
+        assert one.latency_sigma_s > 0.5
+        assert abs(one.scale - SCALE) < 4.0 * one.scale_sigma

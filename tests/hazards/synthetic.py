@@ -104,6 +104,7 @@ class Journey:
             "odometer_m": self.odometer_m(),
             "odometer_stretch": np.zeros(size, dtype=np.int64),
             "odometer_white_m2_per_s": np.full(size, 0.0025),
+            "odometer_reading_m": np.zeros(size),
             "speed_mps": np.full(size, self.speed_mps),
             "direction": pl.Series([1 if self.speed_mps > 0 else -1] * size, dtype=pl.Int8),
             "scale_sigma": np.full(size, 1e-4),
