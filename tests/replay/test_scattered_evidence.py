@@ -8,6 +8,8 @@ import pytest
 
 from pipeline.alignment.align import align
 from pipeline.hazards import establish_truth
+from pipeline.hazards.anchors import Anchors, carry
+from pipeline.hazards.travel import Travel
 from pipeline.matching import match
 from pipeline.telegrams import place_reads
 from schemas.config import Configuration
@@ -59,3 +61,22 @@ def test_rows_that_do_not_scatter_add_nothing():
         CONFIG,
     )
     assert set(aligned["odometer_reading_m"]) == {0.0}
+
+
+@pytest.mark.parametrize(("reading_m", "slipped"), [(0.0, True), (0.5, False)])
+def test_what_rows_scatter_is_no_slip_between_two_reads(reading_m, slipped):
+    """Over 100 m in 10 s the odometer counted 2 m too far: beyond its walk, and within two rows of 0.5 m."""
+    at_ns = np.arange(11, dtype=np.int64) * 10**9
+    counted = 10.2 * np.arange(11.0)
+    travel = Travel(
+        at_ns=at_ns,
+        distance_m=counted,
+        odometer_m=counted,
+        stretch=np.zeros(11, dtype=np.int64),
+        scale_sigma=np.zeros(11),
+        white_m2_per_s=np.full(11, 0.0025),
+        reading_m2=np.full(11, reading_m**2),
+    )
+    carried = carry(Anchors.of(at_ns[[0, 10]], np.array([0.0, 100.0])), travel, at_ns, CONFIG.lds, both_ways=True)
+    assert (carried.slip_m[1:-1] != 0.0).all() == slipped
+    assert (carried.slip_m[1:-1] == 0.0).all() != slipped
