@@ -9,17 +9,17 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.statistics import SURE_SIGMAS
+
 Array = npt.NDArray[np.float64]
 
-# Rows scatter beyond so many of their sigmas once in ten million (DOMAIN section 3, k_T).
-_PLAY_SIGMAS = 5.3267
 # Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
 _NEAR_SIGMAS = 2.0
 
 
 def play_m(reading_sigma_m: Array) -> Array:
     """By how much the distance may leave what is held of it before it has moved [m]."""
-    return _PLAY_SIGMAS * reading_sigma_m
+    return SURE_SIGMAS * reading_sigma_m
 
 
 def with_play(distance_m: Array, width_m: Array) -> Array:
@@ -67,7 +67,7 @@ def without_scatter(t_s: Array, distance_m: Array, width_m: Array, least_mps: fl
     for gap in np.flatnonzero(stood & (gaps > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
         stood_m = float(np.median(distance_m[between]))
-        near = np.abs(distance_m[between] - stood_m) <= _NEAR_SIGMAS / _PLAY_SIGMAS * width_m[between]
+        near = np.abs(distance_m[between] - stood_m) <= _NEAR_SIGMAS / SURE_SIGMAS * width_m[between]
         last = between.start + int(np.flatnonzero(near)[-1]) if near.any() else between.start
         at_s.insert(gap + 1, float(t_s[last]))
         at_m.insert(gap + 1, stood_m)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints
-from pipeline.hazards.arrays import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
+from pipeline.statistics import SURE_SIGMAS
 from pipeline.timeline import linking_gap_s, nominal_period_s
 from schemas.config import LdsConfig
 

@@ -1,4 +1,4 @@
-"""Array operations, and what is beyond chance, for several modules of this area."""
+"""Array operations for several modules of this area."""
 
 from __future__ import annotations
 
@@ -8,10 +8,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.columns import Bools, Floats, Ints
-
-# Beyond chance: two-sided Gaussian 1e-7, as the monitors' k_T by default (DOMAIN section 3). Evidence does not follow
-# their configuration: how easily they alarm tells nothing of the odometer.
-SURE_SIGMAS = 5.3267
 
 
 def words(kinds: Sequence[str], codes: Ints) -> pl.Series:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints
-from pipeline.hazards.arrays import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
+from pipeline.statistics import SURE_SIGMAS
 
 # A short slip shows over seconds, a slow one over a minute.
 _WINDOWS_S = (2.0, 10.0, 60.0)

@@ -14,8 +14,8 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats
-from pipeline.hazards.arrays import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
+from pipeline.statistics import SURE_SIGMAS
 
 Matrix = npt.NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import polars as pl
 
 from pipeline.alignment.scatter import play_m, way_m, without_scatter
 from pipeline.columns import NS_PER_S, Bools, Floats, floats, times_ns
-from pipeline.contradicted import Contradiction, Witness, contradictions
-from pipeline.position_rate import PositionRate
+from pipeline.motion.contradicted import Contradiction, Witness, contradictions
+from pipeline.motion.position_rate import PositionRate
 from pipeline.timeline import moved
 from schemas.config import Configuration
 

@@ -14,8 +14,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
-from pipeline.hazards.arrays import SURE_SIGMAS, runs_of
-from pipeline.position_rate import HOLE_S, PositionRate
+from pipeline.hazards.arrays import runs_of
+from pipeline.motion.position_rate import HOLE_S, PositionRate
+from pipeline.statistics import SURE_SIGMAS
 from schemas.config import Configuration
 from schemas.enums import Evidence
 
