@@ -18,7 +18,7 @@ from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
-from pipeline.motion import Motion, motion_of
+from pipeline.motion import Motion, motion_of, void_evidence
 from pipeline.provenance import provenance
 from pipeline.run_notes import run_notes
 from pipeline.statistics import threshold_factor
@@ -185,6 +185,7 @@ def _case(context: _Context, ride: _Ride) -> tuple[Case, Motion]:
         locate=ride.found.path.locate,
         config=config,
         between=between,
+        void=void_evidence(motion, epochs, truth, passages),
     )
     return case, motion
 

@@ -14,7 +14,7 @@ from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
 from schemas.config import HazardConfig
-from schemas.enums import Verdict
+from schemas.enums import Evidence, Verdict
 from schemas.tables import Alarms
 
 # Streams rarely begin and end with the same epoch: so little without truth says nothing against it.
@@ -42,7 +42,10 @@ def _rings_on(fails: Fails, number: int) -> bool:
 
 def _row(span: AlarmSpan, judged: list[Judged], case: Case) -> dict[str, Any]:
     hazard_id = hazard_of(span, judged)
-    verdict = Verdict.TRUE if hazard_id is not None else verdict_of(span, case.witnesses, case.config.hazards)
+    if hazard_id is None:
+        verdict = verdict_of(span, case.witnesses, case.config.hazards)
+    else:
+        verdict = Verdict.UNKNOWN if _hangs_on_void(judged[hazard_id], case) else Verdict.TRUE
     if hazard_id is not None:
         suspect = judged[hazard_id].suspect
     else:
@@ -56,6 +59,16 @@ def _row(span: AlarmSpan, judged: list[Judged], case: Case) -> dict[str, Any]:
         "suspect": suspect.value,
         "hazard_id": hazard_id,
     }
+
+
+def _hangs_on_void(item: Judged, case: Case) -> bool:
+    """From its onset to its first VB the hazard is known by an odometer alone that lost way, or may have lost it.
+
+    The hazard stands, for it may be one; nobody knows whether the alarm was right.
+    """
+    row = case.series.row
+    first, last = sorted((int(row[item.timing.onset_epoch]), int(row[item.draft.first_epoch])))
+    return item.evidence == Evidence.ODOMETER.value and bool(case.witnesses.void[first : last + 1].any())
 
 
 def hazard_of(span: AlarmSpan, judged: list[Judged]) -> int | None:
@@ -72,9 +85,9 @@ def hazard_of(span: AlarmSpan, judged: list[Judged]) -> int | None:
 def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     """False when |e| stayed below max(5 m, 3 sigma) from 300 s before the alarm to its end.
 
-    More than a second of positions without truth, or an error that the evidence cannot resolve, leave it unknown. So
-    does a position that left the odometer by as much over that time where the odometer is the evidence: its error
-    starts anew at each accepted VB.
+    More than a second of positions without truth, an error that the evidence cannot resolve, or one against an odometer
+    that lost way or may have lost it, leave it unknown. So does a position that left the odometer by as much over that
+    time where the odometer is the evidence: its error starts anew at each accepted VB.
     """
     since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = slice(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
@@ -82,7 +95,7 @@ def verdict_of(span: AlarmSpan, w: Witnesses, config: HazardConfig) -> Verdict:
     tolerated = w.tolerated_m[part]
     with np.errstate(invalid="ignore"):
         beyond: Bools = error >= tolerated
-        proved = beyond & (error > w.bound_m[part])
+        proved = beyond & (error > w.bound_m[part]) & ~w.void[part]
         hidden = (w.slip_m[part] > 0.0) & (error + w.slip_m[part] >= tolerated)
     if proved.any():
         return Verdict.TRUE

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.columns import Floats
+from pipeline.columns import Bools, Floats
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.hazards.passing import TruePassings, true_passings
 from pipeline.hazards.series import Series, errors_of, series_of
@@ -27,7 +27,8 @@ class Case:
 
     `epochs`: matched, aligned and monitored, with the LDS columns; `truth`: from `establish_truth`, row by row;
     `passages`: of the LDS, with those from `with_unoffered`; `balises`: `leg, balise_id, kind, path_m` on the path;
-    `faults`: what was injected, where known; `between`: from `places_between`.
+    `faults`: what was injected, where known; `between`: from `places_between`; `void`: epochs whose evidence is an
+    odometer that lost way or may have (`motion.void_evidence`), none by default.
     """
 
     solution: str
@@ -39,6 +40,7 @@ class Case:
     locate: Locate
     config: Configuration
     between: pl.DataFrame | None = None
+    void: Bools | None = None
 
     @cached_property
     def errors(self) -> dict[str, Floats]:
@@ -55,7 +57,7 @@ class Case:
 
     @cached_property
     def witnesses(self) -> Witnesses:
-        return witnesses_of(self.epochs, self.truth, self.errors, self.config)
+        return witnesses_of(self.epochs, self.truth, self.errors, self.config, self.void)
 
     @cached_property
     def passings(self) -> TruePassings:

@@ -15,6 +15,8 @@ from schemas.config import HazardConfig
 # A jump spread over several epochs reaches from its first to its last increment of at least this
 # share of the largest: noise before and after it is no part of it.
 _SHARE_OF_LARGEST = 0.3
+# A slip is the same number up to rounding.
+_SAME_DECIMALS = 3
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,8 @@ def _slipped(series: Series, first: int, last: int) -> bool:
     Where the odometer counts too far, GNSS minus odometer falls. A slip that lasts over a read is one of each side.
     """
     step = float(series.excess_m[last] - series.excess_m[first - 1])
-    slips = np.unique(series.slip_m[first - 1 : last + 1])
+    # Counted for two, one slip would excuse twice as long a jump.
+    slips = np.unique(np.round(series.slip_m[first - 1 : last + 1], _SAME_DECIMALS))
     proved = float(np.abs(slips[slips * step < 0.0]).sum())
     return proved > 0.0 and abs(step) <= proved + float(series.noise_m[first - 1 : last + 1].max())
 

@@ -26,7 +26,7 @@ class Witnesses:
 
     `tolerated_m`: errors along the track below this are a healthy position's, max(5 m, 3 sigma) (DOMAIN section 5);
     `healthy_m`: the part of it that does not depend on sigma; `slip_m`: size of what two reads around say that the
-    odometer counted wrong.
+    odometer counted wrong; `void`: the evidence is an odometer that lost way or may have lost it.
     """
 
     t_ns: Ints
@@ -52,6 +52,7 @@ class Witnesses:
     velocity_mps: Floats
     by_reference: Bools
     by_odometer: Bools
+    void: Bools
     doubtful_track: Bools
     healthy_m: float
 
@@ -61,7 +62,11 @@ class Witnesses:
 
 
 def witnesses_of(
-    epochs: pl.DataFrame, truth: pl.DataFrame, errors: dict[str, Floats], config: Configuration
+    epochs: pl.DataFrame,
+    truth: pl.DataFrame,
+    errors: dict[str, Floats],
+    config: Configuration,
+    void: Bools | None = None,
 ) -> Witnesses:
     """Everything that can speak for or against the position."""
     truth_sigma = floats(truth, "truth_sigma_m")
@@ -93,6 +98,7 @@ def witnesses_of(
         velocity_mps=floats(epochs, "velocity_along_mps"),
         by_reference=truths(truth["evidence"] == Evidence.REFERENCE.value),
         by_odometer=truths(truth["evidence"] == Evidence.ODOMETER.value),
+        void=np.zeros(epochs.height, dtype=np.bool_) if void is None else void,
         doubtful_track=(gate < config.matching.ambiguity_probability) | off_track,
         healthy_m=config.hazards.false_alarm_margin_m,
     )

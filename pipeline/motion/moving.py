@@ -9,8 +9,9 @@ import polars as pl
 
 from pipeline.alignment.scatter import play_m, way_m, without_scatter
 from pipeline.columns import NS_PER_S, Bools, Floats, floats, times_ns
-from pipeline.motion.contradicted import Contradiction, Witness, contradictions
+from pipeline.motion.contradicted import Contradiction, contradictions
 from pipeline.motion.position_rate import PositionRate
+from pipeline.motion.witness import Witness
 from pipeline.timeline import moved
 from schemas.config import Configuration
 
@@ -64,7 +65,7 @@ def motion_of(epochs: pl.DataFrame, truth: pl.DataFrame, config: Configuration) 
     plain = motion_by_odometer(epochs, deadband_mps)
     if epochs.height < 2:
         return plain
-    positions = PositionRate.of(epochs)
+    positions = PositionRate.of(epochs, ~plain.moving)
     motion = _by_positions(plain, epochs, positions, deadband_mps)
     witness = Witness.of(epochs, truth, positions, plain.moving)
     found = contradictions(witness, config)

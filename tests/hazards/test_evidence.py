@@ -7,6 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.hazards import Case, classify, establish_truth
+from pipeline.hazards.jumps import find_jumps
+from pipeline.hazards.series import series_of
 from schemas.config import Configuration, HazardConfig, MonitorConfig
 from tests.hazards.synthetic import START_NS, UTC, Journey, judge, locate, seconds, stamps, truth_of, with_hazards
 
@@ -119,6 +121,20 @@ def test_error_that_no_slip_between_the_reads_accounts_for_is_a_hazard(size_m, s
     state = judge(journey).epochs_columns["lds_state"]
     assert state[120] == ("P1" if seen else None)
     assert judge(journey.but(steps=())).hazards.height == 0
+
+
+def test_a_slip_excuses_a_jump_no_longer_than_itself_whatever_its_rounding():
+    # The odometer counts 60 m too little; the position leaps 100 m ahead. Sums and differences of the same slip are apart
+    # in their last digits, and two of them would make 120 m of it.
+    journey = Journey(reference=False, reads=(50.0, 550.0), slip=(22.0, 25.0, -20.0), steps=((10.0, 20.0, 100.0),))
+    truth = truth_of(journey)
+    slip_m = truth["truth_slip_m"].to_numpy().copy()
+    assert slip_m[100] < -60.0
+    slip_m[100:] += 4.5e-13
+    told = truth.with_columns(truth_slip_m=pl.Series(slip_m))
+    series = series_of(journey.epochs(), told, Configuration().lds)
+    (ahead, *_) = find_jumps(series, (), HazardConfig())
+    assert (ahead.first, round(ahead.step_m)) == (100, 100)
 
 
 def test_slip_with_doppler_is_no_hazard_whatever_the_evidence():

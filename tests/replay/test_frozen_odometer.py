@@ -203,3 +203,89 @@ def test_an_odometer_that_ends_early_does_not_stand_from_then_on():
     assert rest["moving"].mean() == 1.0
     assert not rest["tvb"].any()
     assert row(tables)["availability"] < 0.6
+
+
+def kept(**gnss):
+    """A run that keeps its epochs without a position; the train stops at a station in the middle of 120 s of them."""
+    station = {**STOP, "phases": [STOP["phases"][0], {"stop_at_m": 3900.0, "hold_s": 40.0}, *STOP["phases"][2:]]}
+    fault = {"kind": "outage", "start_s": 120.0, "duration_s": 120.0}
+    return journey(fault, motion=station, gnss={"keep_lost": True, **gnss})
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 1.0])
+def test_a_station_in_a_tunnel_is_a_stand_of_a_healthy_odometer(rate_hz):
+    run, site = kept(rate_hz=rate_hz)
+    tables = replay(told_by(run, "doppler"), site, VEHICLE)
+    assert set(between(tables, 192.0, 226.0)["moving"]) == {False}
+    assert tables.epochs["moving"].null_count() == tables.epochs["speed_mps"].null_count() == 0
+    assert "stood still" not in (row(tables)["notes"] or "")
+
+
+def test_what_an_odometer_loses_at_a_station_in_a_tunnel_is_missed():
+    """It stays at its count when the train leaves the station, 300 m before the end of the tunnel."""
+    run, site = kept()
+    run = told_by(run, "doppler")
+    dead = run.with_streams(odometer=frozen(run.odometer, 200.0, 254.0, "distance"))
+    tables = replay(dead, site, VEHICLE)
+    assert "stood still" in row(tables)["notes"]
+    assert row(tables)["availability"] <= row(replay(run, site, VEHICLE))["availability"]
+
+
+@pytest.mark.parametrize("sigma_m", [2.0, 5.0])
+@pytest.mark.parametrize("seed", [5, 6])
+def test_noise_of_positions_adds_up_to_no_movement_however_long_the_train_stands(sigma_m, seed):
+    """White noise for half an hour, beside which the odometer is healthy."""
+    stand = {**STOP, "phases": [STOP["phases"][0], {"stop_at_m": 3900.0, "hold_s": 1800.0}, *STOP["phases"][2:]]}
+    noise = {"kind": "noise", "sigma_m": sigma_m, "start_s": 200.0, "duration_s": 1700.0}
+    run, site = journey(noise, motion=stand, gnss={"rate_hz": 1.0}, seed=seed)
+    tables = replay(told_by(run, "nothing"), site, VEHICLE)
+    assert set(between(tables, 192.0, 1980.0)["moving"]) == {False}
+    assert "stood still" not in (row(tables)["notes"] or "")
+
+
+def test_a_train_that_turns_at_once_did_not_stand_where_it_began():
+    """1500 m ahead and as many back with an odometer that counts nothing come to nothing in the sum."""
+    ahead = [{"speed_mps": 20.0}, {"stop_at_m": 4000.0}]
+    back = [{"speed_mps": -20.0}, {"stop_at_m": 2500.0, "hold_s": 20.0}]
+    rest = [{"speed_mps": 30.0}, {"stop_at_m": 8000.0}]
+    run, site = journey(motion={"start_m": 2500.0, "phases": [*ahead, *back, *rest]})
+    dead = run.with_streams(odometer=frozen(run.odometer, 20.0, 1e9, "distance"))
+    tables = replay(told_by(dead, "nothing"), site, VEHICLE)
+    assert between(tables, 25.0, 200.0)["moving"].mean() > 0.98
+    assert row(tables)["distance_m"] == pytest.approx(8500.0, abs=60.0)
+
+
+def test_reads_tell_of_an_odometer_that_was_frozen_between_them():
+    """At 5 m/s nothing else can. It counts again before the last read: so it was lost in between, and nobody knows when."""
+    slow = [{"speed_mps": 5.0, "hold_s": 500.0}, {"speed_mps": 30.0}, {"stop_at_m": 8000.0}]
+    run, site = journey(motion={"start_m": 200.0, "phases": slow})
+    dead = run.with_streams(odometer=frozen(run.odometer, 190.0, 430.0, "distance"))
+    tables = replay(told_by(dead, "reads"), site, VEHICLE)
+    assert set(between(tables, 195.0, 425.0)["moving"]) == {True}
+    assert row(tables)["distance_m"] == pytest.approx(7800.0, abs=20.0)
+
+
+@pytest.mark.parametrize("witness", ["nothing", "reference"])
+def test_no_alarm_is_right_by_an_odometer_that_was_frozen(witness):
+    """The hazard stands, for nobody can exclude it; whether the alarm was a false one the reference knows alone."""
+    run, site = journey()
+    dead = told_by(run, witness).with_streams(odometer=frozen(run.odometer, 100.0, 1e9, "distance"))
+    tables = replay(dead, site, VEHICLE)
+    verdicts = set(tables.alarms["verdict"])
+    if witness == "reference":
+        assert verdicts == {"false"}
+        assert row(tables)["false_alarm_rate_per_h"] > 0.0
+        return
+    assert verdicts == {"unknown"}
+    assert set(tables.hazards["suspect"]) == {"unknown"}
+    assert row(tables)["false_alarm_rate_per_h"] is None
+    assert row(tables)["failures"] > 0
+
+
+def test_an_alarm_before_the_odometer_froze_keeps_its_verdict():
+    leap = {"kind": "step", "size_m": 850.0, "start_s": 60.0, "duration_s": 6.0}
+    run, site = journey(leap)
+    dead = run.with_streams(odometer=frozen(run.odometer, 200.0, 1e9, "distance"))
+    alarms = replay(told_by(dead, "nothing"), site, VEHICLE).alarms
+    assert alarms["verdict"][0] == "true"
+    assert alarms["verdict"][-1] == "unknown"
