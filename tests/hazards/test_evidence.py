@@ -124,8 +124,8 @@ def test_error_that_no_slip_between_the_reads_accounts_for_is_a_hazard(size_m, s
 
 
 def test_a_slip_excuses_a_jump_no_longer_than_itself_whatever_its_rounding():
-    # The odometer counts 60 m too little; the position leaps 100 m ahead. Sums and differences of the same slip are apart
-    # in their last digits, and two of them would make 120 m of it.
+    # The odometer counts 60 m too little; the position leaps 100 m ahead. One slip has other last digits from epoch
+    # to epoch, and two of them would make 120 m of it.
     journey = Journey(reference=False, reads=(50.0, 550.0), slip=(22.0, 25.0, -20.0), steps=((10.0, 20.0, 100.0),))
     truth = truth_of(journey)
     slip_m = truth["truth_slip_m"].to_numpy().copy()

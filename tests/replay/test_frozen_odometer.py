@@ -256,7 +256,7 @@ def test_a_train_that_turns_at_once_did_not_stand_where_it_began():
 
 
 def test_reads_tell_of_an_odometer_that_was_frozen_between_them():
-    """At 5 m/s nothing else can. It counts again before the last read: so it was lost in between, and nobody knows when."""
+    """At 5 m/s nothing else can. It counts again before the last read, so that nobody knows when the way was lost."""
     slow = [{"speed_mps": 5.0, "hold_s": 500.0}, {"speed_mps": 30.0}, {"stop_at_m": 8000.0}]
     run, site = journey(motion={"start_m": 200.0, "phases": slow})
     dead = run.with_streams(odometer=frozen(run.odometer, 190.0, 430.0, "distance"))
