@@ -16,7 +16,7 @@ from pipeline.hazards.excursions import faulty_spans
 from pipeline.hazards.passages import beyond_window, judge_passages, link_passages, within_spans
 from pipeline.hazards.rows import Judged, hazards_table
 from pipeline.hazards.states import contradicted, lds_states
-from pipeline.hazards.suspect import suspect_of_error
+from pipeline.hazards.suspect import left_doppler, suspect_of_error
 from pipeline.hazards.timing import Timing, time_hazard
 from schemas.enums import PassageStatus, Suspect
 
@@ -49,12 +49,18 @@ def classify(case: Case) -> HazardResult:
 
 
 def _judge(draft: Draft, timing: Timing, case: Case) -> list[Judged]:
-    """The hazard with its suspect; none where the odometer that carries the truth is held to be at fault."""
+    """The hazard with its suspect; none where the odometer that carries the truth is held to be at fault.
+
+    An odometer that slips further while a wrong position lasts did not make that position wrong.
+    """
     row, size = case.series.row, case.series.size
     first, last = sorted((int(row[timing.onset_epoch]), int(row[min(draft.end, size - 1)])))
     suspect = suspect_of_error(case.witnesses, first, last, case.fails.failed_in(first, last))
     if suspect is Suspect.ODOMETER:
-        return []
+        came = max(first, int(row[draft.first_epoch]))
+        if not left_doppler(case.witnesses, first, came):
+            return []
+        suspect = Suspect.GNSS
     evidence = str(case.truth["evidence"][int(row[draft.first_epoch])])
     return [_with_passages(Judged(draft, timing, evidence, suspect, False, ()), case)]
 

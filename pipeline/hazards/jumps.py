@@ -45,7 +45,8 @@ def find_jumps(series: Series, beacons: tuple[Beacons, ...], config: HazardConfi
     for sign in (1.0, -1.0):
         begins, ends = runs_of(largest * sign > config.jump_limit_m)
         spans = [_span(series, begin, end, sign, config) for begin, end in zip(begins, ends, strict=True)]
-        jumps += [_jump(series, beacons, first, last) for first, last in spans if not _slipped(series, first, last)]
+        slipped = _excused(series, [span for span in spans if _slipped(series, *span)])
+        jumps += [_jump(series, beacons, *span) for span in spans if span not in slipped]
     return sorted(jumps, key=lambda jump: (jump.first, jump.last))
 
 
@@ -89,10 +90,30 @@ def _slipped(series: Series, first: int, last: int) -> bool:
     Where the odometer counts too far, GNSS minus odometer falls. A slip that lasts over a read is one of each side.
     """
     step = float(series.excess_m[last] - series.excess_m[first - 1])
-    # Counted for two, one slip would excuse twice as long a jump.
-    slips = np.unique(np.round(series.slip_m[first - 1 : last + 1], _SAME_DECIMALS))
-    proved = float(np.abs(slips[slips * step < 0.0]).sum())
+    proved = sum(_proved(series, (first, last)))
     return proved > 0.0 and abs(step) <= proved + float(series.noise_m[first - 1 : last + 1].max())
+
+
+def _proved(series: Series, span: tuple[int, int]) -> frozenset[float]:
+    """Sizes of the slips around a step that are of its direction, each once: counted for two, one excuses too much."""
+    first, last = span
+    step = series.excess_m[last] - series.excess_m[first - 1]
+    slips = np.round(series.slip_m[first - 1 : last + 1], _SAME_DECIMALS)
+    return frozenset(np.abs(slips[slips * step < 0.0]).tolist())
+
+
+def _excused(series: Series, spans: list[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Those of the steps of one direction that the slips account for together: one slip excuses no two jumps."""
+    proved = [_proved(series, span) for span in spans]
+    kept = set()
+    for span, own in zip(spans, proved, strict=True):
+        beside = [(other, slips) for other, slips in zip(spans, proved, strict=True) if own & slips]
+        steps = np.unique(np.concatenate([np.arange(first, last + 1) for (first, last), _ in beside]))
+        together = abs(float((series.excess_m[steps] - series.excess_m[steps - 1]).sum()))
+        slipped = sum(frozenset().union(*(slips for _, slips in beside)))
+        if together <= slipped + float(series.noise_m[steps].max()):
+            kept.add(span)
+    return kept
 
 
 def _jump(series: Series, beacons: tuple[Beacons, ...], first: int, last: int) -> Jump:

@@ -14,10 +14,14 @@ _STATES = [member.value for member in LdsState]
 
 
 def contradicted(error_along_m: Floats, truth: pl.DataFrame, limit_m: float) -> Bools:
-    """Errors that may lie on either side of the limit because two reads contradict the odometer around them."""
+    """Errors that may lie on either side of the limit because two reads contradict the odometer around them.
+
+    One within the limit proves nothing though it is larger than the slip: the true one may be the sum of both.
+    """
     size, slip = np.abs(error_along_m), np.abs(floats(truth, "truth_slip_m"))
+    proves_m = np.maximum(floats(truth, "truth_bound_m"), limit_m)
     with np.errstate(invalid="ignore"):
-        hidden: Bools = (slip > 0.0) & (size + slip > limit_m) & (size <= floats(truth, "truth_bound_m"))
+        hidden: Bools = (slip > 0.0) & (size + slip > limit_m) & (size <= proves_m)
     return hidden
 
 

@@ -15,6 +15,8 @@ from schemas.enums import Evidence, Suspect, Verdict
 _LOOKBACKS_S = (1.0, 30.0, 300.0)
 # What an alarm is about shows when it comes; a long one sees other things too.
 _COMING_S = 30.0
+# Longest step between epochs over which the mean of two velocities stands for the way.
+_JOINED_S = 2.0
 _ACROSS = ("cross_", "up_")
 # A reference is steadier than this over the seconds before an alarm, a map need not be.
 _MAP_ERROR_M = 0.5
@@ -25,8 +27,9 @@ class Witnesses:
     """Per epoch, all epochs: truth, position, odometer and GNSS velocity, NaN where not known.
 
     `tolerated_m`: errors along the track below this are a healthy position's, max(5 m, 3 sigma) (DOMAIN section 5);
-    `healthy_m`: the part of it that does not depend on sigma; `slip_m`: size of what two reads around say that the
-    odometer counted wrong; `void`: the evidence is an odometer that lost way or may have lost it.
+    `healthy_m`: the part of it that does not depend on sigma; beyond `failure_limit_m` a position is wrong; `slip_m`:
+    size of what two reads around say that the odometer counted wrong; `void`: the evidence is an odometer that lost way
+    or may have lost it.
     """
 
     t_ns: Ints
@@ -55,6 +58,7 @@ class Witnesses:
     void: Bools
     doubtful_track: Bools
     healthy_m: float
+    failure_limit_m: float
 
     def epoch_before(self, epoch: int, lookback_s: float) -> int:
         """The first epoch no more than this time before another."""
@@ -101,6 +105,7 @@ def witnesses_of(
         void=np.zeros(epochs.height, dtype=np.bool_) if void is None else void,
         doubtful_track=(gate < config.matching.ambiguity_probability) | off_track,
         healthy_m=config.hazards.false_alarm_margin_m,
+        failure_limit_m=config.hazards.failure_limit_m,
     )
 
 
@@ -245,6 +250,19 @@ def _vote(w: Witnesses, rows: Ints) -> Suspect | None:
         strayed_m = float(np.ptp((by_position - by_doppler)[: at + 1]))
         return Suspect.ODOMETER if strayed_m <= max(w.healthy_m, 0.5 * apart) else Suspect.GNSS
     return Suspect.GNSS if to_odometer < 0.5 * apart else None
+
+
+def left_doppler(w: Witnesses, first: int, last: int) -> bool:
+    """The position left Doppler's way by more than the failure limit over epochs `first..last` or just before them.
+
+    Then it was wrong, whatever the odometer did. What a gap of the position or of Doppler hides counts for nothing.
+    """
+    rows = np.arange(w.epoch_before(first, _LOOKBACKS_S[1]), last + 1)
+    rows = rows[np.isfinite(w.path_m[rows]) & np.isfinite(w.velocity_mps[rows])]
+    dt_s, velocity = np.diff(w.t_ns[rows]) / NS_PER_S, w.velocity_mps[rows]
+    apart = np.diff(w.path_m[rows]) - 0.5 * (velocity[1:] + velocity[:-1]) * dt_s
+    strayed = np.concatenate(([0.0], np.cumsum(np.where(dt_s <= _JOINED_S, apart, 0.0))))
+    return float(np.ptp(strayed)) > w.failure_limit_m
 
 
 def _beyond(error: Floats, noise: Floats, first: int, last: int) -> bool:

@@ -137,6 +137,46 @@ def test_a_slip_excuses_a_jump_no_longer_than_itself_whatever_its_rounding():
     assert (ahead.first, round(ahead.step_m)) == (100, 100)
 
 
+def test_one_slip_between_two_reads_excuses_one_jump():
+    # The odometer counts 60 m too little at 30 s; at 10 s the position leapt 55 m, which the same slip would excuse.
+    journey = Journey(reference=False, reads=(50.0, 1050.0), slip=(30.0, 31.0, -60.0), steps=((10.0, 20.0, 55.0),))
+    series = series_of(journey.epochs(), truth_of(journey), Configuration().lds)
+    found = [(jump.first, round(jump.step_m)) for jump in find_jumps(series, (), HazardConfig())]
+    assert found[:2] == [(100, 55), (200, -55)]
+    alone = journey.but(steps=())
+    assert find_jumps(series_of(alone.epochs(), truth_of(alone), Configuration().lds), (), HazardConfig()) == []
+
+
+def test_error_within_the_limit_that_the_slip_may_carry_beyond_it_is_not_known():
+    # 15 m slipped just behind the first read, where the place is shared out by distance: 33 m look like 20 m, which is
+    # more than the slip itself.
+    journey = Journey(reference=False, reads=(50.0, 550.0), slip=(3.0, 4.0, 15.0), steps=((4.5, 6.0, 33.0),))
+    told = judge(journey).epochs_columns[45:60]
+    seen = journey.epochs()["path_m"][45:60] - truth_of(journey)["truth_path_m"][45:60]
+    assert seen.min() < 20.0
+    assert "P0" not in told["lds_state"].cast(pl.String).to_list()
+    assert told.filter(seen <= 20.0)["error_along_m"].null_count() == (seen <= 20.0).sum()
+
+
+WITH_DOPPLER = Journey(reference=False, reads=READS, doppler=True)
+
+
+@pytest.mark.parametrize(
+    ("error", "slip"),
+    [
+        ({"steps": ((31.0, 60.0, 60.0),)}, (40.0, 42.0, 100.0)),
+        ({"steps": ((31.0, 60.0, 24.0),)}, (31.0, 32.0, 150.0)),
+        ({"ramps": ((30.0, 70.0, 1.0),)}, (36.0, 46.0, -15.0)),
+    ],
+)
+def test_a_slip_beside_a_position_that_left_doppler_hides_no_hazard(error, slip):
+    alone, both = (judge(WITH_DOPPLER.but(slip=by, **error)).hazards for by in (None, slip))
+    assert alone.height
+    assert both["hazard"].to_list() == alone["hazard"].to_list()
+    assert set(both["suspect"]) == {"gnss"}
+    assert judge(WITH_DOPPLER.but(slip=slip)).hazards.height == 0
+
+
 def test_slip_with_doppler_is_no_hazard_whatever_the_evidence():
     journey = Journey(
         reference=False,
