@@ -125,7 +125,7 @@ def dictionary(
     if as_json:
         _print_json(columns if table else {"columns": columns, "settings": settings_frame()})
         return
-    from pipeline.present import show_table
+    from pipeline.results.terminal import show_table
 
     for name, rows in columns.group_by("group", "table", maintain_order=True):
         show_table(rows.drop("group", "table"), f"{name[1]} ({name[0]})")
@@ -143,7 +143,7 @@ def demo(
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
     from datasets.demo import write_demo
-    from pipeline.present import show_table
+    from pipeline.results.terminal import show_table
 
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
     page = write_demo(result, out / "tables")
@@ -178,7 +178,7 @@ def safety(
     if out is not None:
         _assess(out, config, as_json)
         return
-    from pipeline.present import show_table
+    from pipeline.results.terminal import show_table
     from pipeline.safety import safety_tables
 
     settings = _configuration(config)
@@ -201,8 +201,8 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """What a log, a site or a result holds, and what is remarkable in it."""
-    from pipeline.inspection import inspect_path
-    from pipeline.present import show_table
+    from pipeline.results.inspection import inspect_path
+    from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
     tables = inspect_path(path, settings.ingest, result)
@@ -227,7 +227,7 @@ def inject(
     from datasets.inject import inject_all, load_faults
     from datasets.trial import write_run_as
     from pipeline.ingest import read_run
-    from pipeline.ingest.site import read_site
+    from pipeline.site.read import read_site
     from schemas.errors import UsageError
 
     settings = _configuration(config)
@@ -274,11 +274,11 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Measure odometer scale, GNSS latency and the monitors' sigmas on fault-free runs."""
-    from pipeline.calibrate import calibrate as measure
+    from pipeline.calibration.calibrate import calibrate as measure
     from pipeline.campaign import find_runs
     from pipeline.ingest import read_run
-    from pipeline.ingest.site import read_site
-    from pipeline.present import show_table
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
     from pipeline.storage import write_bytes
     from schemas.config import to_toml
 
@@ -330,8 +330,8 @@ def sql(
     as_json: Json = False,
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
-    from pipeline.present import show_table
     from pipeline.results.query import run_sql
+    from pipeline.results.terminal import show_table
 
     answer = run_sql(out, query)
     if as_json:
@@ -351,9 +351,9 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
-    from pipeline.ingest.site import read_site
-    from pipeline.present import how_far
     from pipeline.report import write_report
+    from pipeline.results.terminal import how_far
+    from pipeline.site.read import read_site
 
     place = None if site is None else read_site(site)
     pages = write_report(out, place, jobs, None if quiet else how_far("pages"))
@@ -376,7 +376,7 @@ def export(
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
     from pipeline.export import export_run
     from pipeline.ingest.run import read_run
-    from pipeline.ingest.site import read_site
+    from pipeline.site.read import read_site
 
     settings = _configuration(config)
     ground = None if site is None else read_site(site)
@@ -457,14 +457,14 @@ def _say(text: str) -> None:
 
 
 def _print_json(value: Any) -> None:
-    from pipeline.present import to_json
+    from pipeline.results.terminal import to_json
 
     print(to_json(value))
 
 
 def _assess(out: str, config: Path | None, as_json: bool) -> None:
-    from pipeline.assessment import assess, for_reading
-    from pipeline.present import show_table
+    from pipeline.results.terminal import show_table
+    from pipeline.safety.assessment import assess, for_reading
 
     settings = None if config is None else _configuration(config)
     found = assess(out, settings)
@@ -487,7 +487,7 @@ def _status_of(summary: Summary) -> int:
 
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
     from pipeline.campaign.tally import outcome_line, outcome_rows, summary_line
-    from pipeline.present import show_table
+    from pipeline.results.terminal import show_table
     from schemas.enums import RunStatus
 
     rows = outcome_rows(summary)

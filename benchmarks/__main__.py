@@ -10,7 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from benchmarks.results import Figure
-from pipeline.present import show_table, to_json
+from pipeline.results.terminal import show_table, to_json
 
 MODULES = ("end_to_end", "ingest", "matching", "campaign", "interruptions", "experiment")
 

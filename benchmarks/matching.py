@@ -14,10 +14,10 @@ import polars as pl
 from scipy.spatial import cKDTree
 
 from benchmarks.results import Figure, best_of
-from pipeline.geodesy import points_of
 from pipeline.matching import match
-from pipeline.matching.leg import Visit, leg_of, nearest_on_leg, path_at
-from pipeline.track import geometric_measures_m, track_of
+from pipeline.track.geodesy import points_of
+from pipeline.track.leg import Visit, leg_of, nearest_on_leg, path_at
+from pipeline.track.survey import geometric_measures_m, track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site

@@ -13,9 +13,9 @@ import polars as pl
 import pyproj
 
 from datasets.to_contract import conformed, table_of, virtual_balises
-from pipeline.columns import NS_PER_S, Floats
-from pipeline.geodesy import distances_m, points_of
 from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.track.geodesy import distances_m, points_of
+from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
 from schemas.errors import InputError
 from schemas.inputs import Links, Track

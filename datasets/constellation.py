@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
+from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]

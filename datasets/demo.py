@@ -14,9 +14,9 @@ from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign.finish import write_campaign
 from pipeline.ingest.run import read_run
-from pipeline.ingest.site import read_site
 from pipeline.report import write_report
 from pipeline.results.store import write_config, write_run
+from pipeline.site.read import read_site
 from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site

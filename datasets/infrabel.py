@@ -17,9 +17,9 @@ from datasets.to_contract import conformed, virtual_balises
 from pipeline.ingest.conform import rows_text
 from pipeline.ingest.csv_text import read_log_table
 from pipeline.ingest.novatel import FIX_BY_WORD
-from pipeline.ingest.site import read_site
 from pipeline.receivers import Converted
 from pipeline.receivers.csv import CUT_ROW
+from pipeline.site.read import read_site
 from schemas.enums import Fix
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

@@ -14,7 +14,7 @@ import polars as pl
 from scipy.ndimage import uniform_filter1d
 
 from datasets.scenario import LineSpec, ParallelSpec, SurveySpec
-from pipeline.geodesy import curvature_radii_m, moved_deg
+from pipeline.track.geodesy import curvature_radii_m, moved_deg
 from schemas.errors import ConfigError
 from schemas.inputs import Balises, Links, Track
 

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.clean import clean
-from pipeline.geodesy import curvature_radii_m, distances_m
+from pipeline.ingest.clean import clean
 from pipeline.matching import match
+from pipeline.track.geodesy import curvature_radii_m, distances_m
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

@@ -8,22 +8,22 @@ import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
 from pipeline.alignment.increments import most_scatter_m
-from pipeline.channels import on_path_of
-from pipeline.clean import CleanCounts, clean, require_one_journey, require_two_times
-from pipeline.evidence_notes import evidence_notes, motion_notes, reading_notes, return_notes, undiagnosed_notes
+from pipeline.figures.bounds import threshold_factor
+from pipeline.figures.evidence_notes import evidence_notes, motion_notes, reading_notes, return_notes, undiagnosed_notes
+from pipeline.figures.run_notes import run_notes
+from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
+from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
+from pipeline.lds.telegrams import place_reads, places_near
 from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
+from pipeline.monitors.channels import on_path_of
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
 from pipeline.motion import Motion, motion_of, void_evidence
-from pipeline.provenance import provenance
-from pipeline.run_notes import run_notes
-from pipeline.statistics import threshold_factor
-from pipeline.summary import Alignment, SolutionResults, failed_row, summarise
-from pipeline.telegrams import place_reads, places_near
+from pipeline.results.provenance import provenance
 from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import Evidence

@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.clean import StreamCounts, clean, require_one_journey
+from pipeline.ingest.clean import StreamCounts, clean, require_one_journey
 from schemas.errors import InputError
 from schemas.run import RunLog
 

@@ -24,8 +24,8 @@ from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
 from datasets.experiment.tables import write_page, write_tables
 from datasets.experiment.workers import generator
-from pipeline.statistics import clopper_pearson
-from pipeline.workers import mapped
+from pipeline.campaign.workers import mapped
+from pipeline.figures.bounds import clopper_pearson
 from schemas.config import Configuration, MonitorConfig
 
 Array = npt.NDArray[np.float64]

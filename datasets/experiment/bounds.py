@@ -1,4 +1,4 @@
-"""Exact bounds on expectations and medians of simulated times (shares have theirs in `pipeline.statistics`)."""
+"""Exact bounds on expectations and medians of simulated times (shares have theirs in `pipeline.figures.bounds`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import binom
 
-from pipeline.statistics import CONFIDENCE
+from pipeline.figures.bounds import CONFIDENCE
 
 Array = npt.NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fau
 from datasets.experiment.diagnostics import SEED
 from datasets.experiment.tables import write_page, write_tables
 from datasets.motion import build_motion
+from pipeline.campaign.workers import mapped
 from pipeline.stages import replay
-from pipeline.workers import mapped
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import MONITORS

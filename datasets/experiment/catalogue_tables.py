@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.statistics import clopper_pearson
+from pipeline.figures.bounds import clopper_pearson
 from schemas.tables import MONITORS
 
 

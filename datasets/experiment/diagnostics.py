@@ -21,8 +21,8 @@ from datasets.experiment.passage import NEVER, Passages, first_passages, joined
 from datasets.experiment.plan import Plan, bank_forms, failure_forms
 from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks
-from pipeline.statistics import clopper_pearson
-from pipeline.workers import mapped
+from pipeline.campaign.workers import mapped
+from pipeline.figures.bounds import clopper_pearson
 from schemas.config import Configuration
 
 Ints = npt.NDArray[np.int64]

@@ -25,8 +25,8 @@ from datasets.experiment.thresholds import (
     two_sided,
 )
 from datasets.experiment.workers import generator, in_blocks
-from pipeline.statistics import clopper_pearson, poisson_rate, threshold_factor
-from pipeline.workers import mapped
+from pipeline.campaign.workers import mapped
+from pipeline.figures.bounds import clopper_pearson, poisson_rate, threshold_factor
 from schemas.config import Configuration, LdsConfig
 
 Array = npt.NDArray[np.float64]

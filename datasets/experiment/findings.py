@@ -18,8 +18,8 @@ from datasets.experiment.passage import first_passages
 from datasets.experiment.plan import Plan, bank_forms, failure_forms
 from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks
-from pipeline.statistics import clopper_pearson
-from pipeline.workers import mapped
+from pipeline.campaign.workers import mapped
+from pipeline.figures.bounds import clopper_pearson
 from schemas.config import Configuration
 
 EPOCHS_PER_PLACE = 40

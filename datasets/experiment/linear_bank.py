@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
 from datasets.experiment.plan import BANKS, Reading, Sensors
-from pipeline.statistics import threshold_factor
+from pipeline.figures.bounds import threshold_factor
 from schemas.config import MonitorConfig
 
 Array = npt.NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from datasets.experiment.geometry import TAUS_S, Geometry
 from datasets.experiment.sigmas import bank_sigmas
-from pipeline.statistics import threshold_factor
+from pipeline.figures.bounds import threshold_factor
 
 Array = npt.NDArray[np.float64]
 Reading = Literal["increments", "position"]

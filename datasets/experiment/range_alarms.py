@@ -16,8 +16,8 @@ from scipy.special import chdtrc, chdtri
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.ranges import HEADINGS_DEG, RangePlan, Statistic, held_rows, statistic
 from datasets.experiment.workers import generator, in_blocks
-from pipeline.statistics import clopper_pearson
-from pipeline.workers import mapped
+from pipeline.campaign.workers import mapped
+from pipeline.figures.bounds import clopper_pearson
 
 Array = npt.NDArray[np.float64]
 

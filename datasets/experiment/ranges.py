@@ -20,9 +20,9 @@ from datasets.experiment.diagnostics import SEED
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, default_geometry
 from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks
+from pipeline.campaign.workers import mapped
+from pipeline.figures.bounds import clopper_pearson
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
-from pipeline.statistics import clopper_pearson
-from pipeline.workers import mapped
 from schemas.config import Configuration
 
 Array = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ from scipy.special import log_ndtr, ndtri_exp
 from datasets.experiment.linear_bank import LinearBank
 from datasets.experiment.splitting import Shift, miss_estimate, most_probable_miss
 from datasets.experiment.workers import generator, in_blocks
-from pipeline.workers import mapped
+from pipeline.campaign.workers import mapped
 
 Array = npt.NDArray[np.float64]
 W = TypeVar("W")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 
 from datasets.experiment.rare import Probability
-from pipeline.statistics import clopper_pearson
+from pipeline.figures.bounds import clopper_pearson
 
 _NORMAL_95 = 1.959963984540054
 _CLOSE_ENOUGH = 0.02

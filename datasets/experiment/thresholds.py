@@ -24,7 +24,7 @@ from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Readin
 from datasets.experiment.sigmas import limit_sigmas
 from datasets.experiment.workers import generator
 from pipeline.calibration.sigmas import overall_ratio
-from pipeline.statistics import threshold_factor
+from pipeline.figures.bounds import threshold_factor
 
 Array = npt.NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from pipeline.alignment.increments import EpochArrays, Learned, Mask, odometer_s
 from pipeline.alignment.learning import learn
 from pipeline.alignment.odometer import OdometerTrack, odometer_track, polarity
 from pipeline.alignment.scatter import play_m, with_play
-from pipeline.columns import floats
 from pipeline.monitors.axis import calibrated
 from pipeline.monitors.recursion import Array
+from schemas.arrays import floats
 from schemas.config import Configuration, Vehicle
 
 NO_ODOMETER = "no odometer"

@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from pipeline.alignment.odometer import OdometerTrack
 from pipeline.alignment.odometer_filter import Estimate, error_model
+from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AlongSteps, AxisSeries, Reading, along_axis
 from pipeline.monitors.recursion import Array
-from pipeline.statistics import threshold_factor
 from schemas.config import Configuration
 
 Index = npt.NDArray[np.int64]

@@ -18,10 +18,10 @@ from pipeline.alignment.odometer_filter import (
     estimates_of,
     prior_of,
 )
+from pipeline.epochs.timeline import gap_limit_s
+from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import Array, AxisState
-from pipeline.statistics import threshold_factor
-from pipeline.timeline import gap_limit_s
 from schemas.config import Configuration, Vehicle
 
 # Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.written_steps import step_of
+from pipeline.ingest.written_steps import step_of
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.statistics import SURE_SIGMAS
+from pipeline.figures.bounds import SURE_SIGMAS
 
 Array = npt.NDArray[np.float64]
 

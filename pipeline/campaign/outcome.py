@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
-from pipeline.known_counts import known_counts
-from pipeline.provenance import Provenance
+from pipeline.figures.known_counts import known_counts
+from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.config import digest_of
 from schemas.enums import RunStatus
@@ -120,7 +120,7 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) 
 def failed_tables(job: RunJob, error: str) -> RunTables:
     """Tables without content but for the row that says why; no path, so that they are the same anywhere."""
     # Imported here because it takes a while, and only runs that fail need it.
-    from pipeline.summary import failed_row
+    from pipeline.figures.summary import failed_row
 
     folder = job.address.rstrip("/").rpartition("/")[0]
     made = Provenance(digest_of(job.config, job.vehicle), "", SOFTWARE)

@@ -11,8 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pipeline import storage
-from pipeline.ingest.site import read_site
 from pipeline.results import store
+from pipeline.site.read import read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of

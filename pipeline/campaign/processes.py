@@ -14,7 +14,7 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from pipeline.campaign.outcome import Result
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import replay_one
-from pipeline.workers import single_threaded_children
+from pipeline.campaign.workers import single_threaded_children
 
 _RUNS_PER_PROCESS = 200
 

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.watch import Summary
-from pipeline.present import duration_text
+from pipeline.results.terminal import duration_text
 from schemas.enums import RunStatus
 
 _SLOW_SHOWN = 2

@@ -14,8 +14,8 @@ from pipeline.campaign import known_logs, lock
 from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, worst
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
-from pipeline.ingest.site import read_site
 from pipeline.results import store
+from pipeline.site.read import read_site
 from pipeline.storage.address import is_url, redacted
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError

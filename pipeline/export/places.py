@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import Floats, Ints, moved_deg, points_of
-from pipeline.track import Track, track_of
+from pipeline.track.geodesy import Floats, Ints, moved_deg, points_of
+from pipeline.track.survey import Track, track_of
 
 
 @dataclass(frozen=True)

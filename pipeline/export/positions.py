@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.columns import floats
 from pipeline.export.places import Ground, beside, ground_at, ground_of, sign_of, stretches_of
+from schemas.arrays import floats
 from schemas.run import Site
 
 _COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")

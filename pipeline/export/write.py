@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.export.gis import run_geojson, run_gpx
 from pipeline.export.layout import layout_json
 from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
-from pipeline.provenance import input_digest
+from pipeline.results.provenance import input_digest
 from pipeline.results.store import check_site, metadata_of, read_run, table_address
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog, RunTables, Site

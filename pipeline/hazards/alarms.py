@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints
 from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.case import Case
 from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import HazardConfig
 from schemas.enums import Evidence, Verdict
 from schemas.tables import Alarms

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.figures.bounds import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
-from pipeline.statistics import SURE_SIGMAS
-from pipeline.timeline import linking_gap_s, nominal_period_s
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import LdsConfig
 
 # Sigmas of its own noise by which a slip between two anchors may be larger than it shows.

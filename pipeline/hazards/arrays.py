@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints
 
 
 def words(kinds: Sequence[str], codes: Ints) -> pl.Series:

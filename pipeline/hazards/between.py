@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
 from pipeline.hazards.truth import valid_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
 
 Counted = Callable[[pl.Series], pl.Series]
 """Odometer distance at any times, on the scale of the epochs' `odometer_m`; null where not known."""

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.columns import Bools, Floats
 from pipeline.hazards.fails import Fails, fails_of
 from pipeline.hazards.passing import TruePassings, true_passings
 from pipeline.hazards.series import Series, errors_of, series_of
 from pipeline.hazards.suspect import Witnesses, witnesses_of
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 
 Locate = Callable[[npt.ArrayLike, npt.ArrayLike], tuple[npt.NDArray[np.object_], Floats]]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.columns import flags, times_ns
 from pipeline.hazards.alarms import alarms_table
 from pipeline.hazards.case import Case
 from pipeline.hazards.crossings import beacons_by_leg
@@ -18,6 +17,7 @@ from pipeline.hazards.rows import Judged, hazards_table
 from pipeline.hazards.states import contradicted, lds_states
 from pipeline.hazards.suspect import left_doppler, suspect_of_error
 from pipeline.hazards.timing import Timing, time_hazard
+from schemas.arrays import flags, times_ns
 from schemas.enums import PassageStatus, Suspect
 
 

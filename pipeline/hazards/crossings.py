@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Bools, Floats, Ints, floats
 from pipeline.hazards.series import Series
+from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import BaliseKind
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.columns import NS_PER_S, Bools, Ints
 from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.crossings import Beacons, Crossing, crossings_with_error
 from pipeline.hazards.jumps import Jump, find_jumps
 from pipeline.hazards.series import Series
+from schemas.arrays import NS_PER_S, Bools, Ints
 from schemas.config import HazardConfig
 from schemas.enums import Hazard
 

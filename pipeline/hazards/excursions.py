@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.columns import NS_PER_S
 from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.case import Case
 from pipeline.hazards.episodes import Calm, Draft
@@ -16,6 +15,7 @@ from pipeline.hazards.jumps import Jump
 from pipeline.hazards.rows import Judged
 from pipeline.hazards.series import Series
 from pipeline.hazards.timing import Timing, time_hazard
+from schemas.arrays import NS_PER_S
 from schemas.enums import Hazard
 
 

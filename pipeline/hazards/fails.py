@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Ints, flags, times_ns, truths
+from schemas.arrays import NS_PER_S, Bools, Ints, flags, times_ns, truths
 from schemas.enums import MonitorState
 from schemas.tables import MONITORS
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints
 from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.crossings import Beacons, Crossing, crossing_at
 from pipeline.hazards.series import Series
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import HazardConfig
 
 # A jump spread over several epochs reaches from its first to its last increment of at least this

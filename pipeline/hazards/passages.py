@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
+from pipeline.epochs.timeline import linking_gap_s
 from pipeline.hazards.arrays import interpolate_known
 from pipeline.hazards.case import Case
 from pipeline.hazards.rows import Judged
 from pipeline.hazards.series import Series, direction_of
 from pipeline.hazards.states import contradicted
 from pipeline.hazards.truth import valid_ns
-from pipeline.timeline import linking_gap_s
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
 from schemas.enums import BaliseKind, Cause, FailureMode, PassageStatus
 from schemas.tables import Passages

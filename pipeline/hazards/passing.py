@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, floats, ints
 from pipeline.hazards.truth import valid_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints
 
 # A hole in the epochs over which the train's speed at both ends gives the passage between them.
 _HOLE_S = 120.0

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Floats, Ints, floats, times_ns
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.hazards.anchors import Anchors, carry
 from pipeline.hazards.arrays import interpolate_known
 from pipeline.hazards.travel import Travel
-from pipeline.timeline import linking_gap_s, nominal_period_s
+from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
 from schemas.config import LdsConfig
 from schemas.enums import Evidence
 

@@ -9,12 +9,12 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S
 from pipeline.hazards.case import Case
 from pipeline.hazards.crossings import Crossing
 from pipeline.hazards.episodes import Draft
 from pipeline.hazards.series import Series
 from pipeline.hazards.timing import Timing
+from schemas.arrays import NS_PER_S
 from schemas.enums import Evidence, FailureMode, Hazard, Suspect
 from schemas.enums import Timing as Early
 from schemas.tables import Hazards

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
-from pipeline.timeline import linking_gap_s, nominal_period_s
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import LdsConfig
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from pipeline.figures.bounds import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
-from pipeline.statistics import SURE_SIGMAS
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 # A short slip shows over seconds, a slow one over a minute.
 _WINDOWS_S = (2.0, 10.0, 60.0)

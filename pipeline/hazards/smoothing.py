@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats
+from pipeline.figures.bounds import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
-from pipeline.statistics import SURE_SIGMAS
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 
 Matrix = npt.NDArray[np.float64]
 

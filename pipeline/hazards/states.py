@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Bools, Floats, flags, floats, times_ns, truths
 from pipeline.hazards.arrays import words
 from pipeline.hazards.case import Case
+from schemas.arrays import Bools, Floats, flags, floats, times_ns, truths
 from schemas.enums import BaliseKind, LdsState, PassageStatus
 
 _STATES = [member.value for member in LdsState]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 from schemas.config import Configuration
 from schemas.enums import Evidence, Suspect, Verdict
 

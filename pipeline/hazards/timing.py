@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S
 from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.case import Case
 from pipeline.hazards.episodes import Draft
 from pipeline.hazards.jumps import Jump
 from pipeline.hazards.series import Series
+from schemas.arrays import NS_PER_S
 from schemas.config import HazardConfig
 
 # Faults that do not displace the position along the track; trials name them in words of their own.

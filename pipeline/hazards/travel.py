@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Floats, Ints, floats, ints
+from schemas.arrays import Floats, Ints, floats, ints
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Floats, Ints, flags, floats, times_ns
 from pipeline.hazards.anchors import Anchors, Carried, carry
 from pipeline.hazards.arrays import words
 from pipeline.hazards.reference import Rung, Samples, dense_rung, sparse_rungs
 from pipeline.hazards.slip import Doppler, repaired_by_doppler
 from pipeline.hazards.smoothing import smoothed_truth
 from pipeline.hazards.travel import Travel, odometer_travel
+from schemas.arrays import NS_PER_S, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence, PassageStatus
 

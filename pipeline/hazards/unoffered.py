@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Floats, floats
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.hazards.passages import positions_at
 from pipeline.hazards.passing import TruePassings, legs_of, true_passings
 from pipeline.hazards.truth import valid_ns
-from pipeline.timeline import linking_gap_s, nominal_period_s
+from schemas.arrays import Floats, floats
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import polars as pl
 
-from pipeline.clean import StreamCounts, stamp_counts
+from pipeline.ingest.clean import StreamCounts, stamp_counts
 from pipeline.ingest.generic import UndecodableError, decoder_for
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages

@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.columns import NS_PER_S, floats
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.timeline import linking_gap_s, nominal_period_s
+from schemas.arrays import NS_PER_S, floats
 from schemas.config import LdsConfig
 from schemas.enums import PassageStatus
 

@@ -1,6 +1,6 @@
 """Map matching: which way the train went over the network, and where each epoch is on that path."""
 
 from pipeline.matching.match import Match, match
-from pipeline.matching.path import TravelledPath
+from pipeline.track.path import TravelledPath
 
 __all__ = ["Match", "TravelledPath", "match"]

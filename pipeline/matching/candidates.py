@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
-from pipeline.matching.network import Network
-from pipeline.matching.segments import on_segments
-from pipeline.track import Track
+from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.network import Network
+from pipeline.track.segments import on_segments
+from pipeline.track.survey import Track
 
 # Every place on an element has a search point within this distance along it.
 PROBE_SPACING_M = 40.0

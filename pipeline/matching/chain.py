@@ -7,16 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import Points
 from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
-from pipeline.matching.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.matching.orientation import grows_with
-from pipeline.matching.path import TravelledPath
-from pipeline.matching.segments import Feet, no_feet
 from pipeline.matching.steps import travelled
-from pipeline.track import Track
+from pipeline.track.geodesy import Points
+from pipeline.track.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
+from pipeline.track.path import TravelledPath
+from pipeline.track.segments import Feet, no_feet
+from pipeline.track.survey import Track
 from schemas.config import MatchingConfig
 from schemas.enums import Navigability
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.geodesy import Floats, Ints
-from pipeline.matching.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.matching.moves import Move, best_move
-from pipeline.matching.network import Network
 from pipeline.matching.trellis import Trellis
+from pipeline.track.geodesy import Floats, Ints
+from pipeline.track.leg import Leg, Visit, leg_of, segments_at, shifted
+from pipeline.track.network import Network
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import points_of
 from pipeline.matching.fixes import Fixes
-from pipeline.track import Track
+from pipeline.track.geodesy import points_of
+from pipeline.track.survey import Track
 from schemas.config import MatchingConfig
 from schemas.errors import InputError
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.decode import Decoded
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
+from pipeline.track.geodesy import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.geodesy import Floats, Ints
 from pipeline.matching.fixes import Fixes
-from pipeline.matching.leg import segments_at
-from pipeline.matching.path import TravelledPath
-from pipeline.matching.segments import Feet
+from pipeline.track.geodesy import Floats, Ints
+from pipeline.track.leg import segments_at
+from pipeline.track.path import TravelledPath
+from pipeline.track.segments import Feet
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
 

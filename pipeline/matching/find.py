@@ -6,7 +6,6 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, segments_of
 from pipeline.matching.decode import Decoded, aligned, decode, legs_of, positions_m
 from pipeline.matching.diagnosis import off_the_network
@@ -15,13 +14,14 @@ from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.jumps import with_tracks_aside
 from pipeline.matching.likelihood import likelihood_of
-from pipeline.matching.network import Network
 from pipeline.matching.orientation import grows_with
-from pipeline.matching.path import TravelledPath
 from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
-from pipeline.track import end_places
+from pipeline.track.geodesy import Bools, Floats, Ints
+from pipeline.track.network import Network
+from pipeline.track.path import TravelledPath
+from pipeline.track.survey import end_places
 from schemas.config import MatchingConfig
 
 # An element past whose end a position lies by more is no candidate, unless the track ends there.

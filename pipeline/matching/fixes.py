@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
 from schemas.config import FixSigma
 from schemas.enums import Fix
 

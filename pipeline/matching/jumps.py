@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geodesy import Floats, Ints
 from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged
 from pipeline.matching.fixes import Fixes
-from pipeline.matching.network import Network
 from pipeline.matching.steps import Steps
+from pipeline.track.geodesy import Floats, Ints
+from pipeline.track.network import Network
 
 # Positions are looked for on tracks further off for this long before and after a jump [s], and up to this far [m].
 _WITHIN_S = 120.0

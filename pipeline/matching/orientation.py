@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geodesy import Floats, Ints
 from pipeline.matching.steps import Travelled
+from pipeline.track.geodesy import Floats, Ints
 
 
 def grows_with(position_m: Floats, epoch: Ints, way: Travelled, distance_m: float) -> bool:

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.columns import floats
-from pipeline.written_steps import step_of
+from pipeline.ingest.written_steps import step_of
+from schemas.arrays import floats
 
 Array = npt.NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geodesy import Floats, Ints
 from pipeline.matching.trellis import Trellis
+from pipeline.track.geodesy import Floats, Ints
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.odometer import odometer_track
-from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.fixes import Fixes
+from pipeline.track.geodesy import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 # No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s), none speeds up, brakes

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.geodesy import Bools, Floats, Ints
 from pipeline.matching.candidates import Candidates
 from pipeline.matching.likelihood import Likelihood, expected_m, log_density
 from pipeline.matching.moves import Ways, distance_scores, move_scores
-from pipeline.matching.network import Network
 from pipeline.matching.steps import Steps
+from pipeline.track.geodesy import Bools, Floats, Ints
+from pipeline.track.network import Network
 from schemas.config import MatchingConfig
 
 # Log-probability of a move that the network does not know: only where nothing else is possible.

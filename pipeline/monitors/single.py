@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.channels import paired
-from pipeline.columns import floats
+from pipeline.monitors.channels import paired
 from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
+from schemas.arrays import floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 

@@ -12,12 +12,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.columns import Bools, Floats
+from pipeline.figures.bounds import SURE_SIGMAS
 from pipeline.hazards.arrays import runs_of
 from pipeline.motion.position_rate import PositionRate
 from pipeline.motion.votes import moved_by_votes
 from pipeline.motion.witness import Movement, Witness
-from pipeline.statistics import SURE_SIGMAS
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 
 # Movements of the positions that are no farther apart are one.

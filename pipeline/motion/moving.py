@@ -8,11 +8,11 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.scatter import play_m, way_m, without_scatter
-from pipeline.columns import NS_PER_S, Bools, Floats, floats, times_ns
+from pipeline.epochs.timeline import moved
 from pipeline.motion.contradicted import Contradiction, contradictions
 from pipeline.motion.position_rate import PositionRate
 from pipeline.motion.witness import Witness
-from pipeline.timeline import moved
+from schemas.arrays import NS_PER_S, Bools, Floats, floats, times_ns
 from schemas.config import Configuration
 
 # Time over which the speed of an odometer is taken whose rows scatter.

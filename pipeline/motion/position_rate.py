@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, flags, floats, ints, times_ns
-from pipeline.statistics import SURE_SIGMAS
+from pipeline.figures.bounds import SURE_SIGMAS
+from schemas.arrays import NS_PER_S, Bools, Floats, flags, floats, ints, times_ns
 
 _CELL_S = 1.0
 # Cells of the moving median: a leap is in one of them, so it does not count; a train is no faster for five seconds.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.columns import Bools, ints, times_ns, truths
 from pipeline.motion.moving import Motion
+from schemas.arrays import Bools, ints, times_ns, truths
 from schemas.enums import Evidence, PassageStatus
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.columns import Floats
 from pipeline.motion.position_rate import HOLE_S
 from pipeline.motion.witness import Movement, Witness
+from schemas.arrays import Floats
 
 # A train does not come from this speed to a stand within a second, nor leave like that: no brake does a fifth of it.
 _ABRUPT_MPS, _ABRUPT_S, _NEAR_S = 10.0, 2.0, 15.0

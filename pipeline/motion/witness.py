@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 from pipeline.motion.position_rate import PositionRate
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns, truths
 from schemas.enums import Evidence
 
 

@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.export.places import Ground, ground_of, plane_m
 from pipeline.report.packing import Json
-from pipeline.track import track_of
+from pipeline.track.survey import track_of
 from schemas.run import Site
 
 _PIECES = 400

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.campaign_tables import with_judgement
+from pipeline.figures.bounds import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
+from pipeline.figures.campaign_tables import with_judgement
+from pipeline.figures.run_figures import is_passage
 from pipeline.hazards.independent import independent_episodes
 from pipeline.report.markup import UNKNOWN, number
-from pipeline.run_figures import is_passage
-from pipeline.statistics import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
 from schemas.config import SafetyConfig
 from schemas.enums import TRUTH, BaliseKind, PassageStatus, RunStatus
 

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.campaign.outcome import worst
-from pipeline.known_counts import known_counts
+from pipeline.figures.known_counts import known_counts
 from pipeline.report.architectures import architectures_section, map_section
 from pipeline.report.availability import availability_map
 from pipeline.report.campaign_figures import Figure, headline, level_figures, share_text

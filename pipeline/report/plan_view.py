@@ -14,7 +14,7 @@ from pipeline.export.places import Ground, Stretches, beside, ground_at, ground_
 from pipeline.report.decimate import Floats, Ints, detail_rows
 from pipeline.report.packing import Json, packed
 from pipeline.report.series import UNKNOWN, column_of
-from pipeline.track import track_of
+from pipeline.track.survey import track_of
 from schemas.enums import Direction, LdsState, PassageStatus
 from schemas.run import Site
 

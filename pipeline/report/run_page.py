@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.known_counts import known_counts
+from pipeline.figures.known_counts import known_counts
 from pipeline.report.architectures import architectures_section
 from pipeline.report.markup import (
     Cell,

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
 from pipeline.report.decimate import Band, Flags, Floats, Ints, band, detail_rows, kept_rows
 from pipeline.report.packing import Json, packed
-from pipeline.timeline import gap_limit_s, nominal_period_s
 from schemas.enums import LdsMode, LdsState, MonitorState
 from schemas.tables import MONITORS
 

@@ -12,8 +12,8 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.assessment import over_all_runs
 from pipeline.campaign.plan import software_digest
+from pipeline.campaign.workers import each
 from pipeline.hazards.map_errors import map_places
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
@@ -27,9 +27,9 @@ from pipeline.results.store import (
     read_table,
     table_address,
 )
+from pipeline.safety.assessment import over_all_runs
 from pipeline.safety.side_by_side import Key, side_by_side
 from pipeline.safety.tally import Tally
-from pipeline.workers import each
 from schemas.config import Configuration, read_toml, settings_from
 from schemas.errors import OutputError
 from schemas.run import Site

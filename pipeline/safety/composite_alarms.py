@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.columns import NS_PER_S
+from pipeline.epochs.timeline import nominal_period_s
 from pipeline.hazards.fails import AlarmSpan
-from pipeline.timeline import nominal_period_s
+from schemas.arrays import NS_PER_S
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
 

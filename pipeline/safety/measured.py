@@ -7,16 +7,16 @@ from collections.abc import Iterator
 import dataframely as dy
 import polars as pl
 
-from pipeline.hazards.independent import independent_episodes
-from pipeline.safety.tally import columns_of, continuity_columns
-from pipeline.statistics import (
+from pipeline.epochs.timeline import Uptime
+from pipeline.figures.bounds import (
     clopper_pearson,
     hours_still_needed,
     hours_to_substantiate,
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.timeline import Uptime
+from pipeline.hazards.independent import independent_episodes
+from pipeline.safety.tally import columns_of, continuity_columns
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
 from schemas.conform import conform, dtypes

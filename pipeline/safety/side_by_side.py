@@ -12,15 +12,15 @@ from itertools import permutations
 
 import polars as pl
 
-from pipeline.channels import on_path_of, paired
-from pipeline.columns import Bools
-from pipeline.epoch_clock import Clock, flags, trusted
+from pipeline.epochs.clock import Clock, flags, trusted
+from pipeline.epochs.timeline import held_s, uptime
+from pipeline.figures.bounds import threshold_factor
 from pipeline.hazards.fails import Fails, fails_of
+from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Side, verdicts_of
 from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
-from pipeline.statistics import threshold_factor
-from pipeline.timeline import held_s, uptime
+from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Evidence, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.run_figures import CONTINUITY_S
+from pipeline.epochs.timeline import Uptime
+from pipeline.figures.bounds import UNKNOWN, Estimate, clopper_pearson, poisson_rate
+from pipeline.figures.run_figures import CONTINUITY_S
 from pipeline.safety.continuity import continuity
-from pipeline.statistics import UNKNOWN, Estimate, clopper_pearson, poisson_rate
-from pipeline.timeline import Uptime
 
 Row = dict[str, object]
 

@@ -8,8 +8,8 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at
+from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
-from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 from tests.align.straight import Straight, distance, run, times
 

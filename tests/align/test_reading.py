@@ -9,9 +9,9 @@ import pytest
 from pipeline.alignment.increments import most_scatter_m, reading_of
 from pipeline.alignment.odometer import odometer_track
 from pipeline.alignment.reading import ReadingNoise, count_step_m
+from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AlongSteps, Reading, along_axis, run_axis
 from pipeline.stages import replay
-from pipeline.statistics import threshold_factor
 from schemas.config import Configuration
 from tests.align.straight import odometer_of
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey

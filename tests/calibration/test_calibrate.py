@@ -10,7 +10,7 @@ import pytest
 from datasets.comma2k19 import comma2k19_run
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site
-from pipeline.calibrate import calibrate
+from pipeline.calibration.calibrate import calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
 from pipeline.stages import replay
 from schemas.config import Configuration, MonitorConfig

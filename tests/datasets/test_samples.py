@@ -12,9 +12,9 @@ from datasets.comma2k19 import comma2k19_run
 from datasets.faults import FaultSpec
 from datasets.infrabel import infrabel_run, infrabel_site
 from datasets.inject import inject
-from pipeline.geodesy import distances_m, earth_centred_m
 from pipeline.matching import match
 from pipeline.stages import replay
+from pipeline.track.geodesy import distances_m, earth_centred_m
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site

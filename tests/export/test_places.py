@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.export.places import beside, ground_at, ground_of, plane_m, stretches_of
 from pipeline.export.positions import positions_of
-from pipeline.geodesy import distance_m
+from pipeline.track.geodesy import distance_m
 from tests.export.conftest import Result
 
 # One degree of longitude on the equator is 111 319.49 m: 6 378 137 m · π / 180.

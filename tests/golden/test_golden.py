@@ -16,7 +16,7 @@ from datasets.trial import write_trial
 from pipeline import replay
 from pipeline.diff import compare_tables
 from pipeline.ingest import read_run
-from pipeline.ingest.site import read_site
+from pipeline.site.read import read_site
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Hazard, PassageStatus
 from schemas.run import RunTables

@@ -12,8 +12,8 @@ import pytest
 from mcap.writer import Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
-from pipeline.clean import clean
 from pipeline.ingest import describe_log, read_run
+from pipeline.ingest.clean import clean
 from pipeline.ingest.timescale import utc_from_gps
 from schemas.config import IngestConfig, settings_from
 from schemas.errors import ConfigError, InputError

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.matching.fixes import contradictory_covariances
-from pipeline.matching.leg import Visit, leg_of
-from pipeline.matching.path import TravelledPath
-from pipeline.track import track_of
+from pipeline.track.leg import Visit, leg_of
+from pipeline.track.path import TravelledPath
+from pipeline.track.survey import track_of
 from schemas.config import Vehicle
 from schemas.errors import InputError
 from schemas.run import Site

@@ -8,8 +8,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.ingest.site import read_site
 from pipeline.matching import Match, match
+from pipeline.site.read import read_site
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.run import Site
 

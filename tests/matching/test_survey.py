@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.matching.describe import describe_site
-from pipeline.matching.survey import survey_findings
+from pipeline.site.describe import describe_site
+from pipeline.site.survey_findings import survey_findings
 from schemas.run import Finding, Site
 from tests.matching.builders import line, matched, odometer, run, site
 from tests.matching.ladder import gauss_markov, ladder

@@ -7,10 +7,10 @@ import polars as pl
 import pytest
 
 from pipeline.alignment.align import NO_ODOMETER, align
+from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
 from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged
-from pipeline.statistics import threshold_factor
 from schemas.config import Configuration, Vehicle
 from schemas.tables import BANK_MONITORS
 from tests.align.straight import Straight, epochs_of, odometer_of, run

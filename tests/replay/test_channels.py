@@ -7,10 +7,10 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.assessment import assess
-from pipeline.channels import on_path_of, paired
+from pipeline.monitors.channels import on_path_of, paired
 from pipeline.report import write_report
 from pipeline.results.store import write_run
+from pipeline.safety.assessment import assess
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
 from pipeline.stages import replay
 from schemas.config import Configuration

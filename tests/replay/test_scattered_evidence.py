@@ -10,8 +10,8 @@ from pipeline.alignment.align import align
 from pipeline.hazards import establish_truth
 from pipeline.hazards.anchors import Anchors, carry
 from pipeline.hazards.travel import Travel
+from pipeline.lds.telegrams import place_reads
 from pipeline.matching import match
-from pipeline.telegrams import place_reads
 from schemas.config import Configuration
 from tests.replay.journeys import VEHICLE, journey
 

@@ -13,11 +13,11 @@ import pytest
 
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site
-from pipeline.provenance import Provenance
+from pipeline.figures.summary import failed_row
 from pipeline.report import write_report
+from pipeline.results.provenance import Provenance
 from pipeline.results.store import write_config, write_run
 from pipeline.stages import replay
-from pipeline.summary import failed_row
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables, Site
 from schemas.tables import TABLES

@@ -6,9 +6,9 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pipeline.figures.bounds import clopper_pearson, poisson_rate
 from pipeline.hazards.independent import independent_episodes
 from pipeline.safety import detection_by_level, measured_figures, plain_statements
-from pipeline.statistics import clopper_pearson, poisson_rate
 from schemas.config import SafetyConfig
 from schemas.tables import Runs
 from tests.summary.tables import NS, hazards, table

@@ -5,6 +5,7 @@ import math
 import polars as pl
 import pytest
 
+from pipeline.figures.bounds import hours_to_substantiate
 from pipeline.safety import safety_tables
 from pipeline.safety.architectures import (
     composite_rate_per_h,
@@ -28,7 +29,6 @@ from pipeline.safety.continuity import (
 )
 from pipeline.safety.errata import errata
 from pipeline.safety.markov import lds_hazard_rate_per_h
-from pipeline.statistics import hours_to_substantiate
 from schemas.config import SafetyConfig
 
 CONFIG = SafetyConfig()

@@ -8,9 +8,9 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pipeline.figures.bounds import clopper_pearson
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, REDUNDANT, side_by_side, side_by_side_table
 from pipeline.safety.tally import Alarms, Faults, Tally, Working
-from pipeline.statistics import clopper_pearson
 from schemas.config import Configuration, HazardConfig
 from schemas.tables import Runs
 from tests.summary.tables import NS, alarms, epochs, hazards, table

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geodesy import distance_m, distances_m, earth_centred_m, points_of
+from pipeline.track.geodesy import distance_m, distances_m, earth_centred_m, points_of
 
 GEOD = pyproj.Geod(ellps="WGS84")
 

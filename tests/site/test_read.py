@@ -12,9 +12,9 @@ import pyproj
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.ingest.site import read_site
-from pipeline.inspection import inspect_path
-from pipeline.matching.describe import describe_site
+from pipeline.results.inspection import inspect_path
+from pipeline.site.describe import describe_site
+from pipeline.site.read import read_site
 from schemas.errors import BaliseError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
 from tests.site import builders

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.ingest.site import read_site
+from pipeline.site.read import read_site
 from schemas.errors import SiteError
 from schemas.run import Site
 from tests.site import builders

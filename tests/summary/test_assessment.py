@@ -8,8 +8,8 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.assessment import Assessment, alarm_causes, assess, for_reading
 from pipeline.results.store import write_config, write_run
+from pipeline.safety.assessment import Assessment, alarm_causes, assess, for_reading
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import Runs

@@ -5,8 +5,14 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.campaign_tables import campaign_accuracy, campaign_balises, campaign_levels, campaign_runs, with_judgement
-from pipeline.statistics import clopper_pearson, poisson_rate
+from pipeline.figures.bounds import clopper_pearson, poisson_rate
+from pipeline.figures.campaign_tables import (
+    campaign_accuracy,
+    campaign_balises,
+    campaign_levels,
+    campaign_runs,
+    with_judgement,
+)
 from schemas.campaign import CampaignAccuracy, CampaignBalises, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig, ServiceLevel
 from schemas.tables import Runs

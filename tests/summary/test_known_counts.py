@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob
-from pipeline.inspection import inspect_result
-from pipeline.known_counts import known_counts
+from pipeline.figures.known_counts import known_counts
+from pipeline.results.inspection import inspect_result
 from pipeline.results.store import write_run
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables

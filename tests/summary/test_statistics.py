@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.statistics import (
+from pipeline.figures.bounds import (
     UNKNOWN,
     clopper_pearson,
     hours_still_needed,

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.clean import StreamCounts
+from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
+from pipeline.ingest.clean import StreamCounts
 from pipeline.motion import motion_by_odometer
-from pipeline.provenance import Provenance
-from pipeline.summary import Alignment, SolutionResults, failed_row, summarise
+from pipeline.results.provenance import Provenance
 from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence
 from schemas.run import IngestNotes

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.columns import Bools, Floats, Ints
-from pipeline.timeline import gap_limit_s, held_s, nominal_period_s
+from pipeline.epochs.timeline import gap_limit_s, held_s, nominal_period_s
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 
 

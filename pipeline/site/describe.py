@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.matching.network import Network, network_of
-from pipeline.track import Track, track_of
+from pipeline.track.network import Network, network_of
+from pipeline.track.survey import Track, track_of
 from schemas.run import Finding, Site
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from pipeline import run_figures as figures
-from pipeline.clean import StreamCounts
-from pipeline.epoch_clock import Clock
+from pipeline.epochs.clock import Clock
+from pipeline.figures import run_figures as figures
+from pipeline.ingest.clean import StreamCounts
 from pipeline.motion import Motion
-from pipeline.provenance import Provenance
+from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
 from schemas.enums import Evidence, RunStatus

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import polars as pl
 
+from pipeline.figures.bounds import Estimate, clopper_pearson, poisson_rate
+from pipeline.figures.run_figures import is_passage
 from pipeline.hazards.independent import independent_episodes
-from pipeline.run_figures import is_passage
-from pipeline.statistics import Estimate, clopper_pearson, poisson_rate
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform

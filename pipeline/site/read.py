@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.site_checks import drop_repeated_points, remarks
-from pipeline.ingest.site_geojson import Network, read_network
-from pipeline.ingest.site_tables import (
+from pipeline.site.checks import drop_repeated_points, remarks
+from pipeline.site.geojson import Network, read_network
+from pipeline.site.tables import (
     BALISES,
     EPSG_WGS84,
     LINKS,
@@ -23,7 +23,7 @@ from pipeline.ingest.site_tables import (
 )
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
-from pipeline.track import geometric_measures_m, track_of
+from pipeline.track.survey import geometric_measures_m, track_of
 from schemas.errors import InputError, SiteError
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site

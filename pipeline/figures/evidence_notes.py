@@ -7,8 +7,8 @@ import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
 from pipeline.alignment.increments import most_scatter_m
-from pipeline.columns import NS_PER_S, times_ns
 from pipeline.motion import Motion
+from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
-from pipeline.matching.segments import (
+from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.segments import (
     SAMPLE_SPACING_M,
     Feet,
     Polyline,
@@ -18,7 +18,7 @@ from pipeline.matching.segments import (
     nearest,
     on_segments,
 )
-from pipeline.track import GAP_COUNTS_M, Track
+from pipeline.track.survey import GAP_COUNTS_M, Track
 
 # A hint further than this from the nearest place may mean another passage of the same place,
 # if the track of that passage lies within the second distance of the first.

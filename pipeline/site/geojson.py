@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.ingest.site_tables import EPSG_WGS84, RawTable
+from pipeline.site.tables import EPSG_WGS84, RawTable
 from schemas.enums import Navigability
 
 _ID_KEYS = ("netelementid", "id", "elementid", "name")

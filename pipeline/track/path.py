@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.geodesy import Bools, Floats, Ints, Points, points_of
-from pipeline.matching.leg import Leg, nearest_on_leg, path_at, segments_at
-from pipeline.matching.segments import Feet, no_feet
-from pipeline.track import Track
+from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
+from pipeline.track.segments import Feet, no_feet
+from pipeline.track.survey import Track
 
 Objects = npt.NDArray[np.object_]
 MEASURE_TOLERANCE_M = 0.5

@@ -8,13 +8,13 @@ from datetime import UTC, datetime
 
 import polars as pl
 
+from pipeline.figures.known_counts import known_counts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
-from pipeline.ingest.site import is_geojson, read_site
-from pipeline.known_counts import known_counts
-from pipeline.matching.describe import describe_site
-from pipeline.matching.survey import survey_findings
 from pipeline.results import store
-from pipeline.site_windows import window_findings
+from pipeline.site.describe import describe_site
+from pipeline.site.read import is_geojson, read_site
+from pipeline.site.survey_findings import survey_findings
+from pipeline.site.windows import window_findings
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
 from schemas.config import IngestConfig

@@ -10,8 +10,8 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.geodesy import points_of
-from pipeline.track import GAP_COUNTS_M, Track, end_places, geometric_measures_m, track_of
+from pipeline.track.geodesy import points_of
+from pipeline.track.survey import GAP_COUNTS_M, Track, end_places, geometric_measures_m, track_of
 from schemas.enums import Navigability
 from schemas.run import Finding
 

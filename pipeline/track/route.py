@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import polars as pl
 
-from pipeline.geodesy import points_of
-from pipeline.matching.leg import Visit
-from pipeline.matching.network import Edge, Network
-from pipeline.track import Track, end_places, gaps_m
+from pipeline.track.geodesy import points_of
+from pipeline.track.leg import Visit
+from pipeline.track.network import Edge, Network
+from pipeline.track.survey import Track, end_places, gaps_m
 
 # `Site.route` names directions as the site reader writes them: from an element's start to its end, or back.
 _FORWARD = "AB"

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.derived_tables import derived_tables
+from pipeline.figures.derived_tables import derived_tables
 from pipeline.hazards.map_errors import map_suspects
-from pipeline.present import tall
 from pipeline.results import catalogue, store
+from pipeline.results.terminal import tall
 from pipeline.safety.sentences import level_statements, plain_statements, reservations, slow_receivers
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally

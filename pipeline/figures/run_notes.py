@@ -8,12 +8,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.odometer import STRAIGHT_S, leaps
-from pipeline.clean import StreamCounts
-from pipeline.columns import NS_PER_S, floats, times_ns
-from pipeline.ingest.site_checks import BALISE_PLACE
+from pipeline.ingest.clean import StreamCounts
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
+from pipeline.site.checks import BALISE_PLACE
+from schemas.arrays import NS_PER_S, floats, times_ns
 from schemas.config import Vehicle
 from schemas.run import RunLog, Site
 

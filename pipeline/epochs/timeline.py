@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.columns import NS_PER_S, Bools, Floats, Ints
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 
 @dataclass(frozen=True)

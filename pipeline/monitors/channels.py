@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.columns import NS_PER_S
-from pipeline.timeline import nominal_period_s
+from pipeline.epochs.timeline import nominal_period_s
+from schemas.arrays import NS_PER_S
 
 _PLACE = ("netelement_id", "measure_m", "path_m")
 _LEAST_GAP_S = 1.0

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from pipeline.epoch_clock import Clock, flags, trusted, usable
+from pipeline.epochs.clock import Clock, flags, trusted, usable
+from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
+from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 from pipeline.hazards.independent import independent_episodes, missed_detection
 from pipeline.motion import Motion
-from pipeline.statistics import UNKNOWN, Estimate, poisson_rate
-from pipeline.timeline import availability, outages_s, share_of_time, uptime
 from schemas.config import Configuration, SafetyConfig
 from schemas.enums import (
     TRUTH,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.campaign_tables import (
+from pipeline.figures.campaign_tables import (
     campaign_accuracy,
     campaign_balises,
     campaign_levels,

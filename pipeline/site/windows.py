@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.lds.windows import DEFAULTS, minimal_spacing_m, window_m
-from pipeline.matching.network import Network, network_of
-from pipeline.track import track_of
+from pipeline.track.network import Network, network_of
+from pipeline.track.survey import track_of
 from schemas.config import LdsConfig
 from schemas.run import Finding, Site
 
