@@ -9,11 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-Doubles = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 # Position 3, orientation 4, covariance 36, linear 3, angular 3, covariance 36: the message ends with them.
@@ -50,7 +49,7 @@ def filled(log: Path, seed: int = 1) -> Path:
     return target
 
 
-def _fields(seconds: Doubles, speed_mps: Doubles, rng: np.random.Generator) -> Doubles:
+def _fields(seconds: Floats, speed_mps: Floats, rng: np.random.Generator) -> Floats:
     """The doubles of each message, shape (messages, 85)."""
     dt = np.diff(seconds, prepend=seconds[:1])
     way_m = np.cumsum(speed_mps * dt)

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, earth_centred_m
-
-Array = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
+from schemas.arrays import Floats, Ints
 
 _DEG = np.pi / 180.0
 _DAY_S = 86400.0
@@ -103,7 +100,7 @@ GALILEO: tuple[Slot, ...] = _galileo_slots()
 SIDEREAL_DAY_S = 2.0 * np.pi / _EARTH_RATE_RAD_PER_S
 
 
-def satellite_positions(slots: Sequence[Slot], t_ns: Times) -> Array:
+def satellite_positions(slots: Sequence[Slot], t_ns: Ints) -> Floats:
     """Earth-fixed positions [m] at UTC instants, shape (times, slots, 3)."""
     epoch_ns = np.array([slot.epoch_ns for slot in slots])
     days = (t_ns[:, None] - epoch_ns[None, :]) * 1e-9 / _DAY_S
@@ -124,13 +121,13 @@ def satellite_positions(slots: Sequence[Slot], t_ns: Times) -> Array:
     x = np.cos(node) * np.cos(u) - np.sin(node) * np.sin(u) * np.cos(i)
     y = np.sin(node) * np.cos(u) + np.cos(node) * np.sin(u) * np.cos(i)
     z = np.sin(u) * np.sin(i)
-    positions: Array = np.stack([x, y, z], axis=-1) * axis_m[None, :, None]
+    positions: Floats = np.stack([x, y, z], axis=-1) * axis_m[None, :, None]
     return positions
 
 
 def look_angles(
-    slots: Sequence[Slot], t_ns: Times, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
-) -> tuple[Array, Array]:
+    slots: Sequence[Slot], t_ns: Ints, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
+) -> tuple[Floats, Floats]:
     """Azimuth (clockwise from north, [0, 360)) and elevation [deg], each of shape (times, slots)."""
     frame = _east_north_up(latitude_deg, longitude_deg)
     place_m = earth_centred_m(*(np.array([value]) for value in (latitude_deg, longitude_deg, height_m)))[0]
@@ -142,7 +139,7 @@ def look_angles(
 
 def visible(
     slots: Sequence[Slot],
-    t_ns: Times,
+    t_ns: Ints,
     latitude_deg: float,
     longitude_deg: float,
     height_m: float = 0.0,
@@ -165,14 +162,14 @@ def visible(
     )
 
 
-def _sidereal_angle(t_ns: Times) -> Array:
+def _sidereal_angle(t_ns: Ints) -> Floats:
     """Greenwich mean sidereal time [rad] (IAU 1982, linear term; UT1 taken as UTC)."""
     days = (t_ns - _instant_ns(2000, 1, 1)) * 1e-9 / _DAY_S - 0.5
-    angle: Array = np.radians((280.46061837 + 360.98564736629 * days) % 360.0)
+    angle: Floats = np.radians((280.46061837 + 360.98564736629 * days) % 360.0)
     return angle
 
 
-def _east_north_up(latitude_deg: float, longitude_deg: float) -> Array:
+def _east_north_up(latitude_deg: float, longitude_deg: float) -> Floats:
     sin_b, cos_b = np.sin(latitude_deg * _DEG), np.cos(latitude_deg * _DEG)
     sin_l, cos_l = np.sin(longitude_deg * _DEG), np.cos(longitude_deg * _DEG)
     return np.array(

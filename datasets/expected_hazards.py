@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from datasets.faults import PlacedFault, offset_m
 from datasets.motion import build_motion
 from datasets.scenario import RunSpec, Scenario
 from datasets.trial import placed
-
-Floats = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 LIMIT_M = 20.0
 

@@ -11,15 +11,12 @@ from enum import StrEnum
 from typing import Annotated, Self
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from pydantic import Field, model_validator
 
+from schemas.arrays import Bools, Floats
 from schemas.config import NonNegative, Positive, Settings
 from schemas.inputs import Faults
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 NS_PER_S = 1_000_000_000
 

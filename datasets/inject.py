@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from datasets.faults import (
@@ -24,12 +23,10 @@ from datasets.faults import (
 from datasets.inject_ranges import inject_ranges
 from datasets.line import Places, shifted
 from datasets.run_path import displacement_m
+from schemas.arrays import Floats
 from schemas.config import Settings, read_toml, settings_from
 from schemas.errors import ConfigError, InputError
 from schemas.run import RunLog, Site
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 _PLACE = ("latitude_deg", "longitude_deg", "height_m")
 _LATE = (*_PLACE, "vel_e_mps", "vel_n_mps", "vel_u_mps")

@@ -15,11 +15,9 @@ import polars as pl
 from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, in_sector, offset_m
 from datasets.line import Places, shifted
 from datasets.solution import Solution, protection_levels, solve
+from schemas.arrays import Bools, Floats
 from schemas.errors import InputError
 from schemas.run import RunLog
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 _COVARIANCE = (("ee", 0, 0), ("en", 0, 1), ("eu", 0, 2), ("nn", 1, 1), ("nu", 1, 2), ("uu", 2, 2))
 

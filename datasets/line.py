@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.ndimage import uniform_filter1d
 
 from datasets.scenario import LineSpec, ParallelSpec, SurveySpec
 from pipeline.track.geodesy import curvature_radii_m, moved_deg
+from schemas.arrays import Floats
 from schemas.errors import ConfigError
 from schemas.inputs import Balises, Links, Track
-
-Floats = npt.NDArray[np.float64]
 
 _STEP_M = 1.0
 

@@ -9,11 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from schemas.arrays import Floats
 from schemas.config import NonNegative, Positive, Settings
 from schemas.enums import Direction
 from schemas.errors import ConfigError
-
-Floats = npt.NDArray[np.float64]
 
 
 class PhaseSpec(Settings):

@@ -11,9 +11,8 @@ import polars as pl
 from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, odometer_increments, odometer_speeds
 from datasets.motion import Motion
 from datasets.scenario import OdometerSpec
+from schemas.arrays import Floats
 from schemas.inputs import Odometer
-
-Floats = npt.NDArray[np.float64]
 
 
 def odometer_stream(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from datasets.gnss_errors import gauss_markov
 from pipeline.monitors.sight import ionosphere_m2, troposphere_m2
+from schemas.arrays import Floats
 from schemas.config import NonNegative, Positive, Settings
-
-Floats = npt.NDArray[np.float64]
 
 
 class RangeErrorSpec(Settings):

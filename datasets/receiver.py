@@ -17,11 +17,10 @@ from datasets.odometer import sample_times_ns
 from datasets.scenario import GnssSpec, ReferenceSpec
 from datasets.sky import Observed, observe_sky
 from datasets.solution import protection_levels
+from schemas.arrays import Floats
 from schemas.config import Vehicle
 from schemas.enums import Fix
 from schemas.inputs import Gnss, Reference
-
-Floats = npt.NDArray[np.float64]
 
 # The SBAS satellite that the synthetic receiver uses, and the age of what it sends.
 _SBAS_PRN = 123

@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
 from pipeline.track.geodesy import curvature_radii_m, distances_m
+from schemas.arrays import Floats, Ints
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 # Positions are averaged over this much way, and movement below it is taken for noise of a standing train.
 _BIN_M = 10.0

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from datasets.constellation import GALILEO, GPS, look_angles
@@ -14,11 +13,8 @@ from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, in_sector, o
 from datasets.range_errors import range_errors_m, range_sigma_m
 from datasets.scenario import SkySpec
 from datasets.solution import Solution, protection_levels, solve
+from schemas.arrays import Bools, Floats, Ints
 from schemas.inputs import Satellites
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 _SLOTS = {"gps": GPS, "galileo": GALILEO}
 

@@ -10,12 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from schemas.arrays import Bools, Floats
 
 # DO-229 J.1: horizontal factor for precision approach and for non-precision approach, vertical factor.
 K_H_PA = 6.0

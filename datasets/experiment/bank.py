@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from datasets.experiment.bank_faults import CATALOGUE, HEADING_DEG, Fault, WhiteNoise, failure_s, fault_response
@@ -26,9 +25,8 @@ from datasets.experiment.tables import write_page, write_tables
 from datasets.experiment.workers import generator
 from pipeline.campaign.workers import mapped
 from pipeline.figures.bounds import clopper_pearson
+from schemas.arrays import Floats
 from schemas.config import Configuration, MonitorConfig
-
-Array = npt.NDArray[np.float64]
 
 REPETITIONS = 200
 # So few runs in which all goes well show a share over 95 % (Clopper-Pearson, two-sided 95 %).
@@ -106,7 +104,7 @@ def _alarms_per_h(bank: LinearBank, candidate: _Candidate) -> float:
 
 
 def _row(
-    candidate: _Candidate, bank: LinearBank, fault: Fault, first: Array, by: Array, alarms_per_h: float
+    candidate: _Candidate, bank: LinearBank, fault: Fault, first: Floats, by: Floats, alarms_per_h: float
 ) -> dict[str, object]:
     spec = candidate.spec
     # A fault is in the data one epoch after it began at the earliest; the negation takes one epoch more.

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from datasets.experiment.geometry import Geometry
 from datasets.experiment.linear_bank import AXES, LinearBank
+from schemas.arrays import Floats
 
-Array = npt.NDArray[np.float64]
 Kind = Literal["ramp", "step", "latency", "frozen", "slip", "slide", "scale", "odometer late", "noise"]
 Shape = Literal["ramp", "step", "noise"]
 
@@ -62,7 +62,7 @@ class Fault:
         """The position is wrong, not the odometer."""
         return self.kind not in _ON_ODOMETER
 
-    def rates(self, geometry: Geometry, axes: int) -> Array:
+    def rates(self, geometry: Geometry, axes: int) -> Floats:
         """Per axis: the ramp [m/s], the step [m] or the sigma of the noise [m]."""
         if self.target == "range":
             return np.asarray(self.size * (geometry.axes(HEADING_DEG)[:axes] @ geometry.ramp_direction))
@@ -104,7 +104,7 @@ CATALOGUE: tuple[Fault, ...] = (
 )
 
 
-def fault_response(bank: LinearBank, rates: Array, shape: Shape, epochs: int) -> Array:
+def fault_response(bank: LinearBank, rates: Floats, shape: Shape, epochs: int) -> Floats:
     """What the fault makes of every monitor at epochs 1 .. n on average, (epochs, monitors).
 
     An EWMA answers a ramp with 1 - (1-a)^k of its rate, and a step, which is one increment, with a (1-a)^(k-1) / dt.
@@ -134,7 +134,7 @@ class WhiteNoise:
         self._before = np.zeros(runs)
         self._filtered = np.zeros((bank.alpha.size, runs))
 
-    def step(self, chosen: npt.NDArray[np.int64]) -> Array:
+    def step(self, chosen: npt.NDArray[np.int64]) -> Floats:
         """At the next epoch, (chosen faults, monitors, runs); all such faults share their noise."""
         if not self._sizes.any():
             return np.zeros((1, 1, 1))

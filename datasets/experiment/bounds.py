@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import binom
 
 from pipeline.figures.bounds import CONFIDENCE
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,7 @@ class Expected:
     median_high: float
 
 
-def expected(values: Array, least: float, greatest: float, confidence: float = CONFIDENCE) -> Expected | None:
+def expected(values: Floats, least: float, greatest: float, confidence: float = CONFIDENCE) -> Expected | None:
     """Mean and median of independent values known to lie within [least, greatest]; none without values.
 
     Mean: empirical Bernstein bound, two-sided (Maurer and Pontil 2009, theorem 4), finite-sample.

@@ -23,9 +23,8 @@ from datasets.experiment.tables import refuse_configuration, write_tables
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
 from pipeline.figures.bounds import clopper_pearson
+from schemas.arrays import Ints
 from schemas.config import Configuration
-
-Ints = npt.NDArray[np.int64]
 
 REPETITIONS = 10_000
 SEED = 1

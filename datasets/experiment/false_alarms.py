@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from datasets.experiment.diagnostics import SEED
@@ -27,10 +26,8 @@ from datasets.experiment.thresholds import (
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
 from pipeline.figures.bounds import clopper_pearson, poisson_rate, threshold_factor
+from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, LdsConfig
-
-Array = npt.NDArray[np.float64]
-Counts = npt.NDArray[np.int64]
 
 PROBABILITIES: tuple[float, ...] = (1e-3, 1e-4, 1e-5)
 REPETITIONS = 1_000_000
@@ -52,12 +49,12 @@ def verification_plan(geometry: Geometry) -> Plan:
 @dataclass(frozen=True)
 class _Count:
     plan: Plan
-    limits: Array
+    limits: Floats
     key: tuple[int, ...]
     repetitions: int
 
 
-def _exceedances(work: _Count) -> Counts:
+def _exceedances(work: _Count) -> Ints:
     """How many runs exceed each limit (ways, probabilities, monitors) at the last epoch: one look per run."""
     plan = work.plan
     paths = NoisePaths(plan, work.repetitions, generator(*work.key))

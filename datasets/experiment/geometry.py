@@ -11,12 +11,11 @@ from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
+from schemas.arrays import Floats
 
-Array = npt.NDArray[np.float64]
 Constellation = Literal["gps", "gps_galileo"]
 
 CONSTELLATIONS: tuple[Constellation, ...] = ("gps", "gps_galileo")
@@ -52,34 +51,34 @@ class Geometry:
     t_ns: int
     constellation: Constellation
     svs: tuple[str, ...]
-    azimuth_deg: Array
-    elevation_deg: Array
-    range_variance_m2: Array
+    azimuth_deg: Floats
+    elevation_deg: Floats
+    range_variance_m2: Floats
     faulty: int
 
     @property
-    def gain(self) -> Array:
+    def gain(self) -> Floats:
         """Range errors to east, north, up errors of the weighted least squares position, shape (3, n)."""
         design = np.hstack([line_of_sight_rows(self.azimuth_deg, self.elevation_deg), clock_columns(self.svs)])
         weight = 1.0 / self.range_variance_m2.sum(axis=1)
         normal = design.T @ (weight[:, None] * design)
-        solved: Array = np.linalg.solve(normal, design.T * weight)[:3]
+        solved: Floats = np.linalg.solve(normal, design.T * weight)[:3]
         return solved
 
     @property
-    def source_covariances_m2(self) -> Array:
+    def source_covariances_m2(self) -> Floats:
         """Covariance of the position error by source, shape (sources, 3, 3): S diag(R_j) S'."""
         gain = self.gain
-        covariances: Array = np.einsum("ai,ij,bi->jab", gain, self.range_variance_m2, gain)
+        covariances: Floats = np.einsum("ai,ij,bi->jab", gain, self.range_variance_m2, gain)
         return covariances
 
     @property
-    def ramp_direction(self) -> Array:
+    def ramp_direction(self) -> Floats:
         """East, north, up error per metre of range error of the faulty satellite."""
-        direction: Array = self.gain[:, self.faulty]
+        direction: Floats = self.gain[:, self.faulty]
         return direction
 
-    def axes(self, heading_deg: float) -> Array:
+    def axes(self, heading_deg: float) -> Floats:
         """Unit vectors along, cross (left) and up, rows; heading 0 is towards the faulty satellite."""
         course = np.radians(self.azimuth_deg[self.faulty] + heading_deg)
         east, north = np.sin(course), np.cos(course)

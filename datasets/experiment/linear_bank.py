@@ -12,15 +12,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_discrete_lyapunov
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
 from datasets.experiment.plan import BANKS, Reading, Sensors
 from pipeline.figures.bounds import threshold_factor
+from schemas.arrays import Floats
 from schemas.config import MonitorConfig
-
-Array = npt.NDArray[np.float64]
 
 AXES: tuple[str, ...] = ("along", "cross", "up")
 
@@ -67,32 +65,32 @@ class LinearBank:
     """
 
     spec: BankSpec
-    advance: Array
-    noise: Array
+    advance: Floats
+    noise: Floats
     sources: int
-    slope: Array
-    alpha: Array
+    slope: Floats
+    alpha: Floats
     names: tuple[str, ...]
-    along_error: Array = field(repr=False)
+    along_error: Floats = field(repr=False)
 
     @cached_property
-    def covariance(self) -> Array:
+    def covariance(self) -> Floats:
         """Stationary covariance P of the state: P = A P A' + B B'."""
-        result: Array = solve_discrete_lyapunov(self.advance, self.noise @ self.noise.T)
+        result: Floats = solve_discrete_lyapunov(self.advance, self.noise @ self.noise.T)
         return 0.5 * (result + result.T)
 
     @property
-    def sigma(self) -> Array:
+    def sigma(self) -> Floats:
         """Of each monitor, long after the restart [m/s]."""
-        diagonal: Array = np.sqrt(np.diag(self.covariance)[self.sources :])
+        diagonal: Floats = np.sqrt(np.diag(self.covariance)[self.sources :])
         return diagonal
 
     @property
-    def threshold(self) -> Array:
+    def threshold(self) -> Floats:
         """k_T sigma (DIAG eq. 17), long after the restart [m/s]."""
         return threshold_factor(self.spec.false_alarm_probability) * self.sigma
 
-    def covariances(self, epochs: int) -> Array:
+    def covariances(self, epochs: int) -> Floats:
         """Covariance of the state at epochs 0 .. n of the fault, (epochs + 1, states, states)."""
         states = len(self.advance)
         if self.spec.age_s is None:
@@ -109,21 +107,21 @@ class LinearBank:
             current = self.advance @ current @ self.advance.T + pushed
         return result
 
-    def sigmas(self, epochs: int) -> Array:
+    def sigmas(self, epochs: int) -> Floats:
         """Of each monitor at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
         variances = np.diagonal(self.covariances(epochs)[1:], axis1=1, axis2=2)
         return np.asarray(np.sqrt(variances[:, self.sources :]))
 
-    def thresholds(self, epochs: int) -> Array:
+    def thresholds(self, epochs: int) -> Floats:
         """k_T sigma at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
         return threshold_factor(self.spec.false_alarm_probability) * self.sigmas(epochs)
 
-    def response(self, epochs: int) -> Array:
+    def response(self, epochs: int) -> Floats:
         """To a range ramp of 1 m/s that starts at epoch 0, at epochs 1 .. n; shape (epochs, monitors)."""
         k = np.arange(1, epochs + 1)[:, None]
         return np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
 
-    def covariance_with(self, monitor: int, epoch: int, covariances: Array) -> Array:
+    def covariance_with(self, monitor: int, epoch: int, covariances: Floats) -> Floats:
         """Covariance of all monitors at epochs 1 .. n with one monitor at one epoch (1-based), (epochs, monitors).
 
         `covariances` (n + 1, states, states): those of the state, as above.
@@ -142,7 +140,7 @@ class LinearBank:
             earlier = A.T @ earlier
         return result
 
-    def covariances_by_lag(self, epochs: int) -> Array:
+    def covariances_by_lag(self, epochs: int) -> Floats:
         """Covariance of monitor j at epoch k + lag with monitor i at k, lags -(n-1) .. n-1; (lags, i, j)."""
         size = self.slope.size
         result = np.empty((2 * epochs - 1, size, size))
@@ -153,13 +151,13 @@ class LinearBank:
             later = self.advance @ later
         return result
 
-    def start(self, runs: int, rng: np.random.Generator) -> Array:
+    def start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the fault's onset, shape (states, runs)."""
         values, vectors = np.linalg.eigh(self.covariances(0)[0])
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ rng.standard_normal((values.size, runs)))
 
-    def paths(self, epochs: int, runs: int, rng: np.random.Generator) -> Iterator[Array]:
+    def paths(self, epochs: int, runs: int, rng: np.random.Generator) -> Iterator[Floats]:
         """Noise of all monitors epoch by epoch, each (monitors, runs); the same array is used again."""
         state = self.start(runs, rng)
         normals = np.empty((self.noise.shape[1], runs))
@@ -183,7 +181,7 @@ def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> Linea
     return _assemble(spec, axes, covariances, np.exp(-dt_s / TAUS_S), vectors @ geometry.ramp_direction)
 
 
-def _assemble(spec: BankSpec, axes: tuple[str, ...], covariances: Array, phi: Array, slope: Array) -> LinearBank:
+def _assemble(spec: BankSpec, axes: tuple[str, ...], covariances: Floats, phi: Floats, slope: Floats) -> LinearBank:
     count, gauss_markov = len(axes), len(SOURCES) * len(axes)
     position_white = np.full(count, spec.map_m)
     position_white[0] = spec.odometer_m if spec.reading == "position" else 0.0

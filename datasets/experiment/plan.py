@@ -17,8 +17,8 @@ import numpy.typing as npt
 from datasets.experiment.geometry import TAUS_S, Geometry
 from datasets.experiment.sigmas import bank_sigmas
 from pipeline.figures.bounds import threshold_factor
+from schemas.arrays import Floats
 
-Array = npt.NDArray[np.float64]
 Reading = Literal["increments", "position"]
 Sensors = Literal["odometer", "odometer_and_track"]
 
@@ -52,7 +52,7 @@ class Plan:
     false_alarm_probability: float = 1e-7
 
     @cached_property
-    def alphas(self) -> Array:
+    def alphas(self) -> Floats:
         """Every EWMA weight that some reading uses; the first is the raw monitor."""
         return np.array(sorted({alpha for bank in self.banks.values() for alpha in bank}, reverse=True))
 
@@ -75,10 +75,10 @@ class Forms:
     the ramp raises it. `members` (questions, monitors) says which monitors answer which question.
     """
 
-    rows: Array
+    rows: Floats
     alpha: npt.NDArray[np.int64]
-    threshold: Array
-    slope: Array
+    threshold: Floats
+    slope: Floats
     members: npt.NDArray[np.bool_]
     names: tuple[str, ...]
 
@@ -125,9 +125,9 @@ class _Builder:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._rows: list[Array] = []
+        self._rows: list[Floats] = []
         self._alpha: list[int] = []
-        self._sigma: list[Array] = []
+        self._sigma: list[Floats] = []
         self._slope: list[float] = []
         self._members: list[list[bool]] = []
         self._names: list[str] = []
@@ -160,7 +160,7 @@ class _Builder:
     def _add(
         self,
         name: str,
-        axis: Array,
+        axis: Floats,
         alpha: float,
         signals: dict[str, float],
         white_m: float,

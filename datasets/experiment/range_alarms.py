@@ -18,8 +18,7 @@ from datasets.experiment.ranges import HEADINGS_DEG, RangePlan, Statistic, held_
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
 from pipeline.figures.bounds import clopper_pearson
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 # Error of the survey across and in height, in its stated sigma; none: drawn anew for every epoch.
 SURVEYS: tuple[float | None, ...] = (None, 0.0, 1.0, 2.0)
@@ -99,7 +98,7 @@ def _expected(plan: RangePlan, one: Statistic, heading: float, survey: float | N
     return _tail(one.project.shape[0] - variance.size, variance, centre, limit)
 
 
-def _tail(plain: int, variance: Array, centre: Array, limit: float) -> float:
+def _tail(plain: int, variance: Floats, centre: Floats, limit: float) -> float:
     """P(chi2 with `plain` degrees + v1 X1^2 + v2 X2^2 > limit), X around centre/sqrt(v), by Gauss-Legendre twice."""
     nodes, weights = np.polynomial.legendre.leggauss(200)
     x = 9.0 * nodes

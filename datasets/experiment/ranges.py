@@ -23,10 +23,8 @@ from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
 from pipeline.figures.bounds import clopper_pearson
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
+from schemas.arrays import Floats
 from schemas.config import Configuration
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 REPETITIONS = 5_000
 # Every course of a train: to the other side the error along the track is the same with the other sign.
@@ -53,7 +51,7 @@ class RangePlan:
 class Statistic:
     """`value = |project @ r|^2` of range errors r, chi-square with `project.shape[0]` degrees of freedom."""
 
-    project: Array
+    project: Floats
     threshold: float
 
 
@@ -74,7 +72,7 @@ def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
     return Statistic(kept @ whiten, float(chdtri(kept.shape[0], plan.false_alarm_probability)))
 
 
-def held_rows(plan: RangePlan, heading_deg: float) -> Array:
+def held_rows(plan: RangePlan, heading_deg: float) -> Floats:
     """Range change per metre of survey error across and in height, shape (satellites, 2)."""
     rows = line_of_sight_rows(plan.geometry.azimuth_deg, plan.geometry.elevation_deg)
     return np.asarray(rows @ plan.geometry.axes(heading_deg)[1:].T)
@@ -84,7 +82,7 @@ def held_rows(plan: RangePlan, heading_deg: float) -> Array:
 class RangePassages:
     """Seconds to detection (`_UNDETECTED` if never), and whether the failure was not later, by heading, rate, run."""
 
-    detected_s: Array
+    detected_s: Floats
     failed_first: npt.NDArray[np.bool_]
 
 
@@ -98,7 +96,7 @@ class _RangeErrors:
         self._step = np.sqrt(1.0 - self._phi**2)
         self._unit = rng.standard_normal((TAUS_S.size, len(plan.geometry.svs), repetitions))
 
-    def advance(self) -> Array:
+    def advance(self) -> Floats:
         """Errors at the next recorded epoch [m], shape (satellites, repetitions)."""
         self._unit *= self._phi
         self._unit += self._step * self._rng.standard_normal(self._unit.shape)
@@ -131,7 +129,7 @@ def range_passages(plan: RangePlan, repetitions: int, rng: np.random.Generator) 
 
 
 def _judge(
-    plan: RangePlan, one: Statistic, along: Array, error: Array, offset: Array, ramps_m: Array
+    plan: RangePlan, one: Statistic, along: Floats, error: Floats, offset: Floats, ramps_m: Floats
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Alarm and position failure at ramps of these sizes, shapes (rates, repetitions).
 
@@ -190,7 +188,7 @@ def _table(plan: RangePlan, parts: list[RangePassages]) -> pl.DataFrame:
 
 
 def _row(
-    plan: RangePlan, heading: float, rate: float, detected_s: Array, failed_first: npt.NDArray[np.bool_]
+    plan: RangePlan, heading: float, rate: float, detected_s: Floats, failed_first: npt.NDArray[np.bool_]
 ) -> dict[str, object]:
     found = detected_s != _UNDETECTED
     missed = clopper_pearson(int(failed_first.sum()), failed_first.size)

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import log_ndtr, ndtri_exp
 
 from datasets.experiment.linear_bank import LinearBank
 from datasets.experiment.splitting import Shift, miss_estimate, most_probable_miss
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
+from schemas.arrays import Floats
 
-Array = npt.NDArray[np.float64]
 W = TypeVar("W")
 
 # Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
@@ -99,7 +98,7 @@ def _block_size(bank: LinearBank, epochs: int) -> int:
     return max(1, min(_RUNS_PER_BLOCK, _LARGEST_BLOCK // (epochs * bank.slope.size)))
 
 
-def pooled(block: Callable[[W], Array], works: list[W], runs: int, jobs: int) -> Probability:
+def pooled(block: Callable[[W], Floats], works: list[W], runs: int, jobs: int) -> Probability:
     """Mean of independent unbiased estimates of equal weight, its relative error, and the gain over counting."""
     estimates = np.concatenate(mapped(block, works, jobs))
     greatest = float(estimates.max())
@@ -113,7 +112,7 @@ def pooled(block: Callable[[W], Array], works: list[W], runs: int, jobs: int) ->
     return Probability(mean, error, gain, runs)
 
 
-def _false_alarm_block(work: _Work) -> Array:
+def _false_alarm_block(work: _Work) -> Floats:
     bank, rng = work.bank, generator(*work.key)
     monitors = bank.slope.size
     paths = np.empty((work.epochs, monitors, work.runs))
@@ -141,21 +140,21 @@ def _false_alarm_block(work: _Work) -> Array:
     return estimates
 
 
-def _miss_block(work: _Work) -> Array:
+def _miss_block(work: _Work) -> Floats:
     if work.shift is None:
         raise ValueError("missed detection is sampled around the most probable miss")
     rng = generator(*work.key)
     return np.array([miss_estimate(work.bank, work.epochs, work.rate_mps, work.shift, work.runs, rng)])
 
 
-def _plain_alarm_block(work: _Work) -> Array:
+def _plain_alarm_block(work: _Work) -> Floats:
     alarm = np.zeros(work.runs, dtype=np.bool_)
     for noise in work.bank.paths(work.epochs, work.runs, generator(*work.key)):
         alarm |= (np.abs(noise) > work.bank.threshold[:, None]).any(axis=0)
     return alarm.astype(np.float64)
 
 
-def _plain_miss_block(work: _Work) -> Array:
+def _plain_miss_block(work: _Work) -> Floats:
     bank = work.bank
     ramp, threshold = work.rate_mps * bank.response(work.epochs), bank.thresholds(work.epochs)
     alive = np.ones(work.runs, dtype=np.bool_)

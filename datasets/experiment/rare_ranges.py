@@ -20,8 +20,7 @@ from datasets.experiment.ranges import RangePlan, held_rows, statistic
 from datasets.experiment.rare import Probability, pooled, populations
 from datasets.experiment.splitting import least_norm, log_survival
 from datasets.experiment.workers import generator, in_blocks
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 _MOST_CONSTRAINTS = 60
 _MARGIN = 0.4
@@ -36,10 +35,10 @@ class RangeSystem:
     `phi` (sources,): decorrelation from one recorded epoch to the next. `ramp` (d,): of one metre of range error.
     """
 
-    covariance: Array
-    survey: Array
-    phi: Array
-    ramp: Array
+    covariance: Floats
+    survey: Floats
+    phi: Floats
+    ramp: Floats
     threshold: float
     period_s: float
 
@@ -47,40 +46,40 @@ class RangeSystem:
     def size(self) -> int:
         return int(self.ramp.size)
 
-    def by_lag(self, lags: npt.NDArray[np.int64]) -> Array:
+    def by_lag(self, lags: npt.NDArray[np.int64]) -> Floats:
         """Covariance of z between epochs so far apart, (lags, d, d)."""
         share = self.phi[None, :] ** np.abs(lags)[:, None]
         return np.asarray(np.einsum("ls,sij->lij", share, self.covariance) + self.survey)
 
-    def paths_start(self, runs: int, rng: np.random.Generator) -> Array:
+    def paths_start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the onset: sources, then the survey, d rows each; (states, runs)."""
         parts = [_root(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
         return np.concatenate(parts)
 
-    def following(self, state: Array, rng: np.random.Generator) -> Array:
+    def following(self, state: Floats, rng: np.random.Generator) -> Floats:
         """States at the next recorded epoch."""
         sources = len(self.phi)
         moving = state.reshape(sources + 1, self.size, -1).copy()
         fresh = rng.standard_normal((sources, self.size, state.shape[1]))
         moving[:sources] = self.phi[:, None, None] * moving[:sources] + self._push @ fresh
-        result: Array = moving.reshape(state.shape)
+        result: Floats = moving.reshape(state.shape)
         return result
 
     @cached_property
-    def _push(self) -> Array:
-        push: Array = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([_root(one) for one in self.covariance])
+    def _push(self) -> Floats:
+        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([_root(one) for one in self.covariance])
         return push
 
-    def values(self, state: Array) -> Array:
+    def values(self, state: Floats) -> Floats:
         """Whitened residuals of each run, (d, runs)."""
         return np.asarray(state.reshape(-1, self.size, state.shape[1]).sum(axis=0))
 
-    def ramp_m(self, epochs: int, rate_mps: float) -> Array:
+    def ramp_m(self, epochs: int, rate_mps: float) -> Floats:
         """Range error at epochs 1 .. n of a ramp that begins at 0 s [m]."""
         return np.asarray(rate_mps * self.period_s * np.arange(1, epochs + 1))
 
 
-def _root(covariance: Array) -> Array:
+def _root(covariance: Floats) -> Floats:
     """A matrix with this covariance, which may be singular (the survey's has two dimensions)."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -144,7 +143,7 @@ def plain_alarm_by_ranges(system: RangeSystem, epochs: int, runs: int, seed: int
     return pooled(_plain_alarm_block, works, runs, jobs)
 
 
-def _most_probable(system: RangeSystem, epochs: int, rate_mps: float) -> tuple[Array, Array, float]:
+def _most_probable(system: RangeSystem, epochs: int, rate_mps: float) -> tuple[Floats, Floats, float]:
     """Multiplier at each epoch of z along the ramp, the shifted mean path (epochs, d), half the squared norm."""
     strength = float(np.sqrt(system.ramp @ system.ramp))
     along = system.ramp / strength
@@ -174,13 +173,13 @@ def _most_probable(system: RangeSystem, epochs: int, rate_mps: float) -> tuple[A
     return each, np.asarray(mean), 0.5 * float(multiplier @ gram @ multiplier) if chosen else 0.0
 
 
-def _miss_block(work: _Work) -> Array:
+def _miss_block(work: _Work) -> Floats:
     system, rng = work.system, generator(*work.key)
     multiplier, mean, half = _most_probable(system, work.epochs, work.rate_mps)
     along = system.ramp / np.sqrt(system.ramp @ system.ramp)
     moved = mean + system.ramp_m(work.epochs, work.rate_mps)[:, None] * system.ramp
 
-    def step(k: int, state: Array) -> tuple[Array, Array]:
+    def step(k: int, state: Floats) -> tuple[Floats, Floats]:
         following = system.following(state, rng)
         z = system.values(following)
         inside = np.square(z + moved[k][:, None]).sum(axis=0) <= system.threshold
@@ -190,7 +189,7 @@ def _miss_block(work: _Work) -> Array:
     return np.array([np.exp(log_survival(start, step, work.epochs, rng) - half)])
 
 
-def _plain_miss_block(work: _Work) -> Array:
+def _plain_miss_block(work: _Work) -> Floats:
     system, rng = work.system, generator(*work.key)
     state = system.paths_start(work.runs, rng)
     alive = np.ones(work.runs, dtype=np.bool_)
@@ -201,7 +200,7 @@ def _plain_miss_block(work: _Work) -> Array:
     return alive.astype(np.float64)
 
 
-def _plain_alarm_block(work: _Work) -> Array:
+def _plain_alarm_block(work: _Work) -> Floats:
     system, rng = work.system, generator(*work.key)
     state = system.paths_start(work.runs, rng)
     alarm = np.zeros(work.runs, dtype=np.bool_)
@@ -211,7 +210,7 @@ def _plain_alarm_block(work: _Work) -> Array:
     return alarm.astype(np.float64)
 
 
-def _alarm_block(work: _Work) -> Array:
+def _alarm_block(work: _Work) -> Floats:
     system, rng = work.system, generator(*work.key)
     z = np.empty((work.epochs, system.size, work.runs))
     state = system.paths_start(work.runs, rng)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.monitors.recursion import linear_recurrence
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 
 def bank_sigmas(
-    alphas: Array,
+    alphas: Floats,
     epochs: int,
-    variances_m2: Array,
-    taus_s: Array,
+    variances_m2: Floats,
+    taus_s: Floats,
     white_m: float,
     position_white_m: float,
     rate_hz: float = 1.0,
-) -> Array:
+) -> Floats:
     """Sigma of the EWMAs of a rate [m/s], epochs after a restart by alphas (DOMAIN section 3).
 
     `variances_m2`, `taus_s`: Gauss-Markov errors of the position along the axis. `white_m`: white noise on
@@ -45,13 +43,13 @@ def bank_sigmas(
 
 
 def limit_sigmas(
-    alphas: Array,
-    variances_m2: Array,
-    taus_s: Array,
+    alphas: Floats,
+    variances_m2: Floats,
+    taus_s: Floats,
     white_m: float,
     position_white_m: float,
     rate_hz: float = 1.0,
-) -> Array:
+) -> Floats:
     """The same long after the restart: the closed form of DOMAIN section 3, for any alpha in (0, 1]."""
     alpha = 1.0 - (1.0 - alphas) ** (1.0 / rate_hz)
     keep = 1.0 - alpha[:, None]

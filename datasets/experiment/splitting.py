@@ -14,14 +14,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import nnls
 
 from datasets.experiment.linear_bank import LinearBank
+from schemas.arrays import Floats, Ints
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Step = Callable[[int, Array], tuple[Array, Array]]
+Step = Callable[[int, Floats], tuple[Floats, Floats]]
 
 _MOST_CONSTRAINTS = 120
 # The shifted path stays this many sigmas inside the thresholds: with many constraints at once more runs survive. A slow
@@ -35,10 +33,10 @@ _LEAST_EFFECTIVE = 0.5
 class Shift(NamedTuple):
     """Constraints (epoch, monitor) that hold the noise back, their multipliers, and the shifted mean path."""
 
-    epoch: Index
-    monitor: Index
-    multiplier: Array
-    mean: Array
+    epoch: Ints
+    monitor: Ints
+    multiplier: Floats
+    mean: Floats
     half_square: float
 
 
@@ -56,12 +54,12 @@ def most_probable_miss(bank: LinearBank, epochs: int, rate_mps: float) -> Shift:
     return shift
 
 
-def _shift(bank: LinearBank, epochs: int, rate_mps: float, margin: float, covariances: Array) -> Shift:
+def _shift(bank: LinearBank, epochs: int, rate_mps: float, margin: float, covariances: Floats) -> Shift:
     towards = np.where(bank.slope < 0, -1.0, 1.0)
     ramp, threshold, sigma = rate_mps * bank.response(epochs), bank.thresholds(epochs), bank.sigmas(epochs)
     epoch: list[int] = []
     monitor: list[int] = []
-    columns: list[Array] = []
+    columns: list[Floats] = []
     mean = np.zeros_like(ramp)
     multiplier = np.zeros(0)
     gram = np.zeros((0, 0))
@@ -83,7 +81,7 @@ def _shift(bank: LinearBank, epochs: int, rate_mps: float, margin: float, covari
     return Shift(np.array(epoch, dtype=np.int64), np.array(monitor, dtype=np.int64), signed, mean, half)
 
 
-def least_norm(gram: Array, needed: Array) -> Array:
+def least_norm(gram: Floats, needed: Floats) -> Floats:
     """Multipliers l >= 0 of min l' C l / 2 - l' needed."""
     ridge = 1e-10 * float(np.trace(gram))
     factor = np.linalg.cholesky(gram + ridge * np.eye(len(gram)))
@@ -97,7 +95,7 @@ def miss_estimate(
     """Unbiased estimate of the probability that no monitor fails at epochs 1 .. n, of one population of `runs`."""
     moved, threshold = shift.mean + rate_mps * bank.response(epochs), bank.thresholds(epochs)
 
-    def step(k: int, state: Array) -> tuple[Array, Array]:
+    def step(k: int, state: Floats) -> tuple[Floats, Floats]:
         following = bank.advance @ state
         following += bank.noise @ rng.standard_normal((bank.noise.shape[1], state.shape[1]))
         noise = following[bank.sources :]
@@ -111,7 +109,7 @@ def miss_estimate(
     return float(np.exp(log_survival(bank.start(runs, rng), step, epochs, rng) - shift.half_square))
 
 
-def log_survival(state: Array, step: Step, epochs: int, rng: np.random.Generator) -> float:
+def log_survival(state: Floats, step: Step, epochs: int, rng: np.random.Generator) -> float:
     """Logarithm of the mean product of weights over the epochs; -inf where no run is left.
 
     `state` (states, runs); `step(k, state)` moves all runs to epoch k (from 0) and gives the logarithms of their
@@ -135,7 +133,7 @@ def log_survival(state: Array, step: Step, epochs: int, rng: np.random.Generator
     return total + greatest + float(np.log(np.exp(weight - greatest).mean()))
 
 
-def _copies(shares: Array, rng: np.random.Generator) -> Index:
+def _copies(shares: Floats, rng: np.random.Generator) -> Ints:
     """Systematic resampling: which run each of the next ones continues, in proportion to the shares."""
     ends = np.cumsum(shares) / shares.sum()
     places = (np.arange(shares.size) + rng.random()) / shares.size

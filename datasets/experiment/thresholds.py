@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.special import ndtr
 
@@ -25,8 +24,7 @@ from datasets.experiment.sigmas import limit_sigmas
 from datasets.experiment.workers import generator
 from pipeline.calibration.sigmas import overall_ratio
 from pipeline.figures.bounds import threshold_factor
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 EXTRAPOLATED = 1e-7
 _PER_PLACE = 20
@@ -43,7 +41,7 @@ class SkyMonitor:
     heading_deg: float
     axis: str
     sigma_x_m: float
-    sigma_mps: Array
+    sigma_mps: Floats
 
 
 def sky_monitors(reading: Reading, per_place: int) -> list[SkyMonitor]:
@@ -78,7 +76,7 @@ class Line:
     intercept_mps: float
     slope_per_s: float
 
-    def sigma_mps(self, sigma_x_m: Array) -> Array:
+    def sigma_mps(self, sigma_x_m: Floats) -> Floats:
         return self.intercept_mps + self.slope_per_s * sigma_x_m
 
 
@@ -125,12 +123,12 @@ def regression_table(per_place: int = _PER_PLACE) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def two_sided(factor: Array) -> Array:
+def two_sided(factor: Floats) -> Floats:
     """Probability that a Gaussian is beyond +- factor sigmas."""
     return np.asarray(2.0 * ndtr(-factor))
 
 
-def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> Array:
+def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> Floats:
     """Measured over modelled sigma of each monitor on fault-free runs of an hour."""
     long = replace(plan, span_s=_CALIBRATION_S, onset_s=_CALIBRATION_S)
     forms = bank_forms(long)
@@ -145,7 +143,7 @@ def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> A
     return np.array([overall_ratio(ratios[:, form]) for form in range(values.shape[1])])
 
 
-def regressed_ratios(plan: Plan) -> Array:
+def regressed_ratios(plan: Plan) -> Floats:
     """Regressed over exact long-term sigma of each monitor of the plan, from the lines over all skies."""
     forms = bank_forms(plan)
     axes = plan.geometry.axes(0.0)

@@ -10,13 +10,12 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.increments import EpochArrays, Learned, Mask, odometer_steps, reading_of, stamp_jitter_s
+from pipeline.alignment.increments import EpochArrays, Learned, odometer_steps, reading_of, stamp_jitter_s
 from pipeline.alignment.learning import learn
-from pipeline.alignment.odometer import OdometerTrack, odometer_track, polarity
-from pipeline.alignment.scatter import play_m, with_play
 from pipeline.monitors.axis import calibrated
-from pipeline.monitors.recursion import Array
-from schemas.arrays import floats
+from pipeline.odometry.odometer import OdometerTrack, odometer_track, polarity
+from pipeline.odometry.scatter import play_m, with_play
+from schemas.arrays import Bools, Floats, floats
 from schemas.config import Configuration, Vehicle
 
 NO_ODOMETER = "no odometer"
@@ -45,7 +44,7 @@ def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle,
     )
 
 
-def unrolled(epochs: pl.DataFrame, matched: Mask) -> Array:
+def unrolled(epochs: pl.DataFrame, matched: Bools) -> Floats:
     """Path position with the way taken out that a curve adds to a position beside the track [m]; NaN elsewhere.
 
     A point y left of a track that turns left by its curvature k moves dx / (1 - k y) along it while the train moves
@@ -115,7 +114,7 @@ def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config
     ]
 
 
-def _direction(speed_mps: Array, deadband_mps: float) -> pl.Series:
+def _direction(speed_mps: Floats, deadband_mps: float) -> pl.Series:
     """+1 or -1 along growing path, held inside the dead band and where the speed is not known."""
     moving = np.where(np.abs(np.nan_to_num(speed_mps)) > deadband_mps, np.sign(np.nan_to_num(speed_mps)), 0.0)
     signs = pl.Series(moving).replace(0.0, None).forward_fill().backward_fill().fill_null(1.0)
@@ -150,7 +149,7 @@ def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configurat
     )
 
 
-def speed_of_positions(t_s: Array, path_m: Array, window_s: float = 1.0) -> Array:
+def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float = 1.0) -> Floats:
     """Speed [m/s] from positions at least `window_s` apart, causal; NaN where there are none."""
     speed = np.full(t_s.size, np.nan)
     valid = np.flatnonzero(np.isfinite(path_m))

@@ -5,17 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.alignment.odometer import OdometerTrack
 from pipeline.alignment.odometer_filter import Estimate, error_model
 from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AlongSteps, AxisSeries, Reading, along_axis
-from pipeline.monitors.recursion import Array
+from pipeline.odometry.odometer import OdometerTrack
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
-
-Index = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 _REGULAR_PERIODS = 3
 
@@ -28,15 +24,15 @@ class EpochArrays:
     how coarsely the positions are written down.
     """
 
-    t_s: Array
-    path_m: Array
-    sigma_m: Array
-    usable: Mask
+    t_s: Floats
+    path_m: Floats
+    sigma_m: Floats
+    usable: Bools
     jitter_s: float
-    digits_m: Array
+    digits_m: Floats
 
 
-def stamp_jitter_s(t_s: Array) -> float:
+def stamp_jitter_s(t_s: Floats) -> float:
     """Standard deviation of the stamps about a regular clock [s].
 
     A receiver measures at regular times; a recorder that stamps on receipt scatters them, and at 40 m/s ten
@@ -54,17 +50,17 @@ def stamp_jitter_s(t_s: Array) -> float:
 class Learned:
     """Estimates in use at each epoch; shapes (n,)."""
 
-    scale: Array
-    scale_sigma: Array
-    latency_s: Array
-    latency_sigma_s: Array
+    scale: Floats
+    scale_sigma: Floats
+    latency_s: Floats
+    latency_sigma_s: Floats
 
     @classmethod
     def constant(cls, estimate: Estimate, n: int) -> Learned:
         values = (estimate.scale, estimate.scale_sigma, estimate.latency_s, estimate.latency_sigma_s)
         return cls(*(np.full(n, value) for value in values))
 
-    def put(self, begins: Index, estimates: Array) -> None:
+    def put(self, begins: Ints, estimates: Floats) -> None:
         """Set estimates (changes, 4): each change holds from its epoch to the next, the last for good."""
         lengths = np.diff(begins, append=self.scale.size)
         columns = (self.scale, self.scale_sigma, self.latency_s, self.latency_sigma_s)
@@ -76,11 +72,11 @@ class Learned:
 class OdometerSteps:
     """Corrected odometer distance and speed change from the row before; the first row has none (zero)."""
 
-    distance_m: Array
-    speed_mps: Array
+    distance_m: Floats
+    speed_mps: Floats
 
 
-def odometer_steps(rows: Index, t_s: Array, track: OdometerTrack, learned: Learned) -> OdometerSteps:
+def odometer_steps(rows: Ints, t_s: Floats, track: OdometerTrack, learned: Learned) -> OdometerSteps:
     """Steps between consecutive rows, both ends with the estimates in use at the later one."""
     latency, scale = learned.latency_s[rows], learned.scale[rows]
     now = t_s[rows] - latency
@@ -100,7 +96,7 @@ def most_scatter_m(config: Configuration) -> float:
     return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))
 
 
-def reading_of(track: OdometerTrack, at_s: Array, config: Configuration) -> Reading | None:
+def reading_of(track: OdometerTrack, at_s: Floats, config: Configuration) -> Reading | None:
     """Noise of the odometer's rows at these times, as far as thresholds allow for it; none where they have none."""
     if not track.reading:
         return None
@@ -109,7 +105,7 @@ def reading_of(track: OdometerTrack, at_s: Array, config: Configuration) -> Read
 
 
 def along_series(
-    rows: Index, arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration
+    rows: Ints, arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration
 ) -> AxisSeries:
     """Increments of GNSS minus odometer between consecutive rows (DIAG eq. 1-3)."""
     steps = odometer_steps(rows, arrays.t_s, track, learned)

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.alignment.increments import EpochArrays, Index, Learned, along_series, odometer_steps
-from pipeline.alignment.odometer import OdometerTrack
+from pipeline.alignment.increments import EpochArrays, Learned, along_series, odometer_steps
 from pipeline.alignment.odometer_filter import (
     SPEED_SPAN_S,
     Estimate,
@@ -21,7 +20,9 @@ from pipeline.alignment.odometer_filter import (
 from pipeline.epochs.timeline import gap_limit_s
 from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AxisSeries, run_axis
-from pipeline.monitors.recursion import Array, AxisState
+from pipeline.monitors.recursion import AxisState
+from pipeline.odometry.odometer import OdometerTrack
+from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, Vehicle
 
 # Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
@@ -128,7 +129,7 @@ class _Learner:
             position, block = end, min(2 * block, _BLOCK)
         return state, position
 
-    def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Index, Array]:
+    def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
         """The filter's last state in these positions; from where each of its states may be used; the joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
@@ -154,7 +155,7 @@ class _Learner:
         away = self._outages[before] != self._outages[position]
         return self._filter.restart(state, *self._observation(position), self._limit_m**2 if away else 0.0)
 
-    def _due(self, last_s: float, begin: int, end: int) -> Index:
+    def _due(self, last_s: float, begin: int, end: int) -> Ints:
         """Positions of the updates: the first a filter period after the last one, and so on."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
         due: list[int] = []
@@ -164,7 +165,7 @@ class _Learner:
             position = self._next(self._times[position] + period_s, position + 1)
         return np.array(due, dtype=np.int64)
 
-    def _put(self, use_from: Index, joints: Array) -> None:
+    def _put(self, use_from: Ints, joints: Floats) -> None:
         """Fill the estimates in use, each from its position on."""
         epochs = np.append(self._rows, self._learned.scale.size)  # a position past the last is past all epochs
         self._learned.put(epochs[use_from], estimates_of(joints))
@@ -211,12 +212,12 @@ class _Learner:
         return begin + first, float(away[first] ** 2 + spread[first] ** 2)
 
 
-def _gaps_before(at_s: Array, t_s: Array, gap_s: float) -> Index:
+def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:
     """How many gaps of a series of times end up to each of these times."""
     ends = t_s[1:][np.diff(t_s) > gap_s]
     return np.searchsorted(ends, at_s, side="right")
 
 
-def _in_use(use_from: Index, position: int) -> int:
+def _in_use(use_from: Ints, position: int) -> int:
     """Index of the last state that may be used at a position."""
     return int(np.searchsorted(use_from, position, side="right")) - 1

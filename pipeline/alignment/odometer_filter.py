@@ -20,12 +20,10 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.alignment.odometer import OdometerTrack
+from pipeline.odometry.odometer import OdometerTrack
+from schemas.arrays import Floats
 from schemas.config import AlignConfig, MonitorConfig, Vehicle
-
-Array = npt.NDArray[np.float64]
 
 _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
@@ -63,7 +61,7 @@ class FilterState(NamedTuple):
     variance that the offset has still to walk until a position that came back has settled.
     """
 
-    joint: Array
+    joint: Floats
     t_s: float
     origin_m: float
     unsettled_m2: float = 0.0
@@ -73,7 +71,7 @@ class FilterState(NamedTuple):
         return Estimate(scale, scale_sigma, latency_s, latency_sigma_s)
 
 
-def estimates_of(joints: Array) -> Array:
+def estimates_of(joints: Floats) -> Floats:
     """Scale, its deviation, latency and its deviation [s] of joint states (k, states, states + 1); shape (k, 4)."""
     means, deviations = joints[:, :, -1], np.sqrt(np.diagonal(joints, axis1=1, axis2=2))
     return np.column_stack([1.0 + means[:, _SCALE], deviations[:, _SCALE], means[:, _LATENCY], deviations[:, _LATENCY]])
@@ -83,8 +81,8 @@ def estimates_of(joints: Array) -> Array:
 class ScaleLatencyFilter:
     """Model of the errors; states are passed in and out."""
 
-    shares: Array
-    taus_s: Array
+    shares: Floats
+    taus_s: Floats
     track: OdometerTrack
 
     def start(self, prior: Estimate, t_s: float, path_m: float) -> FilterState:
@@ -122,11 +120,11 @@ class ScaleLatencyFilter:
         joint[_OFFSET, _OFFSET] += brought_m2
         return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
 
-    def after(self, state: FilterState, joint: Array, t_s: float) -> FilterState:
+    def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
         """The state that has become `joint` by a later time."""
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
-    def run(self, state: FilterState, t_s: Array, path_m: Array, sigma_m: Array, jitter_s: float) -> Array:
+    def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: float) -> Floats:
         """The joint state after each of these epochs, shape (epochs, states, states + 1).
 
         Times [s], GNSS path positions and their sigmas, shapes (epochs,); `jitter_s`: how the stamps scatter.
@@ -148,20 +146,20 @@ class ScaleLatencyFilter:
             before = joint
         return joints
 
-    def _rows(self, sigma_m: Array) -> Array:
+    def _rows(self, sigma_m: Floats) -> Floats:
         """By how much each state moves the position; what follows from the odometer comes in epoch by epoch."""
-        rows: Array = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
+        rows: Floats = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
         rows[:, _OFFSET] = 1.0
         return rows
 
-    def _predict(self, before: Array, step_ns: int, settled_m2: float, joint: Array) -> None:
+    def _predict(self, before: Floats, step_ns: int, settled_m2: float, joint: Floats) -> None:
         """Write to `joint` what a joint state becomes over a step in which so much of the offset settles."""
         decay, noise = self._transition(step_ns)
         np.multiply(before, decay, out=joint)
         joint += noise
         joint[_OFFSET, _OFFSET] += settled_m2
 
-    def _seen(self, joint: Array, row: Array, now_s: float, place_m: float, origin_m: float) -> tuple[Array, float]:
+    def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
         """Covariance of the states with what is observed and, as its last, how far the states miss it; the speed.
 
         Completes `row`. The miss is all but the latency, about whose mean the distance was read, and the scale's own
@@ -170,7 +168,7 @@ class ScaleLatencyFilter:
         scale, latency_s = 1.0 + joint.item(_SCALE, -1), joint.item(_LATENCY, -1)
         way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
         row[_SCALE], row[_LATENCY] = way_m, -scale * speed_mps
-        seen: Array = row.dot(joint)
+        seen: Floats = row.dot(joint)
         seen[-1] += way_m + scale * speed_mps * latency_s - place_m
         return seen, speed_mps
 
@@ -194,11 +192,11 @@ class ScaleLatencyFilter:
         return distance - origin_m, (after - before) / (end_s - begin_s)
 
     @cached_property
-    def _transition(self) -> Callable[[int], tuple[Array, Array]]:
+    def _transition(self) -> Callable[[int], tuple[Floats, Floats]]:
         """`_transition_over` with a memory: a receiver's epochs are mostly the same time apart."""
         return lru_cache(maxsize=32)(self._transition_over)
 
-    def _transition_over(self, dt_ns: int) -> tuple[Array, Array]:
+    def _transition_over(self, dt_ns: int) -> tuple[Floats, Floats]:
         """Decay of the joint state over this time, and the noise that comes in."""
         dt_s = dt_ns * 1e-9
         decay = np.concatenate([np.ones(_ERRORS), np.exp(-dt_s / self.taus_s)])
@@ -234,7 +232,7 @@ def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
     )
 
 
-def error_model(config: MonitorConfig) -> tuple[Array, Array]:
+def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
     """Shares of the position variance and correlation times [s] of the Gauss-Markov errors (DIAG Table 1)."""
     shares = [config.ionosphere_share, config.troposphere_share, config.orbit_clock_share, config.user_share]
     taus = [config.ionosphere_tau_s, config.troposphere_tau_s, config.orbit_clock_tau_s, config.user_tau_s]

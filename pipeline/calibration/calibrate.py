@@ -9,13 +9,13 @@ import numpy as np
 import polars as pl
 import tomli_w
 
-from pipeline.alignment.odometer import odometer_track, polarity
 from pipeline.alignment.odometer_filter import error_model
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
 from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from pipeline.figures.bounds import threshold_factor
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
+from pipeline.odometry.odometer import odometer_track, polarity
 from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError

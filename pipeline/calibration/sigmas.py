@@ -14,13 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.optimize import nnls
 
+from schemas.arrays import Floats
 from schemas.tables import AXES, BANK_MONITORS, SCALES
-
-Array = npt.NDArray[np.float64]
 
 _BINS = 12
 _LEAST_EPOCHS = 100
@@ -59,7 +57,7 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float) -> list[SigmaFit
     return fits
 
 
-def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int) -> list[Array]:
+def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int) -> list[Floats]:
     """Rows (sigma of the axis, value over predicted sigma) of evaluated epochs, in blocks for the jackknife."""
     sigma = f"sigma_{axis}_m"
     chosen = run.filter(pl.col(f"{monitor}_state") != "not_evaluated").select(
@@ -70,7 +68,7 @@ def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int
     return [block for block in np.array_split(rows, blocks) if len(block)]
 
 
-def _fit_with_errors(monitor: str, pieces: list[Array]) -> SigmaFit:
+def _fit_with_errors(monitor: str, pieces: list[Floats]) -> SigmaFit:
     whole = _fit(np.concatenate(pieces))
     without = np.array(
         [
@@ -97,12 +95,12 @@ def _fit_with_errors(monitor: str, pieces: list[Array]) -> SigmaFit:
     )
 
 
-def overall_ratio(ratios: Array) -> float:
+def overall_ratio(ratios: Floats) -> float:
     """Measured over predicted sigma, from values over predicted sigmas."""
     return float(np.sqrt(np.mean(np.square(ratios))))
 
 
-def _fit(samples: Array) -> Array:
+def _fit(samples: Floats) -> Floats:
     """Overall ratio, intercept [m] and slope from rows (sigma, ratio): weighted least squares over bins of sigma."""
     sigma, squares = samples[:, 0], samples[:, 1] ** 2
     overall = overall_ratio(samples[:, 1])

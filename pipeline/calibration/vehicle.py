@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.alignment.odometer import OdometerTrack
-
-Array = npt.NDArray[np.float64]
+from pipeline.odometry.odometer import OdometerTrack
+from schemas.arrays import Floats
 
 # Points of one dense covariance, and the time between them: user errors last 100 s, accelerations a few seconds, so a
 # long run loses little at 2 s; a short one is used to the full.
@@ -54,13 +53,13 @@ class RunEstimate:
 class Observations:
     """Usable epochs of one run: time [s on the odometer's scale], path position and its sigma [m]."""
 
-    t_s: Array
-    path_m: Array
-    sigma_m: Array
+    t_s: Floats
+    path_m: Floats
+    sigma_m: Floats
 
 
 def estimate_run(
-    seen: Observations, track: OdometerTrack, shares: Array, taus_s: Array, latency_s: float = 0.0
+    seen: Observations, track: OdometerTrack, shares: Floats, taus_s: Floats, latency_s: float = 0.0
 ) -> RunEstimate | None:
     """Scale and latency of one run, none where too little of it can be compared.
 
@@ -98,7 +97,7 @@ def _blocks(seen: Observations, track: OdometerTrack) -> list[Observations]:
     return pieces
 
 
-def _thinned(t_s: Array) -> npt.NDArray[np.int64]:
+def _thinned(t_s: Floats) -> npt.NDArray[np.int64]:
     """Indices a step apart that suits the length of the run."""
     if t_s.size == 0:
         return np.zeros(0, dtype=np.int64)
@@ -107,18 +106,18 @@ def _thinned(t_s: Array) -> npt.NDArray[np.int64]:
     return np.flatnonzero(np.diff(slot, prepend=-1))
 
 
-def _covariance(block: Observations, track: OdometerTrack, shares: Array, taus_s: Array) -> Array:
+def _covariance(block: Observations, track: OdometerTrack, shares: Floats, taus_s: Floats) -> Floats:
     """Covariance of GNSS minus odometer [m^2]: Gauss-Markov sources, a white rest, the odometer's walk and rows."""
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     correlation = sum(share * np.exp(-lag / tau) for share, tau in zip(shares, taus_s, strict=True))
     gnss = np.outer(block.sigma_m, block.sigma_m) * correlation
     since = block.t_s - block.t_s[0]
     walk = track.white_rate_m2_per_s * np.minimum(since[:, None], since[None, :])
-    result: Array = gnss + walk + np.diag(_WHITE_SHARE * block.sigma_m**2)
+    result: Floats = gnss + walk + np.diag(_WHITE_SHARE * block.sigma_m**2)
     return result + _of_rows(track, block.t_s, block.t_s) if track.reading else result
 
 
-def _of_rows(track: OdometerTrack, one_s: Array, other_s: Array) -> Array:
+def _of_rows(track: OdometerTrack, one_s: Floats, other_s: Floats) -> Floats:
     """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`ReadingNoise`).
 
     A counter is off by the same while the train stands, so that many rows tell no more than one; after a share x of its
@@ -131,13 +130,13 @@ def _of_rows(track: OdometerTrack, one_s: Array, other_s: Array) -> Array:
         at_s, at_m = track.t_s[counts], track.distance_m[counts]
         ways, scale = (np.interp(one_s, at_s, at_m), np.interp(other_s, at_s, at_m)), track.count_step_m / 6.0
     apart = np.abs(ways[0][:, None] - ways[1][None, :])
-    result: Array = np.outer(*sigmas) * np.maximum(1.0 - apart / scale, 0.0)
+    result: Floats = np.outer(*sigmas) * np.maximum(1.0 - apart / scale, 0.0)
     return result
 
 
 def _accumulate(
-    blocks: list[Observations], covariances: list[Array], track: OdometerTrack, estimate: Array
-) -> tuple[Array, Array, float, int]:
+    blocks: list[Observations], covariances: list[Floats], track: OdometerTrack, estimate: Floats
+) -> tuple[Floats, Floats, float, int]:
     """Normal equations of (scale, latency), offsets eliminated; remaining chi-square before the step, its freedom."""
     normal, right = np.zeros((2, 2)), np.zeros(2)
     left_over, freedom = 0.0, -2
@@ -156,7 +155,7 @@ def _accumulate(
     return normal, right, left_over, freedom
 
 
-def _chance_information(block: Observations, covariance: Array, track: OdometerTrack) -> float:
+def _chance_information(block: Observations, covariance: Floats, track: OdometerTrack) -> float:
     """What the odometer's noise alone, taken for changes of speed, seems to tell of the latency [1/s^2], on average.
 
     The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second,
@@ -181,7 +180,7 @@ def _widened(sigma_s: float, by_chance: float) -> float:
     return float(1.0 / np.sqrt(max(told - 2.0 * by_chance, _LEAST_SHARE * told)))
 
 
-def _linearised(block: Observations, track: OdometerTrack, estimate: Array) -> tuple[Array, Array]:
+def _linearised(block: Observations, track: OdometerTrack, estimate: Floats) -> tuple[Floats, Floats]:
     """Columns of scale and latency, and what is observed over what is expected."""
     scale, latency_s = estimate
     at = block.t_s - latency_s
@@ -192,7 +191,7 @@ def _linearised(block: Observations, track: OdometerTrack, estimate: Array) -> t
     return np.column_stack([distance - distance[0], -scale * speed]), block.path_m - scale * distance
 
 
-def _span(t_s: Array, track: OdometerTrack) -> tuple[Array, Array]:
+def _span(t_s: Floats, track: OdometerTrack) -> tuple[Floats, Floats]:
     """Begin and end of the time over which the speed is taken, within what the odometer recorded."""
     return np.maximum(t_s - _SPEED_SPAN_S, track.t_s[0]), np.minimum(t_s + _SPEED_SPAN_S, track.t_s[-1])
 
@@ -205,7 +204,7 @@ class Pooled:
     sigma: float
 
 
-def pooled(values: Array, sigmas: Array) -> Pooled:
+def pooled(values: Floats, sigmas: Floats) -> Pooled:
     """Runs together (DerSimonian and Laird 1986): the sigma includes the scatter between runs.
 
     Wheels wear and sensors drift, so a further run may differ by more than each run's own uncertainty.

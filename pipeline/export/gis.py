@@ -13,7 +13,7 @@ import polars as pl
 from pipeline.export.events import hazard_text
 from pipeline.export.places import Ground, ground_of
 from pipeline.export.positions import positions_of
-from pipeline.track.geodesy import Floats
+from schemas.arrays import Floats
 from schemas.run import RunTables, Site
 
 Feature = dict[str, Any]

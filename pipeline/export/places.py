@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.track.geodesy import Floats, Ints, moved_deg, points_of
+from pipeline.track.geodesy import moved_deg, points_of
 from pipeline.track.survey import Track, track_of
+from schemas.arrays import Floats, Ints
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.odometer import STRAIGHT_S, leaps
 from pipeline.ingest.clean import StreamCounts
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
+from pipeline.odometry.odometer import STRAIGHT_S, leaps
 from pipeline.site.checks import BALISE_PLACE
 from schemas.arrays import NS_PER_S, floats, times_ns
 from schemas.config import Vehicle

@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.figures.bounds import SURE_SIGMAS
 from pipeline.hazards.travel import Travel
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
-
-Matrix = npt.NDArray[np.float64]
 
 _NODE_S = 1.0
 # A position error correlated over tau tells as much in a second as a white one of variance 2 tau sigma^2
@@ -112,7 +109,7 @@ def _smooth(nodes: _Nodes, scale_sigma: float) -> tuple[Floats, Floats]:
     return states[:, 0], covariances[:, 0, 0]
 
 
-def _updated(x: Floats, p: Matrix, offset_m: float, sigma_m: float) -> tuple[Floats, Matrix]:
+def _updated(x: Floats, p: Floats, offset_m: float, sigma_m: float) -> tuple[Floats, Floats]:
     if not (np.isfinite(offset_m) and np.isfinite(sigma_m)):
         return x, p
     innovation = offset_m - x[0]
@@ -123,7 +120,7 @@ def _updated(x: Floats, p: Matrix, offset_m: float, sigma_m: float) -> tuple[Flo
 
 
 def _backwards(
-    states: Floats, covariances: Matrix, predicted: Floats, predicted_covariances: Matrix, moves: Matrix
+    states: Floats, covariances: Floats, predicted: Floats, predicted_covariances: Floats, moves: Floats
 ) -> None:
     """Rauch-Tung-Striebel recursion, in place."""
     for k in range(len(states) - 2, -1, -1):

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from schemas.arrays import Bools
 from schemas.errors import InputError
 from schemas.run import STREAMS, RunLog, Stream
 
@@ -16,7 +17,6 @@ _KEYS: dict[Stream, list[str]] = {
     "satellites": ["solution", "t", "sv"],
     "balise_reads": ["t", "balise_id"],
 }
-Bools = npt.NDArray[np.bool_]
 _PLACE = ("latitude_deg", "longitude_deg")
 _DAY_NS = 86_400_000_000_000
 # Share of positions with a wrong date that may be left out.

@@ -12,8 +12,8 @@ import polars as pl
 import pyarrow as pa
 
 from pipeline.ingest.mcap_block import Bytes
+from schemas.arrays import Bools
 
-Bools = npt.NDArray[np.bool_]
 Words = npt.NDArray[np.uint64]
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.ingest.mcap_records import HEAD_SIZE, DamageError, Op
+from schemas.arrays import Ints
 
-Ints = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 
 # A message record: opcode, length, channel, sequence, log time, publish time, then the payload.

@@ -10,17 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.ingest.mcap_block import (
-    MESSAGE_HEAD,
-    MESSAGE_HEAD_SIZE,
-    Block,
-    Bytes,
-    Ints,
-    block_of,
-    gathered,
-    messages_of,
-)
+from pipeline.ingest.mcap_block import MESSAGE_HEAD, MESSAGE_HEAD_SIZE, Block, Bytes, block_of, gathered, messages_of
 from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, DamageError, Op
+from schemas.arrays import Ints
 
 OnRecord = Callable[[int, memoryview, int], None]
 Index = tuple[int, memoryview]  # channel, pairs of log time and offset

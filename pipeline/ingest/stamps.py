@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
@@ -17,8 +15,6 @@ LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
 # How fields are read that may hold a time, by what their first value is.
 TIME_KINDS: Mapping[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
-
-Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.ingest.layout import Bools, Field, Rows, UnfitError, Values
-from pipeline.ingest.mcap_block import Bytes, Ints, Messages, stretches_of
+from pipeline.ingest.layout import Field, Rows, UnfitError, Values
+from pipeline.ingest.mcap_block import Bytes, Messages, stretches_of
+from schemas.arrays import Bools, Ints
 
 _MOST_TEMPLATES = 256  # layouts of one channel; beyond, messages are decoded one by one
 _MOST_PER_LENGTH = 16

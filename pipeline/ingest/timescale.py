@@ -5,9 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 import numpy as np
-import numpy.typing as npt
 
-Ints = npt.NDArray[np.int64]
+from schemas.arrays import Ints
 
 # First moments of a new difference GPS - UTC (IERS Bulletin C): 1 s in July 1981 to 18 s in January 2017.
 _LEAPS = (

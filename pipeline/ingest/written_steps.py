@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 # How far a change may be from a multiple of the step, in steps.
 _TOLERANCE = 0.02
@@ -13,7 +12,7 @@ _TOLERANCE = 0.02
 _FEWEST_BENDS = 8
 
 
-def step_of(changes: Array, single: Array, least: float, rounded: float) -> float:
+def step_of(changes: Floats, single: Floats, least: float, rounded: float) -> float:
     """The step that all these changes are multiples of, now of more and now of less; in the unit of the changes.
 
     `single`: differences of which some are of one step. 0 where there is no step, none of at least `least`, or where

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.lds.journey import Floats, Journey
+from pipeline.lds.journey import Journey
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import Passage
 from pipeline.lds.standing import Standing
+from schemas.arrays import Floats
 from schemas.config import LdsConfig
 from schemas.enums import Cause, Direction, FailureMode, LdsMode
 from schemas.tables import Epochs, Passages

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.lds.journey import Floats, Integers, Journey
+from pipeline.lds.journey import Journey
+from schemas.arrays import Floats, Ints
 from schemas.enums import BaliseKind, Reaction
 
 
@@ -110,8 +111,8 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> dict[int, lis
     return dict(sorted(found.items()))
 
 
-def _steps(journey: Journey, before: Integers, after: Integers) -> Iterator[_Step]:
-    columns: list[Integers | Floats] = [before, after]
+def _steps(journey: Journey, before: Ints, after: Ints) -> Iterator[_Step]:
+    columns: list[Ints | Floats] = [before, after]
     for values in (journey.t_ns, journey.path_m, journey.odometer_m):
         columns += [values[before], values[after]]
     return (_Step(*row) for row in zip(*(column.tolist() for column in columns), strict=True))

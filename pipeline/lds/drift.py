@@ -14,7 +14,8 @@ from typing import Self
 import numpy as np
 
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.lds.journey import Integers, Journey
+from pipeline.lds.journey import Journey
+from schemas.arrays import Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ class Drift:
     largest_m: float
 
     @classmethod
-    def before(cls, validated: Integers, journey: Journey, limits: LdsLimits) -> Self | None:
+    def before(cls, validated: Ints, journey: Journey, limits: LdsLimits) -> Self | None:
         """`validated`: epochs of the TVBs before the alarm, in order; `None` where there are none.
 
         Reached are those from which the bound of a re-link is within the failure limit (DOMAIN section 4).
@@ -42,7 +43,7 @@ class Drift:
         return 2.0 * drifted_m <= limits.failure_limit_m
 
 
-def _bounds_m(epochs: Integers, journey: Journey, limits: LdsLimits) -> np.ndarray:
+def _bounds_m(epochs: Ints, journey: Journey, limits: LdsLimits) -> np.ndarray:
     """`noise_bound_m` from each epoch to the last one; infinite where the odometer lost its distance between."""
     last = epochs[-1]
     way_m = journey.travelled_m[last] - journey.travelled_m[epochs]

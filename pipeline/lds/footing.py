@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.drift import Drift
-from pipeline.lds.journey import Integers, Journey
+from pipeline.lds.journey import Journey
 from pipeline.lds.reads import Read
 from pipeline.lds.recovery import Anchor, Recovery, read_anchor, relink_bound_m
+from schemas.arrays import Ints
 
 
 class Footing:
@@ -40,7 +41,7 @@ class Footing:
         if self._disputed is not None:
             self._disputed = self._read or self._disputed
 
-    def negate(self, k: int, slow_after: Integers | None) -> None:
+    def negate(self, k: int, slow_after: Ints | None) -> None:
         """An alarm; `slow_after`: where only a slow average fails, the TVBs before it, which may carry its fault.
 
         What the odometer can no longer tell since the last return does not count.

@@ -7,17 +7,12 @@ from functools import cached_property
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.lds.bank_protocol import LdsLimits
-from schemas.arrays import NS_PER_S, floats
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
 from schemas.config import LdsConfig
 from schemas.enums import PassageStatus
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -32,8 +27,8 @@ class Journey:
     crossing is interpolated over (`gap_ns`).
     """
 
-    t_ns: Integers
-    leg: Integers
+    t_ns: Ints
+    leg: Ints
     path_m: Floats
     positioned: Bools
     placed_nowhere: Bools
@@ -41,12 +36,12 @@ class Journey:
     sigma_m: Floats
     confidence_m: Floats
     odometer_m: Floats
-    stretch: Integers
+    stretch: Ints
     speed_mps: Floats
     scale_sigma: Floats
     latency_sigma_s: Floats
-    heading: Integers
-    travel: Integers
+    heading: Ints
+    travel: Ints
     travelled_m: Floats
     blind: Bools
     gap_ns: int
@@ -106,7 +101,7 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
     )
 
 
-def _blind(t_ns: Integers, positioned: Bools, gap_ns: int) -> Bools:
+def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
     last_ns = np.maximum.accumulate(np.where(positioned, t_ns, np.iinfo(np.int64).min))
     first = np.argmax(positioned) if positioned.any() else t_ns.size
     blind: Bools = t_ns - np.maximum(last_ns, t_ns[0] - gap_ns) > gap_ns
@@ -132,7 +127,7 @@ def _refusals(
     return refusals
 
 
-def _headings(odometer_m: Floats, direction: pl.Series, turn_m: float) -> tuple[Integers, Integers]:
+def _headings(odometer_m: Floats, direction: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
     """Direction of travel along growing path, as known at each epoch and as it was.
 
     With an odometer the train has turned once it came back by `turn_m` (the odometer's own fixed
@@ -167,7 +162,7 @@ def _turns(odometer_m: Floats, turn_m: float) -> list[tuple[int, int, int]]:
         start += confirmed
 
 
-def _travelled_m(odometer_m: Floats, travel: Integers) -> Floats:
+def _travelled_m(odometer_m: Floats, travel: Ints) -> Floats:
     """Way run since the first epoch; signed sums, so that jitter at standstill adds up to nothing."""
     travelled_m = np.full(odometer_m.size, np.nan)
     known = np.flatnonzero(np.isfinite(odometer_m))

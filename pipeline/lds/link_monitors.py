@@ -10,8 +10,9 @@ import polars as pl
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.breaks import LOST, NEVER, TOO_FAR, Comparison, Verdict
 from pipeline.lds.crossings import Crossing
-from pipeline.lds.journey import Bools, Floats, Integers, Journey
+from pipeline.lds.journey import Journey
 from pipeline.lds.recovery import Anchor
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import LdsConfig
 from schemas.enums import MonitorState
 from schemas.tables import Epochs
@@ -149,7 +150,7 @@ class LinkDistance:
         return _columns("link_distance", self._value, self._threshold, reason)
 
 
-def _order_reasons(journey: Journey, disabled: bool) -> Integers:
+def _order_reasons(journey: Journey, disabled: bool) -> Ints:
     """Per step, so both its ends must be good for it; a step ends at the epoch that it is noted at."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
@@ -167,7 +168,7 @@ def _order_reasons(journey: Journey, disabled: bool) -> Integers:
     return _reasons(odometer.size, masks)
 
 
-def _distance_reasons(journey: Journey, disabled: bool) -> Integers:
+def _distance_reasons(journey: Journey, disabled: bool) -> Ints:
     odometer = _odometer(journey)
     masks = (
         (np.full(odometer.size, disabled), DISABLED),
@@ -184,7 +185,7 @@ def _odometer(journey: Journey) -> Bools:
     return known
 
 
-def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> Integers:
+def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> Ints:
     """The first reason that applies."""
     reasons = np.full(size, _NO_REASON)
     for mask, reason in reversed(masks):
@@ -192,7 +193,7 @@ def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> Integers:
     return reasons
 
 
-def _columns(monitor: str, value: Floats, threshold: Floats, reasons: Integers) -> dict[str, pl.Series]:
+def _columns(monitor: str, value: Floats, threshold: Floats, reasons: Ints) -> dict[str, pl.Series]:
     fail, passed, unknown = (
         _STATES.index(state) for state in (MonitorState.FAIL, MonitorState.PASS, MonitorState.NOT_EVALUATED)
     )

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import odometer_at
-from pipeline.track.geodesy import Floats, Ints
+from schemas.arrays import Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.geodesy import Points, points_of
 from pipeline.track.network import Network
 from pipeline.track.segments import on_segments
 from pipeline.track.survey import Track
+from schemas.arrays import Bools, Floats, Ints
 
 # Every place on an element has a search point within this distance along it.
 PROBE_SPACING_M = 40.0

@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.matching.moves import Move, best_move
 from pipeline.matching.trellis import Trellis
-from pipeline.track.geodesy import Floats, Ints
 from pipeline.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.track.network import Network
+from schemas.arrays import Floats, Ints
 
 
 @dataclass(frozen=True)

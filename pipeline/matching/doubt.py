@@ -11,7 +11,7 @@ from pipeline.matching.decode import Decoded
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
-from pipeline.track.geodesy import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {

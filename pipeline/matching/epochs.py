@@ -12,10 +12,10 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.matching.fixes import Fixes
-from pipeline.track.geodesy import Floats, Ints
 from pipeline.track.leg import segments_at
 from pipeline.track.path import TravelledPath
 from pipeline.track.segments import Feet
+from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
 

@@ -18,10 +18,10 @@ from pipeline.matching.orientation import grows_with
 from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
-from pipeline.track.geodesy import Bools, Floats, Ints
 from pipeline.track.network import Network
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import end_places
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 # An element past whose end a position lies by more is no candidate, unless the track ends there.

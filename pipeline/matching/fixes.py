@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.geodesy import Points, points_of
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import FixSigma
 from schemas.enums import Fix
 

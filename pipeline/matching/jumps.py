@@ -12,8 +12,8 @@ import numpy as np
 from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.steps import Steps
-from pipeline.track.geodesy import Floats, Ints
 from pipeline.track.network import Network
+from schemas.arrays import Floats, Ints
 
 # Positions are looked for on tracks further off for this long before and after a jump [s], and up to this far [m].
 _WITHIN_S = 120.0

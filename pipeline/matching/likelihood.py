@@ -17,7 +17,7 @@ from scipy.special import log_ndtr
 from pipeline.matching.candidates import Candidates
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.steps import Steps
-from pipeline.track.geodesy import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 # Floor of what the offset changes from step to step [m]: rounding of surveys and fixes; more where the sigma is a

@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.odometer import odometer_track, polarity
 from pipeline.matching.chain import path_on_chain, whole_chain
 from pipeline.matching.doubt import no_doubt
 from pipeline.matching.epochs import Assignment, epoch_frame
@@ -17,13 +16,13 @@ from pipeline.matching.fixes import Fixes, fixes_of
 from pipeline.matching.residuals import biases
 from pipeline.matching.resolution import digit_noise
 from pipeline.matching.steps import ODOMETER_GAP_S
-from pipeline.track.geodesy import Ints
+from pipeline.odometry.odometer import odometer_track, polarity
 from pipeline.track.leg import leg_of
 from pipeline.track.network import network_of
 from pipeline.track.path import TravelledPath
 from pipeline.track.route import network_along, visits_of
 from pipeline.track.survey import Track, track_of
-from schemas.arrays import floats
+from schemas.arrays import Ints, floats
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.track.geodesy import Bools, Floats, Ints
 from pipeline.track.network import Network
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 # Log-probabilities: mismatch between network and travelled distance counts at most the first (a GNSS that

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.matching.steps import Travelled
-from pipeline.track.geodesy import Floats, Ints
+from schemas.arrays import Floats, Ints
 
 
 def grows_with(position_m: Floats, epoch: Ints, way: Travelled, distance_m: float) -> bool:

@@ -8,20 +8,17 @@ digits are looked at, so no fault of the position can pass for it.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.ingest.written_steps import step_of
-from schemas.arrays import floats
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats, floats
 
 _EARTH_RADIUS_M = 6_371_000.0
 # Finer steps drown in the noise of any receiver; less than the other is rounding.
 _LEAST_STEP_M, _ROUNDED_M = 0.02, 1e-4
 
 
-def digit_noise(fixes: pl.DataFrame, heading_deg: Array) -> list[pl.Series]:
+def digit_noise(fixes: pl.DataFrame, heading_deg: Floats) -> list[pl.Series]:
     """Columns `digits_along_m`, `digits_cross_m`, `digits_up_m`: deviation by the steps of the recorded coordinates.
 
     `fixes`: those of one solution, row for row with `heading_deg`, the direction of growing path.
@@ -48,7 +45,7 @@ def digit_noise(fixes: pl.DataFrame, heading_deg: Array) -> list[pl.Series]:
     ]
 
 
-def step_m(values: Array, metres: float) -> float:
+def step_m(values: Floats, metres: float) -> float:
     """The step of a recorded coordinate [m], 0 where there is none to speak of; `metres`: of one unit of it."""
     changes = np.diff(values)
     # At speed the changes themselves are many steps each, but the change of the change is one at times.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.matching.trellis import Trellis
-from pipeline.track.geodesy import Floats, Ints
+from schemas.arrays import Floats, Ints
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.odometer import odometer_track
 from pipeline.matching.fixes import Fixes
-from pipeline.track.geodesy import Bools, Floats, Ints
+from pipeline.odometry.odometer import odometer_track
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 # No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s), none speeds up, brakes

@@ -10,8 +10,8 @@ from pipeline.matching.candidates import Candidates
 from pipeline.matching.likelihood import Likelihood, expected_m, log_density
 from pipeline.matching.moves import Ways, distance_scores, move_scores
 from pipeline.matching.steps import Steps
-from pipeline.track.geodesy import Bools, Floats, Ints
 from pipeline.track.network import Network
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
 # Log-probability of a move that the network does not know: only where nothing else is possible.

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.monitors.recursion import (
-    Array,
     AxisState,
     before_steps,
     ewma_weight,
@@ -16,9 +15,8 @@ from pipeline.monitors.recursion import (
     linear_recurrence,
     variance_of_ewma,
 )
+from schemas.arrays import Bools, Floats
 from schemas.config import MonitorConfig
-
-Mask = npt.NDArray[np.bool_]
 
 # Half of the fastest average's memory: so the variance of all averages is that of rows up to 5 s apart, or above it.
 _LASTS_S = 5.0
@@ -38,17 +36,17 @@ class AxisSeries:
     """
 
     epoch: npt.NDArray[np.int64]
-    fresh: Mask
-    border: Mask
-    dt_s: Array
-    rate_mps: Array
-    sigma_m: Array
-    sigma_before_m: Array
-    decorrelation: Array
-    white_m2: Array
-    border_m2: Array
-    steady_mps: Array
-    latency_mps: Array
+    fresh: Bools
+    border: Bools
+    dt_s: Floats
+    rate_mps: Floats
+    sigma_m: Floats
+    sigma_before_m: Floats
+    decorrelation: Floats
+    white_m2: Floats
+    border_m2: Floats
+    steady_mps: Floats
+    latency_mps: Floats
 
     def between(self, low: int, high: int) -> AxisSeries:
         """Rows [low, high)."""
@@ -59,11 +57,11 @@ class AxisSeries:
 class AxisResult:
     """Statistic and its sigma [m/s], shape (rows, 1 + alphas): raw first, then the EWMAs."""
 
-    value: Array
-    sigma: Array
+    value: Floats
+    sigma: Floats
 
 
-def with_memory(sigma_m: Array, decorrelation: Array) -> dict[str, Array]:
+def with_memory(sigma_m: Floats, decorrelation: Floats) -> dict[str, Floats]:
     """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j, best in Fortran order.
 
     The recursions go along the rows, one source after the other.
@@ -73,8 +71,8 @@ def with_memory(sigma_m: Array, decorrelation: Array) -> dict[str, Array]:
 
 
 def along_errors(
-    sigma_m: Array, jitter_m: Array, dt_s: Array, shares: Array, taus_s: Array, reading: Reading | None = None
-) -> dict[str, Array]:
+    sigma_m: Floats, jitter_m: Floats, dt_s: Floats, shares: Floats, taus_s: Floats, reading: Reading | None = None
+) -> dict[str, Floats]:
     """Error fields of the along-track axis: the Gauss-Markov errors, stamps that scatter, rows of the odometer that do.
 
     `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
@@ -87,7 +85,7 @@ def along_errors(
     return with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T)
 
 
-def calibrated(sigma_m: Array, config: MonitorConfig) -> Array:
+def calibrated(sigma_m: Floats, config: MonitorConfig) -> Floats:
     """Position sigma that the monitors count with [m]: `calibrate` may have fitted a + b sigma."""
     return config.sigma_intercept_m + config.sigma_slope * sigma_m
 
@@ -96,17 +94,17 @@ def calibrated(sigma_m: Array, config: MonitorConfig) -> Array:
 class Reading:
     """Noise of the odometer's rows: its deviation at each epoch [m], shape (m,), and the time between rows [s]."""
 
-    sigma_m: Array
+    sigma_m: Floats
     period_s: float
 
-    def decorrelation(self, dt_s: Array) -> Array:
+    def decorrelation(self, dt_s: Floats) -> Floats:
         """1 - phi over these steps: none is left from row to row; between rows, on straight lines, little changes.
 
         The square is what a step changes on a straight line. Errors that change so little and at random would last for
         `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than `_LASTS_S`.
         """
         changed = np.minimum(dt_s / max(self.period_s, 1e-9), 1.0) ** 2
-        lost: Array = np.maximum(changed, np.minimum(dt_s / _LASTS_S, 1.0))
+        lost: Floats = np.maximum(changed, np.minimum(dt_s / _LASTS_S, 1.0))
         return lost
 
 
@@ -119,21 +117,21 @@ class AlongSteps:
     distance gathers in a second; `reading`: what its rows scatter beside.
     """
 
-    dt_s: Array
-    path_m: Array
-    odometer_m: Array
-    speed_mps: Array
-    sigma_m: Array
-    jitter_s: Array | float
-    white_m2_per_s: Array | float
-    scale_sigma: Array
-    latency_sigma_s: Array
-    digits_m: Array
+    dt_s: Floats
+    path_m: Floats
+    odometer_m: Floats
+    speed_mps: Floats
+    sigma_m: Floats
+    jitter_s: Floats | float
+    white_m2_per_s: Floats | float
+    scale_sigma: Floats
+    latency_sigma_s: Floats
+    digits_m: Floats
     reading: Reading | None = None
 
 
 def along_axis(
-    epoch: npt.NDArray[np.int64], fresh: Mask, steps: AlongSteps, shares: Array, taus_s: Array
+    epoch: npt.NDArray[np.int64], fresh: Bools, steps: AlongSteps, shares: Floats, taus_s: Floats
 ) -> AxisSeries:
     """Increments of GNSS minus odometer (DIAG eq. 1-3), with what scale and latency leave uncertain."""
     dt = steps.dt_s
@@ -152,12 +150,12 @@ def along_axis(
     )
 
 
-def decorrelation_of(dt_s: Array, taus_s: Array) -> Array:
+def decorrelation_of(dt_s: Floats, taus_s: Floats) -> Floats:
     """1 - phi of first-order Gauss-Markov errors over these steps; shape (sources, steps)."""
     return -np.expm1(-dt_s / taus_s[:, None])
 
 
-def run_axis(series: AxisSeries, alphas: Array, state: AxisState | None = None) -> tuple[AxisResult, AxisState]:
+def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None) -> tuple[AxisResult, AxisState]:
     """Values and sigmas of the axis from `state`, or from a restart, on, and the state to carry on with."""
     state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
     moving = ~series.fresh
@@ -181,15 +179,15 @@ def run_axis(series: AxisSeries, alphas: Array, state: AxisState | None = None) 
     return result, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
 
 
-def _response(keep: Array, weight: Array, rate_mps: Array, before: Array) -> Array:
+def _response(keep: Floats, weight: Floats, rate_mps: Floats, before: Floats) -> Floats:
     """What one sigma of an error that stays has made of the EWMAs [m/s]; most axes know none."""
     if not (rate_mps.any() or before.any()):
         return np.zeros_like(keep)
     return linear_recurrence(keep, weight * rate_mps[:, None], before)
 
 
-def _raw_variance(series: AxisSeries, increment_m2: Array) -> Array:
+def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
     """Variance of the raw rate (DIAG eq. 4-7 with correlated GNSS errors) [m^2/s^2]."""
     border = np.where(series.border, series.border_m2, 0.0)
-    noise: Array = (increment_m2 + border) / series.dt_s**2
+    noise: Floats = (increment_m2 + border) / series.dt_s**2
     return noise + series.steady_mps**2 + series.latency_mps**2

@@ -9,8 +9,9 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.monitors.axis import AxisSeries, run_axis
-from pipeline.monitors.recursion import Array, AxisState
+from pipeline.monitors.recursion import AxisState
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, Axis, axes_of
+from schemas.arrays import Floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import SCALES
@@ -24,7 +25,7 @@ _FIRST_BLOCK, _BLOCK = 2048, 8192
 class _AxisBank:
     """One axis of the bank over all epochs of a solution; results are filled up to `_done` rows."""
 
-    def __init__(self, axis: Axis, epochs: int, alphas: Array, factor: float, enabled: list[bool]) -> None:
+    def __init__(self, axis: Axis, epochs: int, alphas: Floats, factor: float, enabled: list[bool]) -> None:
         self.axis = axis
         self._alphas = alphas
         self._factor = factor
@@ -49,7 +50,7 @@ class _AxisBank:
             self._done, self._block = end, min(2 * self._block, _BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
-    def _store(self, part: AxisSeries, value: Array, threshold: Array) -> None:
+    def _store(self, part: AxisSeries, value: Floats, threshold: Floats) -> None:
         evaluated = ~part.fresh[:, None] & self._enabled[None, :]
         failing = ~(np.abs(value) <= threshold)  # what cannot be compared is no pass
         self.state[part.epoch] = np.where(evaluated, np.where(failing, _FAIL, _PASS), _NOT_EVALUATED)

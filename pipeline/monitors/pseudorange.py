@@ -12,18 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.special import chdtri
 
 from pipeline.monitors.series import NO_POSITION
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
 from pipeline.monitors.single import NO_RANGES, blind_monitor, judged
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
 TOO_FEW = "too few satellites to test the ranges"
@@ -60,11 +56,11 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
 class _Ranges:
     """Used satellites with a residual, ordered by epoch; `system` numbers the constellations."""
 
-    epoch: Index
-    system: Index
-    rows: Array
-    residual_m: Array
-    variance_m2: Array
+    epoch: Ints
+    system: Ints
+    rows: Floats
+    residual_m: Floats
+    variance_m2: Floats
 
     @property
     def systems(self) -> int:
@@ -75,13 +71,13 @@ class _Ranges:
 class _Track:
     """The track at each epoch: unit vectors east, north, up and offset of the position from it [m]."""
 
-    along: Array
-    cross: Array
-    offset_m: Array
-    sigma_m: Array
-    height_known: Mask
-    usable: Mask
-    matched: Mask
+    along: Floats
+    cross: Floats
+    offset_m: Floats
+    sigma_m: Floats
+    height_known: Bools
+    usable: Bools
+    matched: Bools
 
 
 def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame) -> _Ranges:
@@ -107,11 +103,11 @@ def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame) -> _Ranges:
     )
 
 
-def _nearest(t_ns: Index, stamps: Index) -> Index:
+def _nearest(t_ns: Ints, stamps: Ints) -> Ints:
     """Index of the epoch nearest to each stamp."""
     after = np.searchsorted(t_ns, stamps).clip(0, t_ns.size - 1)
     before = np.maximum(after - 1, 0)
-    nearest: Index = np.where(stamps - t_ns[before] <= t_ns[after] - stamps, before, after)
+    nearest: Ints = np.where(stamps - t_ns[before] <= t_ns[after] - stamps, before, after)
     return nearest
 
 
@@ -152,13 +148,13 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     )
 
 
-def _unambiguous(epochs: pl.DataFrame, config: Configuration) -> Mask:
+def _unambiguous(epochs: pl.DataFrame, config: Configuration) -> Bools:
     """The causal probability of the path is good enough to hold the position on it."""
     sure = epochs["gate_probability"] >= config.matching.ambiguity_probability
     return sure.fill_null(False).to_numpy()
 
 
-def _sums_of_squares(ranges: _Ranges, track: _Track, epochs: Index) -> tuple[Array, Index]:
+def _sums_of_squares(ranges: _Ranges, track: _Track, epochs: Ints) -> tuple[Floats, Ints]:
     """Weighted sum of squares and degrees of freedom of these epochs, which all have satellites."""
     first = np.searchsorted(ranges.epoch, epochs)
     count = np.searchsorted(ranges.epoch, epochs, side="right") - first
@@ -176,7 +172,7 @@ def _sums_of_squares(ranges: _Ranges, track: _Track, epochs: Index) -> tuple[Arr
     return _left_over(design, weight, residual, prior), count - free
 
 
-def _priors(track: _Track, epochs: Index, present: Mask) -> tuple[Array, Index]:
+def _priors(track: _Track, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
     """Prior precision of along, cross, up and clocks [1/m^2], and how many of them are free.
 
     Nothing is known of the error along the track and of clocks, the survey's sigma holds the others; without
@@ -190,7 +186,7 @@ def _priors(track: _Track, epochs: Index, present: Mask) -> tuple[Array, Index]:
     return prior, free
 
 
-def _left_over(design: Array, weight: Array, residual: Array, prior: Array) -> Array:
+def _left_over(design: Floats, weight: Floats, residual: Floats, prior: Floats) -> Floats:
     """Least weighted sum of squares over the unknowns, priors included."""
     weighted = design * weight[..., None]
     normal = np.einsum("eni,enj->eij", weighted, design)
@@ -204,7 +200,7 @@ def _left_over(design: Array, weight: Array, residual: Array, prior: Array) -> A
     return np.asarray(np.maximum(total, 0.0))
 
 
-def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Mask, config: Configuration) -> pl.Series:
+def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Bools, config: Configuration) -> pl.Series:
     seen = np.isin(np.arange(epochs.height), ranges.epoch)
     return pl.select(
         pl.when(pl.Series(tested))

@@ -9,16 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg.lapack import dtbtrs
 
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 # Between two rows a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
 STEP_OF_SIGMA = 1.5
 
 
-def linear_recurrence(decay: Array, drive: Array, initial: Array) -> Array:
+def linear_recurrence(decay: Floats, drive: Floats, initial: Floats) -> Floats:
     """Solve `y[k] = decay[k] * y[k-1] + drive[k]` with `y[-1] = initial`, shapes (n, c), (n, c), (c,).
 
     In Fortran order, one channel after the other. A recurrence of first order is a triangular system of two
@@ -28,7 +27,7 @@ def linear_recurrence(decay: Array, drive: Array, initial: Array) -> Array:
     return _solved(decay, y, initial)
 
 
-def _solved(decay: Array, y: Array, initial: Array) -> Array:
+def _solved(decay: Floats, y: Floats, initial: Floats) -> Floats:
     """`linear_recurrence` of the drive `y`, an array in Fortran order that the result takes the place of."""
     if not len(y):
         return y
@@ -40,7 +39,7 @@ def _solved(decay: Array, y: Array, initial: Array) -> Array:
     return y
 
 
-def ewma_weight(alpha: Array, dt_s: Array) -> Array:
+def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
     """Weight of a new sample after `dt_s`: 1 - (1 - alpha)^(dt / 1 s); shape (n, alphas), in Fortran order."""
     return 1.0 - ((1.0 - alpha[:, None]) ** dt_s[None, :]).T
 
@@ -49,11 +48,11 @@ def ewma_weight(alpha: Array, dt_s: Array) -> Array:
 class AxisState:
     """What the recursions of one axis carry on; all zero at a restart. Shapes (alphas,), (alphas, sources)."""
 
-    ewma: Array
-    variance: Array
-    covariance: Array
-    steady_response: Array
-    latency_response: Array
+    ewma: Floats
+    variance: Floats
+    covariance: Floats
+    steady_response: Floats
+    latency_response: Floats
 
     @classmethod
     def at_restart(cls, alphas: int, sources: int) -> AxisState:
@@ -62,15 +61,15 @@ class AxisState:
 
 
 def variance_of_ewma(
-    keep: Array,
-    gain: Array,
-    sigma_m: Array,
-    sigma_before_m: Array,
-    decorrelation: Array,
-    increment_m2: Array,
-    white_m2: Array,
+    keep: Floats,
+    gain: Floats,
+    sigma_m: Floats,
+    sigma_before_m: Floats,
+    decorrelation: Floats,
+    increment_m2: Floats,
+    white_m2: Floats,
     state: AxisState,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Variance of the EWMAs of a rate [m^2/s^2], epoch by epoch, from a restart or a carried state.
 
     `keep` (n, alphas): b = 1 - alpha(dt), `gain` (n, alphas): alpha(dt) / dt, both zero at a row that restarts;
@@ -102,7 +101,7 @@ def variance_of_ewma(
     return np.maximum(variance, gain**2 * new_m2[:, None]), covariances
 
 
-def _memory(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> tuple[Array, Array, Array]:
+def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
     """By which factor the errors' covariances go on, what is new in them, and their share in the increment."""
     if np.array_equal(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
@@ -112,7 +111,7 @@ def _memory(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> tupl
     return carried, own, np.where(ratio == 1.0, -decorrelation, carried - 1.0)
 
 
-def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
+def before_steps(sigma_m: Floats, decorrelation: Floats) -> Floats:
     """The sigma before each row that the recursion counts with, per source; shapes (n, sources).
 
     Until a source's sigma first changes by the step, R_j of the row stands for both ends of the increment, as
@@ -129,7 +128,7 @@ def before_steps(sigma_m: Array, decorrelation: Array) -> Array:
     return before
 
 
-def increment_variance(sigma_m: Array, sigma_before_m: Array, decorrelation: Array) -> Array:
+def increment_variance(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> Floats:
     """Variance of the increments of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
     correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
     if np.array_equal(sigma_m, sigma_before_m):

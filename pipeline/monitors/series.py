@@ -12,14 +12,13 @@ from pipeline.alignment.odometer_filter import error_model
 from pipeline.monitors.axis import (
     AlongSteps,
     AxisSeries,
-    Mask,
     Reading,
     along_axis,
     calibrated,
     decorrelation_of,
     with_memory,
 )
-from pipeline.monitors.recursion import Array
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 
 NO_POSITION = "no position"
@@ -78,7 +77,7 @@ def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
 class _Builder:
     """Increments of an axis between consecutive epochs without a reason against it."""
 
-    def __init__(self, epochs: pl.DataFrame, t_s: Array, config: Configuration) -> None:
+    def __init__(self, epochs: pl.DataFrame, t_s: Floats, config: Configuration) -> None:
         self._epochs = epochs
         self._t_s = t_s
         self._gap_reset_s = config.align.gap_reset_s
@@ -87,11 +86,11 @@ class _Builder:
         self._shares, self._taus_s = error_model(config.monitors)
         self._monitors = config.monitors
 
-    def _column(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
-        values: Array = self._epochs[name].to_numpy().astype(np.float64)[rows]
+    def _column(self, name: str, rows: npt.NDArray[np.int64]) -> Floats:
+        values: Floats = self._epochs[name].to_numpy().astype(np.float64)[rows]
         return values
 
-    def _sigma(self, name: str, rows: npt.NDArray[np.int64]) -> Array:
+    def _sigma(self, name: str, rows: npt.NDArray[np.int64]) -> Floats:
         """Position sigma of the axis [m]."""
         return calibrated(self._column(name, rows), self._monitors)
 
@@ -151,18 +150,18 @@ class _Builder:
             latency_mps=zero,
         )
 
-    def _turned_mps(self, rows: npt.NDArray[np.int64]) -> Array:
+    def _turned_mps(self, rows: npt.NDArray[np.int64]) -> Floats:
         """What one sigma of the error along the track makes across it while a curve turns the axes [m/s]."""
         turning = self._column("curvature_per_m", rows) * self._column("speed_mps", rows)
         return np.nan_to_num(turning) * self._sigma("sigma_along_m", rows)
 
-    def _wander(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+    def _wander(self, rows: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
         """How a 2-D survey of no stated accuracy wanders along its elements [m], and its decorrelation."""
         unstated = np.isnan(self._column("survey_sigma_m", rows)) & np.isnan(self._column("vertical_m", rows))
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
         return np.where(unstated, self._wander_m, 0.0), -np.expm1(-way / self._wander_length_m)
 
-    def _chord_error(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Array]:
+    def _chord_error(self, rows: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
         """The polyline's chord error [m] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
         curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))
@@ -170,7 +169,7 @@ class _Builder:
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
         return error, -np.expm1(-way / np.maximum(length, 1.0))
 
-    def _time_steps(self, rows: npt.NDArray[np.int64]) -> tuple[Array, Mask]:
+    def _time_steps(self, rows: npt.NDArray[np.int64]) -> tuple[Floats, Bools]:
         """Time since the row before [s] (1 s stands in where there is none) and rows that nothing leads to."""
         dt = np.diff(self._t_s[rows], prepend=self._t_s[rows[0]] - 1.0)
         fresh = dt > self._gap_reset_s
@@ -178,11 +177,11 @@ class _Builder:
         return dt, fresh
 
 
-def _steps(values: Array) -> Array:
+def _steps(values: Floats) -> Floats:
     return np.diff(values, prepend=values[0])
 
 
-def _changes(values: npt.NDArray[np.generic]) -> Mask:
+def _changes(values: npt.NDArray[np.generic]) -> Bools:
     changed = np.zeros(values.size, dtype=np.bool_)
     changed[1:] = values[1:] != values[:-1]
     return changed

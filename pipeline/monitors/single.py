@@ -11,11 +11,9 @@ import polars as pl
 
 from pipeline.monitors.channels import paired
 from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
-from schemas.arrays import floats
+from schemas.arrays import Floats, floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
-
-Array = npt.NDArray[np.float64]
 
 NO_VELOCITY = "no GNSS velocity"
 NO_VALUE = "nothing to compute it from"
@@ -26,7 +24,7 @@ _WINDOW_S = 1.0
 _STATES = pl.Enum([state.value for state in MonitorState])
 
 
-def judged(value: Array, threshold: Array, reasons: pl.Series) -> pl.DataFrame:
+def judged(value: Floats, threshold: Floats, reasons: pl.Series) -> pl.DataFrame:
     """States of a monitor: where a reason stands it is not evaluated, else |value| against the threshold.
 
     What has no reason and yet no value or threshold is not evaluated either: absence is never health.
@@ -125,8 +123,8 @@ def channel_monitor(
 
 
 def _window(
-    t_s: Array, usable: npt.NDArray[np.bool_], stretch: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], Array]:
+    t_s: Floats, usable: npt.NDArray[np.bool_], stretch: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], Floats]:
     """Epoch at least a second before, and the time since; NaN unless all in between are usable and connected."""
     first = np.maximum(np.searchsorted(t_s, t_s - _WINDOW_S * (1.0 - 1e-6), side="right") - 1, 0)
     bad = np.concatenate([[0], np.cumsum(~usable)])
@@ -137,7 +135,7 @@ def _window(
     return first, np.where(connected, span, np.nan)
 
 
-def _way(t_s: Array, velocity: Array) -> Array:
+def _way(t_s: Floats, velocity: Floats) -> Floats:
     """Way of each step by trapezoids [m], zero where a velocity is missing; as many as epochs."""
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t_s)
     return np.concatenate([np.nan_to_num(steps), [0.0]])

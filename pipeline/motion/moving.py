@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.scatter import play_m, way_m, without_scatter
 from pipeline.epochs.timeline import moved
 from pipeline.motion.contradicted import Contradiction, contradictions
 from pipeline.motion.position_rate import PositionRate
 from pipeline.motion.witness import Witness
+from pipeline.odometry.scatter import play_m, way_m, without_scatter
 from schemas.arrays import NS_PER_S, Bools, Floats, floats, times_ns
 from schemas.config import Configuration
 

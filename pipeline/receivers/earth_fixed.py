@@ -6,10 +6,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pyproj import Transformer
 
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 
 def geodetic(x_m: float, y_m: float, z_m: float) -> dict[str, Any]:
@@ -26,7 +25,7 @@ def local_velocity(
     return {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
 
 
-def east_north_up(latitude_deg: float, longitude_deg: float) -> Array:
+def east_north_up(latitude_deg: float, longitude_deg: float) -> Floats:
     """Rotation from earth-fixed axes to east, north, up; shape (3, 3)."""
     lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
     return np.array(

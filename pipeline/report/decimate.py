@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+from schemas.arrays import Bools, Floats, Ints
 
 BINS = 2500
 DETAIL_EPOCHS = 6000
 BAND_PIECES = 3000
 
 
-def kept_rows(values: Floats, whole: Flags, bins: int = BINS) -> Ints:
+def kept_rows(values: Floats, whole: Bools, bins: int = BINS) -> Ints:
     """Rows of a series to send: of each bin the smallest and largest value and where it begins or ends to be known.
 
     `whole` marks rows that stay in any case; a series that is short anyway stays as it is.
@@ -44,7 +41,7 @@ def _extreme_rows(values: Floats, edges: Ints, extreme: np.ufunc) -> Ints:
     return np.minimum.reduceat(rows, edges[:-1])
 
 
-def _edges_of(known: Flags, edges: Ints) -> Ints:
+def _edges_of(known: Bools, edges: Ints) -> Ints:
     """Per bin the first and last change between known and unknown, both sides of it."""
     changes = np.flatnonzero(np.diff(known)) + 1
     if not len(changes):
@@ -56,7 +53,7 @@ def _edges_of(known: Flags, edges: Ints) -> Ints:
     return np.concatenate([chosen - 1, chosen])
 
 
-def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int = DETAIL_EPOCHS) -> Flags:
+def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int = DETAIL_EPOCHS) -> Bools:
     """Rows near the moments that matter, with a reach that is halved until no more than `limit` are left."""
     reach_ns = reach_s * 1e9
     if not len(moments_ns) or not len(t_ns):

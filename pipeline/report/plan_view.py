@@ -11,10 +11,11 @@ import numpy as np
 import polars as pl
 
 from pipeline.export.places import Ground, Stretches, beside, ground_at, ground_of, plane_m, sign_of, stretches_of
-from pipeline.report.decimate import Floats, Ints, detail_rows
+from pipeline.report.decimate import detail_rows
 from pipeline.report.packing import Json, packed
 from pipeline.report.series import UNKNOWN, column_of
 from pipeline.track.survey import track_of
+from schemas.arrays import Floats, Ints
 from schemas.enums import Direction, LdsState, PassageStatus
 from schemas.run import Site
 

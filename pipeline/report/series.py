@@ -8,8 +8,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
-from pipeline.report.decimate import Band, Flags, Floats, Ints, band, detail_rows, kept_rows
+from pipeline.report.decimate import Band, band, detail_rows, kept_rows
 from pipeline.report.packing import Json, packed
+from schemas.arrays import Bools, Floats, Ints
 from schemas.enums import LdsMode, LdsState, MonitorState
 from schemas.tables import MONITORS
 
@@ -95,7 +96,7 @@ def _residual(epochs: pl.DataFrame) -> Floats:
     return both - both[known[0]] if len(known) else both
 
 
-def _series(t_ms: Ints, values: Floats, whole: Flags) -> Json:
+def _series(t_ms: Ints, values: Floats, whole: Bools) -> Json:
     rows = kept_rows(values, whole)
     return {"x": packed(t_ms[rows], "u4"), "y": packed(values[rows], "f4")}
 

@@ -9,11 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
+from schemas.arrays import Floats, Ints
 
 # NIMA TR8350.2, table 3.1 and 3.3: semi-major axis [m] and first eccentricity squared of WGS 84.
 SEMI_MAJOR_AXIS_M = 6_378_137.0

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.geodesy import Points, points_of
 from pipeline.track.segments import (
     SAMPLE_SPACING_M,
     Feet,
@@ -19,6 +19,7 @@ from pipeline.track.segments import (
     on_segments,
 )
 from pipeline.track.survey import GAP_COUNTS_M, Track
+from schemas.arrays import Bools, Floats, Ints
 
 # A hint further than this from the nearest place may mean another passage of the same place,
 # if the track of that passage lies within the second distance of the first.

@@ -16,8 +16,8 @@ import polars as pl
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.track.geodesy import Bools
 from pipeline.track.survey import Track, end_places, gaps_m
+from schemas.arrays import Bools
 from schemas.enums import Navigability
 
 

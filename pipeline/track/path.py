@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.track.geodesy import Bools, Floats, Ints, Points, points_of
+from pipeline.track.geodesy import Points, points_of
 from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.track.segments import Feet, no_feet
 from pipeline.track.survey import Track
+from schemas.arrays import Bools, Floats, Ints
 
 Objects = npt.NDArray[np.object_]
 MEASURE_TOLERANCE_M = 0.5

@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.track.geodesy import Floats, Ints, Points
+from pipeline.track.geodesy import Points
+from schemas.arrays import Floats, Ints
 
 # Search points along long segments: close enough that the nearest one leads to the nearest segment.
 SAMPLE_SPACING_M = 20.0

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.track.geodesy import Floats, Ints, distances_m, points_of
-from schemas.arrays import floats
+from pipeline.track.geodesy import distances_m, points_of
+from schemas.arrays import Floats, Ints, floats
 
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
 GAP_COUNTS_M = 0.5

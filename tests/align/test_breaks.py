@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 from pipeline.alignment.align import align
-from pipeline.alignment.odometer import odometer_track
 from pipeline.alignment.odometer_filter import ScaleLatencyFilter, error_model, moved_m2, prior_of
+from pipeline.odometry.odometer import odometer_track
 from schemas.config import Configuration, Vehicle
 from tests.align.straight import Straight, distance, odometer_of, run, times
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.alignment.odometer import odometer_track, polarity
+from pipeline.odometry.odometer import odometer_track, polarity
 from tests.align.straight import odometer_of
 
 

@@ -7,10 +7,10 @@ import polars as pl
 import pytest
 
 from pipeline.alignment.increments import most_scatter_m, reading_of
-from pipeline.alignment.odometer import odometer_track
-from pipeline.alignment.reading import ReadingNoise, count_step_m
 from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AlongSteps, Reading, along_axis, run_axis
+from pipeline.odometry.odometer import odometer_track
+from pipeline.odometry.reading import ReadingNoise, count_step_m
 from pipeline.stages import replay
 from schemas.config import Configuration
 from tests.align.straight import odometer_of

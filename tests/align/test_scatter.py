@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.alignment.scatter import play_m, way_m, with_play, without_scatter
+from pipeline.odometry.scatter import play_m, way_m, with_play, without_scatter
 from pipeline.stages import replay
 from tests.replay.journeys import VEHICLE, journey
 

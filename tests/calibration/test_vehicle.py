@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.alignment.odometer import CountedRows, OdometerTrack
 from pipeline.alignment.odometer_filter import error_model
 from pipeline.calibration.vehicle import Observations, estimate_run, pooled
+from pipeline.odometry.odometer import CountedRows, OdometerTrack
 from schemas.config import MonitorConfig
 
 SHARES, TAUS_S = error_model(MonitorConfig())

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from pipeline.matching import Match, match
+from schemas.arrays import Floats
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site
 from tests.matching.ladder import degrees
 
-Floats = npt.NDArray[np.float64]
 Link = tuple[str, int, str, int, str]
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
+from schemas.arrays import Floats
 from schemas.enums import Fix
 from schemas.inputs import Links, Track
 from schemas.run import Site
 
-Floats = npt.NDArray[np.float64]
 ORIGIN_DEG = (50.0, 14.0)
 SPACING_M = 4.0
 SWITCH_M, CROSSOVER_M, END_M = 1000.0, 60.0, 3000.0

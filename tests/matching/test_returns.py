@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pytest
 
+from schemas.arrays import Floats
 from schemas.inputs import Balises
 from schemas.run import Site
 from tests.matching.builders import matched, odometer, run, site
 
-Floats = npt.NDArray[np.float64]
 RATE_HZ = 5.0
 
 

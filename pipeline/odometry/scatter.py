@@ -7,22 +7,20 @@ alone. The distance follows them with as much play as they scatter (`reading`), 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.figures.bounds import SURE_SIGMAS
-
-Array = npt.NDArray[np.float64]
+from schemas.arrays import Floats
 
 # Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
 _NEAR_SIGMAS = 2.0
 
 
-def play_m(reading_sigma_m: Array) -> Array:
+def play_m(reading_sigma_m: Floats) -> Floats:
     """By how much the distance may leave what is held of it before it has moved [m]."""
     return SURE_SIGMAS * reading_sigma_m
 
 
-def with_play(distance_m: Array, width_m: Array) -> Array:
+def with_play(distance_m: Floats, width_m: Floats) -> Floats:
     """The distance with play to both sides [m], causal; NaN where it is not known.
 
     Behind a movement it stays `width_m` back, and turns once the distance came back by twice that.
@@ -41,7 +39,7 @@ def with_play(distance_m: Array, width_m: Array) -> Array:
     return held
 
 
-def way_m(distance_m: Array, width_m: Array) -> float:
+def way_m(distance_m: Floats, width_m: Floats) -> float:
     """Way driven, to and fro [m], by a known distance that scatters within the play."""
     held = with_play(distance_m, width_m)
     steps = np.diff(held)
@@ -50,7 +48,7 @@ def way_m(distance_m: Array, width_m: Array) -> float:
     return float(np.abs(steps).sum() + 2.0 * width_m[turns + 1].sum() + abs(distance_m[-1] - held[-1]))
 
 
-def without_scatter(t_s: Array, distance_m: Array, width_m: Array, least_mps: float) -> tuple[Array, Array]:
+def without_scatter(t_s: Floats, distance_m: Floats, width_m: Floats, least_mps: float) -> tuple[Floats, Floats]:
     """Times and distances [m] between which the train drove evenly, after the fact; slower than this it stood.
 
     From one row that moves the held distance to the next. Where that is a stand, it moved no sooner than from the last

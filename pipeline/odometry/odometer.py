@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.alignment.reading import ReadingNoise, count_step_m, reading_noise
+from pipeline.odometry.reading import ReadingNoise, count_step_m, reading_noise
+from schemas.arrays import Bools, Floats, Ints
 
-Array = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 Number = TypeVar("Number", np.float64, np.int64)
 
 _NS = 1e-9
@@ -36,9 +34,9 @@ _AGREE = 0.2
 class CountedRows:
     """Rows as recorded: times [s], distance [m], and which ways to the next row are by the recorded distance."""
 
-    t_s: Array
-    distance_m: Array
-    whole: Mask
+    t_s: Floats
+    distance_m: Floats
+    whole: Bools
 
 
 @dataclass(frozen=True)
@@ -52,11 +50,11 @@ class OdometerTrack:
     """
 
     epoch_ns: int
-    t_s: Array
-    distance_m: Array
+    t_s: Floats
+    distance_m: Floats
     stretch: npt.NDArray[np.int64]
-    pause: Mask
-    slip: Mask
+    pause: Bools
+    slip: Bools
     white_rate_m2_per_s: float
     period_s: float = 0.0
     counted: CountedRows | None = None
@@ -79,35 +77,35 @@ class OdometerTrack:
         """The same odometer, growing with the path."""
         return replace(self, distance_m=sign * self.distance_m)
 
-    def seconds(self, t_ns: Times) -> Array:
+    def seconds(self, t_ns: Ints) -> Floats:
         """Times on the odometer's own scale [s]."""
         return ((t_ns - self.epoch_ns) * _NS).astype(np.float64)
 
-    def distance_at(self, t_s: Array) -> Array:
+    def distance_at(self, t_s: Floats) -> Floats:
         """Distance at these times [m]; outside the span the end value (see `known_at`)."""
         return np.interp(t_s, self.t_s, self.distance_m)
 
-    def known_at(self, t_s: Array) -> Mask:
+    def known_at(self, t_s: Floats) -> Bools:
         """True where both neighbouring samples exist, without a pause between them, and report no slip."""
         after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
         exact = self.t_s[after] == t_s
         before = np.where(exact, after, np.maximum(after - 1, 0))
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
         paused = ~exact & self.pause[np.minimum(before, self.pause.size - 1)]
-        known: Mask = inside & ~paused & ~self.slip[before] & ~self.slip[after]
+        known: Bools = inside & ~paused & ~self.slip[before] & ~self.slip[after]
         return known
 
-    def stretch_at(self, t_s: Array) -> npt.NDArray[np.int64]:
+    def stretch_at(self, t_s: Floats) -> npt.NDArray[np.int64]:
         """Number of the stretch of unbroken distance that each time lies in."""
         index = np.searchsorted(self.t_s, t_s, side="right") - 1
         stretch: npt.NDArray[np.int64] = self.stretch[index.clip(0, self.t_s.size - 1)]
         return stretch
 
-    def speed_at(self, t_s: Array) -> Array:
+    def speed_at(self, t_s: Floats) -> Floats:
         """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
         start = np.maximum(t_s - _SPEED_WINDOW_S, self.t_s[0])
         span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, _NS)
-        speed: Array = (self.distance_at(t_s) - self.distance_at(start)) / span
+        speed: Floats = (self.distance_at(t_s) - self.distance_at(start)) / span
         return speed
 
 
@@ -153,13 +151,13 @@ def odometer_track(odometer: pl.DataFrame, gap_s: float, sigma_mps: float) -> Od
     return _filled_in(track, speed, np.flatnonzero(apart)) if apart.any() else track
 
 
-def leaps(way_m: Array, dt_s: Array) -> Mask:
+def leaps(way_m: Floats, dt_s: Floats) -> Bools:
     """Ways between rows, in these times, that are longer than any train can drive."""
-    leap: Mask = np.abs(way_m) > _FASTEST_MPS * dt_s + _BUNCHED_M
+    leap: Bools = np.abs(way_m) > _FASTEST_MPS * dt_s + _BUNCHED_M
     return leap
 
 
-def _without_spikes(t_s: Array, distance_m: Array) -> Array:
+def _without_spikes(t_s: Floats, distance_m: Floats) -> Floats:
     """The distance without single rows from which it leaps back to where it was."""
     leap = leaps(np.diff(distance_m), np.diff(t_s))
     if not leap.any():
@@ -170,7 +168,7 @@ def _without_spikes(t_s: Array, distance_m: Array) -> Array:
     return cleaned
 
 
-def _filled_in(track: OdometerTrack, speed_mps: Array, rows: npt.NDArray[np.int64]) -> OdometerTrack:
+def _filled_in(track: OdometerTrack, speed_mps: Floats, rows: npt.NDArray[np.int64]) -> OdometerTrack:
     """The track with samples between these rows and the next, on cubic curves.
 
     Their slopes at the rows are the speeds where these make about the way between (a unit, a sign or a sensor may be
@@ -212,7 +210,7 @@ def _sums(steps: npt.NDArray[Number]) -> npt.NDArray[Number]:
     return sums
 
 
-def _ways(t_s: Array, dt_s: Array, distance_m: Array, speed_mps: Array, limit_s: float) -> tuple[Array, Mask]:
+def _ways(t_s: Floats, dt_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float) -> tuple[Floats, Bools]:
     """Way from each row to the next [m], NaN where not known, and whether it is by the recorded distance."""
     distance_m = _without_spikes(t_s, distance_m)
     way_m = np.diff(distance_m)
@@ -231,7 +229,7 @@ def _ways(t_s: Array, dt_s: Array, distance_m: Array, speed_mps: Array, limit_s:
     return np.where(counted, recorded, driven), counted
 
 
-def _trusted(driven_m: Array, recorded_m: Array, leap: Mask) -> Array:
+def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools) -> Floats:
     """Ways by the speeds; none over leaps where they do not agree with what the counter tells elsewhere.
 
     A unit, a sign or the sensor may be wrong.
@@ -244,17 +242,17 @@ def _trusted(driven_m: Array, recorded_m: Array, leap: Mask) -> Array:
     return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
 
 
-def _drivable(way_m: Array, dt_s: Array) -> Array:
+def _drivable(way_m: Floats, dt_s: Floats) -> Floats:
     """Ways that a train can drive, NaN for others."""
     return np.where(leaps(way_m, dt_s), np.nan, way_m)
 
 
-def _driven(speed_mps: Array, dt_s: Array) -> Array:
-    steps: Array = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * dt_s
+def _driven(speed_mps: Floats, dt_s: Floats) -> Floats:
+    steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * dt_s
     return steps
 
 
-def _carried(t_s: Array, values: Array, limit_s: float) -> Array:
+def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
     """Values between known rows no further apart than the limit by straight lines; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < 2:
@@ -267,7 +265,7 @@ def _carried(t_s: Array, values: Array, limit_s: float) -> Array:
     )
 
 
-def _over_pauses(t_s: Array, distance_m: Array, recorded_m: Array, driven_m: Array, pause: Mask) -> Array:
+def _over_pauses(t_s: Floats, distance_m: Floats, recorded_m: Floats, driven_m: Floats, pause: Bools) -> Floats:
     """Recorded steps, and over a pause between rows without a distance what the counter gained around it.
 
     The counter's last row before the pause and its first after it tell, less the steps to and from the pause. A
@@ -286,7 +284,7 @@ def _over_pauses(t_s: Array, distance_m: Array, recorded_m: Array, driven_m: Arr
     return result
 
 
-def polarity(track: OdometerTrack, t_s: Array, path_m: Array, distance_m: float) -> int:
+def polarity(track: OdometerTrack, t_s: Floats, path_m: Floats, distance_m: float) -> int:
     """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
 
     `path_m` grows in the direction of that same movement (DOMAIN section 2), so GNSS decides once, over these
@@ -307,7 +305,7 @@ def polarity(track: OdometerTrack, t_s: Array, path_m: Array, distance_m: float)
     return -1 if sum(votes) < 0 else 1
 
 
-def _side(odometer: Array, path: Array, distance_m: float) -> int:
+def _side(odometer: Floats, path: Floats, distance_m: float) -> int:
     """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0) over these metres."""
     moved = odometer - odometer[0]
     far = np.flatnonzero(np.abs(moved) >= distance_m)

@@ -13,9 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.ingest.written_steps import step_of
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from schemas.arrays import Bools, Floats
 
 # Over so long, or over so many rows where that is longer, the way of a train is a curve of third degree.
 _SPAN_S = 2.0
@@ -41,14 +39,14 @@ class ReadingNoise:
     still_m2: float = 0.0
     moving_s2: float = 0.0
 
-    def variance_m2(self, speed_mps: Array) -> Array:
+    def variance_m2(self, speed_mps: Floats) -> Floats:
         return self.still_m2 + self.moving_s2 * speed_mps**2
 
     def __bool__(self) -> bool:
         return self.still_m2 > 0.0 or self.moving_s2 > 0.0
 
 
-def reading_noise(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: float) -> ReadingNoise:
+def reading_noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float) -> ReadingNoise:
     """What rows scatter about smooth curves beyond what white noise of the increments explains.
 
     `whole` (rows - 1,): ways between rows that are recorded. Medians over stretches in which the train moves, so that
@@ -60,13 +58,13 @@ def reading_noise(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: fl
     return replace(scatter, still_m2=max(scatter.still_m2, count_step_m(distance_m, whole) ** 2 / 12.0))
 
 
-def count_step_m(distance_m: Array, whole: Mask) -> float:
+def count_step_m(distance_m: Floats, whole: Bools) -> float:
     """The step of a counter [m], 0 where there is none worth a word."""
     ways = np.abs(np.diff(distance_m)[whole])
     return step_of(ways, ways, _LEAST_STEP_M, _ROUNDED_M)
 
 
-def _scatter_beyond(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: float) -> ReadingNoise:
+def _scatter_beyond(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float) -> ReadingNoise:
     """What the rows show of their noise."""
     rows = _moving_stretches(t_s, distance_m, whole)
     if len(rows) < _FEWEST_STRETCHES:
@@ -83,7 +81,7 @@ def _scatter_beyond(t_s: Array, distance_m: Array, whole: Mask, white_m2_per_s: 
     return ReadingNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
 
 
-def _moving_stretches(t_s: Array, distance_m: Array, whole: Mask) -> npt.NDArray[np.int64]:
+def _moving_stretches(t_s: Floats, distance_m: Floats, whole: Bools) -> npt.NDArray[np.int64]:
     """Rows of stretches without a gap in which the train moves, spread over the run; shape (stretches, rows)."""
     period_s = float(np.median(np.diff(t_s)))
     if period_s > _FARTHEST_S or period_s <= 0.0:
@@ -99,7 +97,7 @@ def _moving_stretches(t_s: Array, distance_m: Array, whole: Mask) -> npt.NDArray
     return chosen
 
 
-def _scatter(since_s: Array, way_m: Array, white_m2_per_s: float) -> tuple[Array, Array]:
+def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Floats, Floats]:
     """Variance about the curves [m^2] of each stretch, and what white noise of the increments makes of it."""
     count = since_s.shape[1]
     powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
@@ -112,7 +110,7 @@ def _scatter(since_s: Array, way_m: Array, white_m2_per_s: float) -> tuple[Array
     return found / free, white_m2_per_s * left / free
 
 
-def _beyond(found_m2: Array, explained_m2: Array) -> float:
+def _beyond(found_m2: Floats, explained_m2: Floats) -> float:
     """The median of what is found where it is not explained [m^2], else none."""
     found, explained = float(np.median(found_m2)), float(np.median(explained_m2))
     return found - explained if found > _BEYOND * explained else 0.0
