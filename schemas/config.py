@@ -91,6 +91,7 @@ class MatchingConfig(Settings):
     reach_m: Positive = 50.0
     survey_sigma_default_m: Positive = 1.0
     bias_sigma_m: Positive = 2.0
+    cross_bias_sigma_m: Positive = 1.5
     ambiguity_probability: Probability = 0.99
     heading_sigma_deg: Positive = 10.0
     heading_min_speed_mps: Positive = 2.0
@@ -166,6 +167,8 @@ class LdsConfig(Settings):
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
     crossing_gap_s: Positive = 1.0
     entry_from_unfitted_area: bool = False
+    relink: bool = True
+    anchor_lag_s: NonNegative = 300.0
 
 
 class HazardConfig(Settings):
@@ -181,9 +184,13 @@ class HazardConfig(Settings):
     reaction_s: NonNegative | None = None
     false_alarm_margin_m: NonNegative = 5.0
     false_alarm_lookback_s: NonNegative = 300.0
+    evidence_factor: Positive = 3.0
+    reference_sigma_m: Positive = 1.0
+    reference_gap_s: Positive = 2.0
     balise_read_sigma_m: Positive = 1.0
-    smoothed_reference: bool = False
-    service_level: str = "egnos_observed"
+    known_error_m: Positive = 5.0
+    unknown_share_limit: Probability = 0.01
+    service_level: str = "lpv200"
 
 
 class ServiceLevel(Settings):

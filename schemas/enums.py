@@ -37,6 +37,7 @@ class Hazard(StrEnum):
     VB_JUMP_1A = "VB_JUMP_1A"
     VB_JUMP_1B = "VB_JUMP_1B"
     VB_SHIFT = "VB_SHIFT"
+    VB_WRONG_TRACK = "VB_WRONG_TRACK"
 
 
 class FailureMode(StrEnum):
@@ -55,6 +56,30 @@ class Evidence(StrEnum):
     REFERENCE = "reference"
     BALISE = "balise"
     ODOMETER = "odometer"
+
+
+class Judgement(StrEnum):
+    """What the evidence says of a position (DOMAIN section 5.2). Weaker evidence says `UNKNOWN`, never `RIGHT`."""
+
+    RIGHT = "right"
+    WRONG = "wrong"
+    UNKNOWN = "unknown"
+
+
+class RunVerdict(StrEnum):
+    """Verdict of a run, worst first (DOMAIN section 5.4)."""
+
+    UNSAFE = "unsafe"
+    UNPROVEN = "unproven"
+    SAFE = "safe"
+
+
+class VehicleFigures(StrEnum):
+    """Where scale and latency come from: the vehicle file, the run itself, or nowhere (no odometer)."""
+
+    FILE = "file"
+    LEARNED = "learned"
+    NONE = "none"
 
 
 TRUTH = (Evidence.REFERENCE.value, Evidence.BALISE.value)

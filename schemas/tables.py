@@ -14,6 +14,7 @@ from schemas.enums import (
     Evidence,
     FailureMode,
     Hazard,
+    Judgement,
     LdsMode,
     LdsState,
     LinkingError,
@@ -21,14 +22,16 @@ from schemas.enums import (
     PassageStatus,
     Reaction,
     RunStatus,
+    RunVerdict,
     SigmaSource,
     Suspect,
     ThrVerdict,
     Timing,
+    VehicleFigures,
     Verdict,
 )
 
-CONTRACT_VERSION = "1.0"
+CONTRACT_VERSION = "2.0"
 
 AXES = ("along", "cross", "up")
 SCALES = ("raw", "ewma_0p1", "ewma_0p01", "ewma_0p001")
@@ -63,8 +66,8 @@ class Hazards(dy.Schema):
     hazard = one_of(Hazard, "hazard class")
     failure_mode = one_of(FailureMode, "ETCS failure mode")
     timing = one_of(Timing, "a VB offered early or late")
-    evidence = one_of(Evidence, "what served as truth")
-    suspect = one_of(Suspect, "what the replay holds to be at fault")
+    evidence = one_of(Evidence, "what the judgement rests on")
+    suspect = one_of(Suspect, "an opinion on what was at fault; nothing depends on it")
     caused_by = dy.Int64(nullable=True, min=0, description="hazard_id of the row whose end made this one")
     t_onset = instant("begin of the fault", nullable=True)
     t_hazard = instant("the step, or the offered crossing of the first VB hit")
@@ -77,11 +80,12 @@ class Hazards(dy.Schema):
     alarm_before_onset = flag("an alarm was already standing at the onset")
     time_to_detect_s = real("s", "T_D = t_detected - t_onset")
     time_since_failure_s = real("s", "T_dsf = t_detected - t_failure; negative = in time")
-    hazardous_s = real("s", "max(0, t_negated - t_failure)", min=0)
+    hazardous_s = real("s", "time judged wrong in use, over the whole episode", min=0)
+    hazardous_may_s = real("s", "the same with the time that is unknown", min=0)
     size_m = real("m", "largest error along the track, signed, + = ahead of the train; of a jump back, its step")
     rate_mps = real("m/s", "slope of the error from onset to failure; null for a step")
     balise_ids = texts("VBs hit, in order")
-    accepted_ids = texts("VBs of those that the LDS accepted all the same")
+    accepted_ids = texts("VBs of those that the LDS accepted despite the fault")
     netelement_id = text("net element of the train at t_hazard", nullable=True)
     measure_m = real("m", "measure of the train at t_hazard")
     path_m = real("m", "path position of the train at t_hazard")
@@ -103,7 +107,7 @@ class Passages(dy.Schema):
     status = one_of(PassageStatus, "what the LDS made of it")
     t_offered = instant("the raw matched position crosses the balise, interpolated", nullable=True)
     t_true = instant("the train passes the balise by the evidence", nullable=True)
-    location_error_m = real("m", "position error at the offer; + = offered early")
+    location_error_m = real("m", "position error at the offer where known to 5 m; + = offered early")
     window_open_m = real("m", "expectation window opens, odometer distance from the LRVB")
     window_close_m = real("m", "expectation window closes, odometer distance from the LRVB")
     odometer_distance_m = real("m", "odometer distance from the LRVB at the offer")
@@ -114,6 +118,7 @@ class Passages(dy.Schema):
     cause = one_of(Cause, "wrong position or no position")
     suspect_after_the_fact = flag("accepted between a fault's onset and its detection")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
+    judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
 
@@ -128,7 +133,7 @@ class Alarms(dy.Schema):
     monitors = texts("monitors in order of failing")
     peak_ratio = real("1", "largest |value| / threshold", min=0, tolerance=1e-6)
     verdict = one_of(Verdict, "true: a fault was there; unknown without truth")
-    suspect = one_of(Suspect, "what the replay holds to be at fault")
+    suspect = one_of(Suspect, "an opinion on what was at fault; nothing depends on it")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that it belongs to")
     netelement_id = text("net element of the position at the first fail", nullable=True)
     measure_m = real("m", "measure of the position at the first fail")
@@ -153,7 +158,10 @@ class _EpochsBeforeMonitors(dy.Schema):
     sigma_up_m = real("m", "standard deviation of the height", min=0)
     sigma_source = one_of(SigmaSource, "where the standard deviations come from", nullable=True)
     confidence_m = real("m", "half-width of the confidence interval along the track", min=0)
-    error_along_m = real("m", "position by GNSS minus truth in the direction of travel")
+    error_along_m = real("m", "position minus evidence in the direction of travel, where known to 5 m")
+    error_low_m = real("m", "least error along the track that the evidence leaves")
+    error_high_m = real("m", "largest error along the track that the evidence leaves")
+    judgement = one_of(Judgement, "what the evidence says of the position")
 
 
 class _EpochsAfterMonitors(dy.Schema):
@@ -206,8 +214,12 @@ class Runs(dy.Schema):
     """One row per run and solution; written last, so that it marks the run complete."""
 
     solution = text("solution of the run; empty where the run failed before any was known")
+    verdict = one_of(RunVerdict, "unsafe, unproven or safe; null where the run failed", nullable=True)
     status = one_of(RunStatus, "ok, partial (damaged input read up to the damage) or failed")
     error = text("what went wrong", nullable=True)
+    vehicle = one_of(VehicleFigures, "where odometer scale and latency come from", nullable=True)
+    share_unknown = real("1", "share of moving time in use that the evidence cannot judge", min=0, max=1)
+    odometer_contradicted = count("gaps between anchors that the odometer does not close (with a vehicle file)")
     t_start = instant("first epoch", nullable=True)
     t_end = instant("last epoch", nullable=True)
     partial_until = instant("the log is whole up to here", nullable=True)
@@ -240,16 +252,18 @@ class Runs(dy.Schema):
     balises_rejected = count("of these rejected")
     balises_missed = count("of these missed")
     balises_not_available = count("of these without a position")
-    unsafe_accepted = count("VBs accepted with a location error beyond the failure limit")
+    unsafe_accepted = count("VBs accepted although the evidence says that the position was wrong")
+    unproven_accepted = count("VBs accepted of which the evidence cannot say whether the position was right")
     location_error_mean_m = real("m", "mean location error of accepted VBs")
     location_error_p95_m = real("m", "95 % of |location error| of accepted VBs")
     location_error_max_m = real("m", "largest |location error| of accepted VBs")
     hazards_1a = count("hazards VB_JUMP_1A")
     hazards_1b = count("hazards VB_JUMP_1B")
     hazards_shift = count("hazards VB_SHIFT")
+    hazards_wrong_track = count("hazards VB_WRONG_TRACK")
     hazards_detected = count("hazards that a monitor detected")
     hazards_within_budget = count("hazards negated within the budget")
-    missed_detections = count("hazards with a failure that was not negated within the budget")
+    missed_detections = count("hazards with a failure that no monitor found in time")
     time_to_detect_max_s = real("s", "largest T_D")
     time_since_failure_max_s = real("s", "largest T_dsf")
     hazardous_max_s = real("s", "longest hazardous time")
@@ -280,7 +294,8 @@ class Runs(dy.Schema):
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
     notes = text("what reading and matching found out about the run", nullable=True)
-    failures = count("faults with a position failure; the rows of one fault count once")
+    failures = count("faults with time judged wrong in use, whether they hit a VB or not")
+    failures_within_budget = count("of these within the budget of the configured level")
     service_levels = texts("service levels of the configuration, in order", nullable=True)
     level_allowed_s = reals("s", "allowed T_D of each of them (TVB eq. 7)", nullable=True)
     level_within = counts("failures negated within it", nullable=True)
@@ -293,7 +308,7 @@ class Runs(dy.Schema):
     judged_s = real("s", "of this with both: what the false alarm rate counts", min=0)
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
-    accepted_judged = count("accepted VBs whose location error a reference or balise reads tell")
+    accepted_judged = count("accepted VBs judged right or wrong by reference or balise reads")
 
 
 TABLES: dict[str, type[dy.Schema]] = {

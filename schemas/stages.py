@@ -1,0 +1,56 @@
+"""What passes between the stages of one run: each frame's columns with unit and meaning (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import dataframely as dy
+
+from schemas.columns import flag, instant, one_of, real, text
+from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus
+
+
+class Crossings(dy.Schema):
+    """One row per crossing of a balise by the raw matched position, or per telegram read, in order of time.
+
+    The LDS finds each crossing once and says what became of it; who needs it later joins by `crossing_id`.
+    """
+
+    crossing_id = dy.Int64(min=0, description="0, 1, ... in order of time within the solution")
+    balise_id = text("balise")
+    kind = one_of(BaliseKind, "virtual: crossed by the position; physical: read")
+    netelement_id = text("net element of the balise")
+    measure_m = real("m", "measure of the balise", nullable=False)
+    leg = dy.Int32(description="leg of the path")
+    path_m = real("m", "path position of the balise", nullable=False)
+    before = dy.Int64(min=0, description="row of the last epoch before the crossing")
+    epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
+    t = instant("the crossing, interpolated between both epochs; of a telegram its own time")
+    sense = dy.Int8(description="+1 passed along growing path, -1 against it")
+    heading = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
+    odometer_m = real("m", "odometer distance at the crossing")
+    offered = flag("a passage of its own; false: crossed again before the balise was re-armed, or inside a gap")
+    status = one_of(PassageStatus, "what became of the offer; null where it was none", nullable=True)
+
+
+class EvidenceAt(dy.Schema):
+    """Where the train was at each of some instants, by evidence alone (DOMAIN section 5.1).
+
+    `low_m` and `high_m` are positions on the path of the solution that asks; nothing but this last change of
+    coordinates knows of that solution.
+    """
+
+    t = instant("the instant asked for")
+    evidence = one_of(Evidence, "what it rests on; null where nothing is known", nullable=True)
+    low_m = real("m", "least path position that the evidence leaves")
+    high_m = real("m", "largest path position that the evidence leaves")
+    tracks = dy.Int64(nullable=True, min=0, description="how many tracks the train may have been on")
+    same_track = flag("the net element of the position is one of these; null where not known", nullable=True)
+
+
+class Judged(dy.Schema):
+    """What the evidence says of each epoch or offer (DOMAIN section 5.2)."""
+
+    error_low_m = real("m", "least error along the track, in the direction of travel")
+    error_high_m = real("m", "largest error along the track")
+    error_along_m = real("m", "the middle of both where reference or balise tell it to `known_error_m`")
+    judgement = one_of(Judgement, "right, wrong or unknown")
+    wrong_track = flag("the position, unambiguous, is on a net element that the evidence excludes")
