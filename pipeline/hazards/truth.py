@@ -68,8 +68,6 @@ def establish_truth(
         sigma_m = hazards.balise_read_sigma_m
         carried = carry(anchors, travel, travel.at_ns, config.lds, both_ways=True, anchor_sigma_m=sigma_m)
         rungs.append(_balise_rung(carried, since_m, positions(epochs), hazards))
-    if hazards.smoothed_reference:
-        rungs.append(_smoothed_rung(epochs, travel, hazards))
     rungs.append(_odometer_rung(epochs, passages, travel, config.lds))
     return _ladder(epochs["t"], rungs, travel)
 
