@@ -90,13 +90,13 @@ class MatchingConfig(Settings):
 
     reach_m: Positive = 50.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
-    on_track_sigmas: Positive = 5.0
+    on_track_sigmas: Positive = 3.0
     survey_sigma_default_m: Positive = 1.0
     # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
     # What of a position's variance outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
     slow_share: Annotated[Number, Field(ge=0, lt=1)] = 0.247
-    # Stated sigmas may be so many times too small or too large: a receiver's own, and a table's by kind of fix.
+    # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
     sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     ambiguity_probability: Probability = 0.99

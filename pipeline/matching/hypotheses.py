@@ -42,9 +42,10 @@ class Hypotheses:
 def hypotheses_of(cross_m2: float, survey_m2: float, doubt: float, config: MatchingConfig) -> Hypotheses:
     """The grid for positions of variance `cross_m2` and a survey of variance `survey_m2` [m2].
 
-    `doubt`: the stated sigma may be that many times too small or too large.
+    `doubt`: the truth may be that many times the stated sigma. That it may be less is left out: errors that hardly
+    change, as of dead reckoning, would look small and prove too much.
     """
-    scales = np.array([1.0 / doubt, 1.0, doubt]) if doubt > 1.0 else np.ones(1)
+    scales = np.array([1.0, doubt]) if doubt > 1.0 else np.ones(1)
     lasting_m2 = config.cross_bias_sigma_m**2 + config.slow_share * cross_m2 * scales**2
     sigma_m = np.sqrt(lasting_m2 + survey_m2)
     count = len(_GRID_SIGMAS)

@@ -25,10 +25,10 @@ from schemas.config import MatchingConfig
 _FLOOR_M = 0.02
 _TABLE_FLOOR_M = 0.1
 # An offset outside this many sigmas, and the scale of outliers, lasts for this long [s]: being off costs by the time.
-# Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_SIGMAS = 5.0
+# Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_S = 8.0
-_OFF_WANDER = 0.01
+_OFF_WANDER = 0.1
 _HEADING_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
@@ -75,16 +75,17 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     floor_m2 = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M) ** 2
     fresh = np.maximum(fast_m2 * renewed[:, None] + wander_m2[:, None], floor_m2[:, None])
     whole_m2 = gnss_m2 + survey_m2 + config.cross_bias_sigma_m**2
+    unexplained = candidates.distance_m > config.on_track_sigmas * np.sqrt(whole_m2)
     off = candidates.distance_m > np.maximum(_OFF_SIGMAS * np.sqrt(whole_m2), config.outlier_scale_m)
     heading = _heading(steps, candidates, config)
     share_new = np.clip(gnss_m2 * renewed + wander_m2, np.minimum(floor_m2, whole_m2), whole_m2) / whole_m2
     return Likelihood(
         hypotheses=hypotheses,
         variance_m2=variance,
-        fresh_m2=fresh + _wander_m2(candidates, off, config)[:, None],
+        fresh_m2=fresh + _wander_m2(candidates, unexplained)[:, None],
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
         keep=np.sqrt(1.0 - fast_m2 * renewed[:, None] / (variance + survey_m2[:, None])),
-        renewed_m2=2.0 * survey_m2,
+        renewed_m2=2.0 * (config.sigma_doubt**2) * survey_m2,
         fixed=_ends(candidates, gnss_m2 + survey_m2 + _ENDS_SIGMA_M**2, config)
         + heading * share_new
         - _time_off(steps, candidates, off, config),
@@ -134,7 +135,7 @@ def _wide(off_m: Floats, scale_m: float) -> Floats:
     return np.asarray(-np.log(np.pi * scale_m * (1.0 + (off_m / scale_m) ** 2)))
 
 
-def _wander_m2(candidates: Candidates, off: Bools, config: MatchingConfig) -> Floats:
+def _wander_m2(candidates: Candidates, off: Bools) -> Floats:
     """What the offset changes besides where a position is off every element: that much of the distance to the nearest.
 
     A lost position drifts by metres in seconds, whatever it says of itself; how it moves is weak evidence. It is the
