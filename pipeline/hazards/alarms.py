@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.failure_log import AlarmSpan, FailureLog
 from pipeline.hazards.arrays import runs_of
 from pipeline.hazards.case import Case
-from pipeline.hazards.fails import AlarmSpan, Fails
 from pipeline.hazards.rows import Judged, schema_of
 from pipeline.hazards.suspect import Witnesses, suspect_of_alarm
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
@@ -34,7 +34,7 @@ def alarms_table(case: Case, judged: list[Judged]) -> pl.DataFrame:
     return table.hstack(places).select(Alarms.column_names())
 
 
-def _rings_on(fails: Fails, number: int) -> bool:
+def _rings_on(fails: FailureLog, number: int) -> bool:
     """The position never came back since the alarm before: its fault still rings in the bank (DOMAIN section 4)."""
     between = slice(fails.alarms[number - 1].last, fails.alarms[number].first + 1)
     return bool(fails.negated[between].all())

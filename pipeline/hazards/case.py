@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.hazards.fails import Fails, fails_of
+from pipeline.epochs.failure_log import FailureLog, failure_log_of
 from pipeline.hazards.passing import TruePassings, true_passings
 from pipeline.hazards.series import Series, errors_of, series_of
 from pipeline.hazards.suspect import Witnesses, witnesses_of
@@ -52,8 +52,8 @@ class Case:
         return series_of(self.epochs, self.truth, self.config.lds)
 
     @cached_property
-    def fails(self) -> Fails:
-        return fails_of(self.epochs, self.config.lds.recovery_s)
+    def fails(self) -> FailureLog:
+        return failure_log_of(self.epochs, self.config.lds.recovery_s)
 
     @cached_property
     def witnesses(self) -> Witnesses:

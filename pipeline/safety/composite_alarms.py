@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.epochs.failure_log import AlarmSpan
 from pipeline.epochs.timeline import nominal_period_s
-from pipeline.hazards.fails import AlarmSpan
 from schemas.arrays import NS_PER_S
 from schemas.config import HazardConfig
 from schemas.enums import Verdict

@@ -13,9 +13,9 @@ from itertools import permutations
 import polars as pl
 
 from pipeline.epochs.clock import Clock, flags, trusted
+from pipeline.epochs.failure_log import FailureLog, failure_log_of
 from pipeline.epochs.timeline import held_s, uptime
 from pipeline.figures.bounds import threshold_factor
-from pipeline.hazards.fails import Fails, fails_of
 from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Side, verdicts_of
@@ -45,7 +45,7 @@ class _Channel:
     """Epochs under one kind of diagnosis: its fails, where it judged, and where it worked."""
 
     clock: Clock
-    fails: Fails
+    fails: FailureLog
     judged: Bools
     working: Bools
     known: Bools
@@ -186,7 +186,7 @@ def _channel(
 ) -> _Channel:
     """`epochs`: those of the solution, with the columns that `monitors`, `judged` and `position` take."""
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
-    fails = fails_of(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
+    fails = failure_log_of(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
     seen = flags(epochs, judged)
     working = seen & flags(epochs, position)
@@ -245,7 +245,7 @@ def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel
     return Faults(hazards, failures, missed, common, common_missed, tuple(delays), judged, missed_judged)
 
 
-def _detected_ns(fails: Fails, begin: int, last: int) -> int | None:
+def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
     """An alarm that stands at the onset detects at once, else the first fail until the fault's end."""
     if fails.standing_at(begin) is not None:
         return begin
@@ -267,7 +267,7 @@ def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
     return faults.filter(pl.col("failure").is_not_null() & meets).height > 0
 
 
-def _verdicts_in_table(fails: Fails, alarms: pl.DataFrame) -> list[Verdict]:
+def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:
     """Each alarm of the architecture has the verdict of the alarm of the replay that it began in."""
     spans = alarms.select(pl.col("t_start", "t_end").to_physical(), pl.col("verdict").cast(pl.String)).rows()
     return [

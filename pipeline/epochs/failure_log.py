@@ -1,4 +1,4 @@
-"""Fails of the monitors over the epochs, and the alarm episodes that they make up."""
+"""FailureLog of the monitors over the epochs, and the alarm episodes that they make up."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from schemas.tables import MONITORS
 
 @dataclass(frozen=True)
 class AlarmSpan:
-    """Fails less than the recovery time apart: first and last failing epoch, monitors in order of failing."""
+    """FailureLog less than the recovery time apart: first and last failing epoch, monitors in order of failing."""
 
     first: int
     last: int
@@ -25,7 +25,7 @@ class AlarmSpan:
 
 
 @dataclass(frozen=True)
-class Fails:
+class FailureLog:
     """All epochs' times, the epochs in which a monitor fails, and the alarm episodes."""
 
     t_ns: Ints
@@ -63,8 +63,8 @@ class Fails:
         return next((a.start_ns for a in self.alarms if begin_ns <= a.start_ns < end_ns), None)
 
 
-def fails_of(epochs: pl.DataFrame, recovery_s: float) -> Fails:
-    """Fails of one solution's epochs; monitors that the frame does not hold were not evaluated."""
+def failure_log_of(epochs: pl.DataFrame, recovery_s: float) -> FailureLog:
+    """FailureLog of one solution's epochs; monitors that the frame does not hold were not evaluated."""
     t_ns = times_ns(epochs)
     monitors = [name for name in MONITORS if f"{name}_state" in epochs.columns]
     failing = {name: _failing(epochs, name) for name in monitors}
@@ -75,7 +75,7 @@ def fails_of(epochs: pl.DataFrame, recovery_s: float) -> Fails:
     matrix = np.column_stack([failing[name][rows] for name in monitors]) if monitors else np.zeros((0, 0), np.bool_)
     first = tuple(monitors[index] for index in matrix.argmax(axis=1).tolist()) if rows.size else ()
     spans = _spans(epochs, t_ns, rows, matrix, monitors, recovery_s)
-    return Fails(t_ns, flags(epochs, "negated"), rows, first, spans)
+    return FailureLog(t_ns, flags(epochs, "negated"), rows, first, spans)
 
 
 def _failing(epochs: pl.DataFrame, monitor: str) -> Bools:
