@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import polars as pl
 
 from pipeline.evidence.carrying import Anchor, OdometerReadings, Readings
-from pipeline.evidence.routes import Place, Route
+from pipeline.evidence.routes import Place, Route, routes_of_path
+from pipeline.track.path import TravelledPath
 from pipeline.track.survey import Track
-from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
 from schemas.enums import BaliseKind, Evidence
 
 # A balise this far beyond its element's end is still on it: surveys and balise lists round [m].
 _ON_ELEMENT_M = 0.5
+# Net elements of the own way so far before or after a sample are the same track [m].
+_SAME_WAY_M = 100.0
+
+Pairs = tuple[Ints, Ints]
 
 
 @dataclass(frozen=True)
@@ -34,9 +40,39 @@ class ReferencePlaces:
     rival_sample: Ints
     rival_element: Ints
 
+    @classmethod
+    def of(
+        cls, epochs: pl.DataFrame, path: TravelledPath, rivals: Pairs, sigma_m: Floats, ahead_m: float, track: Track
+    ) -> Self:
+        """Matched samples (`t, leg, path_m, on_track`) and their path; `ahead_m`: the reference's place ahead of the
+        balise antenna, along growing path. `rivals`: samples and net elements (numbers of the survey).
+        """
+        kept = np.flatnonzero(flags(epochs, "on_track") & np.isfinite(floats(epochs, "path_m")))
+        leg, path_m = ints(epochs["leg"])[kept], floats(epochs, "path_m")[kept]
+        legs = tuple(routes_of_path(path, track.index))
+        number = np.full(epochs.height, -1)
+        number[kept] = np.arange(kept.size)
+        sample, element = number[rivals[0]], rivals[1]
+        other = np.flatnonzero((sample >= 0) & ~_on_own_way(legs, leg, path_m, sample, element))
+        order = other[np.argsort(sample[other], kind="stable")]
+        t_ns = times_ns(epochs)[kept]
+        return cls(t_ns, leg, path_m - ahead_m, sigma_m[kept], legs, sample[order], element[order])
+
     def place(self, sample: int) -> Place:
         element, measure, _ = self.legs[int(self.leg[sample])].locate(self.path_m[[sample]])
         return Place(int(element[0]), float(measure[0]))
+
+
+def _on_own_way(legs: tuple[Route, ...], leg: Ints, path_m: Floats, sample: Ints, element: Ints) -> Bools:
+    """The net element is one that the sample's own leg runs over just before or after it: no other track."""
+    near = np.zeros(sample.size, dtype=np.bool_)
+    for number, route in enumerate(legs):
+        rows = np.flatnonzero((sample >= 0) & (leg[sample] == number))
+        for visit in range(route.element.size):
+            own = rows[element[rows] == route.element[visit]]
+            at_m = path_m[sample[own]]
+            near[own] |= (at_m >= route.entry_m[visit] - _SAME_WAY_M) & (at_m <= route.exit_m[visit] + _SAME_WAY_M)
+    return near
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,9 @@ class Judgements:
     kind: Ints
     wrong_track: Bools
 
+    def take(self, rows: Ints) -> Judgements:
+        return Judgements(self.code[rows], self.low_m[rows], self.high_m[rows], self.kind[rows], self.wrong_track[rows])
+
     @property
     def middle_m(self) -> Floats:
         middle: Floats = 0.5 * (self.low_m + self.high_m)

@@ -29,6 +29,16 @@ class Odometry:
     scale: float | None = None
     scale_sigma: float | None = None
 
+    @property
+    def begin_ns(self) -> int:
+        """The first row."""
+        return self.track.epoch_ns
+
+    @property
+    def end_ns(self) -> int:
+        """The last row."""
+        return self.track.epoch_ns + int(np.ceil(self.track.t_s[-1] * 1e9))
+
     def oriented(self, sign: int) -> Odometry:
         """The same odometer, growing with the path; `sign` is +1 or -1."""
         return replace(self, track=self.track.oriented(sign))
