@@ -57,7 +57,7 @@ class Judged(dy.Schema):
 
 
 class Failures(dy.Schema):
-    """One row per failure: an episode with time judged wrong in use, whether it crosses a VB or not (DOMAIN 5.3)."""
+    """One row per failure: a stretch judged wrong in use, whether it crosses a VB or not (DOMAIN section 5.3)."""
 
     t_onset = instant("begin of the fault")
     t_failure = instant("begin of the position failure", nullable=True)
