@@ -196,7 +196,8 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
+    crossings, passages = _shim(lds.passages, aligned)
+    seen = Solution(solution, fixes, monitored, crossings, passages, balises, found.path)
     return _Ride(seen, found, aligned, lds)
 
 
@@ -269,3 +270,20 @@ def _tables(run_id: str, parts: list[_Part]) -> RunTables:
         for name, table in TABLES.items()
     }
     return RunTables(run_id=run_id, **whole)
+
+
+def _shim(passages: pl.DataFrame, aligned: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+    offered = passages.with_row_index("row").filter(pl.col("t_offered").is_not_null()).sort("t_offered", maintain_order=True)
+    t_ns = aligned["t"].dt.timestamp("ns").to_numpy()
+    at = offered["t_offered"].dt.timestamp("ns").to_numpy()
+    epoch = np.searchsorted(t_ns, at).clip(0, t_ns.size - 1)
+    crossings = offered.select(
+        pl.int_range(pl.len()).alias("crossing_id"), "balise_id", "kind", "netelement_id", "measure_m",
+        pl.Series("leg", aligned["leg"].fill_null(strategy="forward").fill_null(0).gather(epoch)), "path_m",
+        pl.Series("before", (epoch - 1).clip(0)), pl.Series("epoch", epoch), pl.col("t_offered").alias("t"),
+        pl.when(pl.col("direction") == "growing").then(1).otherwise(-1).alias("sense"),
+        pl.when(pl.col("direction") == "growing").then(1).otherwise(-1).alias("direction"),
+        pl.lit(None, pl.Float64).alias("odometer_m"), pl.lit(True).alias("offered"), "status",
+    )
+    ids = dict(zip(offered["row"].to_list(), crossings["crossing_id"].to_list()))
+    return crossings, passages.with_columns(pl.Series("crossing_id", [ids.get(i) for i in range(passages.height)], dtype=pl.Int64))

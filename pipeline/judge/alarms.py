@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.failure_log import AlarmSpan, FailureLog
+from pipeline.epochs.failure_log import AlarmEpisode, FailureLog
 from pipeline.evidence.evidence import KINDS
 from pipeline.judge.judgement import Judgements
 from pipeline.judge.suspect import Witnesses, suspect_of
@@ -64,7 +64,7 @@ def alarms_table(
     return pl.DataFrame(rows, schema=dtypes(Alarms))
 
 
-def verdict_of(span: AlarmSpan, w: Witnesses, positioned: Bools, config: HazardConfig) -> Verdict:
+def verdict_of(span: AlarmEpisode, w: Witnesses, positioned: Bools, config: HazardConfig) -> Verdict:
     """True where the whole interval was beyond the margin at some epoch, false where all of it stayed within.
 
     Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end.
@@ -85,7 +85,7 @@ def _by_truth(judged: Judgements) -> Bools:
     return np.isin(judged.kind, [KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE)])
 
 
-def _hazard_of(span: AlarmSpan, faults: Sequence[Fault]) -> int | None:
+def _hazard_of(span: AlarmEpisode, faults: Sequence[Fault]) -> int | None:
     """The first hazard that lasted during the alarm, or that it detected."""
     for fault in faults:
         lasted = span.start_ns <= fault.end_ns and span.end_ns >= fault.onset_ns

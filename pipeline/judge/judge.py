@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.failure_log import FailureLog, failure_log_of
+from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.evidence.evidence import KINDS, NOTHING
 from pipeline.evidence.routes import Place
@@ -51,7 +51,7 @@ class Judged:
 def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | None) -> Judged:
     """Judge one solution; `reference`: as recorded, for errors across the track; `faults`: what was injected."""
     used_s = in_use_s(bench.epochs, bench.config)
-    log = failure_log_of(bench.epochs, bench.config.lds.recovery_s)
+    log = failure_log(bench.epochs, bench.config.lds.recovery_s)
     series = _series(bench, used_s)
     offers = _virtual_offers(bench, series)
     episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)

@@ -52,7 +52,7 @@ def posterior_of(trellis: Trellis, found: Found) -> Posterior:
     keys, inverse = np.unique(step * count + trellis.oriented // 2, return_inverse=True)
     probability = np.bincount(inverse, weights=found.posterior, minlength=len(keys))
     first = np.searchsorted(keys // count, np.arange(len(trellis) + 1))
-    return Posterior(trellis.steps.epoch, first, keys % count, probability)
+    return Posterior(trellis.steps.epoch, first, (keys % count).astype(np.int64), probability)
 
 
 def rivals_of(posterior: Posterior | None, epochs: pl.DataFrame, path: TravelledPath, limit: float) -> Rivals:
