@@ -93,7 +93,7 @@ def _reference_places(
     if run.reference is None or run.reference.is_empty():
         return None
     default_m = config.hazards.reference_sigma_m
-    found = match_reference(run.reference, site, config.matching, default_m)
+    found = match_reference(run.reference, site, config.matching, default_m, run.balise_reads)
     if found is None:
         return None
     rivals = found.rivals(config.hazards.rival_probability)
