@@ -23,7 +23,7 @@ RECEIVER, COUNTER, REFERENCE = Receiver(), Counter(), Better()
 VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=0.001, gnss_latency_s=0.0, gnss_latency_sigma_s=0.01)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class World:
     """What there is; `vehicle` none: no vehicle file."""
 
@@ -40,7 +40,7 @@ class World:
     extra: tuple[Balise, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Journey:
     """The world's record, with its truth beside it."""
 
