@@ -15,9 +15,9 @@ class Fault:
     """A fault of the GNSS from `begin_s` to `end_s`.
 
     `kind`: `step` (`size_m` ahead along the growing route), `ramp` (`rate_mps`, gone at the end), `return` (`size_m` at
-    the middle and back to nothing), `cross` (`size_m` to the left), `latency` (stamps `size_s` late, negative early),
-    `tunnel` (no position; behind it `size_m` that fades with 20 s), `outage` (no position).
-    `in_velocity`: the velocity carries the same fault (a filtered receiver, spoofing).
+    the middle and back to nothing), `cross` (`size_m` to the left), `other_track` (on the track beside it), `latency`
+    (stamps `size_s` late, negative early), `tunnel` (no position; behind it `size_m` that fades with 20 s), `outage`
+    (no position). `in_velocity`: the velocity carries the same fault (a filtered receiver, spoofing).
     """
 
     kind: str
@@ -46,7 +46,10 @@ class Fault:
             return np.where(after >= 0, self.size_m * np.exp(-np.maximum(after, 0.0) / 20.0), 0.0)
         return np.zeros_like(time_s)
 
-    def left_m(self, time_s: Floats) -> Floats:
+    def left_m(self, time_s: Floats, other_m: Floats) -> Floats:
+        """What it adds to the left; `other_m`: how far to the left the other track lies."""
+        if self.kind == "other_track":
+            return np.where(self.inside(time_s), other_m, 0.0)
         return np.where(self.inside(time_s), self.size_m if self.kind == "cross" else 0.0, 0.0)
 
     def late_s(self, time_s: Floats) -> Floats:

@@ -32,7 +32,7 @@ APART_M = 3.0  # tracks nearer than this to each other (at a switch) are not tol
 RUNGS = ("reference", "balise", "odometer")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Judgements:
     """Judged positions with their truth: `error_m` as the program placed them, `beside` on a track that is not ours."""
 
@@ -53,7 +53,7 @@ class Judgements:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rung:
     """One replay under one kind of evidence."""
 

@@ -58,7 +58,7 @@ def geodetic(enu_m: Floats) -> tuple[Floats, Floats, Floats]:
     return np.degrees(latitude), np.degrees(np.arctan2(y, x)), height
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Element:
     """A net element as fine points in the plane; `base_m` is the main line's coordinate abreast of each."""
 
@@ -123,11 +123,26 @@ class Route:
 
 @dataclass(frozen=True)
 class Ground:
-    """All elements, how their ends join, and the route that the train takes."""
+    """All elements, how their ends join, and the route that the train takes; `aside_m`: how far to its left the other
+    track lies where both run in parallel.
+    """
 
     elements: tuple[Element, ...]
     joints: tuple[tuple[str, int, str, int], ...]
     route: Route
+    aside_m: float = 0.0
+
+    def other_left_m(self, way_m: Floats) -> Floats:
+        """How far to the left of the route another track lies there; NaN where there is none."""
+        left = np.full(len(way_m), np.nan)
+        taken = {element.base_m[0]: number for number, element in enumerate(self.route.elements)}
+        names = {element.name for element in self.route.elements}
+        for other in (element for element in self.elements if element.name not in names):
+            number = taken[other.base_m[0]]
+            begin, end = self.route.starts_m[number : number + 2]
+            here = (way_m >= begin) & (way_m <= end)
+            left[here] = self.aside_m * _switch(way_m[here] - begin, end - begin)
+        return left
 
     def element(self, name: str) -> Element:
         return next(element for element in self.elements if element.name == name)
@@ -153,10 +168,14 @@ def part(of: Element, name: str, begin_m: float, end_m: float) -> Element:
 def beside(of: Element, name: str, left_m: float) -> Element:
     """A neighbour that leaves an element at its start, runs `left_m` aside and comes back at its end."""
     _, tangent = of.at(of.measure_m)
-    ends = np.minimum(of.measure_m, of.length_m - of.measure_m) / SWITCH_LENGTH_M
-    ramp = np.clip(ends, 0.0, 1.0)
-    aside = left_m * ramp**2 * (3 - 2 * ramp)
+    aside = left_m * _switch(of.measure_m, of.length_m)
     return Element(name, of.east_m - tangent[:, 1] * aside, of.north_m + tangent[:, 0] * aside, of.base_m)
+
+
+def _switch(measure_m: Floats, length_m: float) -> Floats:
+    """Share of the full distance aside, from switch to switch."""
+    ramp = np.clip(np.minimum(measure_m, length_m - measure_m) / SWITCH_LENGTH_M, 0.0, 1.0)
+    return np.asarray(ramp**2 * (3 - 2 * ramp))
 
 
 def make_ground(
@@ -180,7 +199,8 @@ def make_ground(
     other = beside(pieces[number], "neighbour", left_m)
     joined = ((pieces[number - 1].name, 1, other.name, 0), (other.name, 1, pieces[number + 1].name, 0))
     taken = [*pieces[:number], other, *pieces[number + 1 :]] if over_neighbour else pieces
-    return Ground((*pieces, other), (*_in_order(pieces), *joined), Route(tuple(taken)))
+    aside_m = -left_m if over_neighbour else left_m
+    return Ground((*pieces, other), (*_in_order(pieces), *joined), Route(tuple(taken)), aside_m)
 
 
 def _in_order(pieces: list[Element]) -> tuple[tuple[str, int, str, int], ...]:

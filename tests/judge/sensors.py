@@ -9,7 +9,7 @@ import polars as pl
 
 from schemas.inputs import BaliseReads, Gnss, Odometer, Reference
 from tests.judge.faults import Fault, Slip
-from tests.judge.ground import Balise, Floats, Route, geodetic
+from tests.judge.ground import Balise, Floats, Ground, Route, geodetic
 from tests.judge.ride import Ride
 
 START_NS = 1_772_352_000_000_000_000  # 2026-03-01T08:00:00Z
@@ -98,14 +98,17 @@ def _noise(rng: np.random.Generator, time_s: Floats, of: Receiver) -> Floats:
     return np.asarray(slow + of.white_m * rng.standard_normal(len(time_s)))
 
 
-def gnss(rng: np.random.Generator, ride: Ride, route: Route, of: Receiver) -> Place:
+def gnss(rng: np.random.Generator, ride: Ride, ground: Ground, of: Receiver) -> Place:
     """Epochs of the receiver; `along_m` is the way of the balise antenna as its position says it."""
     time = _ticks(ride.length_s, of.rate_hz)
     late = of.latency_s + sum((fault.late_s(time) for fault in of.faults), np.zeros_like(time))
     fault = sum((fault.along_m(time) for fault in of.faults), np.zeros_like(time))
-    left = sum((fault.left_m(time) for fault in of.faults), np.zeros_like(time))
+    other = np.nan_to_num(ground.other_left_m(ride.way_m(time - late) + fault))
+    left = sum((fault.left_m(time, other) for fault in of.faults), np.zeros_like(time))
     along = ride.way_m(time - late) + fault + _noise(rng, time, of)
-    enu, tangent = route.points(along + of.antenna_ahead_m, left + _noise(rng, time, of), 1.5 * _noise(rng, time, of))
+    enu, tangent = ground.route.points(
+        along + of.antenna_ahead_m, left + _noise(rng, time, of), 1.5 * _noise(rng, time, of)
+    )
     speed = ride.speed_mps(time - late) + _carried(of.faults, time, of.rate_hz)
     velocity = speed[:, None] * tangent + of.velocity_sigma_mps * rng.standard_normal((len(time), 2))
     heard = ~np.any([fault.silent(time) for fault in of.faults] or [np.zeros(len(time), bool)], axis=0)

@@ -13,7 +13,7 @@ from tests.judge.faults import Fault
 from tests.judge.findings import CI_LIMIT_M, LIMIT_M, Rung, findings, rungs_of
 from tests.judge.ground import make_ground
 from tests.judge.ride import Leg
-from tests.judge.sensors import Better, Receiver
+from tests.judge.sensors import Better
 from tests.judge.world import World, make_journey
 
 LINE = make_ground(18000.0, bend_deg=3.0)

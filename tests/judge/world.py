@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.config import Vehicle
 from schemas.run import RunLog, Site
+from tests.judge.faults import Slip
 from tests.judge.ground import Balise, Floats, Ground, balises_every, make_site
 from tests.judge.ride import Leg, Ride, make_ride
 from tests.judge.sensors import Better, Counter, Receiver, gnss, odometer, reads, reference
@@ -22,7 +23,7 @@ RECEIVER, COUNTER, REFERENCE = Receiver(), Counter(), Better()
 VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=0.001, gnss_latency_s=0.0, gnss_latency_sigma_s=0.01)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class World:
     """What there is; `vehicle` none: no vehicle file."""
 
@@ -39,7 +40,7 @@ class World:
     extra: tuple[Balise, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Journey:
     """The world's record, with its truth beside it."""
 
@@ -85,17 +86,26 @@ class Journey:
     def _abreast(self, name: str, measure_m: Floats) -> Floats:
         ground = self.world.ground
         names = [element.name for element in ground.route.elements]
+        starts: Floats = ground.route.starts_m
         if name in names:
-            return ground.route.starts_m[names.index(name)] + measure_m
+            return np.asarray(starts[names.index(name)] + measure_m)
         element = ground.element(name)
         base = np.interp(measure_m, element.measure_m, element.base_m)
         number = next(k for k, other in enumerate(ground.route.elements) if other.base_m[0] == element.base_m[0])
         twin = ground.route.elements[number]
-        return ground.route.starts_m[number] + np.interp(base, twin.base_m, twin.measure_m)
+        return np.asarray(starts[number] + np.interp(base, twin.base_m, twin.measure_m))
 
     def on_route(self, netelement_id: list[str | None]) -> NDArray[np.bool_]:
         names = {element.name for element in self.world.ground.route.elements}
         return np.array([name in names for name in netelement_id], bool)
+
+    def apart_m(self, way_m: Floats) -> Floats:
+        """How far another track lies beside the route there; infinite where there is none."""
+        return np.nan_to_num(np.abs(self.world.ground.other_left_m(way_m)), nan=np.inf)
+
+    @property
+    def slips(self) -> tuple[Slip, ...]:
+        return self.world.counter.slips if self.world.counter is not None else ()
 
     def weaker(self, *gone: str) -> RunLog:
         """The run without some of its streams."""
@@ -115,15 +125,15 @@ def make_journey(world: World, seed: int, name: str = "run") -> Journey:
         *balises_every(world.ground, world.physical_every_m, "physical", world.first_physical_m, "B"),
         *world.extra,
     ]
-    receiver = replace(world.receiver, antenna_ahead_m=vehicle.gnss_antenna_ahead_m)
-    place = gnss(rng, ride, route, receiver)
+    # An odometer that falls along the route belongs to a train that runs backwards over it.
+    polarity = world.counter.polarity if world.counter is not None else 1
+    ahead_m = vehicle.gnss_antenna_ahead_m * polarity
+    place = gnss(rng, ride, world.ground, replace(world.receiver, antenna_ahead_m=ahead_m))
     run = RunLog(
         run_id=name,
         gnss=place.frame,
         odometer=None if world.counter is None else odometer(rng, ride, world.counter),
-        reference=None
-        if world.better is None
-        else reference(rng, ride, route, world.better, vehicle.gnss_antenna_ahead_m),
+        reference=None if world.better is None else reference(rng, ride, route, world.better, ahead_m),
         balise_reads=reads(rng, ride, route, balises, READ_SIGMA_M),
         input_digest=f"{name}-{seed}",
     )
