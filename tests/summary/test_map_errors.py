@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.hazards.map_errors import map_places, map_suspects
+from pipeline.figures.map_errors import map_places, map_suspects
 from tests.hazards.synthetic import Journey, judge
 
 
