@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
@@ -16,7 +17,6 @@ from pipeline.hazards import Case, HazardResult, classify, establish_truth, plac
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
-from pipeline.lds.telegrams import place_reads, places_near
 from pipeline.matching import Match, match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.channels import on_path_of
@@ -24,9 +24,10 @@ from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
 from pipeline.motion import Motion, motion_of, void_evidence
 from pipeline.results.provenance import provenance
+from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import conform, shaped
-from schemas.enums import Evidence
+from schemas.enums import BaliseKind, Evidence
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
@@ -159,10 +160,19 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     matched = found.epochs.with_columns(fixes["hpl_m"], digits)
     aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
-    telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
-    lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
+    reads = _reads_on_odometer(context, aligned)
+    lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
+    telegrams = None if reads is None else lds.crossings.filter(pl.col("kind") == BaliseKind.PHYSICAL.value)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
     return _Ride(solution, fixes, found, balises, aligned, monitored, telegrams, lds)
+
+
+def _reads_on_odometer(context: _Context, aligned: pl.DataFrame) -> pl.DataFrame | None:
+    """Telegrams with the odometer at each, on the scale of `aligned`."""
+    reads, odometer = context.run.balise_reads, context.run.odometer
+    if reads is None or odometer is None:
+        return reads
+    return reads.with_columns(odometer_at(reads["t"], aligned, odometer, context.config))
 
 
 def _case(context: _Context, ride: _Ride) -> tuple[Case, Motion]:
@@ -247,7 +257,7 @@ def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -
     reference = context.run.reference
     if reference is None:
         return None
-    leg, near_path_m = places_near(reference["t"], aligned) or (None, None)
+    leg, near_path_m = _places_near(reference["t"], aligned) or (None, None)
     places = found.path.project(
         reference["latitude_deg"], reference["longitude_deg"], reference["height_m"], leg, near_path_m
     )
@@ -258,6 +268,18 @@ def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -
         pl.Series("vertical_m", places.vertical_m - context.vehicle.antenna_height_m, nan_to_null=True),
         "sigma_m",
     )
+
+
+def _places_near(times: pl.Series, aligned: pl.DataFrame) -> tuple[Ints, Floats] | None:
+    """Leg and path position [m] of the epoch next in time to each instant; None in a run without a position."""
+    placed = aligned.drop_nulls(["leg", "path_m"])
+    if placed.is_empty():
+        return None
+    stamps, at = placed["t"].dt.timestamp("ns").to_numpy(), times.dt.timestamp("ns").to_numpy()
+    after = np.searchsorted(stamps, at).clip(0, stamps.size - 1)
+    before = np.maximum(after - 1, 0)
+    rows = np.where(np.abs(stamps[before] - at) <= np.abs(stamps[after] - at), before, after)
+    return placed["leg"].to_numpy().astype(np.int64)[rows], placed["path_m"].to_numpy()[rows]
 
 
 def _between(
