@@ -10,6 +10,7 @@ import polars as pl
 
 from datasets.expectation import ExpectedHazard, ExpectedRun
 from datasets.scenario import RunSpec
+from pipeline.figures.verdict import word_of, worst_verdict
 from schemas.errors import ConfigError
 from schemas.run import RunLog, RunTables
 
@@ -33,11 +34,12 @@ class Check:
 
 
 def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[Check]:
-    """Each expectation of a run against its tables: hazards, their onset, balises, alarms, odometer scale."""
+    """Each expectation of a run against its tables, its verdict first: hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
         raise ConfigError("says nothing of what has to be found", place=f"scenario: run {spec.id}")
     injected = describe_faults(run.faults)
     pairs = [
+        ("verdict", spec.expected.verdict.value, word_of(worst_verdict(tables.runs["verdict"].to_list()))),
         ("status", "ok", _one_of(tables.runs["status"].to_list())),
         *_hazards(spec.expected, tables.hazards),
         *_onsets(spec, run, tables.hazards),
@@ -112,7 +114,7 @@ def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
 def _words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
     lists = [" ".join(ids) or "-" if isinstance(ids, list | tuple) else "-" for ids in (hit, accepted)]
     seen = "detected" if detected else "not detected"
-    return f"{hazard} {mode} {timing}: {lists[0]}, accepted {lists[1]}, {seen}"
+    return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {seen}"
 
 
 def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:

@@ -28,14 +28,15 @@ def unambiguous(epochs: pl.DataFrame, config: Configuration) -> Bools:
 def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
     """For how long each epoch stands for a position in use [s]: from the epoch before, for a fault may be that old.
 
-    At most max(1.5 periods, 1 s); of a negated time only what comes before the reaction.
+    At most max(1.5 periods, 1 s), the first epoch for one period; of a negated time only what comes before the
+    reaction.
     """
     t_ns = times_ns(epochs)
     usable = flags(epochs, "fix_valid") & np.isfinite(floats(epochs, "path_m")) & unambiguous(epochs, config)
     usable &= floats(epochs, "confidence_m") <= config.lds.ci_limit_m
-    most_s = linking_gap_s(nominal_period_s(t_ns), _LEAST_HELD_S)
+    period_s = nominal_period_s(t_ns) or 0.0
     end_s = (t_ns - t_ns[:1]) / NS_PER_S
-    begin_s = end_s - np.minimum(np.diff(end_s, prepend=end_s[:1]), most_s)
+    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), linking_gap_s(period_s, _LEAST_HELD_S))
     blocked = np.zeros(t_ns.size)
     for from_s, until_s in _negated_spans(end_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
         blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)

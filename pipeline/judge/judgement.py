@@ -98,12 +98,13 @@ def judge_positions(
 ) -> Judgements:
     """Wrong where it is wrong wherever the train may have been, right where it is right wherever it may have been.
 
-    `legs`: the legs of the solution's own path, coordinate `path_m`.
+    `legs`: the legs of the solution's own path, coordinate `path_m`. The interval is that of the tracks on which the
+    place along the track can be compared.
     """
     size, limit_m = positions.element.size, config.failure_limit_m
     low, high = np.full(size, np.inf), np.full(size, -np.inf)
     right, wrong, off = (np.ones(size, dtype=np.bool_) for _ in range(3))
-    weighed, unplaced = (np.zeros(size, dtype=np.bool_) for _ in range(2))
+    weighed = np.zeros(size, dtype=np.bool_)
     for alternative in evidence.alternatives:
         kept = positions.known[alternative.rows]
         rows = alternative.rows[kept]
@@ -116,11 +117,10 @@ def judge_positions(
             right[rows] &= ~found.off_track & (found.low_m >= -limit_m) & (found.high_m <= limit_m)
         off[rows] &= excluded
         weighed[rows] = True
-        unplaced[rows] |= ~np.isfinite(found.low_m)
         low[rows], high[rows] = np.fmin(low[rows], found.low_m), np.fmax(high[rows], found.high_m)
     _weigh_rivals(positions, evidence, right, wrong, off)
     code = np.where(weighed & wrong, WRONG, np.where(weighed & right, RIGHT, UNKNOWN))
-    told = weighed & ~unplaced
+    told = weighed & np.isfinite(low)
     return Judgements(
         code=code,
         low_m=np.where(told, low, np.nan),

@@ -40,7 +40,8 @@ class Campaign:
 
 
 _RUN_COLUMNS = (
-    ("share_unknown", "share unknown"), ("duration_s", "duration [s]"), ("distance_m", "distance [m]"), ("availability", "availability"),
+    ("share_unknown", "share unknown"),
+    ("duration_s", "duration [s]"), ("distance_m", "distance [m]"), ("availability", "availability"),
     ("evidence", "evidence"), ("hazards", "hazards"), ("hazards_detected", "detected"),
     ("missed_detections", "missed detections"), ("time_to_detect_max_s", "T_D max [s]"),
     ("hazardous_max_s", "hazardous max [s]"), ("balises_accepted", "VBs accepted"),
@@ -53,8 +54,8 @@ _RUN_COLUMNS = (
 _HAZARD_COLUMNS = (
     ("failure_mode", "ETCS failure"), ("size_m", "size [m]"), ("t_onset", "onset"), ("monitor", "detected by"),
     ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
-    ("hazardous_may_s", "with what is unknown [s]"), ("within_budget", "within budget"), ("balise_ids", "VBs hit"), ("accepted_ids", "accepted despite the fault"),
-    ("suspect", "suspect"),
+    ("hazardous_may_s", "with what is unknown [s]"), ("within_budget", "within budget"), ("balise_ids", "VBs hit"),
+    ("accepted_ids", "accepted despite the fault"), ("suspect", "suspect"),
 )  # fmt: skip
 _PLOTS = (
     ("classes", "Hazards by class", "Within the budget, beyond it, not known."),

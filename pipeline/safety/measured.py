@@ -176,8 +176,12 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: Safety
     failures = failures_of(runs)
     episodes = independent_episodes(hazards)
     solutions = sorted({*failures["solution"].to_list(), *episodes["solution"].to_list()})
-    parts = [(name, *(frame.filter(solution=name) for frame in (failures, episodes))) for name in solutions]
-    return _table([row for part in parts for row in _by_level(*part, config)], CampaignDetection)
+    rows = [
+        row
+        for name in solutions
+        for row in _by_level(name, failures.filter(solution=name), episodes.filter(solution=name), config)
+    ]
+    return _table(rows, CampaignDetection)
 
 
 def failures_of(runs: pl.DataFrame) -> pl.DataFrame:

@@ -118,7 +118,7 @@ def _statement(row: dict[str, Any]) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
     head = " ".join([_failures(row), _missed(row), _acceptances(row)])
     if row["share_p1"]:
-        head += f" Judged wrong and not negated, at a balise or not: {row['share_p1']:.3%} of the time in runs with a truth."
+        head += f" Judged wrong and not negated: {row['share_p1']:.3%} of the time in runs with a truth."
     if row["hours_still_needed"] == 0.0:
         return f"{head} This substantiates a {claim}."
     return (
