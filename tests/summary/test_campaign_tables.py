@@ -152,7 +152,9 @@ class TestBalises:
         assert (row["location_error_p95_m"], row["location_error_max_m"]) == (pytest.approx(27.3), 30.0)
 
     def test_without_evidence_nothing_is_known_of_unsafe_acceptances(self) -> None:
-        row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None, judgement="unknown")).row(0, named=True)
+        row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None, judgement="unknown")).row(
+            0, named=True
+        )
         assert (row["passages"], row["accepted"], row["accepted_judged"], row["unproven_accepted"]) == (2, 2, 0, 2)
         assert (row["unsafe_rate"], row["unsafe_rate_high"], row["location_error_mean_m"]) == (None, None, None)
 
