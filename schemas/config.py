@@ -187,6 +187,7 @@ class HazardConfig(Settings):
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
     reference_gap_s: Positive = 2.0
+    rival_probability: Probability = 0.001
     balise_read_sigma_m: Positive = 1.0
     known_error_m: Positive = 5.0
     unknown_share_limit: Probability = 0.01
