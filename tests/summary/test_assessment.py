@@ -19,8 +19,8 @@ ACROSS = {"monitors": [["cross_raw"]], "verdict": "false", "suspect": "unknown",
 
 
 def run_of(
-    run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = {}, **found: Any
-) -> RunTables:  # noqa: B006
+    run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = None, **found: Any
+) -> RunTables:
     rows: dict[str, Any] = {
         "solution": list(solutions),
         "status": "ok",
@@ -37,7 +37,7 @@ def run_of(
         "verdict": "safe",
         "failure_hazardous_s": [[]] * len(solutions),
         "failure_hazardous_may_s": [[]] * len(solutions),
-    } | counted
+    } | (counted or {})
     points = [20.0 * k for k in range(3)]
     stand = {"netelement_id": "A", "measure_m": points, "path_m": points, "sigma_along_m": 1.0}
     tables = {"hazards": hazards(), "alarms": alarms(), "passages": passages()} | found

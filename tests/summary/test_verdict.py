@@ -73,7 +73,7 @@ def test_a_campaign_is_headed_by_its_worst_run_with_counts() -> None:
 
 
 def test_rows_of_one_fault_are_one_event() -> None:
-    """Begin at 100 s in two rows and a third that follows; T_dsf of the last fault is not known: nor is its detection."""
+    """Begin at 100 s in two rows and a third that follows; without T_dsf of the last fault nobody can say."""
     frame = hazards(
         5,
         solution="primary",
