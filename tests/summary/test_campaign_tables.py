@@ -83,7 +83,7 @@ class TestRuns:
         rate, share = poisson_rate(2, 0.5), clopper_pearson(1, 2)
         assert (row["faults"], row["hazard_rate_per_h"]) == (2, 4.0)
         assert (row["hazard_rate_low_per_h"], row["hazard_rate_high_per_h"]) == (rate.low, rate.high)
-        assert (row["failures"], row["missed"], row["missed_unknown"], row["missed_share"]) == (3, 1, 0, 0.5)
+        assert (row["failures"], row["missed"], row["missed_share"]) == (3, 1, 0.5)
         assert (row["missed_share_low"], row["missed_share_high"]) == (share.low, share.high)
         # One within the budget, one beyond it; of the third nobody can say, and no share counts it.
         assert (row["beyond_budget_share"], row["beyond_budget_share_high"]) == (0.5, share.high)
