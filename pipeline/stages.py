@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.align import align
+from pipeline.alignment.align import align, odometer_at
 from pipeline.alignment.increments import most_scatter_m
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
@@ -19,7 +19,6 @@ from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
-from pipeline.lds.telegrams import place_reads
 from pipeline.matching import Match, match
 from pipeline.matching.reference import match_reference
 from pipeline.monitors.bank import MonitorBank
@@ -193,12 +192,19 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     matched = found.epochs.with_columns(fixes["hpl_m"], digits)
     aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
-    telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
-    lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
+    reads = _reads_on_odometer(context, aligned)
+    lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    crossings, passages = _shim(lds.passages, aligned)
-    seen = Solution(solution, fixes, monitored, crossings, passages, balises, found.path)
+    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
     return _Ride(seen, found, aligned, lds)
+
+
+def _reads_on_odometer(context: _Context, aligned: pl.DataFrame) -> pl.DataFrame | None:
+    """Telegrams with the odometer at each, on the scale of `aligned`."""
+    reads, odometer = context.run.balise_reads, context.run.odometer
+    if reads is None or odometer is None:
+        return reads
+    return reads.with_columns(odometer_at(reads["t"], aligned, odometer, context.config))
 
 
 def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFrame) -> SolutionResults:
@@ -270,20 +276,3 @@ def _tables(run_id: str, parts: list[_Part]) -> RunTables:
         for name, table in TABLES.items()
     }
     return RunTables(run_id=run_id, **whole)
-
-
-def _shim(passages: pl.DataFrame, aligned: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
-    offered = passages.with_row_index("row").filter(pl.col("t_offered").is_not_null()).sort("t_offered", maintain_order=True)
-    t_ns = aligned["t"].dt.timestamp("ns").to_numpy()
-    at = offered["t_offered"].dt.timestamp("ns").to_numpy()
-    epoch = np.searchsorted(t_ns, at).clip(0, t_ns.size - 1)
-    crossings = offered.select(
-        pl.int_range(pl.len()).alias("crossing_id"), "balise_id", "kind", "netelement_id", "measure_m",
-        pl.Series("leg", aligned["leg"].fill_null(strategy="forward").fill_null(0).gather(epoch)), "path_m",
-        pl.Series("before", (epoch - 1).clip(0)), pl.Series("epoch", epoch), pl.col("t_offered").alias("t"),
-        pl.when(pl.col("direction") == "growing").then(1).otherwise(-1).alias("sense"),
-        pl.when(pl.col("direction") == "growing").then(1).otherwise(-1).alias("direction"),
-        pl.lit(None, pl.Float64).alias("odometer_m"), pl.lit(True).alias("offered"), "status",
-    )
-    ids = dict(zip(offered["row"].to_list(), crossings["crossing_id"].to_list()))
-    return crossings, passages.with_columns(pl.Series("crossing_id", [ids.get(i) for i in range(passages.height)], dtype=pl.Int64))

@@ -21,14 +21,16 @@ class Crossings(dy.Schema):
     measure_m = real("m", "measure of the balise", nullable=False)
     leg = dy.Int32(description="leg of the path")
     path_m = real("m", "path position of the balise", nullable=False)
-    before = dy.Int64(min=0, description="row of the last epoch before the crossing")
+    before = dy.Int64(min=0, description="row of the last epoch before the crossing with a position; of a telegram any")
     epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
-    t = instant("the crossing, interpolated between both epochs; of a telegram its own time")
+    t = instant("the crossing, interpolated; of a telegram its own time; after a gap that of `epoch`")
     sense = dy.Int8(description="+1 passed along growing path, -1 against it")
-    heading = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
+    direction = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
     odometer_m = real("m", "odometer distance at the crossing")
-    offered = flag("a passage of its own; false: crossed again before the balise was re-armed, or inside a gap")
-    status = one_of(PassageStatus, "what became of the offer; null where it was none", nullable=True)
+    offered = flag("offered to the train; false: inside a gap, or crossed again before the balise was re-armed")
+    status = one_of(
+        PassageStatus, "what became of it; null where crossed again before the balise was re-armed", nullable=True
+    )
 
 
 class EvidenceAt(dy.Schema):

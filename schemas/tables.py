@@ -121,6 +121,7 @@ class Passages(dy.Schema):
     judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
+    crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
 
 
 class Alarms(dy.Schema):

@@ -125,8 +125,8 @@ class Bench:
 
     @cached_property
     def offers(self) -> pl.DataFrame:
-        """Crossings that were offered, of virtual balises and telegrams."""
-        return self.solution.crossings.filter("offered")
+        """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them."""
+        return self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
 
     @cached_property
     def offers_judged(self) -> Judgements:

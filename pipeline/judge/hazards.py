@@ -17,10 +17,10 @@ from schemas.enums import Hazard
 
 @dataclass(frozen=True)
 class VirtualOffers:
-    """Offered crossings of virtual balises, judged; arrays in order of time.
+    """Crossings of virtual balises, judged; arrays in order of time.
 
     `number`: the valid position (`Series`) that completes the crossing; `beyond_window`: offered after its window
-    closed; `accepted`: by the LDS.
+    closed; `accepted`: by the LDS; not `offered`: crossed again before it was re-armed, which only a jump does.
     """
 
     balise_id: list[str]
@@ -30,6 +30,7 @@ class VirtualOffers:
     judged: Judgements
     beyond_window: Bools
     accepted: Bools
+    offered: Bools
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _hits(episode: Episode, offers: VirtualOffers, taken: set[int], config: Haza
     """Offers judged wrong during the episode, beyond the shift limit or on another track, that no jump crossed."""
     beyond = (offers.judged.least_m > config.shift_limit_m) | offers.judged.wrong_track
     inside = (offers.number >= episode.onset) & (offers.number < episode.end)
-    hit = np.flatnonzero(inside & beyond & (offers.judged.code == WRONG))
+    hit = np.flatnonzero(inside & beyond & offers.offered & (offers.judged.code == WRONG))
     return [number for number in hit.tolist() if number not in taken]
 
 

@@ -89,6 +89,7 @@ def _virtual_offers(bench: Bench, series: Series) -> VirtualOffers:
     offers = bench.offers[rows]
     late = bench.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
     return VirtualOffers(
+        offered=offers["offered"].to_numpy(),
         balise_id=offers["balise_id"].to_list(),
         t_ns=times_ns(offers),
         number=np.searchsorted(series.row, ints(offers["epoch"])).clip(0, max(series.size - 1, 0)),
@@ -102,7 +103,7 @@ def _virtual_offers(bench: Bench, series: Series) -> VirtualOffers:
 def _marked(series: Series, offers: VirtualOffers) -> Bools:
     """Valid positions that complete an offer judged wrong."""
     marked = np.zeros(series.size, dtype=np.bool_)
-    marked[offers.number[offers.judged.code == WRONG]] = True
+    marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
     return marked
 
 
