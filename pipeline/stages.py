@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
-from pipeline.alignment.increments import most_scatter_m
 from pipeline.figures.bounds import threshold_factor
 from pipeline.figures.evidence_notes import evidence_notes, motion_notes, reading_notes, return_notes, undiagnosed_notes
 from pipeline.figures.run_notes import run_notes
@@ -23,8 +22,9 @@ from pipeline.monitors.channels import on_path_of
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
 from pipeline.motion import Motion, motion_of, void_evidence
+from pipeline.odometry import Odometry, odometry_of
 from pipeline.results.provenance import provenance
-from schemas.config import Configuration, LdsConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import Evidence
 from schemas.errors import InputError
@@ -51,6 +51,7 @@ class _Context:
     config: Configuration
     counts: CleanCounts
     factor: float
+    odometry: Odometry | None
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class _Ride:
     """One solution on its way, before anything is known of the truth.
 
     `balises`: those on the path; `aligned`: epochs before the monitors; `monitored`: with their columns and those of
-    the LDS; `telegrams`: reads of physical balises, none where the run has no such stream.
+    the LDS; `telegrams`: reads of physical balises, none where the run has no such stream;
+    `odometry`: growing with the path.
     """
 
     solution: str
@@ -69,6 +71,7 @@ class _Ride:
     monitored: pl.DataFrame
     telegrams: pl.DataFrame | None
     lds: LdsResult
+    odometry: Odometry | None
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
@@ -80,7 +83,9 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     config = config or Configuration()
     cleaned, counts = clean(run)
     factor = threshold_factor(config.monitors.false_alarm_probability)
-    context = _Context(cleaned, site, vehicle or Vehicle(), config, counts, factor)
+    vehicle = vehicle or Vehicle()
+    odometry = odometry_of(cleaned.odometer, vehicle, config)
+    context = _Context(cleaned, site, vehicle, config, counts, factor, odometry)
     matches, errors = _matches(context)
     parts = [
         _failed(context, name, errors[name]) if name in errors else _replay_solution(context, name, matches)
@@ -111,7 +116,7 @@ def _match(context: _Context, solution: str) -> Match:
     require_one_journey(fixes, f"gnss of solution {solution!r}")
     return match(
         fixes,
-        run.odometer,
+        context.odometry,
         context.site,
         context.vehicle,
         context.config.matching,
@@ -155,14 +160,13 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     run, config, found = context.run, context.config, matches[solution]
     balises = found.path.balises(context.site.balises)
     fixes = run.gnss.filter(pl.col("solution") == solution)
-    digits = pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=most_scatter_m(config))
-    matched = found.epochs.with_columns(fixes["hpl_m"], digits)
-    aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
+    odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
+    aligned = align(found.epochs, odometry, context.vehicle, config)
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
-    telegrams = place_reads(run.balise_reads, aligned, balises, run.odometer, config)
+    telegrams = place_reads(run.balise_reads, aligned, balises, odometry)
     lds = run_lds(aligned, bank, balises, telegrams, config.lds, LdsLimits.of(config), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    return _Ride(solution, fixes, found, balises, aligned, monitored, telegrams, lds)
+    return _Ride(solution, fixes, found, balises, aligned, monitored, telegrams, lds, odometry)
 
 
 def _case(context: _Context, ride: _Ride) -> tuple[Case, Motion]:
@@ -173,7 +177,7 @@ def _case(context: _Context, ride: _Ride) -> tuple[Case, Motion]:
     truth = establish_truth(ride.monitored, reference, reads, ride.lds.passages, config)
     motion = motion_of(ride.monitored, truth, config)
     epochs = ride.monitored.with_columns(motion.columns())
-    between = _between(context, ride.aligned, truth, reference, reads)
+    between = _between(context, ride, truth, reference, reads)
     passages = with_unoffered(ride.lds.passages, epochs, truth, ride.balises, config.lds, ride.solution, between)
     case = Case(
         solution=ride.solution,
@@ -197,7 +201,17 @@ def _notes(
     limit_m = context.config.hazards.failure_limit_m
     counts = context.counts.solutions[ride.solution]
     return (
-        *run_notes(context.run, context.site, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
+        *run_notes(
+            context.run,
+            context.site,
+            counts,
+            ride.fixes,
+            ride.found,
+            ride.lds,
+            context.vehicle,
+            context.odometry,
+            context.config.align.straight_s,
+        ),
         *reading_notes(ride.aligned, context.config),
         *evidence_notes(ride.aligned, truth, limit_m),
         *return_notes(epochs, result.hazards, limit_m),
@@ -215,12 +229,6 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
     """Scale and latency as they stand at the end of the run."""
     names = ("latency_s", "latency_sigma_s", "odometer_scale", "scale_sigma")
     return Alignment(*(aligned[name][-1] for name in names))
-
-
-def _confidence(lds: LdsConfig) -> pl.Expr:
-    """Half-width of the confidence interval along the track: K sigma, or the receiver's HPL (DOMAIN section 4)."""
-    half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
-    return half_width.alias("confidence_m")
 
 
 def _single_monitors(
@@ -262,19 +270,18 @@ def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -
 
 def _between(
     context: _Context,
-    aligned: pl.DataFrame,
+    ride: _Ride,
     truth: pl.DataFrame,
     reference: pl.DataFrame | None,
     reads: pl.DataFrame | None,
 ) -> pl.DataFrame | None:
     """Places inside gaps of the positions, by the streams that go on there."""
-    odometer = context.run.odometer
 
     def counted(times: pl.Series) -> pl.Series:
         unknown = pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
-        return unknown if odometer is None else odometer_at(times, aligned, odometer, context.config)
+        return unknown if ride.odometry is None else odometer_at(times, ride.aligned, ride.odometry)
 
-    return places_between(aligned, truth, reference, reads, odometer, counted)
+    return places_between(ride.aligned, truth, reference, reads, context.run.odometer, counted)
 
 
 def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:

@@ -82,7 +82,7 @@ def _gaps(epochs: pl.DataFrame, truth: pl.DataFrame) -> list[_Gap]:
     if ends.size == 0:
         return []
     leg = ints(epochs["leg"].fill_null(strategy="forward").fill_null(strategy="backward"))[rows]
-    stretch, counted = ints(epochs["odometer_stretch"])[rows], np.isfinite(floats(epochs, "odometer_m"))[rows]
+    stretch, counted = ints(epochs["odometer_segment"])[rows], np.isfinite(floats(epochs, "odometer_m"))[rows]
     whole: Bools = np.zeros(rows.size, dtype=np.bool_)
     whole[1:] = (np.diff(stretch) == 0) & counted[1:] & counted[:-1]
     return [

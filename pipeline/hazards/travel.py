@@ -49,8 +49,8 @@ def odometer_travel(epochs: pl.DataFrame, at_ns: Ints) -> Travel:
         at_ns=at_ns,
         distance_m=floats(epochs, "odometer_m"),
         odometer_m=floats(epochs, "odometer_m"),
-        stretch=ints(epochs["odometer_stretch"]),
+        stretch=ints(epochs["odometer_segment"]),
         scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
         white_m2_per_s=np.nan_to_num(white),
-        reading_m2=np.nan_to_num(floats(epochs, "odometer_reading_m")) ** 2,
+        reading_m2=np.nan_to_num(floats(epochs, "odometer_rows_m")) ** 2,
     )

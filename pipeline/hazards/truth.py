@@ -34,7 +34,7 @@ def establish_truth(
     """Truth of one solution's epochs, at the time that each position is of: `t - latency`, as known in the end.
 
     `epochs`: `t, path_m, fix_valid, direction, latency_s` and the aligned odometer (`odometer_m,
-    odometer_stretch, scale_sigma, odometer_white_m2_per_s, odometer_reading_m`, and `velocity_along_mps` where known).
+    odometer_segment, scale_sigma, odometer_white_m2_per_s, odometer_rows_m`, and `velocity_along_mps` where known).
     `reference`: `t, path_m, cross_track_m, vertical_m, sigma_m` on the same path;
     `balise_reads`: `t, path_m` of physical balises and, where known, `odometer_m` at the read, which inside an outage
     the epochs cannot tell; `passages`: `status, path_m, t_offered` of the

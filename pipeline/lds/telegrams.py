@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import odometer_at
+from pipeline.odometry import Odometry
 from schemas.arrays import Floats, Ints
-from schemas.config import Configuration
 from schemas.enums import BaliseKind
 
 
@@ -15,8 +15,7 @@ def place_reads(
     reads: pl.DataFrame | None,
     aligned: pl.DataFrame,
     balises: pl.DataFrame,
-    odometer: pl.DataFrame | None,
-    config: Configuration,
+    odometry: Odometry | None,
 ) -> pl.DataFrame | None:
     """Reads (`t, balise_id`) with `odometer_m, leg, path_m`; null where the balise is not on the path.
 
@@ -26,8 +25,8 @@ def place_reads(
     if reads is None:
         return None
     known = pl.Series("odometer_m", [None] * reads.height, dtype=pl.Float64)
-    if odometer is not None:
-        known = odometer_at(reads["t"], aligned, odometer, config)
+    if odometry is not None:
+        known = odometer_at(reads["t"], aligned, odometry)
     physical = balises.filter(pl.col("kind") == BaliseKind.PHYSICAL.value)
     places = physical.select("balise_id", "leg", "path_m").partition_by("balise_id", as_dict=True)
     near = places_near(reads["t"], aligned)

@@ -11,7 +11,7 @@ from pipeline.epochs.timeline import moved
 from pipeline.motion.contradicted import Contradiction, contradictions
 from pipeline.motion.position_rate import PositionRate
 from pipeline.motion.witness import Witness
-from pipeline.odometry.scatter import play_m, way_m, without_scatter
+from pipeline.odometry.driven import evenly_driven, hysteresis_m, way_m
 from schemas.arrays import NS_PER_S, Bools, Floats, floats, times_ns
 from schemas.config import Configuration
 
@@ -41,13 +41,13 @@ class Motion:
 def motion_by_odometer(epochs: pl.DataFrame, deadband_mps: float) -> Motion:
     """What the odometer says, and the GNSS speed where the run has none; nothing is held against it.
 
-    `epochs`: `t, path_m, odometer_m, speed_mps, direction`, and `odometer_reading_m` where rows may scatter.
+    `epochs`: `t, path_m, odometer_m, speed_mps, direction`, and `odometer_rows_m` where rows may scatter.
     """
     t_ns, distance, speed = times_ns(epochs), floats(epochs, "odometer_m"), floats(epochs, "speed_mps")
     counted = np.flatnonzero(np.isfinite(distance))
     width = np.zeros(0)
-    if "odometer_reading_m" in epochs.columns and counted.size:
-        width = play_m(np.nan_to_num(floats(epochs, "odometer_reading_m")))[counted]
+    if "odometer_rows_m" in epochs.columns and counted.size:
+        width = hysteresis_m(np.nan_to_num(floats(epochs, "odometer_rows_m")))[counted]
     if not width.any():
         moving = _held(moved(t_ns, distance, speed, deadband_mps))
         return Motion(moving, np.ones(t_ns.size, dtype=np.bool_), speed, _distance_m(epochs))
@@ -101,7 +101,7 @@ def _held(moving: Bools, *, append: bool = True) -> Bools:
 def _moved_with_play(t_s: Floats, distance_m: Floats, width_m: Floats, speed_mps: Floats, deadband_mps: float) -> Bools:
     """As `timeline.moved`, of a distance that scatters: over a second around each step, or over longer ones."""
     counted = np.flatnonzero(np.isfinite(distance_m))
-    at_s, at_m = without_scatter(t_s[counted], distance_m[counted], width_m, deadband_mps)
+    at_s, at_m = evenly_driven(t_s[counted], distance_m[counted], width_m, deadband_mps)
     begin, end = t_s, np.append(t_s[1:], t_s[-1:])
     half_s, centre = 0.5 * np.maximum(end - begin, _WINDOW_S), 0.5 * (begin + end)
     way = np.interp(centre + half_s, at_s, at_m) - np.interp(centre - half_s, at_s, at_m)

@@ -62,7 +62,7 @@ def _through_holes(epochs: pl.DataFrame, t_s: Floats, path_m: Floats, stood: Boo
     From end to end the positions are right. In between the train went as the odometer counted; what that leaves out,
     beyond the doubt of its scale, it drove while the odometer stood. Straight on where the odometer tells nothing.
     """
-    odometer, stretch = floats(epochs, "odometer_m"), ints(epochs["odometer_stretch"])
+    odometer, stretch = floats(epochs, "odometer_m"), ints(epochs["odometer_segment"])
     scale_sigma = np.nan_to_num(floats(epochs, "scale_sigma"))
     known = np.flatnonzero(np.isfinite(path_m))
     holes = np.flatnonzero((np.diff(known) > 1) & (np.diff(t_s[known]) > hole_s))

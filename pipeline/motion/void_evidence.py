@@ -16,7 +16,7 @@ def void_evidence(motion: Motion, epochs: pl.DataFrame, truth: pl.DataFrame, pas
     From where positions contradict it until the next accepted VB or balise, from which it counts anew, or until its
     distance begins anew. `epochs`: aligned; `truth`: row by row; `passages`: of the LDS.
     """
-    t_ns, stretch = times_ns(epochs), ints(epochs["odometer_stretch"])
+    t_ns, stretch = times_ns(epochs), ints(epochs["odometer_segment"])
     accepted = passages.filter(passages["status"] == PassageStatus.ACCEPTED.value).drop_nulls("t_offered")
     offered_ns = np.sort(times_ns(accepted, "t_offered"))
     void = np.zeros(t_ns.size, dtype=np.bool_)

@@ -44,7 +44,7 @@ class Witness:
             path_m=np.where(known, floats(epochs, "path_m"), np.nan),
             sigma_m=floats(epochs, "sigma_along_m"),
             odometer_m=odometer,
-            stretch=ints(epochs["odometer_stretch"]),
+            stretch=ints(epochs["odometer_segment"]),
             stood=counted & ~moving,
             reference_m=np.where(truths(evidence == Evidence.REFERENCE.value), place, np.nan),
             reads_m=np.where(truths(evidence == Evidence.BALISE.value), place, np.nan),

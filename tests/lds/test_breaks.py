@@ -111,7 +111,7 @@ def test_a_lost_odometer_distance_is_never_compared_through() -> None:
     at_m = [20.0 * k for k in range(60)]
     odometer_m = [x + (500.0 if k >= BEFORE else 0.0) for k, x in enumerate(at_m)]
     stretch = [int(k >= BEFORE) for k in range(60)]
-    result = run(epochs_of(at_m, odometer_m, odometer_stretch=stretch), balises_at(V1), ScriptedBank(blind=[BEFORE]))
+    result = run(epochs_of(at_m, odometer_m, odometer_segment=stretch), balises_at(V1), ScriptedBank(blind=[BEFORE]))
     assert not result.epochs["alarm"].any()
     reasons = result.epochs["link_distance_reason"].to_list()
     assert [k for k, reason in enumerate(reasons) if reason == LOST] == list(range(BEFORE, BEFORE + 12))
@@ -146,11 +146,11 @@ def test_a_turn_inside_the_outage_counts_with_the_way_run() -> None:
 def test_a_poor_first_position_is_held_against_once_it_is_good_enough() -> None:
     sigma = [1.0] * BEFORE + [9.0, 9.0, 1.0] + [1.0] * 57
     confidence = [6.18 * s for s in sigma]
-    result = outage(90.0, 30.0, sigma_along_m=sigma, confidence_m=confidence)
+    result = outage(90.0, 30.0, position_sigma_m=sigma, confidence_m=confidence)
     states = result.epochs["link_distance_state"].to_list()
     assert states[BEFORE : BEFORE + 3] == ["not_evaluated", "not_evaluated", "fail"]
     assert not result.epochs["tvb"][BEFORE:].any()
-    healthy = outage(90.0, 0.0, sigma_along_m=sigma, confidence_m=confidence)
+    healthy = outage(90.0, 0.0, position_sigma_m=sigma, confidence_m=confidence)
     assert healthy.epochs["tvb"][BEFORE : BEFORE + 4].to_list() == [False, False, False, True]
 
 
@@ -175,7 +175,7 @@ def test_no_relink_through_a_lost_odometer_distance() -> None:
     path_m = [x - (40.0 if k >= 40 else 0.0) for k, x in enumerate(true_m)]
     odometer_m = [x - (40.0 if k >= 50 else 0.0) for k, x in enumerate(true_m)]
     stretch = [int(k >= 50) for k in range(160)]
-    epochs = epochs_of(path_m, odometer_m, odometer_stretch=stretch)
+    epochs = epochs_of(path_m, odometer_m, odometer_segment=stretch)
     balises = balises_at(V1 | {"V2": 2710.0})
     result = run(epochs, balises, ScriptedBank(fails=[40]))
     assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(40, None)]
@@ -184,7 +184,7 @@ def test_no_relink_through_a_lost_odometer_distance() -> None:
     balises = balises_at(V1 | {"B": 1400.0, "V2": 2710.0}, kind=["virtual", "physical", "virtual"])
     for off_m, end in ((40.0, None), (0.0, 70)):
         path_m = [x - (off_m if k >= 40 else 0.0) for k, x in enumerate(true_m)]
-        epochs = epochs_of(path_m, odometer_m, odometer_stretch=stretch)
+        epochs = epochs_of(path_m, odometer_m, odometer_segment=stretch)
         result = run(epochs, balises, ScriptedBank(fails=[40]), reads_at([(70.0, "B")]))
         assert [(n.first_epoch, n.end_epoch) for n in result.negations] == [(40, end)]
 
@@ -197,7 +197,7 @@ def test_a_read_before_the_distance_was_lost_tells_nothing_after_it(offset_m: fl
     slipped = [t > 105.0 for t in t_s]
     odometer_m = [x + 40.0 * late for x, late in zip(true_m, slipped, strict=True)]
     path_m = [x + offset_m * late for x, late in zip(true_m, slipped, strict=True)]
-    epochs = epochs_of(path_m, odometer_m, t_s, odometer_stretch=[int(late) for late in slipped])
+    epochs = epochs_of(path_m, odometer_m, t_s, odometer_segment=[int(late) for late in slipped])
     balises = balises_at({"V1": 110.0, "P1": 2000.0}, kind=["virtual", "physical"])
     reads = reads_at([(100.0, "P1")]).with_columns(odometer_m=pl.lit(2000.0))
     result = run(epochs, balises, ScriptedBank(blind=[BEFORE]), reads)
@@ -213,7 +213,7 @@ def test_a_read_between_two_epochs_counts_where_the_odometer_held(stretch: int, 
     path_m = [None if t == 50.0 else 20.0 * t for t in t_s]
     odometer_m = [20.0 * t for t in t_s]
     stretches = [stretch * (t >= 51.0) for t in t_s]
-    epochs = epochs_of(path_m, odometer_m, t_s, odometer_stretch=stretches)
+    epochs = epochs_of(path_m, odometer_m, t_s, odometer_segment=stretches)
     balises = balises_at({"V1": 110.0, "P1": 1010.0}, kind=["virtual", "physical"])
     result = run(epochs, balises, ScriptedBank(blind=[BEFORE, BEFORE + 1]), reads_at([(50.5, "P1")]))
     assert result.epochs["link_distance_state"][BEFORE + 1] == state

@@ -356,7 +356,7 @@ def test_link_distance_bounds() -> None:
         ({"on_track": [True] * 9 + [False]}, "match ambiguous or off track", "match ambiguous or off track"),
         ({"fix_valid": [True] * 9 + [False]}, "no position", "no position"),
         (
-            {"sigma_along_m": [None] * 10},
+            {"position_sigma_m": [None] * 10},
             "no standard deviation of the position",
             "no standard deviation of the position",
         ),

@@ -60,7 +60,7 @@ def test_rows_that_do_not_scatter_add_nothing():
         VEHICLE,
         CONFIG,
     )
-    assert set(aligned["odometer_reading_m"]) == {0.0}
+    assert set(aligned["odometer_rows_m"]) == {0.0}
 
 
 @pytest.mark.parametrize(("reading_m", "slipped"), [(0.0, True), (0.5, False)])
