@@ -16,6 +16,10 @@ from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 NO_ODOMETER = "no odometer"
 BEYOND_SPAN = "outside the odometer's time span"
 INTERRUPTED = "odometer interrupted or slipping"
+_OF_ODOMETER = (
+    *("along_m", "odometer_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m", "odometer_period_s"),
+    *("odometer_scale", "scale_sigma"),
+)
 
 
 def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
@@ -138,10 +142,8 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     by_doppler = floats(positions, "velocity_along_mps")
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
-    absent = ("along_m", "odometer_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m")
-    absent = (*absent, "odometer_period_s", "odometer_scale", "scale_sigma")
     return positions.with_columns(
-        **dict.fromkeys(absent, nothing),
+        **dict.fromkeys(_OF_ODOMETER, nothing),
         odometer_reason=pl.lit(NO_ODOMETER),
         odometer_segment=pl.lit(0, pl.Int64),
         speed_mps=pl.Series(speed, nan_to_null=True),

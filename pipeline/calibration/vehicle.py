@@ -86,7 +86,12 @@ def estimate_run(
 def _blocks(seen: Observations, odometry: Odometry) -> list[Observations]:
     """Thinned observations in pieces of unbroken odometry, each with an offset of its own."""
     begin_s, end_s = _span(seen.t_s, odometry)
-    known = odometry.known_at_s(seen.t_s) & odometry.known_at_s(seen.t_s - 1.0) & odometry.known_at_s(begin_s) & odometry.known_at_s(end_s)
+    known = (
+        odometry.known_at_s(seen.t_s)
+        & odometry.known_at_s(seen.t_s - 1.0)
+        & odometry.known_at_s(begin_s)
+        & odometry.known_at_s(end_s)
+    )
     rows = np.flatnonzero(known & np.isfinite(seen.path_m) & np.isfinite(seen.sigma_m) & (seen.sigma_m > 0))
     rows = rows[_thinned(seen.t_s[rows])]
     pieces: list[Observations] = []

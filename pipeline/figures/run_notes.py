@@ -100,8 +100,8 @@ def _odometer(odometry: Odometry | None, straight_s: float) -> Iterator[str]:
         )
     if odometry.period_s > straight_s:
         yield (
-            f"the odometer has a row every {odometry.period_s:.3g} s only: where the speed changes in between, alarms along the "
-            "track may be its own"
+            f"the odometer has a row every {odometry.period_s:.3g} s only: where the speed changes in between, alarms "
+            "along the track may be its own"
         )
 
 

@@ -220,7 +220,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         return None
     align = config.align
     t_ns, speed = times_ns(stream), floats(stream, "speed_mps")
-    t_s = (t_ns - int(t_ns[0])) * 1e-9
+    t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
     dt_s = np.diff(t_s)
     period_s = float(np.median(dt_s))
     limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)

@@ -12,6 +12,7 @@ from pipeline.hazards.anchors import Anchors, carry
 from pipeline.hazards.travel import Travel
 from pipeline.lds.telegrams import place_reads
 from pipeline.matching import match
+from pipeline.odometry import odometry_of
 from schemas.config import Configuration
 from tests.replay.journeys import VEHICLE, journey
 
@@ -23,9 +24,11 @@ MOTION = {
 
 
 def truth_by_reads(run, site, odometer):
-    found = match(run.gnss, odometer, site, VEHICLE, CONFIG.matching, CONFIG.fix_sigma, run.balise_reads)
-    aligned = align(found.epochs, odometer, VEHICLE, CONFIG)
-    reads = place_reads(run.balise_reads, aligned, found.path.balises(site.balises), odometer, CONFIG)
+    odometry = odometry_of(odometer, VEHICLE, CONFIG)
+    found = match(run.gnss, odometry, site, VEHICLE, CONFIG.matching, CONFIG.fix_sigma, run.balise_reads)
+    odometry = odometry.oriented(found.odometer_sign)
+    aligned = align(found.epochs, odometry, VEHICLE, CONFIG)
+    reads = place_reads(run.balise_reads, aligned, found.path.balises(site.balises), odometry)
     epochs = aligned.with_columns(alarm=False, negated=False)
     return establish_truth(epochs, None, reads.drop_nulls("path_m"), None, CONFIG)
 
@@ -54,12 +57,9 @@ def test_sigma_and_slip_allow_for_rows_that_scatter(kind, size_m):
 
 def test_rows_that_do_not_scatter_add_nothing():
     run, site = journey(motion=MOTION)
-    aligned = align(
-        match(run.gnss, run.odometer, site, VEHICLE, CONFIG.matching, CONFIG.fix_sigma, None).epochs,
-        run.odometer,
-        VEHICLE,
-        CONFIG,
-    )
+    odometry = odometry_of(run.odometer, VEHICLE, CONFIG)
+    found = match(run.gnss, odometry, site, VEHICLE, CONFIG.matching, CONFIG.fix_sigma, None)
+    aligned = align(found.epochs, odometry, VEHICLE, CONFIG)
     assert set(aligned["odometer_rows_m"]) == {0.0}
 
 
