@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.odometry.curves import filled_in
-from pipeline.odometry.driven import evenly_driven, hysteresis_m
+from pipeline.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
 from pipeline.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
 from pipeline.odometry.rows import leaps, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
@@ -106,15 +106,13 @@ class Odometry:
     def travelled_at(self, t_ns: Ints) -> Floats:
         """Way driven since the first row [m], turns included, as recorded; a best guess where it is not known.
 
-        Quantisation noise is neither way nor turn, and noise at standstill adds up to no more than it moves the place.
+        Quantisation noise is neither way nor turn, and noise at standstill adds up to no more than it leaves the place.
         """
-        at_s, way_m, _ = self._driven
-        return np.interp(self.seconds(t_ns), at_s, way_m)
+        return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
         """Time since the first row in which the train moved [s]."""
-        at_s, _, moving_s = self._driven
-        return np.interp(self.seconds(t_ns), at_s, moving_s)
+        return np.interp(self.seconds(t_ns), *self._moving_s)
 
     def moved(self, t_ns: Ints) -> Bools:
         """Per step from an instant to the next: whether the train moved for more than half of it; shape (n - 1,).
@@ -188,22 +186,26 @@ class Odometry:
         return before, after
 
     @cached_property
-    def _driven(self) -> tuple[Floats, Floats, Floats]:
-        """Times [s], and way driven [m] and time moving [s] up to each."""
+    def _width_m(self) -> Floats:
+        """Hysteresis of each sample."""
+        return hysteresis_m(self.row_sigma_m(self.t_s))
+
+    @cached_property
+    def _moving_s(self) -> tuple[Floats, Floats]:
+        """Times [s], and the time moving up to each [s]."""
         at_s, at_m = self.t_s, self.distance_m
         if self.noise.quantisation:
-            width_m = hysteresis_m(self.row_sigma_m(at_s))
-            at_s, at_m = evenly_driven(at_s, at_m, width_m, self.deadband_mps)
-        step_s = np.diff(at_s)
-        half_s, centre_s = 0.5 * np.maximum(step_s, SPEED_WINDOW_S), 0.5 * (at_s[1:] + at_s[:-1])
-        begin_m, end_m = np.interp(centre_s - half_s, at_s, at_m), np.interp(centre_s + half_s, at_s, at_m)
-        moving = np.abs(end_m - begin_m) > self.deadband_mps * 2.0 * half_s
-        # Of a stand only its net way counts, for the noise of its steps would add up.
-        first = np.flatnonzero(np.diff(moving, prepend=~moving[:1]))
-        steps = np.diff(first, append=moving.size)
-        net_m = np.abs(at_m[first + steps] - at_m[first])
-        way_m = np.where(moving, np.abs(np.diff(at_m)), np.repeat(net_m / steps, steps))
-        return at_s, _sums(way_m), _sums(np.where(moving, step_s, 0.0))
+            at_s, at_m = evenly_driven(at_s, at_m, self._width_m, self.deadband_mps)
+        moving = moving_steps(at_s, at_m, self.deadband_mps, SPEED_WINDOW_S)
+        return at_s, _sums(np.where(moving, np.diff(at_s), 0.0))
+
+    @cached_property
+    def _travelled_m(self) -> Floats:
+        """Way driven up to each sample."""
+        if self.noise.quantisation:
+            return driven_m(self.distance_m, self._width_m)
+        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, SPEED_WINDOW_S)
+        return driven_or_left_m(self.distance_m, moving)
 
 
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
