@@ -19,6 +19,7 @@ from pipeline.alignment.align import align
 from pipeline.lds import LdsLimits, LdsResult, run_lds
 from pipeline.matching import match
 from pipeline.monitors.bank import MonitorBank
+from pipeline.odometry import odometry_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import shaped
@@ -96,9 +97,10 @@ def lds_of(made: Journey, config: Configuration, vehicle: Vehicle | None = None)
     """Aligned epochs and what the LDS makes of them; `vehicle` stands in for that of the journey."""
     vehicle = vehicle or made.vehicle
     run, site = made.run, made.site
-    found = match(run.gnss, run.odometer, site, vehicle, config.matching, config.fix_sigma, None)
-    confidence = (config.lds.ci_factor * pl.col("sigma_along_m")).alias("confidence_m")
-    aligned = align(found.epochs, run.odometer, vehicle, config).with_columns(confidence)
+    odometry = odometry_of(run.odometer, vehicle, config)
+    found = match(run.gnss, odometry, site, vehicle, config.matching, config.fix_sigma, None)
+    along = None if odometry is None else odometry.oriented(found.odometer_sign)
+    aligned = align(found.epochs, along, vehicle, config)
     limits = LdsLimits.of(config, vehicle)
     bank = MonitorBank(aligned, {}, config, limits.threshold_factor)
     return aligned, run_lds(aligned, bank, found.path.balises(site.balises), None, config.lds, limits)

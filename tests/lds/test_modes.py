@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.lds import LdsResult
 from schemas.tables import Epochs, Passages
-from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, reads_at, run, steps, told
+from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, run, steps, told
 
 FAR = {"V9": 1e6}
 V1 = {"V1": 110.0}
@@ -205,7 +205,7 @@ def test_link_distance_bounds() -> None:
         ({"on_track": [True] * 9 + [False]}, "match ambiguous or off track", "match ambiguous or off track"),
         ({"fix_valid": [True] * 9 + [False]}, "no position", "no position"),
         (
-            {"sigma_along_m": [None] * 10},
+            {"position_sigma_m": [None] * 10},
             "no standard deviation of the position",
             "no standard deviation of the position",
         ),
