@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 
 import polars as pl
 
@@ -105,9 +105,10 @@ def _hazard_text(hazard: ExpectedHazard) -> str:
 def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
     names = ("hazard", "failure_mode", "timing", "balise_ids", "accepted_ids", "detected")
     text = _words(*(row[name] for name in names))
-    early_s = row["time_since_failure_s"]
-    if expected is not None and expected.before_failure is not None and isinstance(early_s, float):
-        text += ", before the failure" if early_s < 0.0 else ", behind the failure"
+    if expected is not None and expected.before_failure is not None:
+        detected, failure = row["t_detected"], row["t_failure"]
+        known = isinstance(detected, datetime) and isinstance(failure, datetime)
+        text += ", before the failure" if known and detected < failure else ", behind the failure"  # type: ignore[operator]
     return text if row["caused_by"] is None else f"{text}, caused by {row['caused_by']}"
 
 

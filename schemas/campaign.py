@@ -51,8 +51,7 @@ def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns["faults"] = count("faults in the hazard table; the rows that belong to one fault count once")
     columns |= _estimate("hazard_rate", "faults per hour judged by a reference or balise reads", "1/h", "_per_h")
     columns["missed"] = count("faults with a failure that no monitor found by t_failure + budget")
-    columns["missed_unknown"] = count("faults with a failure of which that cannot be said")
-    columns |= _estimate("missed_share", "share of missed ones, of the faults with a failure where that is known")
+    columns |= _estimate("missed_share", "share of missed ones, of the faults with a failure that a truth judged")
     columns |= _estimate("beyond_budget_share", "share of failures beyond the budget, of those where that is known")
     columns |= _estimate("unsafe_share", "share of `accepted_judged` that are `unsafe_accepted`")
     columns |= _estimate("outage_rate", "outages per hour", "1/h", "_per_h")
@@ -140,8 +139,7 @@ def _figures_schema() -> type[dy.Schema]:
         "hazards_judged": count("of these those that a reference or balise reads tell"),
         **_estimate("hazard_rate", "faults per hour, both by a reference or balise reads", "1/h", "_per_h"),
         "missed": count("faults with a failure that no monitor found by t_failure + budget"),
-        "missed_unknown": count("faults with a failure of which that cannot be said"),
-        "missed_known": count("faults with a failure, by a reference or balise reads, of which it can be said"),
+        "missed_known": count("faults with a failure that a reference or balise reads tell"),
         "missed_judged": count("of these missed"),
         **_estimate("missed_share", "share of missed ones of these"),
         "failures": count("stretches judged wrong in use, whether they hit a VB or not"),

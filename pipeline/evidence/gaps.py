@@ -101,15 +101,43 @@ def _distinct(ways: list[Way]) -> list[Way]:
     return list(kept.values())
 
 
-def oriented_alike(gaps: list[Gap]) -> list[Gap]:
-    """Ways that go through each anchor as those of the gap before and after it do: a train keeps its front."""
-    gaps = list(gaps)
+def oriented_alike(gaps: list[Gap], network: Network) -> list[Gap]:
+    """Ways that go through each anchor as those of the gap before and after it do: a train keeps its front.
+
+    Where no loop turns trains round, it keeps it over the whole run.
+    """
+    gaps = _on_one_sheet(gaps, network) if _keeps_its_front(gaps, network) else list(gaps)
     for _ in range(2):
         for order in (range(1, len(gaps)), range(len(gaps) - 2, -1, -1)):
             for here in order:
                 there = here - 1 if order.step > 0 else here + 1
                 gaps[here] = _agreeing(gaps[here], gaps[there])
     return gaps
+
+
+def _keeps_its_front(gaps: list[Gap], network: Network) -> bool:
+    """No loop turns trains round, and all anchors lie on one connected network."""
+    elements = {anchor.place.element for gap in gaps for anchor in gap.anchors}
+    if not network.orientable or not elements:
+        return False
+    seen: set[int] = set()
+    ahead = [2 * next(iter(elements))]
+    while ahead:
+        oriented = ahead.pop()
+        if oriented // 2 not in seen:
+            seen.add(oriented // 2)
+            ahead += [edge.to for side in (oriented, oriented ^ 1) for edge in network.successors[side]]
+    return elements <= seen
+
+
+def _on_one_sheet(gaps: list[Gap], network: Network) -> list[Gap]:
+    """Ways of one orientation, where every gap that tells leaves but one."""
+    told = [{network.usable[way.chain.oriented[0]] for way in gap.ways} for gap in gaps if gap.ways]
+    common = set.intersection(*told) if told else set()
+    if len(common) != 1:
+        return list(gaps)
+    kept = [[way for way in gap.ways or [] if network.usable[way.chain.oriented[0]] in common] for gap in gaps]
+    return [gap if gap.ways is None else replace(gap, ways=ways) for gap, ways in zip(gaps, kept, strict=True)]
 
 
 def _agreeing(gap: Gap, beside: Gap) -> Gap:
@@ -129,13 +157,19 @@ def _oriented_at(way: Way, gap: Gap, anchor: Anchor) -> int | None:
 
 def with_open_ends(gaps: list[Gap], odometry: OdometerReadings | None, network: Network, figures: Figures) -> list[Gap]:
     """Every gap with chains that reach as far as the odometer says that the train went, over every branch."""
-    orientations = _orientations(gaps)
+    orientations = _orientations(gaps, network)
     return [_reaching(gap, orientations, odometry, network, figures) for gap in gaps]
 
 
-def _orientations(gaps: list[Gap]) -> dict[Anchor, set[int]]:
+def _orientations(gaps: list[Gap], network: Network) -> dict[Anchor, set[int]]:
     """How the train ran over the net element of each anchor, where chains between anchors tell."""
     known: dict[Anchor, set[int]] = {}
+    sheets = {network.usable[way.chain.oriented[0]] for gap in gaps for way in gap.ways or []}
+    if len(sheets) == 1 and _keeps_its_front(gaps, network):
+        for anchor in (anchor for gap in gaps for anchor in gap.anchors):
+            both = (2 * anchor.place.element, 2 * anchor.place.element + 1)
+            known[anchor] = {oriented for oriented in both if network.usable[oriented] in sheets}
+        return known
     for gap in gaps:
         for way in gap.ways or []:
             for anchor in gap.anchors:

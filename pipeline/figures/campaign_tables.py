@@ -45,7 +45,7 @@ def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configurati
     table = _with_estimates(
         joined,
         ("hazard_rate", "_per_h", poisson_rate, "faults_judged", "hours_seen"),
-        ("missed_share", "", clopper_pearson, "missed_judged", "missed_known"),
+        ("missed_share", "", clopper_pearson, "missed_judged", "failed_judged"),
         ("beyond_budget_share", "", clopper_pearson, "beyond_budget", "budget_known"),
         ("unsafe_share", "", clopper_pearson, "unsafe_judged", "truth_judged"),
         ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
@@ -90,14 +90,13 @@ def _where(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
 
 
 def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
-    """Faults and missed detections of each run; `missed_known`, `missed_judged`: by a reference or balise reads."""
+    """Faults and missed detections of each run; `failed_judged`, `missed_judged`: by a reference or balise reads."""
     missed, truth = pl.col("missed"), pl.col("with_truth")
     counts = {
         "faults": pl.len(),
         "faults_judged": truth.sum(),
         "missed": missed.sum(),
-        "missed_unknown": missed.null_count(),
-        "missed_known": (pl.col("failed") & truth & missed.is_not_null()).sum(),
+        "failed_judged": (pl.col("failed") & truth).sum(),
         "missed_judged": (truth & missed).sum(),
     }
     return independent_episodes(hazards).group_by(_RUN).agg(**{k: v.cast(pl.Int64) for k, v in counts.items()})

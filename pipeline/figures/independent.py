@@ -8,15 +8,10 @@ from schemas.enums import TRUTH
 
 
 def missed_detection() -> pl.Expr:
-    """No monitor failed by `t_failure` + budget (DIAG's Pmd; DOMAIN section 5.3); null where it cannot be said.
-
-    That is without a failure, and where the failure may have begun earlier than `t_failure` (no T_dsf).
-    """
+    """No monitor failed by `t_failure` + budget (DIAG's Pmd; DOMAIN section 5.3); null without a failure."""
     budget = (pl.col("budget_s") * 1e9).round().cast(pl.Int64).cast(pl.Duration("ns"))
     late = pl.col("t_detected").is_null() | (pl.col("t_detected") > pl.col("t_failure") + budget)
-    in_time = ~late & pl.col("time_since_failure_s").is_not_null()
-    known = pl.when(late).then(statement=True).when(in_time).then(statement=False)
-    return pl.when(pl.col("t_failure").is_not_null()).then(known)
+    return pl.when(pl.col("t_failure").is_not_null()).then(late)
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
@@ -24,8 +19,7 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
 
     A fault may stand in several rows of `hazards` (one per class, and the jump back as a row `caused_by` the first);
     counted one by one they would make the bounds too narrow. Takes the hazards of many runs with their `run_id`.
-    `missed` is null where it cannot be said. Shares are of faults `with_truth` (reference or balise reads): the
-    odometer alone mostly sees what was detected.
+    Shares are of faults `with_truth` (reference or balise reads): the odometer alone mostly sees what was detected.
     """
     failed = pl.col("t_failure").is_not_null()
     return (
@@ -34,7 +28,7 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
         .group_by("run_id", "solution", "begin")
         .agg(
             failed=failed.any(),
-            missed=pl.col("missed").filter(failed).any(ignore_nulls=False),
+            missed=pl.col("missed").any(),
             with_truth=pl.col("evidence").is_in(TRUTH).all(),
             detected=pl.col("detected").any(),
             time_to_detect_s=pl.col("time_to_detect_s").max(),

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
-from pipeline.figures.evidence_notes import evidence_notes, motion_notes
+from pipeline.figures.evidence_notes import evidence_notes, motion_notes, undiagnosed_notes
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
 from pipeline.results.provenance import Provenance
@@ -137,9 +137,14 @@ def _identity(results: SolutionResults) -> Row:
 
 def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config: Configuration) -> str | None:
     """What the reader should know beside the figures."""
-    judged_by = evidence_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config)
-    notes = [*_ingest_remarks(results.ingest), *results.notes, *judged_by, *motion_notes(results.epochs, clock)]
-    return "; ".join(notes) or None
+    found = (
+        *_ingest_remarks(results.ingest),
+        *results.notes,
+        *evidence_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
+        *undiagnosed_notes(results.epochs, results.passages),
+        *motion_notes(results.epochs, clock),
+    )
+    return "; ".join(found) or None
 
 
 def _ingest_remarks(ingest: IngestNotes) -> list[str]:

@@ -140,7 +140,7 @@ class Bench:
             measure_m=floats(offers, "measure_m"),
             leg=ints(offers["leg"]),
             path_m=floats(offers, "path_m"),
-            direction=ints(offers["direction"]),
+            direction=self.positions.direction[ints(offers["before"])],
             unambiguous=sure[ints(offers["before"])] & sure[ints(offers["epoch"])],
         )
         t_ns = times_ns(offers)

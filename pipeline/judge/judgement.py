@@ -103,7 +103,7 @@ def judge_positions(
     """
     size, limit_m = positions.element.size, config.failure_limit_m
     low, high = np.full(size, np.inf), np.full(size, -np.inf)
-    right, wrong, off = (np.ones(size, dtype=np.bool_) for _ in range(3))
+    right, ahead, behind, off = (np.ones(size, dtype=np.bool_) for _ in range(4))
     weighed = np.zeros(size, dtype=np.bool_)
     for alternative in evidence.alternatives:
         kept = positions.known[alternative.rows]
@@ -113,11 +113,13 @@ def judge_positions(
         found = _relative(positions, rows, _only(alternative, kept), legs)
         excluded = found.off_track & positions.unambiguous[rows]
         with np.errstate(invalid="ignore"):
-            wrong[rows] &= excluded | (found.low_m > limit_m) | (found.high_m < -limit_m)
+            ahead[rows] &= excluded | (found.low_m > limit_m)
+            behind[rows] &= excluded | (found.high_m < -limit_m)
             right[rows] &= ~found.off_track & (found.low_m >= -limit_m) & (found.high_m <= limit_m)
         off[rows] &= excluded
         weighed[rows] = True
         low[rows], high[rows] = np.fmin(low[rows], found.low_m), np.fmax(high[rows], found.high_m)
+    wrong = ahead | behind
     _weigh_rivals(positions, evidence, right, wrong, off)
     code = np.where(weighed & wrong, WRONG, np.where(weighed & right, RIGHT, UNKNOWN))
     told = weighed & np.isfinite(low)

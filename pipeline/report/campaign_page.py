@@ -104,12 +104,13 @@ def _run_counts(runs: pl.DataFrame) -> str:
 
 
 def _runs_table(campaign: Campaign) -> str:
-    order = {verdict.value: place for place, verdict in enumerate(RunVerdict)}
+    order = {RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
+    failed = 1
     runs = (
         known_counts(campaign.runs)
         .with_columns(
             hazards=pl.sum_horizontal(HAZARD_COUNTS, ignore_nulls=False),
-            order=pl.col("verdict").cast(pl.String).replace_strict(order, default=len(order), return_dtype=pl.Int64),
+            order=pl.col("verdict").cast(pl.String).replace_strict(order, default=failed, return_dtype=pl.Int64),
         )
         .sort("order", "run_id", "solution")
     )
@@ -123,7 +124,7 @@ def _runs_table(campaign: Campaign) -> str:
         figures = [cell(row[key]) for key, _ in _RUN_COLUMNS]
         rows.append([verdict, name, status, reason, cell(row["solution"] or None), *figures])
     titles = ["verdict", "run", "status", "reason or notes", "solution", *(title for _, title in _RUN_COLUMNS)]
-    return table("table-runs", "Runs, unsafe ones first", titles, rows)
+    return table("table-runs", "Runs, unsafe and failed ones first", titles, rows)
 
 
 def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool) -> str:

@@ -51,7 +51,8 @@ HAZARD_COLUMNS = (
     ("t_onset", "onset"), ("t_failure", "failure"), ("t_detected", "detected"), ("monitor", "by"),
     ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
     ("hazardous_may_s", "with what is unknown [s]"), ("budget_s", "budget [s]"), ("within_budget", "within budget"),
-    ("balise_ids", "VBs hit"), ("accepted_ids", "accepted despite the fault"), ("suspect", "suspect"), ("evidence", "evidence"),
+    ("balise_ids", "VBs hit"), ("accepted_ids", "accepted despite the fault"), ("suspect", "suspect"),
+    ("evidence", "evidence"),
     ("speed_mps", "speed [m/s]"), ("caused_by", "follows from"),
 )  # fmt: skip
 PASSAGE_COLUMNS = (

@@ -133,14 +133,13 @@ def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) ->
 def _detections(episodes: pl.DataFrame, truth_h: float) -> Row:
     """Faults and missed detections; rate and share by a reference or balise reads."""
     judged = episodes.filter(pl.col("with_truth"))
-    known = judged.filter(pl.col("failed") & pl.col("missed").is_not_null())
+    known = judged.filter("failed")
     missed = int(known["missed"].sum())
     return {
         "hazards": episodes.height,
         "hazards_judged": judged.height,
         **columns_of("hazard_rate", poisson_rate(judged.height, truth_h), "_per_h"),
         "missed": int(episodes["missed"].sum()),
-        "missed_unknown": episodes["missed"].null_count(),
         "missed_known": known.height,
         "missed_judged": missed,
         **columns_of("missed_share", clopper_pearson(missed, known.height)),

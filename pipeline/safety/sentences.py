@@ -139,12 +139,10 @@ def _failures(row: dict[str, Any]) -> str:
 
 
 def _missed(row: dict[str, Any]) -> str:
-    known, missed, unknown = row["missed_known"], row["missed_judged"], row["missed_unknown"]
+    known, missed = row["missed_known"], row["missed_judged"]
     said = f"Of {known} faults with a failure that a truth judged {missed} were missed detections"
     if row["missed"] > missed:
         said += f"; {row['missed'] - missed} more were seen by the odometer alone, and shares leave them out"
-    if unknown:
-        said += f"; of {unknown} it cannot be said"
     return f"{said}."
 
 

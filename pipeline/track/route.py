@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.track.geodesy import points_of
 from pipeline.track.leg import Visit
-from pipeline.track.network import Edge, Network, network_of
+from pipeline.track.network import Edge, Network, network_of, oriented_sheet
 from pipeline.track.survey import Track, end_places, gaps_m, track_of
 from schemas.run import Site
 
@@ -103,7 +103,7 @@ def network_on(track: Track, visits: list[Visit]) -> Network:
         for one, other in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
             if all(edge.to != other for edge in successors[one]):
                 successors[one].append(Edge(other, gap, True, True))
-    return Network(track, successors, [True] * len(successors), orientable=True)
+    return Network(track, successors, *oriented_sheet(successors))
 
 
 def site_network(site: Site) -> Network:

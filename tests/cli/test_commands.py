@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -84,7 +84,7 @@ def test_replay_as_json(balise: Balise, small_trial: SmallTrial, tmp_path: Path)
     assert said.status == 1
     assert {json.loads(line)["event"] for line in said.err.splitlines()} == {"progress", "run"}
     found = json.loads(said.out)
-    assert list(found)[0] == "verdict"
+    assert next(iter(found)) == "verdict"
     assert found["verdicts"] == {"unsafe": 0, "unproven": 0, "safe": 0, "failed": 1}
     assert (found["verdict"], found["planned"]) == ("failed", 1)
     assert [(run["run_id"], run["status"]) for run in found["runs"]] == [("bad", "failed")]

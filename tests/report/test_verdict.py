@@ -33,13 +33,13 @@ def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTab
     spent = {"failure_hazardous_s": [failed_s], "failure_hazardous_may_s": [failed_s]}
     plain = {"solution": "primary", "evidence": "balise", "vehicle": "file", "duration_s": 60.0, "evidence_s": 60.0}
     judgement = ["right", "unknown", "wrong"]
-    hit = hazards(1, solution="primary", accepted_ids=[["VB2"]], t_failure=NS, budget_s=0.5025) if failed_s else hazards()
+    hit = (
+        hazards(1, solution="primary", accepted_ids=[["VB2"]], t_failure=NS, budget_s=0.5025) if failed_s else hazards()
+    )
     return RunTables(
         run_id,
         epochs=epochs([0.0, 1.0, 2.0], solution="primary", judgement=judgement, netelement_id="A", measure_m=1.0),
-        passages=passages(
-            3, solution="primary", status="accepted", judgement=judgement, measure_m=1.0, path_m=1.0
-        ),
+        passages=passages(3, solution="primary", status="accepted", judgement=judgement, measure_m=1.0, path_m=1.0),
         hazards=hit,
         alarms=alarms(),
         runs=table(Runs, 1, **(plain | levels | spent | counts)),
@@ -81,7 +81,7 @@ def test_all_reasons_stand_behind_it(report: Path) -> None:
 
 def test_runs_stand_worst_first(report: Path) -> None:
     table_of_runs = (report / "index.html").read_text().partition('id="table-runs"')[2]
-    assert table_of_runs.index(">bad<") < table_of_runs.index(">good<") < table_of_runs.index(">lost<")
+    assert table_of_runs.index(">bad<") < table_of_runs.index(">lost<") < table_of_runs.index(">good<")
 
 
 def test_failures_against_the_levels(report: Path) -> None:

@@ -107,7 +107,9 @@ def test_rates_over_the_campaign() -> None:
     assert (found["accepted_judged"], found["unsafe_judged"], found["unsafe_share"]) == (18, 1, unsafe.value)
     assert (found["unsafe_share_low"], found["unsafe_share_high"]) == (unsafe.low, unsafe.high)
     (sentence,) = plain_statements(figures)
-    assert "of 4 position failures in use, at a virtual balise or not, 1 were within the budget and 2 beyond" in sentence
+    assert (
+        "of 4 position failures in use, at a virtual balise or not, 1 were within the budget and 2 beyond" in sentence
+    )
     assert "of 1 it cannot be said, in 3.75 h judged, 1.75 h of these by a truth" in sentence
     assert "Of 18 accepted virtual balises judged by a truth 1 were accepted despite a wrong position" in sentence
     assert "and 2 more by the odometer alone; of 14 accepted ones nothing says" in sentence
@@ -135,10 +137,7 @@ def test_a_trial_that_is_long_enough_says_so() -> None:
 def test_a_position_wrong_between_balises_is_not_kept_quiet() -> None:
     """No virtual balise was hit, yet for 0.4 % of the time the position was wrong and in use."""
     figures = measured_figures(runs(2, held_s=3600.0, share_p1=[0.008, 0.0]), NO_HAZARDS, CONFIG)
-    assert (
-        "Judged wrong and not negated: 0.400% of the time in runs with a truth."
-        in plain_statements(figures)[0]
-    )
+    assert "Judged wrong and not negated: 0.400% of the time in runs with a truth." in plain_statements(figures)[0]
 
 
 def test_no_runs_no_rows() -> None:
@@ -172,7 +171,9 @@ def test_shares_are_of_failures_that_a_truth_judged() -> None:
     assert (found["missed_share"], found["missed_share_low"]) == (0.5, share.low)
     assert (found["stanford_nominal"], found["stanford_hpl_nominal"]) == (5, None)
     (sentence,) = plain_statements(figures)
-    assert "Of 2 faults with a failure that a truth judged 1 were missed detections; 1 more were seen by the" in sentence
+    assert (
+        "Of 2 faults with a failure that a truth judged 1 were missed detections; 1 more were seen by the" in sentence
+    )
     row = detection_by_level(catalogue, faults, CONFIG).row(1, named=True)  # LPV-200, 0.5025 s
     assert (row["failures"], row["within"], row["exceeded"]) == (4, 1, 2)
     assert (row["failures_judged"], row["within_judged"]) == (2, 1)

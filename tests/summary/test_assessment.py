@@ -18,7 +18,9 @@ from tests.summary.tables import NS, alarms, epochs, hazards, passages, table
 ACROSS = {"monitors": [["cross_raw"]], "verdict": "false", "suspect": "unknown", "netelement_id": "A"}
 
 
-def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = {}, **found: Any) -> RunTables:  # noqa: B006
+def run_of(
+    run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = None, **found: Any
+) -> RunTables:
     rows: dict[str, Any] = {
         "solution": list(solutions),
         "status": "ok",
@@ -35,7 +37,7 @@ def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | 
         "verdict": "safe",
         "failure_hazardous_s": [[]] * len(solutions),
         "failure_hazardous_may_s": [[]] * len(solutions),
-    } | counted
+    } | (counted or {})
     points = [20.0 * k for k in range(3)]
     stand = {"netelement_id": "A", "measure_m": points, "path_m": points, "sigma_along_m": 1.0}
     tables = {"hazards": hazards(), "alarms": alarms(), "passages": passages()} | found
@@ -107,7 +109,9 @@ def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     said = found.statements
     assert said[0] == "unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed."
     assert said[1].startswith("Faults were injected into 1 of 3 runs")
-    assert any(text.startswith("primary: of 1 position failures in use, at a virtual balise or not, 0") for text in said)
+    assert any(
+        text.startswith("primary: of 1 position failures in use, at a virtual balise or not, 0") for text in said
+    )
     assert "0 within against 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
 
 
@@ -127,7 +131,9 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     said = found.statements
     assert set(found.tables["levels"].select("no_failure", "unknown", "no_truth").rows()) == {(2, 1, 1)}
     assert said[1] == "1 of 3 runs are partial: what was read of them counts."
-    assert said[2].startswith("primary: for 1 of 3 h nothing says whether the position was right (1 of 3 runs have no evidence at all)")
+    assert said[2].startswith(
+        "primary: for 1 of 3 h nothing says whether the position was right (1 of 3 runs have no evidence at all)"
+    )
     assert said[3].startswith("primary: 1 alarms in 1 runs are neither true nor false for want of evidence")
 
 

@@ -83,7 +83,7 @@ class TestRuns:
         rate, share = poisson_rate(2, 0.5), clopper_pearson(1, 2)
         assert (row["faults"], row["hazard_rate_per_h"]) == (2, 4.0)
         assert (row["hazard_rate_low_per_h"], row["hazard_rate_high_per_h"]) == (rate.low, rate.high)
-        assert (row["failures"], row["missed"], row["missed_unknown"], row["missed_share"]) == (3, 1, 0, 0.5)
+        assert (row["failures"], row["missed"], row["missed_share"]) == (3, 1, 0.5)
         assert (row["missed_share_low"], row["missed_share_high"]) == (share.low, share.high)
         # One within the budget, one beyond it; of the third nobody can say, and no share counts it.
         assert (row["beyond_budget_share"], row["beyond_budget_share_high"]) == (0.5, share.high)
@@ -152,7 +152,9 @@ class TestBalises:
         assert (row["location_error_p95_m"], row["location_error_max_m"]) == (pytest.approx(27.3), 30.0)
 
     def test_without_evidence_nothing_is_known_of_unsafe_acceptances(self) -> None:
-        row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None, judgement="unknown")).row(0, named=True)
+        row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None, judgement="unknown")).row(
+            0, named=True
+        )
         assert (row["passages"], row["accepted"], row["accepted_judged"], row["unproven_accepted"]) == (2, 2, 0, 2)
         assert (row["unsafe_rate"], row["unsafe_rate_high"], row["location_error_mean_m"]) == (None, None, None)
 

@@ -327,15 +327,16 @@ class TestFailures:
         assert (found["share_unknown"], found["level_verdict"]) == (0.03, ["unknown"] * 4)
 
 
-class TestVerdict:
-    ACCEPTED = {"status": "accepted", "judgement": "right"}
+ACCEPTED = {"status": "accepted", "judgement": "right"}
 
+
+class TestVerdict:
     def test_safe(self) -> None:
-        assert row(epochs(seconds(3)), passages=passages(1, **self.ACCEPTED))["verdict"] == "safe"
+        assert row(epochs(seconds(3)), passages=passages(1, **ACCEPTED))["verdict"] == "safe"
 
     def test_a_failure_that_hit_no_balise_is_unsafe(self) -> None:
         frame = failures(1, hazardous_s=[9.0], within_budget=False)
-        assert row(epochs(seconds(3)), passages=passages(1, **self.ACCEPTED), failures=frame)["verdict"] == "unsafe"
+        assert row(epochs(seconds(3)), passages=passages(1, **ACCEPTED), failures=frame)["verdict"] == "unsafe"
 
     def test_share_unknown_is_of_moving_time_in_use(self) -> None:
         """100 s: unknown while standing for 30 s, while negated for 20 s, and 2 s of the 50 s that are left."""
@@ -346,11 +347,11 @@ class TestVerdict:
             moving=[k >= 30 for k in range(101)],
             in_use=[not 30 <= k < 50 for k in range(101)],
         )
-        found = row(frame, passages=passages(1, **self.ACCEPTED))
+        found = row(frame, passages=passages(1, **ACCEPTED))
         assert (found["share_unknown"], found["verdict"]) == (0.04, "unproven")
         assert "4.0% of the moving time in use cannot be judged" in found["notes"]
         lenient = Configuration.model_validate({"hazards": {"unknown_share_limit": 0.04}})
-        assert row(frame, lenient, passages=passages(1, **self.ACCEPTED))["verdict"] == "safe"
+        assert row(frame, lenient, passages=passages(1, **ACCEPTED))["verdict"] == "safe"
 
     def test_unknown_movement_counts_as_moving(self) -> None:
         frame = epochs(seconds(5), judgement=["unknown", *["right"] * 4], moving=[None, *[True] * 4])

@@ -73,7 +73,7 @@ def test_a_campaign_is_headed_by_its_worst_run_with_counts() -> None:
 
 
 def test_rows_of_one_fault_are_one_event() -> None:
-    """Begin at 100 s in two rows and a third that follows; T_dsf of the last fault is not known: nor is its detection."""
+    """Begin at 100 s in two rows and a third that follows; the last is seen 2 s after the failure, too late."""
     frame = hazards(
         5,
         solution="primary",
@@ -82,13 +82,12 @@ def test_rows_of_one_fault_are_one_event() -> None:
         t_hazard=[110 * NS, 120 * NS, 150 * NS, 905 * NS, 990 * NS],
         caused_by=[None, None, 0, None, None],
         t_failure=[112 * NS, None, 150 * NS, None, 990 * NS],
-        t_detected=[113 * NS, None, None, None, 991 * NS],
-        time_since_failure_s=[1.0, None, None, None, None],
+        t_detected=[113 * NS, None, None, None, 992 * NS],
         time_to_detect_s=[12.0, 13.0, None, None, None],
         evidence=["reference", "odometer", "reference", "reference", "reference"],
     ).with_columns(run_id=pl.lit("r0"))
     events = independent_episodes(frame)
     assert events["failed"].to_list() == [True, False, True]
-    assert events["missed"].to_list() == [False, False, None]
+    assert events["missed"].to_list() == [False, False, True]
     assert events["with_truth"].to_list() == [False, True, True]
     assert events["time_to_detect_s"].to_list() == [13.0, None, None]
