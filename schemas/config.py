@@ -121,10 +121,39 @@ class AlignConfig(Settings):
     """Odometer against GNSS (DOMAIN section 3), and the causal filter of scale and latency."""
 
     gap_reset_s: Positive = 60.0
+    # A pause of the recording inside which the way is not known: longer than this, and than so many periods. Loggers
+    # drop single rows at any rate.
     odometer_gap_s: Positive = 1.0
+    odometer_gap_periods: Positive = 2.5
+    # A counter that gains more was reset, ran over or lied: the speed record on rails is 160 m/s. Rows that are stamped
+    # in bunches seem to gain some metres in no time.
+    fastest_mps: Positive = 200.0
+    bunched_stamps_m: NonNegative = 20.0
+    # Speeds tell the way over such a leap if, over the whole run, they differ from the distance by a smaller share:
+    # another unit or sign differs by more than a half, slip and scale by some percent.
+    speed_agreement: Probability = 0.2
+    # Between rows no farther apart a straight line is within 0.5 m of a train that brakes as hard as this, which
+    # is an emergency brake.
+    straight_s: Positive = 1.5
+    braking_mps2: Positive = 1.8
+    # A counter's step that is worth a word: a finer one scatters less than the white noise of one second.
+    counter_step_m: Positive = 0.05
+    # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
+    # 400 pieces is within 10 % of its mean.
+    quantisation_factor: Positive = 2.0
     scale_prior_sigma: Positive = 0.01
     latency_prior_sigma_s: Positive = 0.2
     filter_period_s: Positive = 1.0
+    # Stamps that scatter make no gap by themselves: the first position after one that they made is always late.
+    scattered_gap_sigmas: NonNegative = 3.0
+    # Before it is seen, a position is rather thought to come back from a long break beside its place: to be sure of a
+    # wrong scale is worse than to learn it more slowly. A receiver coasts over seconds and starts anew after half a
+    # minute or so: were single missing epochs thought the same of, noisy positions would teach next to nothing.
+    break_moved_probability: Probability = 0.8
+    break_moving_s: Positive = 30.0
+    # Variance that has still to settle fades with this time constant: positions that settle over 10 to 60 s are
+    # followed; longer, and a drift that begins meanwhile would be learned as scale the sooner.
+    settling_tau_s: Positive = 25.0
 
 
 class MonitorConfig(Settings):
@@ -197,6 +226,7 @@ class HazardConfig(Settings):
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
     reference_gap_s: Positive = 2.0
+    rival_probability: Probability = 0.001
     balise_read_sigma_m: Positive = 1.0
     known_error_m: Positive = 5.0
     unknown_share_limit: Probability = 0.01

@@ -5,7 +5,68 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus
+from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus, SigmaSource
+
+
+class Positions(dy.Schema):
+    """One row per GNSS epoch of a solution, in order of time: the position on the track network, by matching.
+
+    Positions are those of the balise antenna. Null where the epoch has no position.
+    """
+
+    t = instant("stamp of the epoch")
+    solution = text("solution of the run")
+    leg = dy.Int32(nullable=True, min=0, description="leg of the path, on which path positions are one to one")
+    netelement_id = text("matched net element", nullable=True)
+    measure_m = real("m", "measure on it")
+    path_m = real("m", "path position, raw: never smoothed")
+    cross_track_m = real("m", "position left of growing path")
+    vertical_m = real("m", "position above the track; null without a height in position or survey")
+    on_track = flag("a net element of the path is within reach")
+    path_probability = real("1", "posterior of the path by the whole run (forward-backward)", min=0, max=1)
+    gate_probability = real("1", "posterior of the path by what came before (forward): for detection", min=0, max=1)
+    heading_deg = real("deg", "azimuth of growing path at the GNSS antenna, clockwise from north")
+    slope = real("1", "rise over run of growing path")
+    curvature_per_m = real("1/m", "curvature of the track, positive to the left")
+    interpolation_error_m = real("m", "chord error of the survey's polyline at that place", min=0)
+    survey_sigma_m = real("m", "standard deviation of the survey; null where not stated", min=0)
+    sigma_along_m = real("m", "standard deviation of the position along the track, as stated", min=0)
+    sigma_cross_m = real("m", "standard deviation of the position across the track, as stated", min=0)
+    sigma_up_m = real("m", "standard deviation of the height, as stated", min=0)
+    sigma_source = one_of(SigmaSource, "receiver, or a table by kind of fix", nullable=True)
+    fix_valid = flag("the receiver has a fix and a position")
+    velocity_along_mps = real("m/s", "GNSS velocity along growing path")
+    hpl_m = real("m", "horizontal protection level of the receiver", min=0)
+    digits_along_m = real("m", "deviation by the step in which positions are written down, along", min=0)
+    digits_cross_m = real("m", "the same across the track", min=0)
+    digits_up_m = real("m", "the same of the height", min=0)
+
+
+class Aligned(Positions):
+    """`Positions` with the odometer at each epoch's time of validity, and what tests along the track allow for.
+
+    Scale and latency are those in use at the epoch: of the vehicle file, or learned from earlier epochs only.
+    """
+
+    position_sigma_m = real("m", "deviation that every test along the track counts with: calibrated, digits", min=0)
+    calibrated_along_m = real("m", "a + b sigma_along_m, as `calibrate` found: of errors with memory", min=0)
+    calibrated_cross_m = real("m", "the same across the track", min=0)
+    calibrated_up_m = real("m", "the same of the height", min=0)
+    confidence_m = real("m", "half-width of the confidence interval along the track", min=0)
+    along_m = real("m", "path position without the way that a curve adds beside the track: for increments")
+    odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
+    odometer_reason = text("why there is no odometer", nullable=True)
+    odometer_segment = dy.Int64(min=0, description="continuity segment: distances compare where it is the same")
+    odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)
+    odometer_rows_m = real("m", "quantisation noise of the odometer's rows, as far as thresholds allow for it", min=0)
+    odometer_period_s = real("s", "time between rows of the odometer", min=0)
+    stamp_jitter_s = real("s", "deviation of the stamps about the receiver's clock", min=0)
+    speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none")
+    direction = dy.Int8(description="direction of travel along growing path, 1 or -1, held in the dead band")
+    odometer_scale = real("1", "true over odometer distance", min=0)
+    scale_sigma = real("1", "its standard deviation", min=0)
+    latency_s = real("s", "by how much the position is older than its stamp")
+    latency_sigma_s = real("s", "its standard deviation", min=0)
 
 
 class Crossings(dy.Schema):
@@ -21,14 +82,16 @@ class Crossings(dy.Schema):
     measure_m = real("m", "measure of the balise", nullable=False)
     leg = dy.Int32(description="leg of the path")
     path_m = real("m", "path position of the balise", nullable=False)
-    before = dy.Int64(min=0, description="row of the last epoch before the crossing")
+    before = dy.Int64(min=0, description="row of the last epoch before the crossing with a position; of a telegram any")
     epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
-    t = instant("the crossing, interpolated between both epochs; of a telegram its own time")
+    t = instant("the crossing, interpolated; of a telegram its own time; after a gap that of `epoch`")
     sense = dy.Int8(description="+1 passed along growing path, -1 against it")
-    heading = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
+    direction = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
     odometer_m = real("m", "odometer distance at the crossing")
-    offered = flag("a passage of its own; false: crossed again before the balise was re-armed, or inside a gap")
-    status = one_of(PassageStatus, "what became of the offer; null where it was none", nullable=True)
+    offered = flag("offered to the train; false: inside a gap, or crossed again before the balise was re-armed")
+    status = one_of(
+        PassageStatus, "what became of it; null where crossed again before the balise was re-armed", nullable=True
+    )
 
 
 class EvidenceAt(dy.Schema):
@@ -54,3 +117,16 @@ class Judged(dy.Schema):
     error_along_m = real("m", "the middle of both where reference or balise tell it to `known_error_m`")
     judgement = one_of(Judgement, "right, wrong or unknown")
     wrong_track = flag("the position, unambiguous, is on a net element that the evidence excludes")
+
+
+class Failures(dy.Schema):
+    """One row per failure: a stretch judged wrong in use, whether it crosses a VB or not (DOMAIN section 5.3)."""
+
+    t_onset = instant("begin of the fault")
+    t_failure = instant("begin of the position failure", nullable=True)
+    t_end = instant("end of the episode")
+    hazardous_s = real("s", "time judged wrong in use, over the whole episode", nullable=False, min=0)
+    hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
+    within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
+    wrong_track = flag("the position was on a net element that the evidence excludes")
+    hazard_id = dy.Int64(nullable=True, min=0, description="first hazard row of the episode; null where it hit no VB")

@@ -9,14 +9,15 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds import LdsLimits, LdsResult, run_lds
-from schemas.config import Configuration, LdsConfig
+from schemas.config import Configuration, LdsConfig, Vehicle
 
-LIMITS = LdsLimits.of(Configuration())
+VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4)
+LIMITS = LdsLimits.of(Configuration(), VEHICLE)
 INSTANT = pl.Datetime("ns", "UTC")
 
 
 class ScriptedBank:
-    """Fails at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
+    """FailureLog at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
 
     def __init__(
         self,
@@ -68,14 +69,11 @@ def epochs_of(
         on_track=pl.lit(True),
         fix_valid=path.is_not_null(),
         gate_probability=pl.lit(1.0),
-        sigma_along_m=pl.lit(1.0),
+        position_sigma_m=pl.lit(1.0),
         confidence_m=pl.lit(6.18),
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
-        scale_sigma=pl.lit(1e-4),
-        odometer_stretch=pl.lit(0, pl.Int64),
-        speed_mps=pl.lit(20.0),
-        latency_sigma_s=pl.lit(0.0),
+        odometer_segment=pl.lit(0, pl.Int64),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration import Claim, claims, trial
-from pipeline.matching import match
-from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.matching.builders import line, matched, run, site
 
 
@@ -60,5 +58,4 @@ def test_the_bias_shown_on_one_element_counts_on_the_next() -> None:
 def test_a_trial_is_the_same_every_time() -> None:
     one, again = trial(5), trial(5)
     assert one.fixes.equals(again.fixes)
-    first = match(one.fixes, one.odometer, one.site, Vehicle(), MatchingConfig(), FixSigma())
-    assert first.path.elements()[0].startswith(tuple("abc"))
+    assert matched(one.fixes, one.site, one.odometer).path.elements()[0].startswith(tuple("abc"))
