@@ -68,8 +68,7 @@ def _blocks(trellis: Trellis) -> Iterator[_Block]:
     for rows in _batches(trellis, begins[1:]):
         pairs = trellis.pairs(begins[1:][rows])
         for number, (begin, end) in enumerate(zip(begins[1:][rows].tolist(), ends[1:][rows].tolist(), strict=True)):
-            weight, changes = pairs.at(number)
-            yield _Block(begin, end, weight * ~changes[:, :, None], weight * changes[:, :, None])
+            yield _Block(begin, end, *pairs.at(number))
 
 
 def _batches(trellis: Trellis, steps: Ints) -> Iterator[slice]:

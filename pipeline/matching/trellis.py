@@ -65,27 +65,29 @@ class Trellis:
         move = self.pair_move[self.pair_first[step] + number]
         score = np.maximum(move[:, None] + score, BREAK + self.initial[other])
         most = np.maximum.reduceat(score.max(axis=1), begin[:-1])
-        return Pairs(before, after, begin, np.exp(score - np.repeat(most, sizes)[:, None]), changes)
+        weight = np.exp(score - np.repeat(most, sizes)[:, None])
+        return Pairs(before, after, begin, weight * ~changes[:, None], weight * changes[:, None])
 
 
 @dataclass(frozen=True)
 class Pairs:
     """Of several steps: `begin[k] : begin[k + 1]` are the pairs of step k, `before` times `after` states, row by row.
 
-    `weight`: probability of each under each hypothesis, the largest of a step being one; `changes`: to another element.
+    `same`, `other`: probability of each under each hypothesis, the largest of a step being one, in `same` of those that
+    stay on an element and in `other` of those that change to another; zero elsewhere.
     """
 
     before: Ints
     after: Ints
     begin: Ints
-    weight: Floats
-    changes: Bools
+    same: Floats
+    other: Floats
 
-    def at(self, number: int) -> tuple[Floats, Bools]:
-        """Weights `[before, after, hypothesis]` of one step, and which pairs lead to another element."""
+    def at(self, number: int) -> tuple[Floats, Floats]:
+        """`same` and `other` of one step: `[before, after, hypothesis]`."""
         part = slice(int(self.begin[number]), int(self.begin[number + 1]))
-        shape = int(self.before[number]), int(self.after[number])
-        return self.weight[part].reshape(*shape, -1), self.changes[part].reshape(shape)
+        shape = int(self.before[number]), int(self.after[number]), self.same.shape[1]
+        return self.same[part].reshape(shape), self.other[part].reshape(shape)
 
 
 def trellis_of(
