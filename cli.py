@@ -216,7 +216,7 @@ def inspect(
     from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result)
+    tables = inspect_path(path, settings.ingest, result, settings.matching)
     if as_json:
         _print_json(tables)
     else:
