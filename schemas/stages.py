@@ -82,14 +82,16 @@ class Crossings(dy.Schema):
     measure_m = real("m", "measure of the balise", nullable=False)
     leg = dy.Int32(description="leg of the path")
     path_m = real("m", "path position of the balise", nullable=False)
-    before = dy.Int64(min=0, description="row of the last epoch before the crossing")
+    before = dy.Int64(min=0, description="row of the last epoch before the crossing with a position; of a telegram any")
     epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
-    t = instant("the crossing, interpolated between both epochs; of a telegram its own time")
+    t = instant("the crossing, interpolated; of a telegram its own time; after a gap that of `epoch`")
     sense = dy.Int8(description="+1 passed along growing path, -1 against it")
-    heading = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
+    direction = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
     odometer_m = real("m", "odometer distance at the crossing")
-    offered = flag("a passage of its own; false: crossed again before the balise was re-armed, or inside a gap")
-    status = one_of(PassageStatus, "what became of the offer; null where it was none", nullable=True)
+    offered = flag("offered to the train; false: inside a gap, or crossed again before the balise was re-armed")
+    status = one_of(
+        PassageStatus, "what became of it; null where crossed again before the balise was re-armed", nullable=True
+    )
 
 
 class EvidenceAt(dy.Schema):
@@ -115,3 +117,16 @@ class Judged(dy.Schema):
     error_along_m = real("m", "the middle of both where reference or balise tell it to `known_error_m`")
     judgement = one_of(Judgement, "right, wrong or unknown")
     wrong_track = flag("the position, unambiguous, is on a net element that the evidence excludes")
+
+
+class Failures(dy.Schema):
+    """One row per failure: a stretch judged wrong in use, whether it crosses a VB or not (DOMAIN section 5.3)."""
+
+    t_onset = instant("begin of the fault")
+    t_failure = instant("begin of the position failure", nullable=True)
+    t_end = instant("end of the episode")
+    hazardous_s = real("s", "time judged wrong in use, over the whole episode", nullable=False, min=0)
+    hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
+    within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
+    wrong_track = flag("the position was on a net element that the evidence excludes")
+    hazard_id = dy.Int64(nullable=True, min=0, description="first hazard row of the episode; null where it hit no VB")

@@ -121,6 +121,7 @@ class Passages(dy.Schema):
     judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
+    crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
 
 
 class Alarms(dy.Schema):
@@ -187,6 +188,7 @@ class _EpochsAfterMonitors(dy.Schema):
     hpl_m = real("m", "horizontal protection level of the receiver", min=0)
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where nobody knows", nullable=True)
+    in_use = flag("fix valid, unambiguous, confident, not negated (DOMAIN section 5.2)")
 
 
 def _monitor_columns(monitor: str) -> dict[str, dy.Column]:
@@ -241,12 +243,15 @@ class Runs(dy.Schema):
     along_error_mean_m = real("m", "mean error along the track")
     along_error_p95_m = real("m", "95 % of |error| along the track")
     along_error_max_m = real("m", "largest |error| along the track")
+    along_error_epochs = count("epochs that these three are of: errors along the track that are known")
     cross_error_mean_m = real("m", "mean error across the track")
     cross_error_p95_m = real("m", "95 % of |error| across the track")
     cross_error_max_m = real("m", "largest |error| across the track")
+    cross_error_epochs = count("epochs that these three are of: errors across the track that are known")
     up_error_mean_m = real("m", "mean error of height")
     up_error_p95_m = real("m", "95 % of |error| of height")
     up_error_max_m = real("m", "largest |error| of height")
+    up_error_epochs = count("epochs that these three are of: errors of height that are known")
     balises_on_path = count("virtual balises passed")
     balises_accepted = count("of these accepted")
     balises_rejected = count("of these rejected")
@@ -257,16 +262,17 @@ class Runs(dy.Schema):
     location_error_mean_m = real("m", "mean location error of accepted VBs")
     location_error_p95_m = real("m", "95 % of |location error| of accepted VBs")
     location_error_max_m = real("m", "largest |location error| of accepted VBs")
+    location_error_count = count("accepted VBs that these three are of: the error is known to 5 m")
     hazards_1a = count("hazards VB_JUMP_1A")
     hazards_1b = count("hazards VB_JUMP_1B")
     hazards_shift = count("hazards VB_SHIFT")
     hazards_wrong_track = count("hazards VB_WRONG_TRACK")
     hazards_detected = count("hazards that a monitor detected")
     hazards_within_budget = count("hazards negated within the budget")
-    missed_detections = count("hazards with a failure that no monitor found in time")
+    missed_detections = count("hazards with a failure that no monitor found by t_failure + budget")
     time_to_detect_max_s = real("s", "largest T_D")
     time_since_failure_max_s = real("s", "largest T_dsf")
-    hazardous_max_s = real("s", "longest hazardous time")
+    hazardous_max_s = real("s", "longest hazardous time of a failure, whether it hit a VB or not")
     alarms = count("alarm episodes")
     false_alarms = count("of these false", nullable=True)
     false_alarm_rate_per_h = real("1/h", "false alarms per hour", min=0)
@@ -296,19 +302,23 @@ class Runs(dy.Schema):
     notes = text("what reading and matching found out about the run", nullable=True)
     failures = count("faults with time judged wrong in use, whether they hit a VB or not")
     failures_within_budget = count("of these within the budget of the configured level")
+    failures_beyond_budget = count("of these not within it; of the rest it cannot be said")
+    failure_hazardous_s = reals("s", "hazardous time of each failure, in order of time", nullable=True)
+    failure_hazardous_may_s = reals("s", "the same with the time that is unknown", nullable=True)
     service_levels = texts("service levels of the configuration, in order", nullable=True)
     level_allowed_s = reals("s", "allowed T_D of each of them (TVB eq. 7)", nullable=True)
-    level_within = counts("failures negated within it", nullable=True)
+    level_within = counts("failures within it, what is unknown included", nullable=True)
+    level_exceeded = counts("failures beyond it, what is unknown left out", nullable=True)
     level_verdict = ones_of(
-        ThrVerdict, "kept or exceeded, no failure to judge, or unknown without evidence", nullable=True
+        ThrVerdict, "kept, exceeded, no failure, or unknown where the evidence does not say", nullable=True
     )
     held_s = real("s", "time that the epochs stand for, gaps apart", min=0)
     monitored_s = real("s", "of this with a verdict of the along-track bank", min=0)
-    evidence_s = real("s", "of this with a known error along the track", min=0)
+    evidence_s = real("s", "of this judged right or wrong", min=0)
     judged_s = real("s", "of this with both: what the false alarm rate counts", min=0)
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
-    accepted_judged = count("accepted VBs judged right or wrong by reference or balise reads")
+    accepted_judged = count("accepted VBs judged right or wrong")
 
 
 TABLES: dict[str, type[dy.Schema]] = {

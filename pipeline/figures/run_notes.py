@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 import polars as pl
 
 from pipeline.ingest.clean import StreamCounts
+from pipeline.lds.relink import UNLINKED
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
@@ -132,11 +133,10 @@ def _ambiguous(found: Match) -> Iterator[str]:
 
 
 def _linking(lds: LdsResult) -> Iterator[str]:
-    if lds.undecided:
-        yield (
-            f"after {len(lds.undecided)} breaks of position or odometer nothing could tell whether the position had "
-            "moved meanwhile: what the expectation windows let pass is not seen there"
-        )
+    reasons = lds.epochs["link_distance_reason"]
+    if unlinked := int(reasons.str.starts_with(UNLINKED).sum()):
+        why = ", ".join(sorted(set(reasons.filter(reasons.str.starts_with(UNLINKED).fill_null(False)))))
+        yield f"after {unlinked} outages the position could not re-link and was not used: {why}"
     if lds.unknown_reads.height:
         names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
         yield "reads of balises that are not on the path: " + ", ".join(names)

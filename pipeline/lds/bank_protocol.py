@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from schemas.config import Configuration
+from schemas.config import Configuration, Vehicle
 
 
 class Bank(Protocol):
@@ -52,22 +52,30 @@ class Bank(Protocol):
 class LdsLimits:
     """Limits that the LDS shares with other stages.
 
-    `threshold_factor` is k_T, two-sided Gaussian for the false alarm probability per sample;
-    `odometer_sigma_mps` the odometer's noise over one second [m]; `disabled` names monitors.
+    `threshold_factor` is k_T, two-sided Gaussian for the false alarm probability per sample; `odometer_sigma_mps` the
+    odometer's noise over one second [m]; `odometer_scale_sigma` that of the vehicle file, None unless it gives scale
+    and sigma; `gap_reset_s`: over a longer gap the bank begins anew; `disabled` names monitors.
     """
 
     ambiguity_probability: float
     failure_limit_m: float
     threshold_factor: float
     odometer_sigma_mps: float
+    odometer_scale_sigma: float | None
+    balise_read_sigma_m: float
+    gap_reset_s: float
     disabled: tuple[str, ...]
 
     @classmethod
-    def of(cls, configuration: Configuration) -> Self:
+    def of(cls, configuration: Configuration, vehicle: Vehicle) -> Self:
+        monitors, hazards = configuration.monitors, configuration.hazards
         return cls(
             ambiguity_probability=configuration.matching.ambiguity_probability,
-            failure_limit_m=configuration.hazards.failure_limit_m,
-            threshold_factor=float(-ndtri(configuration.monitors.false_alarm_probability / 2)),
-            odometer_sigma_mps=configuration.monitors.odometer_sigma_mps,
-            disabled=configuration.monitors.disabled,
+            failure_limit_m=hazards.failure_limit_m,
+            threshold_factor=float(-ndtri(monitors.false_alarm_probability / 2)),
+            odometer_sigma_mps=monitors.odometer_sigma_mps,
+            odometer_scale_sigma=None if vehicle.odometer_scale is None else vehicle.odometer_scale_sigma,
+            balise_read_sigma_m=hazards.balise_read_sigma_m,
+            gap_reset_s=configuration.align.gap_reset_s,
+            disabled=monitors.disabled,
         )

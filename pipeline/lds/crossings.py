@@ -1,11 +1,11 @@
-"""Where the raw matched position passes a balise (DOMAIN section 4: a VB is *offered*)."""
+"""Where the raw matched position passes a virtual balise (DOMAIN section 4): found once, here."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from math import isfinite
+from math import isnan
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,8 @@ import polars as pl
 
 from pipeline.lds.journey import Journey
 from schemas.arrays import Floats, Ints
-from schemas.enums import BaliseKind, Reaction
+from schemas.enums import BaliseKind, PassageStatus, Reaction
+from schemas.stages import Crossings
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,28 +33,47 @@ class Balise:
 
 
 class Seen(Enum):
-    """How a balise was passed by the position."""
+    """How a balise was passed: between near epochs (or read), in a gap, or in a gap with positions off all track."""
 
     CROSSED = "crossed"
-    IN_GAP = "in_gap"
+    IN_GAP = "in gap"
     UNPLACED = "unplaced"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Crossing:
-    """The position passes a balise between the valid epochs `before` and `epoch`.
+    """The position passes a virtual balise, or the reader reads a physical one.
 
-    `sense` is +1 where the position passes it along growing path. Time and odometer distance are
-    interpolated where the two epochs are near enough in time, else unknown.
+    `before`, `epoch`: rows of the epochs around it. `sense`: +1 where the position passes the balise along growing
+    path; `direction`: direction of travel as known at `epoch`. Time, odometer and way run are interpolated; after a
+    gap they are those of `epoch`. `offered`, `status`: what became of it, as in `Crossings`.
     """
 
     balise: Balise
     before: int
     epoch: int
-    sense: int
-    seen: Seen
     t_ns: int
+    sense: int
+    direction: int
     odometer_m: float | None
+    travelled_m: float
+    confidence_m: float | None
+    seen: Seen = Seen.CROSSED
+    offered: bool = False
+    status: PassageStatus | None = None
+
+
+class _Step(NamedTuple):
+    """Two successive valid epochs, by row, time, path and odometer."""
+
+    before: int
+    epoch: int
+    t_before_ns: int
+    t_ns: int
+    path_before_m: float
+    path_m: float
+    odometer_before_m: float
+    odometer_m: float
 
 
 def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
@@ -75,27 +95,14 @@ def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
     ]
 
 
-class _Step(NamedTuple):
-    """Two successive valid epochs, by index, time, path and odometer."""
-
-    before: int
-    epoch: int
-    t_before_ns: int
-    t_ns: int
-    path_before_m: float
-    path_m: float
-    odometer_before_m: float
-    odometer_m: float
-
-
-def find_crossings(journey: Journey, balises: Sequence[Balise]) -> dict[int, list[Crossing]]:
-    """Crossings by the epoch that completes them, those of one step in the order of being passed.
+def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
+    """Crossings in order of the epoch that completes them, those of one step in the order of being passed.
 
     A balise is passed growing when the position comes from before it to it or beyond, and falling
     when it comes from there to before it, so that touching it and turning back are two passings.
     """
     known = np.flatnonzero(journey.positioned)
-    found: dict[int, list[Crossing]] = {}
+    found: list[Crossing] = []
     for leg in sorted({balise.leg for balise in balises}):
         on_leg = [balise for balise in balises if balise.leg == leg]
         at_m = np.array([balise.path_m for balise in on_leg])
@@ -106,9 +113,8 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> dict[int, lis
         passing = np.flatnonzero(passed_before != passed_after)
         counts = zip(passed_before[passing].tolist(), passed_after[passing].tolist(), strict=True)
         for step, (first, last) in zip(_steps(journey, before[passing], after[passing]), counts, strict=True):
-            passed = _in_order(on_leg, first, last)
-            found[step.epoch] = [_crossing(journey, balise, step, sense) for balise, sense in passed]
-    return dict(sorted(found.items()))
+            found += [_crossing(journey, balise, step, sense) for balise, sense in _in_order(on_leg, first, last)]
+    return sorted(found, key=lambda crossing: crossing.epoch)
 
 
 def _steps(journey: Journey, before: Ints, after: Ints) -> Iterator[_Step]:
@@ -126,14 +132,64 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
 
 
 def _crossing(journey: Journey, balise: Balise, step: _Step, sense: int) -> Crossing:
-    waited_ns = step.t_ns - step.t_before_ns
-    if waited_ns > journey.gap_ns:
-        unplaced = journey.placed_nowhere[step.before + 1 : step.epoch].any()
-        seen = Seen.UNPLACED if unplaced else Seen.IN_GAP
-        odometer_m = step.odometer_m if isfinite(step.odometer_m) else None
-        return Crossing(balise, step.before, step.epoch, sense, seen, step.t_ns, odometer_m)
-    share = (balise.path_m - step.path_before_m) / (step.path_m - step.path_before_m)
-    at_m = step.odometer_before_m + share * (step.odometer_m - step.odometer_before_m)
-    t_ns = step.t_before_ns + round(share * waited_ns)
-    odometer_m = at_m if isfinite(at_m) else None
-    return Crossing(balise, step.before, step.epoch, sense, Seen.CROSSED, t_ns, odometer_m)
+    k, seen, share = step.epoch, _seen(journey, step), 1.0
+    if seen is Seen.CROSSED:
+        share = (balise.path_m - step.path_before_m) / (step.path_m - step.path_before_m)
+    back_m = 0.0 if share == 1.0 else (1.0 - share) * (step.odometer_m - step.odometer_before_m)
+    direction = int(journey.direction[k]) if journey.has_odometer else sense
+    return Crossing(
+        balise=balise,
+        before=step.before,
+        epoch=k,
+        t_ns=step.t_before_ns + round(share * (step.t_ns - step.t_before_ns)),
+        sense=sense,
+        direction=direction,
+        odometer_m=_known(step.odometer_m - back_m),
+        travelled_m=float(journey.travelled_m[k]) - back_m * direction,
+        confidence_m=_known(float(journey.confidence_m[k])),
+        seen=seen,
+    )
+
+
+def _seen(journey: Journey, step: _Step) -> Seen:
+    if step.t_ns - step.t_before_ns <= journey.gap_ns:
+        return Seen.CROSSED
+    return Seen.UNPLACED if journey.placed_nowhere[step.before + 1 : step.epoch].any() else Seen.IN_GAP
+
+
+def _known(value: float) -> float | None:
+    return None if isnan(value) else value
+
+
+def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
+    """All crossings of a solution; the place in this list is the `crossing_id`."""
+    return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
+
+
+def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFrame:
+    """The table of crossings (`Crossings`), `crossings` in order of time."""
+    columns: dict[str, list[object]] = {
+        "crossing_id": list(range(len(crossings))),
+        "balise_id": [crossing.balise.balise_id for crossing in crossings],
+        "kind": [crossing.balise.kind.value for crossing in crossings],
+        "netelement_id": [crossing.balise.netelement_id for crossing in crossings],
+        "measure_m": [crossing.balise.measure_m for crossing in crossings],
+        "leg": [crossing.balise.leg for crossing in crossings],
+        "path_m": [crossing.balise.path_m for crossing in crossings],
+        "before": [crossing.before for crossing in crossings],
+        "epoch": [crossing.epoch for crossing in crossings],
+        "t": [crossing.t_ns for crossing in crossings],
+        "sense": [crossing.sense for crossing in crossings],
+        "direction": [journey.direction_at(crossing.t_ns, crossing.direction) for crossing in crossings],
+        "odometer_m": [crossing.odometer_m for crossing in crossings],
+        "offered": [crossing.offered for crossing in crossings],
+        "status": [crossing.status and crossing.status.value for crossing in crossings],
+    }
+    kinds = {name: column.dtype for name, column in Crossings.columns().items()}
+    series = [
+        pl.Series(name, columns[name], dtype=pl.Int64).cast(kind)
+        if kind == pl.Datetime
+        else pl.Series(name, columns[name], dtype=kind)
+        for name, kind in kinds.items()
+    ]
+    return pl.DataFrame(series)

@@ -1,4 +1,4 @@
-"""Balises as the train meets them: what the position passes and the reader reads, offered to the linking chains."""
+"""Balises as the train meets them: what the position crosses and the reader reads, offered to the linking chains."""
 
 from __future__ import annotations
 
@@ -8,45 +8,40 @@ from math import isnan
 import numpy as np
 
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.lds.crossings import Balise, Crossing, Seen, find_crossings
+from pipeline.lds.crossings import Balise, Crossing, Seen
 from pipeline.lds.journey import Journey, turning_epochs
 from pipeline.lds.link_monitors import LinkOrder, disorder
 from pipeline.lds.linking import LinkingChain
-from pipeline.lds.passage import Offer
-from pipeline.lds.reads import Read
-from pipeline.lds.rearming import Latch
 from schemas.config import LdsConfig
-from schemas.enums import PassageStatus
+from schemas.enums import BaliseKind, PassageStatus
 
 
 class BaliseDetection:
     """Virtual and physical balises along a journey; asked epoch by epoch, in order.
 
-    `events`: the epochs at which a balise is passed or read, or the train turns.
+    `events`: the epochs at which a balise is crossed or read, or the train turns.
     """
 
     def __init__(
         self,
         journey: Journey,
-        virtual: Sequence[Balise],
-        physical: Sequence[Balise],
-        reads: Sequence[Read],
+        balises: dict[BaliseKind, list[Balise]],
+        crossings: Sequence[Crossing],
         config: LdsConfig,
         limits: LdsLimits,
     ) -> None:
         self._journey, self._config, self._limits = journey, config, limits
-        self._has_odometer = journey.has_odometer
-        self._crossings = find_crossings(journey, virtual)
-        self._reads: dict[int, list[Read]] = {}
-        for read in reads:
-            self._reads.setdefault(read.epoch, []).append(read)
+        self._at: dict[BaliseKind, dict[int, list[Crossing]]] = {kind: {} for kind in BaliseKind}
+        for crossing in crossings:
+            self._at[crossing.balise.kind].setdefault(crossing.epoch, []).append(crossing)
         self._turns = turning_epochs(journey)
-        self._latch = Latch(journey, config)
-        self._along_m: list[float] = (journey.odometer_m * journey.heading).tolist()
-        self.virtual = LinkingChain(virtual, config)
-        self.physical = LinkingChain(physical if reads else [], config)
+        self._disarmed = Disarmed(journey, config)
+        self._along_m: list[float] = (journey.odometer_m * journey.direction).tolist()
+        self.virtual = LinkingChain(balises[BaliseKind.VIRTUAL], config)
+        # A run without telegrams has no reader, so its physical balises have no passages.
+        self.physical = LinkingChain(balises[BaliseKind.PHYSICAL] if self._at[BaliseKind.PHYSICAL] else [], config)
         self.order = LinkOrder(journey, limits)
-        self.events = sorted({*self._turns, *self._reads, *self._crossings})
+        self.events = sorted({*self._turns, *(crossing.epoch for crossing in crossings)})
 
     @property
     def closing_m(self) -> float:
@@ -54,9 +49,9 @@ class BaliseDetection:
         return min(self.virtual.closing_m, self.physical.closing_m)
 
     @property
-    def latched(self) -> bool:
+    def disarmed(self) -> bool:
         """A balise was detected so near that noise could detect it again."""
-        return bool(self._latch)
+        return bool(self._disarmed)
 
     def turn(self, k: int) -> None:
         """Both chains learn that the train goes another way from this epoch on."""
@@ -67,48 +62,41 @@ class BaliseDetection:
             chain.turn(
                 float(journey.odometer_m[k]),
                 float(journey.travelled_m[k]),
-                int(journey.heading[k]),
+                int(journey.direction[k]),
                 int(journey.leg[k]),
             )
 
-    def read(self, k: int) -> list[Read]:
+    def read(self, k: int) -> list[Crossing]:
         """Telegrams accepted by the rules of linking; only windows can reject them, no monitor."""
-        accepted: list[Read] = []
-        heading = int(self._journey.heading[k])
-        for read in self._reads.get(k, ()):
-            if self._latch.holds(read.balise):
-                continue
-            offer = Offer(read.balise, read.t_ns, heading, heading, read.odometer_m, read.travelled_m, None, None)
-            passage = self.physical.offer(offer)
-            self._latch.disarm(read.balise, read.odometer_m)
-            if passage.status is PassageStatus.ACCEPTED:
-                accepted.append(read)
-        return accepted
+        reads = self._at[BaliseKind.PHYSICAL].get(k, ())
+        return [read for read in reads if not self._disarmed.holds(read.balise) and self._offer(read, None)]
 
-    def pass_virtual(self, k: int, distrusted: bool, entering: bool) -> tuple[list[Offer], bool]:
-        """Offer what the position passed in this step: what was accepted, and is the order of identities broken?
+    def pass_virtual(self, k: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
+        """Offer what the position crossed in this step: what was accepted, and is the order of identities broken?
 
         `distrusted`: negated, or a monitor fails; `entering`: no chain has begun.
         """
         offered: list[Crossing] = []
-        for crossing in self._crossings.get(k, ()):
-            if self._latch.holds(crossing.balise):
-                self.virtual.cross_again(crossing.balise, crossing.sense, self._heading(crossing))
+        for crossing in self._at[BaliseKind.VIRTUAL].get(k, ()):
+            if self._disarmed.holds(crossing.balise):
+                self.virtual.cross_again(crossing)
             elif crossing.seen is Seen.CROSSED:
                 offered.append(crossing)
             else:
-                self._pass_unseen(crossing)
+                unplaced = crossing.seen is Seen.UNPLACED
+                status = PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
+                self.virtual.pass_unoffered(crossing, status)
+                self._disarmed.add(crossing)
         if not offered:
             return [], False
         overdue = sum(self.virtual.is_overdue(crossing.balise) for crossing in offered)
-        offers = [self._offer_of(crossing, self._refusal_of(crossing, distrusted, entering)) for crossing in offered]
-        accepted = [offer for offer in offers if self._offer(offer)]
+        accepted = [one for one in offered if self._offer(one, self._refusal_of(one, distrusted, entering))]
         return accepted, self._order_fails(k, offered, overdue)
 
     def rearm(self, k: int) -> None:
         """Balises that the train has left behind can be detected again."""
-        if self._latch:
-            self._latch.advance(k)
+        if self._disarmed:
+            self._disarmed.rearm(k)
 
     def close_windows(self, k: int, t_ns: int) -> None:
         """Windows that the train has left are closed."""
@@ -119,53 +107,28 @@ class BaliseDetection:
             self.physical.advance(float(self._journey.odometer_m[k]), t_ns, PassageStatus.MISSED)
 
     def finish(self, t_ns: int) -> None:
-        """Balises that the train has passed by its reckoning when the run ends without a position."""
+        """Balises that the train has passed by its odometer when the run ends without a position."""
         known = np.flatnonzero(np.isfinite(self._journey.odometer_m))
         absence = self._absence(len(self._along_m) - 1) if known.size else PassageStatus.MISSED
         if absence is not PassageStatus.MISSED:
             self.virtual.finish(float(self._journey.odometer_m[known[-1]]), t_ns, absence)
 
-    def _offer(self, offer: Offer) -> bool:
-        passage = self.virtual.offer(offer)
-        self._latch.disarm(offer.balise, offer.odometer_m)
-        return passage.status is PassageStatus.ACCEPTED
-
-    def _pass_unseen(self, crossing: Crossing) -> None:
-        unplaced = crossing.seen is Seen.UNPLACED
-        status = PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
-        self.virtual.pass_unoffered(self._offer_of(crossing, status), status)
-        self._latch.disarm(crossing.balise, crossing.odometer_m)
-
-    def _heading(self, crossing: Crossing) -> int:
-        """Direction of travel; without an odometer there is only that of the position itself."""
-        return int(self._journey.heading[crossing.epoch]) if self._has_odometer else crossing.sense
-
-    def _offer_of(self, crossing: Crossing, refusal: PassageStatus | None) -> Offer:
-        k, odometer_m, heading = crossing.epoch, crossing.odometer_m, self._heading(crossing)
-        since_m = 0.0 if odometer_m is None else (float(self._journey.odometer_m[k]) - odometer_m) * heading
-        confidence_m = float(self._journey.confidence_m[k])
-        return Offer(
-            balise=crossing.balise,
-            t_ns=crossing.t_ns,
-            sense=crossing.sense,
-            heading=heading,
-            odometer_m=odometer_m,
-            travelled_m=float(self._journey.travelled_m[k]) - since_m,
-            confidence_m=None if isnan(confidence_m) else confidence_m,
-            refusal=refusal,
-        )
+    def _offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
+        chain = self.virtual if crossing.balise.kind is BaliseKind.VIRTUAL else self.physical
+        self._disarmed.add(crossing)
+        return chain.offer(crossing, refusal)
 
     def _refusal_of(self, crossing: Crossing, distrusted: bool, entering: bool) -> PassageStatus | None:
         """Why a virtual balise is not detected at this crossing, whatever linking says.
 
-        A step out of an ambiguous position passes what the train did not.
+        A step out of an ambiguous position crosses what the train did not.
         """
         if distrusted:
             return PassageStatus.REJECTED_MONITOR
         if self._journey.refusal[crossing.before] is PassageStatus.REJECTED_AMBIGUOUS:
             return PassageStatus.REJECTED_AMBIGUOUS
         refusal = self._journey.refusal[crossing.epoch]
-        if refusal is None and entering and self._config.entry_from_unfitted_area and self._has_odometer:
+        if refusal is None and entering and self._config.entry_from_unfitted_area and self._journey.has_odometer:
             # Insertion is what endangers an entry: the diagnosis must stand behind the first VB too.
             return PassageStatus.REJECTED_MONITOR
         return refusal
@@ -183,3 +146,40 @@ class BaliseDetection:
         out_of_order = disorder(offered, overdue, self._journey, self._config, self._limits)
         self.order.note(k, out_of_order)
         return out_of_order > 0
+
+
+class Disarmed:
+    """Balises just detected, re-armed once the odometer has moved max(`rearm_m`, 3 sigma) away (DOMAIN section 4).
+
+    Where the run has no odometer, the position's distance from the balise has to serve.
+    """
+
+    def __init__(self, journey: Journey, config: LdsConfig) -> None:
+        self._journey, self._config = journey, config
+        self._at: dict[str, tuple[Balise, float]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._at)
+
+    def holds(self, balise: Balise) -> bool:
+        """A crossing of this balise is not an offer."""
+        return balise.balise_id in self._at
+
+    def add(self, crossing: Crossing) -> None:
+        odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
+        self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
+
+    def rearm(self, k: int) -> None:
+        """Re-arm what the train has left behind at epoch `k`."""
+        away_m = max(self._config.rearm_m, 3.0 * float(self._journey.sigma_m[k]))
+        for name, (balise, at_m) in list(self._at.items()):
+            if abs(self._moved_m(k, balise, at_m)) >= away_m:
+                del self._at[name]
+
+    def _moved_m(self, k: int, balise: Balise, at_m: float) -> float:
+        if not self._journey.has_odometer:
+            return float(self._journey.path_m[k]) - balise.path_m
+        odometer_m = float(self._journey.odometer_m[k])
+        if isnan(at_m):
+            self._at[balise.balise_id] = (balise, odometer_m)
+        return odometer_m - at_m

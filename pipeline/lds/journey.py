@@ -20,11 +20,10 @@ class Journey:
     """Epochs in order of time; a NaN is a value that is not known.
 
     `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
-    count, `None` where it would. `heading`: direction of travel (+1/-1) as known at that epoch;
+    count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
     `travel`: that of the step from this epoch to the next, put back to where the train turned (for
-    labels only). `travelled_m`: way run, turns included. `stretch`: odometer readings of one stretch can be
-    compared, between stretches the distance was lost. `blind`: no position for longer than a
-    crossing is interpolated over (`gap_ns`).
+    labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
+    segments its distance was lost. `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
     """
 
     t_ns: Ints
@@ -36,11 +35,8 @@ class Journey:
     sigma_m: Floats
     confidence_m: Floats
     odometer_m: Floats
-    stretch: Ints
-    speed_mps: Floats
-    scale_sigma: Floats
-    latency_sigma_s: Floats
-    heading: Ints
+    segment: Ints
+    direction: Ints
     travel: Ints
     travelled_m: Floats
     blind: Bools
@@ -65,19 +61,25 @@ class Journey:
         known: Bools = np.isfinite(self.odometer_m) & np.isfinite(self.sigma_m)
         return known & self.positioned & ~self.ambiguous
 
-    @property
+    @cached_property
     def has_odometer(self) -> bool:
         return bool(np.isfinite(self.odometer_m).any())
 
+    def direction_at(self, t_ns: int, otherwise: int) -> int:
+        """Direction of travel at a time, turns as they were; `otherwise` where there is no odometer."""
+        if not self.has_odometer:
+            return otherwise
+        return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
+
 
 def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Journey:
-    """Take the columns of matched and aligned epochs (see `run_lds`)."""
+    """Take the columns of matched and aligned epochs: the only place where the LDS reads them (see `run_lds`)."""
     t_ns = epochs["t"].dt.epoch("ns").to_numpy().astype(np.int64)
     path_m = floats(epochs, "path_m")
     fix_valid = epochs["fix_valid"].fill_null(False).to_numpy()
     positioned = fix_valid & np.isfinite(path_m)
     odometer_m = floats(epochs, "odometer_m")
-    heading, travel = _headings(odometer_m, epochs["direction"], config.odometer_fixed_m)
+    direction, travel = _directions(odometer_m, epochs["direction"], config.odometer_fixed_m)
     gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.crossing_gap_s) * NS_PER_S)
     return Journey(
         t_ns=t_ns,
@@ -89,11 +91,8 @@ def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Jo
         sigma_m=floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m"),
         confidence_m=floats(epochs, "confidence_m"),
         odometer_m=odometer_m,
-        stretch=epochs["odometer_segment"].to_numpy().astype(np.int64),
-        speed_mps=np.nan_to_num(floats(epochs, "speed_mps")),
-        latency_sigma_s=np.nan_to_num(floats(epochs, "latency_sigma_s")),
-        scale_sigma=np.nan_to_num(floats(epochs, "scale_sigma")),
-        heading=heading,
+        segment=epochs["odometer_segment"].to_numpy().astype(np.int64),
+        direction=direction,
         travel=travel,
         travelled_m=_travelled_m(odometer_m, travel),
         blind=_blind(t_ns, positioned, gap_ns),
@@ -127,23 +126,23 @@ def _refusals(
     return refusals
 
 
-def _headings(odometer_m: Floats, direction: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
+def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
     """Direction of travel along growing path, as known at each epoch and as it was.
 
     With an odometer the train has turned once it came back by `turn_m` (the odometer's own fixed
     error): a wheel's jitter at standstill is no turn. Without one: the matched direction, held.
     """
     if not np.isfinite(odometer_m).any():
-        held = direction.replace(0, None).fill_null(strategy="forward").fill_null(1)
-        heading = held.to_numpy().astype(np.int64)
-        return heading, heading
+        held = matched.replace(0, None).fill_null(strategy="forward").fill_null(1)
+        direction = held.to_numpy().astype(np.int64)
+        return direction, direction
     known = np.flatnonzero(np.isfinite(odometer_m))
-    heading = np.ones(odometer_m.size, dtype=np.int64)
-    travel = heading.copy()
+    direction = np.ones(odometer_m.size, dtype=np.int64)
+    travel = direction.copy()
     for turned_at, confirmed_at, sign in _turns(odometer_m[known], turn_m):
-        heading[known[confirmed_at] :] = sign
+        direction[known[confirmed_at] :] = sign
         travel[known[turned_at] :] = sign
-    return heading, travel
+    return direction, travel
 
 
 def _turns(odometer_m: Floats, turn_m: float) -> list[tuple[int, int, int]]:
@@ -175,5 +174,5 @@ def _travelled_m(odometer_m: Floats, travel: Ints) -> Floats:
 def turning_epochs(journey: Journey) -> frozenset[int]:
     """Epochs at which direction or leg differ from those of the epoch before, odometer known."""
     known = np.flatnonzero(np.isfinite(journey.odometer_m))
-    changed = (np.diff(journey.heading[known]) != 0) | (np.diff(journey.leg[known]) != 0)
+    changed = (np.diff(journey.direction[known]) != 0) | (np.diff(journey.leg[known]) != 0)
     return frozenset(known[1:][changed].tolist())

@@ -7,11 +7,11 @@ from math import sqrt
 import numpy as np
 import polars as pl
 
+from pipeline.lds import relink
 from pipeline.lds.bank_protocol import LdsLimits
-from pipeline.lds.breaks import LOST, NEVER, TOO_FAR, Comparison, Verdict
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
-from pipeline.lds.recovery import Anchor
+from pipeline.lds.relink import Anchor, Comparison
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import LdsConfig
 from schemas.enums import MonitorState
@@ -19,7 +19,7 @@ from schemas.tables import Epochs
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
-_STRETCH = 4096
+_BLOCK = 4096  # epochs evaluated at once
 
 DISABLED = "disabled by configuration"
 NO_ODOMETER = "no odometer"
@@ -27,7 +27,10 @@ NO_POSITION = "no position"
 AMBIGUOUS = "match ambiguous or off track"
 NO_SIGMA = "no standard deviation of the position"
 FIRST_EPOCH = "no epoch before"
-_REASONS = (DISABLED, NO_ODOMETER, NO_POSITION, AMBIGUOUS, NEVER, NO_SIGMA, FIRST_EPOCH, LOST, TOO_FAR)
+NEVER = "no balise or validated position to measure from"
+LOST = "odometer distance lost since the last validated position"
+_OF_RELINK = (relink.LOST, relink.NO_ANCHOR, relink.NO_VEHICLE, relink.SWITCHED_OFF)
+_REASONS = (DISABLED, NO_ODOMETER, NO_POSITION, AMBIGUOUS, NEVER, NO_SIGMA, FIRST_EPOCH, LOST, *_OF_RELINK)
 _NO_REASON = -1  # a reason is held as its place in the list above
 _STATES = tuple(state.value for state in MonitorState)
 
@@ -43,7 +46,7 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Ld
     excess_m = abs(journey.path_m[j] - journey.path_m[i] - odometer_step_m)
     noise_m = limits.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)
     unexplained = excess_m > noise_m + config.odometer_share * abs(odometer_step_m)
-    backwards = offered[0].sense != journey.heading[j]
+    backwards = offered[0].sense != journey.direction[j]
     return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
 
 
@@ -69,8 +72,8 @@ class LinkOrder:
 class LinkDistance:
     """GNSS against odometer distance since the LRVB, or since the TVB that began the chain.
 
-    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T. After a break it
-    is also the distance since the last validated position, within the bounds of a re-link (see `breaks`).
+    Bounds: the odometer's 5 m + 5 % (SUBSET-041 5.3.1.1), and the noise of the two positions at k_T. At the first
+    position after an outage it is the distance since the re-link anchor, within the bound of a re-link (`relink`).
     """
 
     def __init__(self, journey: Journey, config: LdsConfig, limits: LdsLimits) -> None:
@@ -93,8 +96,8 @@ class LinkDistance:
         return bool(self._possible[k])
 
     def can_measure(self, k: int) -> bool:
-        """What the distance counts from is on the same stretch of the odometer as this epoch."""
-        return self._anchor is not None and self._anchor.stretch == self._journey.stretch[k]
+        """What the distance counts from is in the same continuity segment of the odometer as this epoch."""
+        return self._anchor is not None and self._anchor.segment == self._journey.segment[k]
 
     def fails(self, k: int) -> bool:
         if self._anchor is None:
@@ -114,13 +117,13 @@ class LinkDistance:
         return k + (first if ahead[first] else ahead.size)
 
     def _evaluate(self, anchor: Anchor, k: int) -> None:
-        """A stretch ahead at once: elementwise, so every epoch still knows only its own past."""
-        self._done = min(k + _STRETCH, self._fails.size)
+        """A block ahead at once: elementwise, so every epoch still knows only its own past."""
+        self._done = min(k + _BLOCK, self._fails.size)
         ahead = slice(k, self._done)
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         noise_m = self._limits.threshold_factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
-        lost = self._possible[ahead] & (self._journey.stretch[ahead] != anchor.stretch)
+        lost = self._possible[ahead] & (self._journey.segment[ahead] != anchor.segment)
         known = self._possible[ahead] & ~lost
         self._reason[ahead] = np.where(lost, _REASONS.index(LOST), np.where(known, _NO_REASON, self._reason[ahead]))
         self._value[ahead] = np.where(known, self._offset_m[ahead] - anchor.offset_m, np.nan)
@@ -128,13 +131,11 @@ class LinkDistance:
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
     def hold_against(self, found: Comparison, k: int) -> None:
-        """The verdict on a position after a break joins that of the bounds at epoch `k`, whose fail remains."""
+        """The verdict on a position after an outage joins that of the bounds at epoch `k`, whose fail remains."""
         if self.fails(k):
             return
-        unknown = found.verdict is Verdict.UNKNOWN
-        self._value[k] = np.nan if unknown else found.moved_m
-        self._threshold[k] = np.nan if unknown else found.bound_m
-        self._fails[k] = found.verdict is Verdict.MOVED
+        self._value[k], self._threshold[k] = found.moved_m, found.bound_m
+        self._fails[k] = found.reason is None and not found.holds
         self._reason[k] = _NO_REASON if found.reason is None else _REASONS.index(found.reason)
 
     def forget(self, k: int) -> None:

@@ -9,13 +9,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.lds.crossings import Balise
-from pipeline.lds.passage import Offer, Passage, Reference, blame
+from pipeline.lds.crossings import Balise, Crossing
+from pipeline.lds.passage import Passage
 from pipeline.lds.windows import Window, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction
 
 MISSED_IN_A_ROW = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The last relevant balise: where odometer and way run stood when it was detected."""
+
+    balise: Balise
+    odometer_m: float | None
+    travelled_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +44,7 @@ class LinkingChain:
         self.reference: Reference | None = None
         self._announced = [balise for balise in balises if balise.linked]
         self._config = config
-        self._heading = 1
+        self._direction = 1
         self._leg: int | None = None
         self._turn: _Turn | None = None
         self._ahead: list[Balise] = []
@@ -70,11 +79,11 @@ class LinkingChain:
         if self.linking:
             self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
-    def turn(self, odometer_m: float, travelled_m: float, heading: int, leg: int) -> None:
+    def turn(self, odometer_m: float, travelled_m: float, direction: int, leg: int) -> None:
         """The train goes the other way, or on another leg: expect what lies on its new way."""
         if self.reference is None or not self.linking:
             return
-        self._heading, self._leg = heading, leg
+        self._direction, self._leg = direction, leg
         self._turn = _Turn(self._distance_m(odometer_m), travelled_m - self.reference.travelled_m)
         for kept in (self._own, self._set_aside, self._unoffered):
             kept.clear()
@@ -83,47 +92,54 @@ class LinkingChain:
         self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
         self._look_ahead([balise for balise, window in windows if window.close_m > here_m])
 
-    def offer(self, offer: Offer) -> Passage:
-        """Judge an offered balise; its passage is written whatever comes of it."""
+    def offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
+        """Judge an offered balise; its passage is written whatever comes of it. True where it is accepted.
+
+        `refusal`: why it does not count as a detection, None where it does.
+        """
         distance_m = None
-        if self.linking and offer.odometer_m is not None:
-            distance_m = self._distance_m(offer.odometer_m)
-            self._close_windows(distance_m, offer.t_ns, PassageStatus.MISSED)
-        overdue = offer.sense == offer.heading and self.is_overdue(offer.balise)
-        passage = self._passage_of(offer)
+        if self.linking and crossing.odometer_m is not None:
+            distance_m = self._distance_m(crossing.odometer_m)
+            self._close_windows(distance_m, crossing.t_ns, PassageStatus.MISSED)
+        overdue = crossing.sense == crossing.direction and self.is_overdue(crossing.balise)
+        passage = self._passage_of(crossing)
         passage.odometer_distance_m = distance_m
         if distance_m is None and not overdue:
             passage.window = None
-        if offer.refusal is not None:
-            passage.status = offer.refusal
+        if refusal is not None:
+            passage.status = refusal
         elif overdue:
             passage.status = PassageStatus.REJECTED_WINDOW
         elif distance_m is None:
             passage.status = PassageStatus.ACCEPTED
         else:
             self._judge(passage, distance_m)
-        if passage.status is PassageStatus.ACCEPTED:
-            self._refer_to(offer)
-        return passage
+        crossing.offered, crossing.status = True, passage.status
+        accepted = passage.status is PassageStatus.ACCEPTED
+        if accepted:
+            self._refer_to(crossing)
+        return accepted
 
-    def pass_unoffered(self, offer: Offer, status: PassageStatus) -> None:
+    def pass_unoffered(self, crossing: Crossing, status: PassageStatus) -> None:
         """The position was on one side before a gap and on the other after it."""
-        name = offer.balise.balise_id
-        if offer.sense != offer.heading:
-            self.cross_again(offer.balise, offer.sense, offer.heading)
+        crossing.status = status
+        name = crossing.balise.balise_id
+        if crossing.sense != crossing.direction:
+            self.cross_again(crossing)
         elif name in self._unoffered:
             self._unoffered[name].status = status
         else:
-            passage = self._new_passage(offer.balise, offer.t_ns, offer.heading)
+            passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
             passage.status = status
             self._own[name] = passage
 
-    def cross_again(self, balise: Balise, sense: int, heading: int) -> None:
+    def cross_again(self, crossing: Crossing) -> None:
         """Crossed once more before it was re-armed: not offered, but the position changed sides."""
-        taken, kept = (self._set_aside, self._own) if sense == heading else (self._own, self._set_aside)
-        passage = taken.pop(balise.balise_id, None)
+        forward = crossing.sense == crossing.direction
+        taken, kept = (self._set_aside, self._own) if forward else (self._own, self._set_aside)
+        passage = taken.pop(crossing.balise.balise_id, None)
         if passage is not None:
-            kept[balise.balise_id] = passage
+            kept[crossing.balise.balise_id] = passage
 
     def finish(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
         """The run ends without a position: `absence` is the status of what was passed by reckoning."""
@@ -133,17 +149,17 @@ class LinkingChain:
         for balise in self._ahead:
             unseen = balise.balise_id not in self._own and balise.balise_id not in self._optional
             if unseen and self._announced_m(balise) < distance_m:
-                passage = self._new_passage(balise, t_ns, self._heading)
+                passage = self._new_passage(balise, t_ns, self._direction)
                 passage.status = absence
 
     def _distance_m(self, odometer_m: float) -> float:
         assert self.reference is not None
         assert self.reference.odometer_m is not None
-        return (odometer_m - self.reference.odometer_m) * self._heading
+        return (odometer_m - self.reference.odometer_m) * self._direction
 
     def _announced_m(self, balise: Balise) -> float:
         assert self.reference is not None
-        return (balise.path_m - self.reference.balise.path_m) * self._heading
+        return (balise.path_m - self.reference.balise.path_m) * self._direction
 
     def _window(self, balise: Balise) -> Window:
         assert self.reference is not None
@@ -169,9 +185,9 @@ class LinkingChain:
         if expected.balise_id == balise.balise_id and self._window(balise).holds(distance_m):
             passage.status = PassageStatus.ACCEPTED
         elif expected.balise_id != balise.balise_id and self._window(expected).holds(distance_m):
-            blame(passage, LinkingError.ORDER, expected.reaction)
+            passage.record(LinkingError.ORDER, expected.reaction)
         else:
-            blame(passage, LinkingError.EARLY, balise.reaction)
+            passage.record(LinkingError.EARLY, balise.reaction)
 
     def _position_ahead(self, balise: Balise) -> int | None:
         """Index of the expected balise that this offer stands against, `None` where it is not ahead.
@@ -196,19 +212,19 @@ class LinkingChain:
             return
         passage = self._own.pop(balise.balise_id, None)
         if passage is None:
-            passage = self._new_passage(balise, t_ns, self._heading)
+            passage = self._new_passage(balise, t_ns, self._direction)
             passage.status = absence
             self._unoffered[balise.balise_id] = passage
         self._missed_in_a_row += 1
-        blame(passage, LinkingError.MISSED, balise.reaction)
+        passage.record(LinkingError.MISSED, balise.reaction)
         if self._missed_in_a_row >= MISSED_IN_A_ROW:
-            blame(passage, LinkingError.MISSED, Reaction.SERVICE_BRAKE)
+            passage.record(LinkingError.MISSED, Reaction.SERVICE_BRAKE)
 
-    def _refer_to(self, offer: Offer) -> None:
+    def _refer_to(self, crossing: Crossing) -> None:
         """An accepted balise becomes the reference; what lies beyond it is expected next."""
-        balise = offer.balise
-        self.reference = Reference(balise, offer.odometer_m, offer.travelled_m)
-        self._heading, self._leg, self._turn = offer.heading, balise.leg, None
+        balise = crossing.balise
+        self.reference = Reference(balise, crossing.odometer_m, crossing.travelled_m)
+        self._direction, self._leg, self._turn = crossing.direction, balise.leg, None
         self._missed_in_a_row = 0
         self._optional = set()
         self._own.pop(balise.balise_id, None)
@@ -217,36 +233,35 @@ class LinkingChain:
 
     def _in_order_of_travel(self) -> list[Balise]:
         on_leg = [balise for balise in self._announced if balise.leg == self._leg]
-        return on_leg if self._heading > 0 else on_leg[::-1]
+        return on_leg if self._direction > 0 else on_leg[::-1]
 
     def _look_ahead(self, ahead: list[Balise]) -> None:
         self._ahead = ahead
         self.closing_m = float("inf")
         if ahead and self.reference is not None and self.reference.odometer_m is not None:
-            start_m = self.reference.odometer_m * self._heading
+            start_m = self.reference.odometer_m * self._direction
             self.closing_m = start_m + self._window(ahead[0]).close_m
 
-    def _passage_of(self, offer: Offer) -> Passage:
+    def _passage_of(self, crossing: Crossing) -> Passage:
         """The passage that this offer belongs to: a new one, or one whose window closed before."""
-        name = offer.balise.balise_id
-        forward = offer.sense == offer.heading
+        name = crossing.balise.balise_id
+        forward = crossing.sense == crossing.direction
         passage = self._unoffered.pop(name, None) if forward else None
         if passage is None:
-            passage = self._new_passage(offer.balise, offer.t_ns, offer.heading)
+            passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
             self._own.pop(name, None)
             self._set_aside.pop(name, None)
             if forward:
                 self._own[name] = passage
-        passage.t_offered_ns = passage.t_ns = offer.t_ns
-        passage.confidence_m = offer.confidence_m
+        passage.crossing, passage.t_ns = crossing, crossing.t_ns
         return passage
 
-    def _new_passage(self, balise: Balise, t_ns: int, heading: int) -> Passage:
-        passage = Passage(balise, t_ns, heading)
+    def _new_passage(self, balise: Balise, t_ns: int, direction: int) -> Passage:
+        passage = Passage(balise, t_ns, direction)
         if balise.balise_id in (ahead.balise_id for ahead in self._ahead):
             passage.window = self._window(balise)
         if self.reference is not None and self.reference.odometer_m is not None:
             along_m = balise.path_m - self.reference.balise.path_m
-            passage.reckoned_odometer_m = self.reference.odometer_m + along_m
+            passage.announced_odometer_m = self.reference.odometer_m + along_m
         self.passages.append(passage)
         return passage

@@ -1,4 +1,4 @@
-"""The LDS stage: matched, aligned epochs of one solution in, LDS columns and passages out."""
+"""The LDS stage: matched, aligned epochs of one solution in; LDS columns, crossings and passages out."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.lds.bank_protocol import Bank, LdsLimits
-from pipeline.lds.columns import epoch_columns, passage_rows
-from pipeline.lds.crossings import balises_of
+from pipeline.lds.columns import epoch_columns
+from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time
 from pipeline.lds.journey import journey_of
-from pipeline.lds.machine import LocationSystem
+from pipeline.lds.machine import LocationSystem, Negation
+from pipeline.lds.passage import passage_rows
 from pipeline.lds.reads import reads_of
-from pipeline.lds.standing import Negation
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
 
@@ -21,18 +21,18 @@ from schemas.enums import BaliseKind
 class LdsResult:
     """What the LDS made of one solution.
 
-    `epochs`: `t` and the LDS columns, row for row with the input. `passages`: as in the contract,
-    in order of time; what needs a truth is null or `none`; beside it `t_reckoned`: when the train
-    passes a balise that was not offered, by LRVB and odometer. `restarts`: epochs at which
-    the bank was restarted after the first. `undecided`: epochs after a break of the diagnosis at which the odometer
-    could not tell whether the position had moved meanwhile. `unknown_reads`: telegrams of balises not on the path.
+    `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: as in `schemas.stages.Crossings`, each
+    balise crossed or read. `passages`: as in the contract, in order of time, joined to crossings by `crossing_id`;
+    what needs a truth is null or `none`; beside it `t_reckoned`: when the train passes a balise that was not offered,
+    by LRVB and odometer. `restarts`: epochs at which the bank was restarted after the first. `unknown_reads`:
+    telegrams of balises not on the path.
     """
 
     epochs: pl.DataFrame
+    crossings: pl.DataFrame
     passages: pl.DataFrame
     restarts: list[int]
     negations: list[Negation]
-    undecided: list[int]
     unknown_reads: pl.DataFrame
 
 
@@ -49,23 +49,24 @@ def run_lds(
 
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
-    where unknown)`, odometer_segment, speed_mps, direction` (+1/-1, used where there is no odometer)`,
-    scale_sigma, latency_sigma_s`.
+    where unknown)`, odometer_segment, direction` (+1/-1, used where there is no odometer).
     `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, optionally `odometer_m`
     at the read; without it the odometer is interpolated between near epochs. A run without that
     stream has no reader, so its physical balises have no passages.
     """
     journey = journey_of(epochs, config, limits)
-    physical = balises_of(balises, BaliseKind.PHYSICAL)
-    reads, unknown = reads_of(balise_reads, physical, journey)
-    system = LocationSystem(journey, bank, balises_of(balises, BaliseKind.VIRTUAL), physical, reads, config, limits)
+    on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
+    reads, unknown = reads_of(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
+    found = [*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads]
+    system = LocationSystem(journey, bank, on_path, found, config, limits)
     system.run()
+    crossings = in_order_of_time(found)
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
         epochs=epoch_columns(epochs["t"], system, journey, config),
-        passages=passage_rows(passages, journey, solution),
+        crossings=crossing_rows(crossings, journey),
+        passages=passage_rows(passages, crossings, journey, solution),
         restarts=system.restarts,
         negations=system.negations,
-        undecided=system.undecided,
         unknown_reads=unknown,
     )

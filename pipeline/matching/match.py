@@ -15,6 +15,7 @@ from pipeline.matching.find import find_path
 from pipeline.matching.fixes import Fixes, fixes_of
 from pipeline.matching.residuals import biases
 from pipeline.matching.resolution import digit_noise
+from pipeline.matching.rivals import Posterior, Rivals, rivals_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import polarity
 from pipeline.track.leg import leg_of
@@ -32,7 +33,8 @@ from schemas.run import Site
 class Match:
     """Epochs on the path, the path, and stretches of doubt.
 
-    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `odometer_sign`: of the recorded
+    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
+    possible at the steps of the search; none where nothing was to be searched. `odometer_sign`: of the recorded
     odometer against growing path, set here and nowhere else.
     """
 
@@ -40,12 +42,17 @@ class Match:
     path: TravelledPath
     ambiguous: pl.DataFrame
     antenna_ahead_m: float
+    posterior: Posterior | None = None
     odometer_sign: int = 1
 
     @cached_property
     def biases(self) -> pl.DataFrame:
         """Cross-track biases per element."""
         return biases(self.epochs)
+
+    def rivals(self, limit: float) -> Rivals:
+        """Per epoch the net elements whose posterior reaches `limit` there, the path's own among them."""
+        return rivals_of(self.posterior, self.epochs, self.path, limit)
 
 
 def match(
@@ -65,7 +72,7 @@ def match(
     arrays = fixes_of(fixes, fix_sigma)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    path, found, ambiguous = _path(arrays, odometry, site, config, balise_reads)
+    path, found, ambiguous, posterior = _path(arrays, odometry, site, config, balise_reads)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
@@ -73,8 +80,8 @@ def match(
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    epochs = epochs.with_columns(fixes["hpl_m"], *digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, odometer_sign=sign)
+    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
+    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, sign)
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:
@@ -92,14 +99,14 @@ def _path(
     site: Site,
     config: MatchingConfig,
     balise_reads: pl.DataFrame | None,
-) -> tuple[TravelledPath, Assignment, pl.DataFrame]:
+) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior | None]:
     """A route or a site that leaves no choice needs no search, unless it comes back to where it was."""
     track = track_of(site.track)
     visits = whole_chain(track, site.links) if site.route is None else visits_of(track, site.route)
     if visits is not None:
         leg = leg_of(track, visits)
         if not leg.returns:
-            return *path_on_chain(fixes, odometry, track, leg, config), no_doubt()
+            return *path_on_chain(fixes, odometry, track, leg, config), no_doubt(), None
     network = network_of(track, site.links) if visits is None else network_along(track, visits)
     pinned = pins_of(fixes, site, network.track, balise_reads)
     return find_path(fixes, odometry, network, pinned, config)

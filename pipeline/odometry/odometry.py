@@ -71,6 +71,16 @@ class Odometry:
     scale_sigma: float | None = None
     leaps_ns: tuple[int, ...] = ()
 
+    @property
+    def begin_ns(self) -> int:
+        """The first row."""
+        return self.epoch_ns
+
+    @property
+    def end_ns(self) -> int:
+        """The last row."""
+        return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
+
     def oriented(self, sign: int) -> Odometry:
         """The same odometer, growing with the path; `sign` is +1 or -1."""
         return self if sign > 0 else replace(self, distance_m=-self.distance_m)

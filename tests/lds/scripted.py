@@ -9,14 +9,15 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds import LdsLimits, LdsResult, run_lds
-from schemas.config import Configuration, LdsConfig
+from schemas.config import Configuration, LdsConfig, Vehicle
 
-LIMITS = LdsLimits.of(Configuration())
+VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4)
+LIMITS = LdsLimits.of(Configuration(), VEHICLE)
 INSTANT = pl.Datetime("ns", "UTC")
 
 
 class ScriptedBank:
-    """Fails at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
+    """FailureLog at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
 
     def __init__(
         self,
@@ -72,10 +73,7 @@ def epochs_of(
         confidence_m=pl.lit(6.18),
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
-        scale_sigma=pl.lit(1e-4),
         odometer_segment=pl.lit(0, pl.Int64),
-        speed_mps=pl.lit(20.0),
-        latency_sigma_s=pl.lit(0.0),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()

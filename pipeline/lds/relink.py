@@ -1,0 +1,166 @@
+"""May a negated position return? Recovery time and re-link (DOMAIN section 4).
+
+The position returns only where GNSS minus odometer is what it was at the *anchor*. A slow drift has moved the last TVB
+before an alarm already, so the anchor lies `anchor_lag_s` before the first alarm; alarms that follow may be about the
+same fault, so a return does not move it. A physical balise says where the train is: only a telegram renews the anchor.
+The same test decides on the first position after an outage over which the bank began anew (`breaks`), for nobody looked
+on meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from pipeline.lds.bank_protocol import Bank, LdsLimits
+from pipeline.lds.crossings import Crossing
+from pipeline.lds.journey import Journey
+from pipeline.odometry.drift import drift_m2, relink_bound_m
+from schemas.arrays import NS_PER_S
+from schemas.config import LdsConfig
+from schemas.enums import BaliseKind
+
+UNLINKED = "no re-link: "
+SWITCHED_OFF = UNLINKED + "switched off"
+NO_ANCHOR = UNLINKED + "no validated position or telegram before"
+LOST = UNLINKED + "the odometer lost its distance since the anchor"
+NO_VEHICLE = UNLINKED + "without scale and its sigma in a vehicle file only at a telegram"
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """GNSS minus odometer [m] where it was trusted: at a TVB, or at a telegram of a physical balise.
+
+    `sigma_m`: of the position, or of the read. `epoch`: of a telegram the first one at or after it.
+    """
+
+    epoch: int
+    t_ns: int
+    offset_m: float
+    sigma_m: float
+    travelled_m: float
+    segment: int
+    is_read: bool = False
+
+    @classmethod
+    def at_epoch(cls, journey: Journey, k: int) -> Anchor:
+        offset_m = float(journey.path_m[k] - journey.odometer_m[k])
+        travelled_m, segment = float(journey.travelled_m[k]), int(journey.segment[k])
+        return cls(k, int(journey.t_ns[k]), offset_m, float(journey.sigma_m[k]), travelled_m, segment)
+
+    @classmethod
+    def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
+        """The balise's own place against the odometer; None where that is not known, or its distance was lost there."""
+        segment, is_read = int(journey.segment[crossing.epoch]), crossing.balise.kind is BaliseKind.PHYSICAL
+        whole = segment == journey.segment[crossing.before]
+        if crossing.odometer_m is None or not whole or not isfinite(crossing.travelled_m):
+            return None
+        offset_m = crossing.balise.path_m - crossing.odometer_m
+        return cls(crossing.epoch, crossing.t_ns, offset_m, sigma_m, crossing.travelled_m, segment, is_read)
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """How far GNSS minus odometer moved since the anchor, and how far it may have; else why nothing can be told."""
+
+    moved_m: float = np.nan
+    bound_m: float = np.nan
+    reason: str | None = None
+
+    @property
+    def holds(self) -> bool:
+        """The position is where the anchor and the odometer expect it."""
+        return self.reason is None and abs(self.moved_m) <= self.bound_m
+
+
+class Relink:
+    """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs, as far as they are known."""
+
+    def __init__(self, journey: Journey, tvb: list[bool], config: LdsConfig, limits: LdsLimits) -> None:
+        self._journey, self._tvb, self._config, self._limits = journey, tvb, config, limits
+        self._anchor: Anchor | None = None
+        self._alarmed = False
+        self._mission_from = 0
+
+    def begin_mission(self, k: int) -> None:
+        """What was before epoch `k` does not count."""
+        self._anchor, self._alarmed, self._mission_from = None, False, k
+
+    def note_read(self, read: Crossing) -> None:
+        """A telegram says where the train is."""
+        self._anchor = Anchor.at_crossing(self._journey, read, self._limits.balise_read_sigma_m) or self._anchor
+
+    def note_alarm(self, k: int) -> None:
+        """The first alarm with an anchor before it fixes that; only a telegram moves it from there."""
+        self._anchor = self.anchor_at(k)
+        self._alarmed = self._anchor is not None
+
+    def anchor_at(self, k: int) -> Anchor | None:
+        """Before the first alarm: the last TVB `anchor_lag_s` before epoch `k`, else the first TVB, or a later read."""
+        if self._alarmed:
+            return self._anchor
+        old_ns = int(self._journey.t_ns[k]) - round(self._config.anchor_lag_s * NS_PER_S)
+        tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : k])
+        if not tvbs.size:
+            return self._anchor
+        last_old = int(np.searchsorted(self._journey.t_ns[tvbs], old_ns, side="right")) - 1
+        tvb = Anchor.at_epoch(self._journey, int(tvbs[max(last_old, 0)]))
+        return tvb if self._anchor is None or tvb.t_ns > self._anchor.t_ns else self._anchor
+
+    def compare(self, k: int) -> Comparison:
+        """Hold the position at epoch `k` against the anchor."""
+        anchor = self.anchor_at(k)
+        if not self._config.relink:
+            return Comparison(reason=SWITCHED_OFF)
+        if anchor is None:
+            return Comparison(reason=NO_ANCHOR)
+        if anchor.segment != self._journey.segment[k]:
+            return Comparison(reason=LOST)
+        if self._limits.odometer_scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
+            return Comparison(reason=NO_VEHICLE)
+        offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
+        return Comparison(offset_m - anchor.offset_m, self._bound_m(anchor, k))
+
+    def _bound_m(self, anchor: Anchor, k: int) -> float:
+        """min(failure limit / 2, k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2)) (DOMAIN section 4).
+
+        2 sigma_x^2 is the sum of both variances: of the anchor, and of the position now.
+        """
+        waited_s = (int(self._journey.t_ns[k]) - anchor.t_ns) / NS_PER_S
+        way_m = float(self._journey.travelled_m[k]) - anchor.travelled_m
+        positions_m2 = anchor.sigma_m**2 + float(self._journey.sigma_m[k]) ** 2
+        limits = self._limits
+        scale_sigma = limits.odometer_scale_sigma or 0.0
+        variance_m2 = drift_m2(positions_m2, waited_s, way_m, limits.odometer_sigma_mps, scale_sigma)
+        return float(relink_bound_m(variance_m2, limits.threshold_factor, limits.failure_limit_m))
+
+
+class Recovery:
+    """One negation: since when nothing has failed fast."""
+
+    def __init__(self, k: int, journey: Journey, bank: Bank, config: LdsConfig) -> None:
+        self._journey, self._bank = journey, bank
+        self._recovery_ns = config.recovery_s * NS_PER_S
+        self._failed_at_ns = self._seen_at_ns = int(journey.t_ns[k])
+
+    def is_over(self, k: int, seen: bool, failing: bool) -> bool:
+        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now."""
+        t_ns = int(self._journey.t_ns[k])
+        if seen:
+            if t_ns - self._seen_at_ns > self._journey.gap_ns:
+                self._failed_at_ns = t_ns
+            self._seen_at_ns = t_ns
+        if failing or self._bank.fast_failed(k):
+            self._failed_at_ns = t_ns
+        return seen and bool(self._journey.usable[k]) and t_ns - self._failed_at_ns >= self._recovery_ns
+
+
+def breaks(journey: Journey, limits: LdsLimits) -> frozenset[int]:
+    """The first usable epochs after outages of position or odometer over which the bank began anew."""
+    known = np.flatnonzero(journey.comparable)
+    usable = np.flatnonzero(journey.comparable & journey.usable)
+    after = known[1:][np.diff(journey.t_ns[known]) > limits.gap_reset_s * NS_PER_S]
+    rows = np.searchsorted(usable, after)
+    return frozenset(usable[rows[rows < usable.size]].tolist())
