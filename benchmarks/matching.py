@@ -15,10 +15,11 @@ from scipy.spatial import cKDTree
 
 from benchmarks.results import Figure, best_of
 from pipeline.matching import match
+from pipeline.odometry import odometry_of
 from pipeline.track.geodesy import points_of
 from pipeline.track.leg import Visit, leg_of, nearest_on_leg, path_at
 from pipeline.track.survey import geometric_measures_m, track_of
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site
 
@@ -173,7 +174,12 @@ def speeds(with_shapely: bool) -> list[Figure]:
 
 def whole_s(site: Site, fixes: pl.DataFrame, odometer: pl.DataFrame) -> float:
     """Path, posterior, projection and all columns."""
-    return best_of(3, lambda: match(fixes, odometer, site, Vehicle(), MatchingConfig(), FixSigma()))
+    return best_of(
+        3,
+        lambda: match(
+            fixes, odometry_of(odometer, Vehicle(), Configuration()), site, Vehicle(), MatchingConfig(), FixSigma()
+        ),
+    )
 
 
 def calibration(seeds: int) -> list[Figure]:
@@ -186,7 +192,14 @@ def calibration(seeds: int) -> list[Figure]:
         claims, rights, wrong = [], [], 0
         for seed in range(seeds):
             trip = trip_of(seed, sigma_m)
-            epochs = match(trip.fixes, trip.odometer, site, Vehicle(), MatchingConfig(), FixSigma()).epochs
+            epochs = match(
+                trip.fixes,
+                odometry_of(trip.odometer, Vehicle(), Configuration()),
+                site,
+                Vehicle(),
+                MatchingConfig(),
+                FixSigma(),
+            ).epochs
             rights.append(np.abs(matched_lateral_m(epochs) - trip.lateral_m) < 1.0)
             claims.append(epochs["path_probability"].to_numpy())
             wrong += bool(((claims[-1] > 0.99) & ~rights[-1]).mean() > 0.01)

@@ -9,9 +9,10 @@ import polars as pl
 
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
+from pipeline.odometry import odometry_of
 from pipeline.track.geodesy import curvature_radii_m, distances_m
 from schemas.arrays import Floats, Ints
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -78,7 +79,8 @@ def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
     """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
     ordered, _ = clean(run)
     fixes = ordered.gnss.filter(pl.col("solution") == solution)
-    found = match(fixes, ordered.odometer, site, Vehicle(), MatchingConfig(), FixSigma(), ordered.balise_reads)
+    odometry = odometry_of(ordered.odometer, Vehicle(), Configuration())
+    found = match(fixes, odometry, site, Vehicle(), MatchingConfig(), FixSigma(), ordered.balise_reads)
     epochs = found.epochs.filter(pl.col("path_m").is_not_null())
     if epochs["leg"].n_unique() != 1:
         raise InputError("the path changes direction at a switch", place=run.run_id, remedy="Inject without --site.")

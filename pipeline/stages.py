@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
-from pipeline.alignment.increments import most_scatter_m
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.bounds import threshold_factor
@@ -30,7 +29,7 @@ from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network
 from pipeline.track.route import site_network
 from schemas.arrays import floats, times_ns
-from schemas.config import Configuration, LdsConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
 from schemas.enums import VehicleFigures
 from schemas.errors import InputError
@@ -140,7 +139,7 @@ def _match(context: _Context, solution: str) -> Match:
     require_one_journey(fixes, f"gnss of solution {solution!r}")
     return match(
         fixes,
-        run.odometer,
+        context.odometry,
         context.site,
         context.vehicle,
         context.config.matching,
@@ -188,28 +187,38 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     run, config, found = context.run, context.config, matches[solution]
     balises = found.path.balises(context.site.balises)
     fixes = run.gnss.filter(pl.col("solution") == solution)
-    digits = pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=most_scatter_m(config))
-    matched = found.epochs.with_columns(fixes["hpl_m"], digits)
-    aligned = align(matched, run.odometer, context.vehicle, config).with_columns(_confidence(config.lds))
+    odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
+    aligned = align(found.epochs, odometry, context.vehicle, config)
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
-    reads = _reads_on_odometer(context, aligned)
+    reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
     lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
+    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path, found.odometer_sign)
     return _Ride(seen, found, aligned, lds)
 
 
-def _reads_on_odometer(context: _Context, aligned: pl.DataFrame) -> pl.DataFrame | None:
+def _reads_on_odometer(
+    reads: pl.DataFrame | None, aligned: pl.DataFrame, odometry: Odometry | None
+) -> pl.DataFrame | None:
     """Telegrams with the odometer at each, on the scale of `aligned`."""
-    reads, odometer = context.run.balise_reads, context.run.odometer
-    if reads is None or odometer is None:
+    if reads is None or odometry is None:
         return reads
-    return reads.with_columns(odometer_at(reads["t"], aligned, odometer, context.config))
+    return reads.with_columns(odometer_at(reads["t"], aligned, odometry))
 
 
 def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFrame) -> SolutionResults:
     name, counts = ride.solution.name, context.counts.solutions[ride.solution.name]
-    notes = run_notes(context.run, context.site, counts, ride.solution.fixes, ride.found, ride.lds, context.vehicle)
+    notes = run_notes(
+        context.run,
+        context.site,
+        counts,
+        ride.solution.fixes,
+        ride.found,
+        ride.lds,
+        context.vehicle,
+        context.odometry,
+        context.config.align.straight_s,
+    )
     return SolutionResults(
         solution=name,
         epochs=epochs,
@@ -245,12 +254,6 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
     """Scale and latency as they stand at the end of the run."""
     names = ("latency_s", "latency_sigma_s", "odometer_scale", "scale_sigma")
     return Alignment(*(aligned[name][-1] for name in names))
-
-
-def _confidence(lds: LdsConfig) -> pl.Expr:
-    """Half-width of the confidence interval along the track: K sigma, or the receiver's HPL (DOMAIN section 4)."""
-    half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
-    return half_width.alias("confidence_m")
 
 
 def _single_monitors(

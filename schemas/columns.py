@@ -14,6 +14,7 @@ import dataframely as dy
 _TOLERANCE_BY_UNIT = {
     "m": 1e-6,
     "m2": 1e-6,
+    "m2/s": 1e-9,
     "m/s": 1e-6,
     "s": 1e-6,
     "deg": 1e-10,

@@ -89,15 +89,23 @@ class MatchingConfig(Settings):
     """Map matching (DOMAIN section 2; Newson & Krumm 2009)."""
 
     reach_m: Positive = 50.0
+    # A position is on the track within so many standard deviations of position, survey and bias together.
+    on_track_sigmas: Positive = 3.0
     survey_sigma_default_m: Positive = 1.0
-    bias_sigma_m: Positive = 2.0
+    # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
+    # What of a position's variance outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
+    slow_share: Annotated[Number, Field(ge=0, lt=1)] = 0.247
+    # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
+    sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
+    table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     ambiguity_probability: Probability = 0.99
     heading_sigma_deg: Positive = 10.0
     heading_min_speed_mps: Positive = 2.0
     transition_scale_m: Positive = 5.0
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
+    # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
     survey_correlation_m: Positive = 200.0
     outlier_probability: Probability = 1e-4
@@ -111,10 +119,39 @@ class AlignConfig(Settings):
     """Odometer against GNSS (DOMAIN section 3), and the causal filter of scale and latency."""
 
     gap_reset_s: Positive = 60.0
+    # A pause of the recording inside which the way is not known: longer than this, and than so many periods. Loggers
+    # drop single rows at any rate.
     odometer_gap_s: Positive = 1.0
+    odometer_gap_periods: Positive = 2.5
+    # A counter that gains more was reset, ran over or lied: the speed record on rails is 160 m/s. Rows that are stamped
+    # in bunches seem to gain some metres in no time.
+    fastest_mps: Positive = 200.0
+    bunched_stamps_m: NonNegative = 20.0
+    # Speeds tell the way over such a leap if, over the whole run, they differ from the distance by a smaller share:
+    # another unit or sign differs by more than a half, slip and scale by some percent.
+    speed_agreement: Probability = 0.2
+    # Between rows no farther apart a straight line is within 0.5 m of a train that brakes as hard as this, which
+    # is an emergency brake.
+    straight_s: Positive = 1.5
+    braking_mps2: Positive = 1.8
+    # A counter's step that is worth a word: a finer one scatters less than the white noise of one second.
+    counter_step_m: Positive = 0.05
+    # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
+    # 400 pieces is within 10 % of its mean.
+    quantisation_factor: Positive = 2.0
     scale_prior_sigma: Positive = 0.01
     latency_prior_sigma_s: Positive = 0.2
     filter_period_s: Positive = 1.0
+    # Stamps that scatter make no gap by themselves: the first position after one that they made is always late.
+    scattered_gap_sigmas: NonNegative = 3.0
+    # Before it is seen, a position is rather thought to come back from a long break beside its place: to be sure of a
+    # wrong scale is worse than to learn it more slowly. A receiver coasts over seconds and starts anew after half a
+    # minute or so: were single missing epochs thought the same of, noisy positions would teach next to nothing.
+    break_moved_probability: Probability = 0.8
+    break_moving_s: Positive = 30.0
+    # Variance that has still to settle fades with this time constant: positions that settle over 10 to 60 s are
+    # followed; longer, and a drift that begins meanwhile would be learned as scale the sooner.
+    settling_tau_s: Positive = 25.0
 
 
 class MonitorConfig(Settings):

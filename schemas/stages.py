@@ -5,7 +5,68 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus
+from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus, SigmaSource
+
+
+class Positions(dy.Schema):
+    """One row per GNSS epoch of a solution, in order of time: the position on the track network, by matching.
+
+    Positions are those of the balise antenna. Null where the epoch has no position.
+    """
+
+    t = instant("stamp of the epoch")
+    solution = text("solution of the run")
+    leg = dy.Int32(nullable=True, min=0, description="leg of the path, on which path positions are one to one")
+    netelement_id = text("matched net element", nullable=True)
+    measure_m = real("m", "measure on it")
+    path_m = real("m", "path position, raw: never smoothed")
+    cross_track_m = real("m", "position left of growing path")
+    vertical_m = real("m", "position above the track; null without a height in position or survey")
+    on_track = flag("a net element of the path is within reach")
+    path_probability = real("1", "posterior of the path by the whole run (forward-backward)", min=0, max=1)
+    gate_probability = real("1", "posterior of the path by what came before (forward): for detection", min=0, max=1)
+    heading_deg = real("deg", "azimuth of growing path at the GNSS antenna, clockwise from north")
+    slope = real("1", "rise over run of growing path")
+    curvature_per_m = real("1/m", "curvature of the track, positive to the left")
+    interpolation_error_m = real("m", "chord error of the survey's polyline at that place", min=0)
+    survey_sigma_m = real("m", "standard deviation of the survey; null where not stated", min=0)
+    sigma_along_m = real("m", "standard deviation of the position along the track, as stated", min=0)
+    sigma_cross_m = real("m", "standard deviation of the position across the track, as stated", min=0)
+    sigma_up_m = real("m", "standard deviation of the height, as stated", min=0)
+    sigma_source = one_of(SigmaSource, "receiver, or a table by kind of fix", nullable=True)
+    fix_valid = flag("the receiver has a fix and a position")
+    velocity_along_mps = real("m/s", "GNSS velocity along growing path")
+    hpl_m = real("m", "horizontal protection level of the receiver", min=0)
+    digits_along_m = real("m", "deviation by the step in which positions are written down, along", min=0)
+    digits_cross_m = real("m", "the same across the track", min=0)
+    digits_up_m = real("m", "the same of the height", min=0)
+
+
+class Aligned(Positions):
+    """`Positions` with the odometer at each epoch's time of validity, and what tests along the track allow for.
+
+    Scale and latency are those in use at the epoch: of the vehicle file, or learned from earlier epochs only.
+    """
+
+    position_sigma_m = real("m", "deviation that every test along the track counts with: calibrated, digits", min=0)
+    calibrated_along_m = real("m", "a + b sigma_along_m, as `calibrate` found: of errors with memory", min=0)
+    calibrated_cross_m = real("m", "the same across the track", min=0)
+    calibrated_up_m = real("m", "the same of the height", min=0)
+    confidence_m = real("m", "half-width of the confidence interval along the track", min=0)
+    along_m = real("m", "path position without the way that a curve adds beside the track: for increments")
+    odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
+    odometer_reason = text("why there is no odometer", nullable=True)
+    odometer_segment = dy.Int64(min=0, description="continuity segment: distances compare where it is the same")
+    odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)
+    odometer_rows_m = real("m", "quantisation noise of the odometer's rows, as far as thresholds allow for it", min=0)
+    odometer_period_s = real("s", "time between rows of the odometer", min=0)
+    stamp_jitter_s = real("s", "deviation of the stamps about the receiver's clock", min=0)
+    speed_mps = real("m/s", "speed along growing path by the odometer, by GNSS where there is none")
+    direction = dy.Int8(description="direction of travel along growing path, 1 or -1, held in the dead band")
+    odometer_scale = real("1", "true over odometer distance", min=0)
+    scale_sigma = real("1", "its standard deviation", min=0)
+    latency_s = real("s", "by how much the position is older than its stamp")
+    latency_sigma_s = real("s", "its standard deviation", min=0)
 
 
 class Crossings(dy.Schema):

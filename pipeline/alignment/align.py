@@ -1,47 +1,62 @@
-"""Alignment: the odometer at each GNSS epoch's time of validity, scale and latency known or learned causally.
-
-Adds to the matched epochs: `along_m, odometer_m, odometer_reason, odometer_stretch, speed_mps, direction,
-odometer_scale, scale_sigma, latency_s, latency_sigma_s, stamp_jitter_s, odometer_white_m2_per_s, odometer_reading_m,
-odometer_period_s`. A reason says why an epoch has no odometer.
-"""
+"""Alignment: the odometer at each epoch's time of validity, and what a test along the track has to allow for."""
 
 from __future__ import annotations
 
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.increments import EpochArrays, Learned, odometer_steps, reading_of, stamp_jitter_s
+from pipeline.alignment.estimates import EpochArrays, Learned, stamp_jitter_s
 from pipeline.alignment.learning import learn
-from pipeline.monitors.axis import calibrated
-from pipeline.odometry.odometer import OdometerTrack, odometer_track, polarity
-from pipeline.odometry.scatter import play_m, with_play
-from schemas.arrays import Bools, Floats, floats
-from schemas.config import Configuration, Vehicle
+from pipeline.monitors.along import most_scatter_m
+from pipeline.odometry.driven import hysteresis_m, with_hysteresis
+from pipeline.odometry.odometry import Odometry
+from schemas.arrays import Bools, Floats, floats, times_ns
+from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 
 NO_ODOMETER = "no odometer"
 BEYOND_SPAN = "outside the odometer's time span"
 INTERRUPTED = "odometer interrupted or slipping"
+_OF_ODOMETER = (
+    *("along_m", "odometer_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m", "odometer_period_s"),
+    *("odometer_scale", "scale_sigma"),
+)
 
 
-def align(epochs: pl.DataFrame, odometer: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
-    """Matched epochs of one solution with the odometer's columns (see the module's head)."""
-    if odometer is None:
-        return _without_odometer(epochs, vehicle, config)
-    sigma_mps = config.monitors.odometer_sigma_mps
-    track = odometer_track(odometer, config.align.odometer_gap_s, sigma_mps)
-    t_s = track.seconds(epochs["t"].dt.timestamp("ns").to_numpy())
-    path_m = floats(epochs, "path_m")
-    matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy() & np.isfinite(path_m)
-    sign = polarity(track, t_s, np.where(matched, path_m, np.nan), config.matching.orientation_distance_m)
-    track = track.oriented(sign)
-    along_m = unrolled(epochs, matched)
-    sigma_m = calibrated(floats(epochs, "sigma_along_m"), config.monitors)
-    digits_m = floats(epochs, "digits_along_m")
-    arrays = EpochArrays(t_s, along_m, np.hypot(sigma_m, digits_m), matched, stamp_jitter_s(t_s), digits_m)
-    learned = learn(arrays, track, vehicle, config)
-    return epochs.with_columns(
-        *_columns(arrays, track, learned, config), pl.Series("along_m", along_m, nan_to_null=True)
+def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
+    """Positions of one solution with the odometer beside them: `schemas.stages.Aligned`.
+
+    `odometry` grows with the path. Scale and latency are known by the vehicle file or learned causally.
+    """
+    positions = positions.with_columns(pl.col(r"^digits_(along|cross|up)_m$").clip(upper_bound=most_scatter_m(config)))
+    positions = positions.with_columns(*_sigmas(config.monitors), _confidence(config.lds))
+    if odometry is None:
+        return _without_odometer(positions, vehicle, config)
+    path_m = floats(positions, "path_m")
+    matched = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy() & np.isfinite(path_m)
+    along_m, t_ns = unrolled(positions, matched), times_ns(positions)
+    sigma_m, digits_m = floats(positions, "calibrated_along_m"), floats(positions, "digits_along_m")
+    jitter_s = stamp_jitter_s(odometry.seconds(t_ns))
+    arrays = EpochArrays(t_ns, along_m, sigma_m, digits_m, matched, jitter_s)
+    learned = learn(arrays, odometry, vehicle, config)
+    return positions.with_columns(
+        *_columns(arrays, odometry, learned, config), pl.Series("along_m", along_m, nan_to_null=True)
     )
+
+
+def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
+    """Sigmas of a position that every test counts with: a + b sigma as `calibrate` fitted it, and the digits."""
+    calibrated = {
+        f"calibrated_{axis}_m": config.sigma_intercept_m + config.sigma_slope * pl.col(f"sigma_{axis}_m")
+        for axis in ("along", "cross", "up")
+    }
+    with_digits = (calibrated["calibrated_along_m"] ** 2 + pl.col("digits_along_m") ** 2).sqrt()
+    return [with_digits.alias("position_sigma_m"), *(value.alias(name) for name, value in calibrated.items())]
+
+
+def _confidence(lds: LdsConfig) -> pl.Expr:
+    """Half-width of the confidence interval along the track: K sigma, or the receiver's HPL (DOMAIN section 4)."""
+    half_width = lds.ci_factor * pl.col("sigma_along_m") if lds.ci_source == "sigma" else pl.col("hpl_m")
+    return half_width.alias("confidence_m")
 
 
 def unrolled(epochs: pl.DataFrame, matched: Bools) -> Floats:
@@ -58,53 +73,50 @@ def unrolled(epochs: pl.DataFrame, matched: Bools) -> Floats:
     return along
 
 
-def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometer: pl.DataFrame, config: Configuration) -> pl.Series:
+def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> pl.Series:
     """Odometer distance at any times [m], on the scale of `aligned`'s `odometer_m`; null beyond what is known.
 
-    Carried on from the nearest epoch before (or the first one) with the scale in use there.
+    Carried on from the nearest epoch before (or the first one) with the scale in use there; `odometry` grows with the
+    path.
     """
     anchors = aligned.drop_nulls("odometer_m")
     if anchors.is_empty():
         return pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
-    track = odometer_track(odometer, config.align.odometer_gap_s, config.monitors.odometer_sigma_mps)
-    anchor_s = track.seconds(anchors["t"].dt.timestamp("ns").to_numpy()) - floats(anchors, "latency_s")
-    travelled = floats(anchors, "odometer_m")
-    forward = np.sum(np.diff(travelled) * np.diff(track.distance_at(anchor_s)))
-    track = track.oriented(-1 if forward < 0 else 1)
-    at_s = track.seconds(times.dt.timestamp("ns").to_numpy())
+    anchor_s = odometry.seconds(times_ns(anchors)) - floats(anchors, "latency_s")
+    at_s = odometry.seconds(times.dt.timestamp("ns").to_numpy())
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
-    way = track.distance_at(at_s) - track.distance_at(anchor_s[near])
-    known = track.known_at(at_s) & (track.stretch_at(at_s) == track.stretch_at(anchor_s[near]))
-    distance = np.where(known, travelled[near] + floats(anchors, "odometer_scale")[near] * way, np.nan)
-    return pl.Series("odometer_m", distance, nan_to_null=True)
+    way = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
+    whole = odometry.segment_at_s(at_s) == odometry.segment_at_s(anchor_s[near])
+    distance = floats(anchors, "odometer_m")[near] + floats(anchors, "odometer_scale")[near] * way
+    known = np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
+    return pl.Series("odometer_m", known, nan_to_null=True)
 
 
-def _columns(arrays: EpochArrays, track: OdometerTrack, learned: Learned, config: Configuration) -> list[pl.Series]:
-    at = arrays.t_s - learned.latency_s
-    known = track.known_at(at)
-    inside = (at >= track.t_s[0]) & (at <= track.t_s[-1])
+def _columns(arrays: EpochArrays, odometry: Odometry, learned: Learned, config: Configuration) -> list[pl.Series]:
+    at = odometry.seconds(arrays.t_ns) - learned.latency_s
+    known = odometry.known_at_s(at)
+    rows = np.flatnonzero(known)
+    step = np.zeros(known.size)
+    step[rows] = odometry.increments(arrays.t_ns[rows], learned.scale[rows], learned.latency_s[rows]).distance_m
+    total = np.where(known, np.cumsum(step), np.nan)
+    speed = np.where(known, learned.scale * odometry.speed_at_s(at), np.nan)
+    rows_m = np.minimum(odometry.row_sigma_m(at), most_scatter_m(config))
+    turning = speed_of_positions(at, with_hysteresis(total, hysteresis_m(rows_m))) if rows_m.any() else speed
     reason = (
         pl.when(pl.Series(known))
         .then(None)
-        .when(pl.Series(inside))
+        .when(pl.Series((at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])))
         .then(pl.lit(INTERRUPTED))
         .otherwise(pl.lit(BEYOND_SPAN))
     )
-    steps = odometer_steps(np.flatnonzero(known), arrays.t_s, track, learned)
-    step = np.full(known.size, np.nan)
-    step[known] = steps.distance_m
-    speed = np.where(known, learned.scale * track.speed_at(at), np.nan)
-    reading = reading_of(track, at, config)
-    total = np.where(known, np.cumsum(np.nan_to_num(step)), np.nan)
-    turning = speed if reading is None else speed_of_positions(at, with_play(total, play_m(reading.sigma_m)))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.select(reason.alias("odometer_reason")).to_series(),
-        pl.Series("odometer_stretch", track.stretch_at(at)),
+        pl.Series("odometer_segment", odometry.segment_at_s(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, arrays.jitter_s)),
-        pl.Series("odometer_white_m2_per_s", np.full(known.size, track.white_rate_m2_per_s)),
-        pl.Series("odometer_reading_m", np.zeros(known.size) if reading is None else reading.sigma_m),
-        pl.Series("odometer_period_s", np.full(known.size, track.period_s)),
+        pl.Series("odometer_white_m2_per_s", np.full(known.size, odometry.noise.white_m2_per_s)),
+        pl.Series("odometer_rows_m", rows_m),
+        pl.Series("odometer_period_s", np.full(known.size, odometry.period_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),
         pl.Series("direction", _direction(turning, config.matching.deadband_mps)),
         pl.Series("odometer_scale", learned.scale),
@@ -121,29 +133,21 @@ def _direction(speed_mps: Floats, deadband_mps: float) -> pl.Series:
     return signs.cast(pl.Int8)
 
 
-def _without_odometer(epochs: pl.DataFrame, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
+def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
     """No odometer: speed and direction from GNSS (velocity, else positions over the second before)."""
     nothing = pl.lit(None, pl.Float64)
-    t_s = epochs["t"].dt.timestamp("ns").to_numpy() * 1e-9
-    t_s = t_s - t_s[0]
-    valid = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
-    by_position = speed_of_positions(t_s, np.where(valid, floats(epochs, "path_m"), np.nan))
-    by_doppler = floats(epochs, "velocity_along_mps")
+    t_s = times_ns(positions) * 1e-9
+    valid = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy()
+    by_position = speed_of_positions(t_s - t_s[0], np.where(valid, floats(positions, "path_m"), np.nan))
+    by_doppler = floats(positions, "velocity_along_mps")
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
-    return epochs.with_columns(
-        along_m=nothing,
-        odometer_m=nothing,
+    return positions.with_columns(
+        **dict.fromkeys(_OF_ODOMETER, nothing),
         odometer_reason=pl.lit(NO_ODOMETER),
-        odometer_stretch=pl.lit(0, pl.Int64),
-        stamp_jitter_s=nothing,
-        odometer_white_m2_per_s=nothing,
-        odometer_reading_m=nothing,
-        odometer_period_s=nothing,
+        odometer_segment=pl.lit(0, pl.Int64),
         speed_mps=pl.Series(speed, nan_to_null=True),
         direction=_direction(speed, config.matching.deadband_mps),
-        odometer_scale=nothing,
-        scale_sigma=nothing,
         latency_s=pl.lit(latency, pl.Float64),
         latency_sigma_s=pl.lit(None if latency is None else vehicle.gnss_latency_sigma_s or 0.0, pl.Float64),
     )

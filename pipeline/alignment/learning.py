@@ -7,37 +7,29 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.alignment.increments import EpochArrays, Learned, along_series, odometer_steps
-from pipeline.alignment.odometer_filter import (
-    SPEED_SPAN_S,
-    Estimate,
-    FilterState,
-    ScaleLatencyFilter,
-    error_model,
-    estimates_of,
-    prior_of,
-)
+from pipeline.alignment.estimates import EpochArrays, Estimate, Learned
+from pipeline.alignment.odometer_filter import SPEED_SPAN_S, FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.epochs.timeline import gap_limit_s
 from pipeline.figures.bounds import threshold_factor
-from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
+from pipeline.monitors.axis import AxisSeries, error_model, run_axis
 from pipeline.monitors.recursion import AxisState
-from pipeline.odometry.odometer import OdometerTrack
+from pipeline.odometry.drift import drift_m2, relink_bound_m
+from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, Vehicle
 
 # Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
 _FIRST_BLOCK, _BLOCK = 2048, 8192
-# Stamps that scatter make no gap by themselves: the first position after one that they made is always late.
-_SCATTERED = 3.0
 
 
-def learn(arrays: EpochArrays, track: OdometerTrack, vehicle: Vehicle, config: Configuration) -> Learned:
+def learn(arrays: EpochArrays, odometry: Odometry, vehicle: Vehicle, config: Configuration) -> Learned:
     """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only."""
     prior = prior_of(vehicle, config.align)
-    learned = Learned.constant(prior, arrays.t_s.size)
+    learned = Learned.constant(prior, arrays.t_ns.size)
     if vehicle.odometer_scale is not None and vehicle.gnss_latency_s is not None:
         return learned
-    _Learner(arrays, track, vehicle, config, learned).run(prior)
+    _Learner(arrays, odometry, vehicle, config, learned).run(prior)
     if vehicle.odometer_scale is not None:
         learned.scale_sigma[:] = prior.scale_sigma
     if vehicle.gnss_latency_s is not None:
@@ -55,41 +47,41 @@ class _Learner:
     """
 
     def __init__(
-        self, arrays: EpochArrays, track: OdometerTrack, vehicle: Vehicle, config: Configuration, learned: Learned
+        self, arrays: EpochArrays, odometry: Odometry, vehicle: Vehicle, config: Configuration, learned: Learned
     ) -> None:
         self._config = config
-        self._track = track
+        self._odometry = odometry
         self._learned = learned
         self._arrays = arrays
-        shares, taus_s = error_model(config.monitors)
-        self._filter = ScaleLatencyFilter(shares, taus_s, track)
+        self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
         self._factor = threshold_factor(config.monitors.false_alarm_probability)
-        margin_s = 5.0 * config.align.latency_prior_sigma_s
-        known = track.known_at(arrays.t_s) & track.known_at(arrays.t_s - margin_s)
+        # Latencies of five sigmas have to find a known distance too.
+        margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
+        known = odometry.known_at(arrays.t_ns) & odometry.known_at(arrays.t_ns - margin_ns)
         self._rows = np.flatnonzero(arrays.usable & known)
+        t_s = odometry.seconds(arrays.t_ns)
         self._t_s, self._path_m, self._sigma_m = (
-            values[self._rows] for values in (arrays.t_s, arrays.path_m, arrays.sigma_m)
+            values[self._rows] for values in (t_s, arrays.path_m, np.hypot(arrays.sigma_m, arrays.digits_m))
         )
-        self._stretch = track.stretch_at(self._t_s)
+        self._segment = odometry.segment_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
         self._limit_m = config.hazards.failure_limit_m
-        period_s = float(np.median(np.diff(arrays.t_s)))
-        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + _SCATTERED * arrays.jitter_s
+        period_s = float(np.median(np.diff(t_s)))
+        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + config.align.scattered_gap_sigmas * arrays.jitter_s
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
-        self._outages = _gaps_before(self._t_s, arrays.t_s[arrays.usable], gap_s)
-        self._scale_known = vehicle.odometer_scale is not None
-        self._latency_known = vehicle.gnss_latency_s is not None
+        self._outages = _gaps_before(self._t_s, t_s[arrays.usable], gap_s)
+        self._vehicle = vehicle
 
     def run(self, prior: Estimate) -> None:
         if self._rows.size == 0:
             return
         prior = Estimate(
             prior.scale,
-            0.0 if self._scale_known else prior.scale_sigma,
+            prior.scale_sigma if self._vehicle.odometer_scale is None else 0.0,
             prior.latency_s,
-            0.0 if self._latency_known else prior.latency_sigma_s,
+            prior.latency_sigma_s if self._vehicle.gnss_latency_s is None else 0.0,
         )
         state, position = self._filter.start(prior, *self._observation(0)), 0
         while position < self._rows.size:
@@ -133,7 +125,7 @@ class _Learner:
         """The filter's last state in these positions; from where each of its states may be used; the joint states."""
         due = self._due(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
-        broken = (self._stretch[before] != self._stretch[due]) | (self._breaks[before] != self._breaks[due])
+        broken = (self._segment[before] != self._segment[due]) | (self._breaks[before] != self._breaks[due])
         joints = np.empty((due.size, *state.joint.shape))
         for first, last in pairwise((0, *np.flatnonzero(broken).tolist(), due.size)):
             if first == last:
@@ -149,7 +141,7 @@ class _Learner:
 
     def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
         """The state at the first position after a break; where the odometer lost its way, nothing tells of a move."""
-        if self._stretch[before] == self._stretch[position]:
+        if self._segment[before] == self._segment[position]:
             observed = *self._observation(position), float(self._sigma_m[position]), self._arrays.jitter_s
             return self._filter.resume(state, *observed, self._limit_m)
         away = self._outages[before] != self._outages[position]
@@ -177,39 +169,62 @@ class _Learner:
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
         """Along-track increments of these positions; the one at `restart` has none before it."""
         first = max(begin - 1, restart)
-        rows = self._rows[first:end]
-        series = along_series(rows, self._arrays, self._track, self._learned, self._config)
-        return series.between(begin - first, rows.size)
+        rows, arrays = self._rows[first:end], self._arrays
+        scale, scale_sigma, latency_s, latency_sigma_s = self._learned.at(rows)
+        at_s = self._t_s[first:end] - latency_s
+        epochs = AlongEpochs(
+            epoch=rows,
+            t_s=self._t_s[first:end],
+            along_m=self._path_m[first:end],
+            segment=self._odometry.segment_at_s(at_s),
+            sigma_m=arrays.sigma_m[rows],
+            digits_m=arrays.digits_m[rows],
+            jitter_s=arrays.jitter_s,
+            scale_sigma=scale_sigma,
+            latency_sigma_s=latency_sigma_s,
+            white_m2_per_s=self._odometry.noise.white_m2_per_s,
+            rows_m=np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config)),
+            period_s=self._odometry.period_s,
+        )
+        odometer = self._odometry.increments(arrays.t_ns[rows], scale, latency_s)
+        return along_series(epochs, odometer, self._config).between(begin - first, rows.size)
 
     def _hold(self, estimate: Estimate, alarm: int) -> tuple[int, float]:
         """Position from which learning goes on after the alarm at `alarm`, and what it has still to settle [m2].
 
         The number of positions if it never goes on. What may settle is how far the position is from its place then.
         """
-        begin = max(alarm - 1, 0)
-        config, rows = self._config, self._rows[begin:]
-        t_s, path_m, sigma_m = self._t_s[begin:], self._path_m[begin:], self._sigma_m[begin:]
-        steps = odometer_steps(rows, self._arrays.t_s, self._track, self._learned)
-        away = path_m - path_m[0] - np.cumsum(steps.distance_m)
-        series = self._series(begin, self._rows.size, begin)
-        result, _ = run_axis(series, self._alphas)
-        beyond = ~(np.abs(result.value[:, :2]) <= self._factor * result.sigma[:, :2])
-        fast = beyond.any(axis=1) | (np.arange(rows.size) <= 1)
-        last_fail = np.maximum.accumulate(np.where(fast, t_s, -np.inf))
-        quiet = t_s - last_fail >= config.lds.recovery_s
-        elapsed = t_s - t_s[0]
-        spread = np.sqrt(
-            2.0 * sigma_m**2
-            + self._track.white_rate_m2_per_s * elapsed
-            + (estimate.scale_sigma * np.cumsum(np.abs(steps.distance_m))) ** 2
+        begin = position = max(alarm - 1, 0)
+        bank: AxisState | None = None
+        away_m, failed_s, block = np.zeros(1), np.full(1, -np.inf), _FIRST_BLOCK
+        while position < self._rows.size:
+            end = min(position + block, self._rows.size)
+            t_s, series = self._t_s[position:end], self._series(position, end, begin)
+            result, bank = run_axis(series, self._alphas[:1], bank)
+            failing = ~(np.abs(result.value) <= self._factor * result.sigma).all(axis=1)
+            failing |= np.arange(position, end) <= begin + 1
+            failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
+            away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
+            variance_m2 = self._drift_m2(begin, position, end, estimate)
+            near = np.abs(away_m) <= relink_bound_m(variance_m2, self._factor, self._limit_m)
+            back = np.flatnonzero(near & (t_s - failed_s >= self._config.lds.recovery_s))
+            if back.size:
+                first = int(back[0])
+                return position + first, float(away_m[first] ** 2 + variance_m2[first])
+            position, block = end, min(2 * block, _BLOCK)
+        return self._rows.size, 0.0
+
+    def _drift_m2(self, anchor: int, begin: int, end: int, estimate: Estimate) -> Floats:
+        """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
+        sigma_m, t_ns = self._sigma_m, self._arrays.t_ns[self._rows]
+        way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
+        return drift_m2(
+            sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2,
+            self._t_s[begin:end] - self._t_s[anchor],
+            np.cumsum(way_m),
+            self._config.monitors.odometer_sigma_mps,
+            max(estimate.scale_sigma, self._vehicle.odometer_scale_sigma or 0.0),
         )
-        near = np.abs(away) <= np.minimum(config.hazards.failure_limit_m, self._factor * spread)
-        may_return = self._factor * spread <= config.hazards.failure_limit_m
-        back = np.flatnonzero(quiet & near & may_return)
-        if not back.size:
-            return self._rows.size, 0.0
-        first = int(back[0])
-        return begin + first, float(away[first] ** 2 + spread[first] ** 2)
 
 
 def _gaps_before(at_s: Floats, t_s: Floats, gap_s: float) -> Ints:

@@ -21,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.odometry.odometer import OdometerTrack
+from pipeline.alignment.estimates import Estimate
+from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Floats
-from schemas.config import AlignConfig, MonitorConfig, Vehicle
+from schemas.config import AlignConfig, Vehicle
 
 _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
@@ -33,25 +34,8 @@ _WHITE_SHARE = 0.01
 # speed tell the latency. A speed over less time has noise that would pass for such changes: at constant speed the
 # filter would grow sure of any latency.
 SPEED_SPAN_S = 2.0
-# Before it is seen, a position is rather thought to come back from a long break beside its place: to be sure of a wrong
-# scale is worse than to learn it more slowly. A receiver coasts over seconds and starts anew after half a minute or so:
-# were single missing epochs thought the same of, a noisy position with many of them would teach next to nothing.
-_MOVED_PROBABILITY = 0.8
-_MOVING_S = 30.0
 # Half the square of so many sigmas that no doubt is left; beyond it the exponential would overflow.
 _CERTAIN = 100.0
-# Variance that has still to settle fades with this time constant. Positions that settle over 10 to 60 s are followed;
-# longer, and a drift that begins meanwhile would be learned as scale the sooner.
-_SETTLING_S = 25.0
-
-
-class Estimate(NamedTuple):
-    """Scale (true over odometer distance) and latency [s] with their standard deviations."""
-
-    scale: float
-    scale_sigma: float
-    latency_s: float
-    latency_sigma_s: float
 
 
 class FilterState(NamedTuple):
@@ -83,12 +67,13 @@ class ScaleLatencyFilter:
 
     shares: Floats
     taus_s: Floats
-    track: OdometerTrack
+    odometry: Odometry
+    config: AlignConfig
 
     def start(self, prior: Estimate, t_s: float, path_m: float) -> FilterState:
         """A new state at this epoch: offset and GNSS errors unknown, scale and latency as in `prior`."""
         errors = self.shares.size
-        origin_m = float(self.track.distance_at(np.array([t_s - prior.latency_s]))[0])
+        origin_m = float(self.odometry.distance_at_s(np.array([t_s - prior.latency_s]))[0])
         mean = np.concatenate([[path_m, prior.scale - 1.0, prior.latency_s], np.zeros(errors)])
         variances = [_OFFSET_PRIOR_M2, prior.scale_sigma**2, prior.latency_sigma_s**2]
         covariance = np.diag(np.concatenate([variances, np.ones(errors)]))
@@ -114,7 +99,7 @@ class ScaleLatencyFilter:
         self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
         variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
-        probability = _MOVED_PROBABILITY * -math.expm1((state.t_s - t_s) / _MOVING_S)
+        probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
         # More than the offset's own prior would say no more, and leave no digits for the position's noise.
         brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
         joint[_OFFSET, _OFFSET] += brought_m2
@@ -132,7 +117,7 @@ class ScaleLatencyFilter:
         joints = np.empty((t_s.size, *state.joint.shape))
         times_s, rows = t_s.tolist(), self._rows(sigma_m)
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
-        unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / _SETTLING_S)
+        unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
         settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
         white_m2 = (_WHITE_SHARE * sigma_m**2).tolist()
         before = state.joint
@@ -174,11 +159,12 @@ class ScaleLatencyFilter:
 
     def _scatter_m2(self, jitter_s: float, speed_mps: float) -> float:
         """Variance of stamps and of the odometer's rows, both without memory [m^2]."""
-        return self.track.reading.still_m2 + (jitter_s**2 + self.track.reading.moving_s2) * speed_mps**2
+        rows = self.odometry.noise.quantisation
+        return rows.still_m2 + (jitter_s**2 + rows.moving_s2) * speed_mps**2
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
         """What the offset has still to walk at a later time."""
-        return state.unsettled_m2 * math.exp((state.t_s - t_s) / _SETTLING_S)
+        return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
         """Way from the origin [m] and speed [m/s].
@@ -186,9 +172,9 @@ class ScaleLatencyFilter:
         The speed is centred, but at the ends of the odometer: one from the same odometer noise as the innovation would
         bias the latency upwards.
         """
-        times_s = self.track.t_s
+        times_s = self.odometry.t_s
         begin_s, end_s = max(at_s - SPEED_SPAN_S, times_s.item(0)), min(at_s + SPEED_SPAN_S, times_s.item(-1))
-        before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.track.distance_m).tolist()
+        before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()
         return distance - origin_m, (after - before) / (end_s - begin_s)
 
     @cached_property
@@ -201,7 +187,7 @@ class ScaleLatencyFilter:
         dt_s = dt_ns * 1e-9
         decay = np.concatenate([np.ones(_ERRORS), np.exp(-dt_s / self.taus_s)])
         noise = 1.0 - decay * decay
-        noise[_OFFSET] = self.track.white_rate_m2_per_s * dt_s
+        noise[_OFFSET] = self.odometry.noise.white_m2_per_s * dt_s
         return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
 
 
@@ -230,10 +216,3 @@ def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
         latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,
         latency_sigma_s=(vehicle.gnss_latency_sigma_s or 0.0) if latency_known else config.latency_prior_sigma_s,
     )
-
-
-def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
-    """Shares of the position variance and correlation times [s] of the Gauss-Markov errors (DIAG Table 1)."""
-    shares = [config.ionosphere_share, config.troposphere_share, config.orbit_clock_share, config.user_share]
-    taus = [config.ionosphere_tau_s, config.troposphere_tau_s, config.orbit_clock_tau_s, config.user_tau_s]
-    return np.array(shares), np.array(taus)

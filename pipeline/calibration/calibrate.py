@@ -9,14 +9,15 @@ import numpy as np
 import polars as pl
 import tomli_w
 
-from pipeline.alignment.odometer_filter import error_model
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
 from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
 from pipeline.figures.bounds import threshold_factor
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
-from pipeline.odometry.odometer import odometer_track, polarity
+from pipeline.monitors.axis import error_model
+from pipeline.odometry import odometry_of
 from pipeline.stages import replay
+from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -108,18 +109,14 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
 def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> RunEstimate | None:
     run, _ = clean(log)
     fixes = run.gnss.filter(pl.col("solution") == solution)
-    if run.odometer is None or run.odometer.height < 2 or fixes.is_empty():
+    odometry = odometry_of(run.odometer, vehicle, config)
+    if odometry is None or fixes.is_empty():
         return None
-    epochs = match(
-        fixes, run.odometer, site, vehicle, config.matching, config.fix_sigma, run.balise_reads
-    ).epochs.filter("fix_valid", "on_track")
-    track = odometer_track(run.odometer, config.align.odometer_gap_s, config.monitors.odometer_sigma_mps)
-    t_s = track.seconds(epochs["t"].dt.timestamp("ns").to_numpy())
-    path_m = epochs["path_m"].to_numpy().astype(np.float64)
-    sign = polarity(track, t_s, path_m, config.matching.orientation_distance_m)
-    shares, taus_s = error_model(config.monitors)
-    sigma_m = epochs["sigma_along_m"].to_numpy().astype(np.float64)
-    return estimate_run(Observations(t_s, path_m, sigma_m), track.oriented(sign), shares, taus_s)
+    found = match(fixes, odometry, site, vehicle, config.matching, config.fix_sigma, run.balise_reads)
+    epochs = found.epochs.filter("fix_valid", "on_track")
+    t_s = odometry.seconds(times_ns(epochs))
+    seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
+    return estimate_run(seen, odometry.oriented(found.odometer_sign), *error_model(config.monitors))
 
 
 def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:

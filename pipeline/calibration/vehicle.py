@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.odometry.odometer import OdometerTrack
+from pipeline.odometry import Odometry
 from schemas.arrays import Floats
 
 # Points of one dense covariance, and the time between them: user errors last 100 s, accelerations a few seconds, so a
@@ -59,20 +59,20 @@ class Observations:
 
 
 def estimate_run(
-    seen: Observations, track: OdometerTrack, shares: Floats, taus_s: Floats, latency_s: float = 0.0
+    seen: Observations, odometry: Odometry, shares: Floats, taus_s: Floats, latency_s: float = 0.0
 ) -> RunEstimate | None:
     """Scale and latency of one run, none where too little of it can be compared.
 
-    `track` must grow with the path. Solved by Gauss-Newton steps from `latency_s`.
+    `odometry` must grow with the path. Solved by Gauss-Newton steps from `latency_s`.
     """
-    blocks = _blocks(seen, track)
+    blocks = _blocks(seen, odometry)
     if not blocks:
         return None
-    covariances = [_covariance(block, track, shares, taus_s) for block in blocks]
-    by_chance = sum(_chance_information(block, c, track) for block, c in zip(blocks, covariances, strict=True))
+    covariances = [_covariance(block, odometry, shares, taus_s) for block in blocks]
+    by_chance = sum(_chance_information(block, c, odometry) for block, c in zip(blocks, covariances, strict=True))
     estimate = np.array([1.0, latency_s])
     for _ in range(_ITERATIONS):
-        normal, right, left_over, freedom = _accumulate(blocks, covariances, track, estimate)
+        normal, right, left_over, freedom = _accumulate(blocks, covariances, odometry, estimate)
         if np.linalg.matrix_rank(normal) < normal.shape[0]:
             return None
         estimate = estimate + np.linalg.solve(normal, right)
@@ -83,14 +83,19 @@ def estimate_run(
     return RunEstimate(float(estimate[0]), float(sigma[0]), float(estimate[1]), float(sigma[1]), misfit, points)
 
 
-def _blocks(seen: Observations, track: OdometerTrack) -> list[Observations]:
+def _blocks(seen: Observations, odometry: Odometry) -> list[Observations]:
     """Thinned observations in pieces of unbroken odometry, each with an offset of its own."""
-    begin_s, end_s = _span(seen.t_s, track)
-    known = track.known_at(seen.t_s) & track.known_at(seen.t_s - 1.0) & track.known_at(begin_s) & track.known_at(end_s)
+    begin_s, end_s = _span(seen.t_s, odometry)
+    known = (
+        odometry.known_at_s(seen.t_s)
+        & odometry.known_at_s(seen.t_s - 1.0)
+        & odometry.known_at_s(begin_s)
+        & odometry.known_at_s(end_s)
+    )
     rows = np.flatnonzero(known & np.isfinite(seen.path_m) & np.isfinite(seen.sigma_m) & (seen.sigma_m > 0))
     rows = rows[_thinned(seen.t_s[rows])]
     pieces: list[Observations] = []
-    for piece in np.split(rows, np.flatnonzero(np.diff(track.stretch_at(seen.t_s[rows]))) + 1):
+    for piece in np.split(rows, np.flatnonzero(np.diff(odometry.segment_at_s(seen.t_s[rows]))) + 1):
         for part in np.array_split(piece, max(1, -(-piece.size // _BLOCK_POINTS))):
             if part.size >= _LEAST_POINTS:
                 pieces.append(Observations(seen.t_s[part], seen.path_m[part], seen.sigma_m[part]))
@@ -106,42 +111,42 @@ def _thinned(t_s: Floats) -> npt.NDArray[np.int64]:
     return np.flatnonzero(np.diff(slot, prepend=-1))
 
 
-def _covariance(block: Observations, track: OdometerTrack, shares: Floats, taus_s: Floats) -> Floats:
+def _covariance(block: Observations, odometry: Odometry, shares: Floats, taus_s: Floats) -> Floats:
     """Covariance of GNSS minus odometer [m^2]: Gauss-Markov sources, a white rest, the odometer's walk and rows."""
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     correlation = sum(share * np.exp(-lag / tau) for share, tau in zip(shares, taus_s, strict=True))
     gnss = np.outer(block.sigma_m, block.sigma_m) * correlation
     since = block.t_s - block.t_s[0]
-    walk = track.white_rate_m2_per_s * np.minimum(since[:, None], since[None, :])
+    walk = odometry.noise.white_m2_per_s * np.minimum(since[:, None], since[None, :])
     result: Floats = gnss + walk + np.diag(_WHITE_SHARE * block.sigma_m**2)
-    return result + _of_rows(track, block.t_s, block.t_s) if track.reading else result
+    return result + _of_rows(odometry, block.t_s, block.t_s) if odometry.noise.quantisation else result
 
 
-def _of_rows(track: OdometerTrack, one_s: Floats, other_s: Floats) -> Floats:
-    """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`ReadingNoise`).
+def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
+    """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`QuantisationNoise`).
 
     A counter is off by the same while the train stands, so that many rows tell no more than one; after a share x of its
     step the correlation of what it leaves out is 1 - 6 x + 6 x^2, by the first terms. Other noise is each row's own.
     """
-    sigmas = [np.sqrt(track.reading.variance_m2(track.speed_at(at_s))) for at_s in (one_s, other_s)]
-    ways, scale = (one_s, other_s), track.period_s
-    if track.count_step_m > 0.0:
-        counts = np.flatnonzero(np.diff(track.distance_m, prepend=np.nan) != 0)
-        at_s, at_m = track.t_s[counts], track.distance_m[counts]
-        ways, scale = (np.interp(one_s, at_s, at_m), np.interp(other_s, at_s, at_m)), track.count_step_m / 6.0
+    sigmas = [odometry.row_sigma_m(at_s) for at_s in (one_s, other_s)]
+    ways, scale = (one_s, other_s), odometry.period_s
+    if odometry.noise.counter_m > 0.0:
+        counts = np.flatnonzero(np.diff(odometry.distance_m, prepend=np.nan) != 0)
+        at_s, at_m = odometry.t_s[counts], odometry.distance_m[counts]
+        ways, scale = (np.interp(one_s, at_s, at_m), np.interp(other_s, at_s, at_m)), odometry.noise.counter_m / 6.0
     apart = np.abs(ways[0][:, None] - ways[1][None, :])
     result: Floats = np.outer(*sigmas) * np.maximum(1.0 - apart / scale, 0.0)
     return result
 
 
 def _accumulate(
-    blocks: list[Observations], covariances: list[Floats], track: OdometerTrack, estimate: Floats
+    blocks: list[Observations], covariances: list[Floats], odometry: Odometry, estimate: Floats
 ) -> tuple[Floats, Floats, float, int]:
     """Normal equations of (scale, latency), offsets eliminated; remaining chi-square before the step, its freedom."""
     normal, right = np.zeros((2, 2)), np.zeros(2)
     left_over, freedom = 0.0, -2
     for block, covariance in zip(blocks, covariances, strict=True):
-        design, miss = _linearised(block, track, estimate)
+        design, miss = _linearised(block, odometry, estimate)
         factor = np.linalg.cholesky(covariance)
         white = np.linalg.solve(factor, np.column_stack([np.ones(miss.size), design, miss]))
         offset = white[:, 0] / np.linalg.norm(white[:, 0])
@@ -155,7 +160,7 @@ def _accumulate(
     return normal, right, left_over, freedom
 
 
-def _chance_information(block: Observations, covariance: Floats, track: OdometerTrack) -> float:
+def _chance_information(block: Observations, covariance: Floats, odometry: Odometry) -> float:
     """What the odometer's noise alone, taken for changes of speed, seems to tell of the latency [1/s^2], on average.
 
     The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second,
@@ -163,11 +168,11 @@ def _chance_information(block: Observations, covariance: Floats, track: Odometer
     """
     span_s = 2.0 * _SPEED_SPAN_S
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
-    noise = track.white_rate_m2_per_s * np.maximum(span_s - lag, 0.0) / span_s**2
-    if track.reading:
-        begin_s, end_s = _span(block.t_s, track)
-        across = _of_rows(track, begin_s, end_s)
-        rows = _of_rows(track, begin_s, begin_s) + _of_rows(track, end_s, end_s) - across - across.T
+    noise = odometry.noise.white_m2_per_s * np.maximum(span_s - lag, 0.0) / span_s**2
+    if odometry.noise.quantisation:
+        begin_s, end_s = _span(block.t_s, odometry)
+        across = _of_rows(odometry, begin_s, end_s)
+        rows = _of_rows(odometry, begin_s, begin_s) + _of_rows(odometry, end_s, end_s) - across - across.T
         noise = noise + rows / span_s**2
     solved = np.linalg.solve(covariance, np.column_stack([noise, np.ones(block.t_s.size)]))
     inverse_ones = solved[:, -1]
@@ -180,20 +185,20 @@ def _widened(sigma_s: float, by_chance: float) -> float:
     return float(1.0 / np.sqrt(max(told - 2.0 * by_chance, _LEAST_SHARE * told)))
 
 
-def _linearised(block: Observations, track: OdometerTrack, estimate: Floats) -> tuple[Floats, Floats]:
+def _linearised(block: Observations, odometry: Odometry, estimate: Floats) -> tuple[Floats, Floats]:
     """Columns of scale and latency, and what is observed over what is expected."""
     scale, latency_s = estimate
     at = block.t_s - latency_s
-    distance = track.distance_at(at)
+    distance = odometry.distance_at_s(at)
     # Centred, as a speed from the odometer noise of the same second would bias the latency.
-    begin_s, end_s = _span(at, track)
-    speed = (track.distance_at(end_s) - track.distance_at(begin_s)) / (end_s - begin_s)
+    begin_s, end_s = _span(at, odometry)
+    speed = (odometry.distance_at_s(end_s) - odometry.distance_at_s(begin_s)) / (end_s - begin_s)
     return np.column_stack([distance - distance[0], -scale * speed]), block.path_m - scale * distance
 
 
-def _span(t_s: Floats, track: OdometerTrack) -> tuple[Floats, Floats]:
+def _span(t_s: Floats, odometry: Odometry) -> tuple[Floats, Floats]:
     """Begin and end of the time over which the speed is taken, within what the odometer recorded."""
-    return np.maximum(t_s - _SPEED_SPAN_S, track.t_s[0]), np.minimum(t_s + _SPEED_SPAN_S, track.t_s[-1])
+    return np.maximum(t_s - _SPEED_SPAN_S, odometry.t_s[0]), np.minimum(t_s + _SPEED_SPAN_S, odometry.t_s[-1])
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
-from pipeline.alignment.increments import most_scatter_m
 from pipeline.epochs.clock import Clock, flags
+from pipeline.monitors.along import most_scatter_m
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures
 
@@ -59,7 +59,7 @@ def reading_notes(epochs: pl.DataFrame, config: Configuration) -> tuple[str, ...
     """
     most_m = most_scatter_m(config)
     digits_m = epochs.select(pl.max_horizontal(pl.col(r"^digits_(along|cross|up)_m$").max())).item()
-    texts = {_READING: epochs["odometer_reading_m"].max(), _DIGITS: digits_m}
+    texts = {_READING: epochs["odometer_rows_m"].max(), _DIGITS: digits_m}
     notes = []
     for text, sigma_m in texts.items():
         if isinstance(sigma_m, float) and sigma_m > _WORTH_M:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import UTC, datetime
 
-import numpy as np
 import polars as pl
 
 from pipeline.ingest.clean import StreamCounts
@@ -12,9 +12,9 @@ from pipeline.lds.relink import UNLINKED
 from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
-from pipeline.odometry.odometer import STRAIGHT_S, leaps
+from pipeline.odometry import Odometry
 from pipeline.site.checks import BALISE_PLACE
-from schemas.arrays import NS_PER_S, floats, times_ns
+from schemas.arrays import NS_PER_S
 from schemas.config import Vehicle
 from schemas.run import RunLog, Site
 
@@ -30,14 +30,19 @@ def run_notes(
     found: Match,
     lds: LdsResult,
     vehicle: Vehicle,
+    odometry: Odometry | None,
+    straight_s: float,
 ) -> tuple[str, ...]:
-    """Notes on what went in and what matching and the LDS made of it; `counts`, `fixes`: the GNSS of this solution."""
+    """Notes on what went in and what matching and the LDS made of it.
+
+    `counts`, `fixes`: the GNSS of this solution. `straight_s`: rows of an odometer may be so far apart [s].
+    """
     return (
         *_injected(run),
         *_off_the_track(site),
         *_stamps(counts),
         *_extents(run),
-        *_odometer(run),
+        *_odometer(odometry, straight_s),
         *_positions(fixes, found, vehicle),
         *_ambiguous(found),
         *_linking(lds),
@@ -84,22 +89,20 @@ def _extents(run: RunLog) -> Iterator[str]:
         yield "the GNSS begins after the odometer"
 
 
-def _odometer(run: RunLog) -> Iterator[str]:
+def _odometer(odometry: Odometry | None, straight_s: float) -> Iterator[str]:
     """What the odometer's rows cannot tell."""
-    if run.odometer is None:
+    if odometry is None:
         return
-    dt_s = np.diff(times_ns(run.odometer)) / NS_PER_S
-    leap = leaps(np.diff(floats(run.odometer, "distance_m")), dt_s)
-    if leap.any():
-        first = run.odometer["t"][int(leap.argmax()) + 1]
+    if odometry.leaps_ns:
+        first = datetime.fromtimestamp(odometry.leaps_ns[0] // NS_PER_S, UTC)
         yield (
-            f"the odometer's distance leaps by more than a train can drive, {int(leap.sum())} times, first at "
+            f"the odometer's distance leaps by more than a train can drive, {len(odometry.leaps_ns)} times, first at "
             f"{first:%H:%M:%S}: its speed counts there, or where none agrees with the distance, the way is lost"
         )
-    if (period_s := float(np.median(dt_s))) > STRAIGHT_S:
+    if odometry.period_s > straight_s:
         yield (
-            f"the odometer has a row every {period_s:.3g} s only: where the speed changes in between, alarms along the "
-            "track may be its own"
+            f"the odometer has a row every {odometry.period_s:.3g} s only: where the speed changes in between, alarms "
+            "along the track may be its own"
         )
 
 

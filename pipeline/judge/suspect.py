@@ -61,7 +61,7 @@ def suspect_of(w: Witnesses, begin_ns: int, end_ns: int) -> Suspect:
 
 
 def _parted_together(w: Witnesses, rows: Ints) -> bool:
-    """Position and Doppler agree with each other where both left the odometer."""
+    """Position and Doppler agree with each other where both left the odometer, by half the margin of the position."""
     known = rows[np.isfinite(w.path_m[rows]) & np.isfinite(w.odometer_m[rows]) & np.isfinite(w.velocity_mps[rows])]
     if known.size < 2:
         return False
@@ -69,6 +69,6 @@ def _parted_together(w: Witnesses, rows: Ints) -> bool:
     mean_mps = 0.5 * (w.velocity_mps[known][1:] + w.velocity_mps[known][:-1])
     doppler_m = np.concatenate([[0.0], np.cumsum(np.where(dt_s <= _LONGEST_STEP_S, mean_mps * dt_s, 0.0))])
     position_m, odometer_m = w.path_m[known] - w.path_m[known[0]], w.odometer_m[known] - w.odometer_m[known[0]]
-    margin = w.margin_m[known]
+    margin = 0.5 * w.margin_m[known]
     both = (np.abs(position_m - odometer_m) > margin) & (np.abs(doppler_m - odometer_m) > margin)
     return bool((both & (np.abs(position_m - doppler_m) <= margin)).any())

@@ -48,8 +48,8 @@ def run_lds(
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
-    gate_probability, sigma_along_m, confidence_m, odometer_m` (along growing path, cumulative; null
-    where unknown)`, odometer_stretch, direction` (+1/-1, used where there is no odometer).
+    gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
+    where unknown)`, odometer_segment, direction` (+1/-1, used where there is no odometer).
     `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, optionally `odometer_m`
     at the read; without it the odometer is interpolated between near epochs. A run without that
     stream has no reader, so its physical balises have no passages.

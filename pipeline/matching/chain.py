@@ -12,6 +12,7 @@ from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.orientation import grows_with
 from pipeline.matching.steps import travelled
+from pipeline.odometry import Odometry
 from pipeline.track.geodesy import Points
 from pipeline.track.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.track.path import TravelledPath
@@ -22,7 +23,7 @@ from schemas.enums import Navigability
 
 
 def path_on_chain(
-    fixes: Fixes, odometer: pl.DataFrame | None, track: Track, leg: Leg, config: MatchingConfig
+    fixes: Fixes, odometry: Odometry | None, track: Track, leg: Leg, config: MatchingConfig
 ) -> tuple[TravelledPath, Assignment]:
     """The part of a chain that the run covers, oriented as the run began; nothing is in doubt on it."""
     known = np.flatnonzero(fixes.valid)
@@ -34,7 +35,7 @@ def path_on_chain(
     position[known] = np.where(near, path_at(leg, feet), np.nan)
     used = leg.visit[feet.segment[near]]
     part = slice(int(used.min()), int(used.max()) + 1)
-    forward = grows_with(position, np.arange(len(fixes)), travelled(fixes, odometer), config.orientation_distance_m)
+    forward = grows_with(position, np.arange(len(fixes)), travelled(fixes, odometry), config.orientation_distance_m)
     if forward and len(leg.visits[part]) == len(leg.visits):
         covered = leg
     else:

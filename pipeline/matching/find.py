@@ -19,6 +19,7 @@ from pipeline.matching.rivals import Posterior, posterior_of
 from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
+from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import end_places
@@ -39,7 +40,7 @@ _THINNING = 4
 
 def find_path(
     fixes: Fixes,
-    odometer: pl.DataFrame | None,
+    odometry: Odometry | None,
     network: Network,
     pinned: Ints,
     config: MatchingConfig,
@@ -48,7 +49,7 @@ def find_path(
 
     `pinned` holds per epoch the element that a balise read proves, -1 without one.
     """
-    way = travelled(fixes, odometer)
+    way = travelled(fixes, odometry)
     believed = believable(fixes, fixes.valid, way, config)
     trellis = _trellis(fixes, believed, way, network, pinned, config)
     found = search(trellis)

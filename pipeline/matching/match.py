@@ -16,14 +16,14 @@ from pipeline.matching.fixes import Fixes, fixes_of
 from pipeline.matching.residuals import biases
 from pipeline.matching.resolution import digit_noise
 from pipeline.matching.rivals import Posterior, Rivals, rivals_of
-from pipeline.matching.steps import ODOMETER_GAP_S
-from pipeline.odometry.odometer import odometer_track, polarity
+from pipeline.odometry import Odometry
+from pipeline.odometry.polarity import polarity
 from pipeline.track.leg import leg_of
 from pipeline.track.network import network_of
 from pipeline.track.path import TravelledPath
 from pipeline.track.route import network_along, visits_of
 from pipeline.track.survey import Track, track_of
-from schemas.arrays import Ints, floats
+from schemas.arrays import Ints, floats, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
@@ -34,7 +34,8 @@ class Match:
     """Epochs on the path, the path, and stretches of doubt.
 
     `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
-    possible at the steps of the search; none where nothing was to be searched.
+    possible at the steps of the search; none where nothing was to be searched. `odometer_sign`: of the recorded
+    odometer against growing path, set here and nowhere else.
     """
 
     epochs: pl.DataFrame
@@ -42,6 +43,7 @@ class Match:
     ambiguous: pl.DataFrame
     antenna_ahead_m: float
     posterior: Posterior | None = None
+    odometer_sign: int = 1
 
     @cached_property
     def biases(self) -> pl.DataFrame:
@@ -55,7 +57,7 @@ class Match:
 
 def match(
     fixes: pl.DataFrame,
-    odometer: pl.DataFrame | None,
+    odometry: Odometry | None,
     site: Site,
     vehicle: Vehicle,
     config: MatchingConfig,
@@ -64,39 +66,36 @@ def match(
 ) -> Match:
     """Place one solution's epochs (ordered, unique `t`) on the site's track.
 
-    `odometer` is the cleaned stream with `t, distance_m, speed_mps`, or none. Raises `InputError` where no
+    `odometry`: of the run, as recorded, or none. Raises `InputError` where no
     epoch comes near any track.
     """
     arrays = fixes_of(fixes, fix_sigma)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    path, found, ambiguous, posterior = _path(arrays, odometer, site, config, balise_reads)
+    path, found, ambiguous, posterior = _path(arrays, odometry, site, config, balise_reads)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    if vehicle.gnss_antenna_ahead_m and _begins_reversing(arrays, epochs, odometer, config):
+    sign = _odometer_sign(odometry, epochs, config)
+    if sign < 0 and vehicle.gnss_antenna_ahead_m:
+        # The odometer falls when reversing (CONTRACT section 1): the leading end faces against growing path, and the
+        # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior)
+    epochs = epochs.with_columns(fixes["hpl_m"], *digit_noise(fixes, floats(epochs, "heading_deg")))
+    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, odometer_sign=sign)
 
 
-def _begins_reversing(
-    fixes: Fixes, epochs: pl.DataFrame, odometer: pl.DataFrame | None, config: MatchingConfig
-) -> bool:
-    """The odometer falls over the first net movement: the leading end faces against growing path.
-
-    `distance_m` falls when reversing (CONTRACT section 1), and the antenna stays where it is on the train.
-    """
-    if odometer is None or odometer.height < 2:
-        return False
-    track = odometer_track(odometer, gap_s=ODOMETER_GAP_S, sigma_mps=1.0)
-    matched = fixes.valid & epochs["on_track"].to_numpy()
-    path_m = np.where(matched, epochs["path_m"].cast(pl.Float64).to_numpy(), np.nan)
-    return polarity(track, track.seconds(fixes.t_ns), path_m, config.orientation_distance_m) < 0
+def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:
+    """+1 or -1: the odometer's sign against growing path (DOMAIN section 2); +1 without one."""
+    if odometry is None:
+        return 1
+    matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
+    path_m = np.where(matched, floats(epochs, "path_m"), np.nan)
+    return polarity(odometry, times_ns(epochs), path_m, config.orientation_distance_m)
 
 
 def _path(
     fixes: Fixes,
-    odometer: pl.DataFrame | None,
+    odometry: Odometry | None,
     site: Site,
     config: MatchingConfig,
     balise_reads: pl.DataFrame | None,
@@ -107,10 +106,10 @@ def _path(
     if visits is not None:
         leg = leg_of(track, visits)
         if not leg.returns:
-            return *path_on_chain(fixes, odometer, track, leg, config), no_doubt(), None
+            return *path_on_chain(fixes, odometry, track, leg, config), no_doubt(), None
     network = network_of(track, site.links) if visits is None else network_along(track, visits)
     pinned = pins_of(fixes, site, network.track, balise_reads)
-    return find_path(fixes, odometer, network, pinned, config)
+    return find_path(fixes, odometry, network, pinned, config)
 
 
 def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame | None) -> Ints:

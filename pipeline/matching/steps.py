@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import polars as pl
 
 from pipeline.matching.fixes import Fixes
-from pipeline.odometry.odometer import odometer_track
+from pipeline.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
@@ -25,8 +24,6 @@ _SPEED_SPAN_S = (1.0, 5.0)
 _ODOMETER_SHARE = 0.05
 _JUMP_SIGMAS = 5.0
 _JUMP_MARGIN_M = 10.0
-# Inside a pause of the odometer that is longer the way is not known; of speeds alone it is lost.
-ODOMETER_GAP_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -49,24 +46,22 @@ class Steps:
 
 @dataclass(frozen=True)
 class Travelled:
-    """Odometer distance at each epoch [m], NaN where it is not known; comparable within one `stretch` only."""
+    """Odometer distance at each epoch [m], NaN where it is not known; comparable within one `segment` only."""
 
     distance_m: Floats
-    stretch: Ints
+    segment: Ints
 
     def between(self, rows: Ints, others: Ints) -> Floats:
         """Signed distance from some epochs to others, NaN where the odometer does not know it."""
-        same = self.stretch[rows] == self.stretch[others]
+        same = self.segment[rows] == self.segment[others]
         return np.where(same, self.distance_m[others] - self.distance_m[rows], np.nan)
 
 
-def travelled(fixes: Fixes, odometer: pl.DataFrame | None) -> Travelled:
+def travelled(fixes: Fixes, odometry: Odometry | None) -> Travelled:
     """The odometer at the epochs' times."""
-    if odometer is None or odometer.height < 2:
+    if odometry is None:
         return Travelled(np.full(len(fixes), np.nan), np.zeros(len(fixes), dtype=np.int64))
-    track = odometer_track(odometer, gap_s=ODOMETER_GAP_S, sigma_mps=1.0)
-    t_s = track.seconds(fixes.t_ns)
-    return Travelled(np.where(track.known_at(t_s), track.distance_at(t_s), np.nan), track.stretch_at(t_s))
+    return Travelled(odometry.distance_at(fixes.t_ns), odometry.segment_at(fixes.t_ns))
 
 
 def steps_of(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Steps:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.monitors.recursion import (
     AxisState,
@@ -15,11 +14,8 @@ from pipeline.monitors.recursion import (
     linear_recurrence,
     variance_of_ewma,
 )
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MonitorConfig
-
-# Half of the fastest average's memory: so the variance of all averages is that of rows up to 5 s apart, or above it.
-_LASTS_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +31,7 @@ class AxisSeries:
     error that a curve turns into this axis) and of the latency makes of the rate, signed.
     """
 
-    epoch: npt.NDArray[np.int64]
+    epoch: Ints
     fresh: Bools
     border: Bools
     dt_s: Floats
@@ -70,84 +66,11 @@ def with_memory(sigma_m: Floats, decorrelation: Floats) -> dict[str, Floats]:
     return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
 
 
-def along_errors(
-    sigma_m: Floats, jitter_m: Floats, dt_s: Floats, shares: Floats, taus_s: Floats, reading: Reading | None = None
-) -> dict[str, Floats]:
-    """Error fields of the along-track axis: the Gauss-Markov errors, stamps that scatter, rows of the odometer that do.
-
-    `jitter_m`: standard deviation of the way that the stamp's jitter makes; it has no memory (phi = 0).
-    """
-    sigmas = [np.outer(np.sqrt(shares), sigma_m), np.abs(jitter_m)]
-    decorrelations = [decorrelation_of(dt_s, taus_s), np.ones(dt_s.size)]
-    if reading is not None:
-        sigmas.append(reading.sigma_m)
-        decorrelations.append(reading.decorrelation(dt_s))
-    return with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T)
-
-
-def calibrated(sigma_m: Floats, config: MonitorConfig) -> Floats:
-    """Position sigma that the monitors count with [m]: `calibrate` may have fitted a + b sigma."""
-    return config.sigma_intercept_m + config.sigma_slope * sigma_m
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Noise of the odometer's rows: its deviation at each epoch [m], shape (m,), and the time between rows [s]."""
-
-    sigma_m: Floats
-    period_s: float
-
-    def decorrelation(self, dt_s: Floats) -> Floats:
-        """1 - phi over these steps: none is left from row to row; between rows, on straight lines, little changes.
-
-        The square is what a step changes on a straight line. Errors that change so little and at random would last for
-        `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than `_LASTS_S`.
-        """
-        changed = np.minimum(dt_s / max(self.period_s, 1e-9), 1.0) ** 2
-        lost: Floats = np.maximum(changed, np.minimum(dt_s / _LASTS_S, 1.0))
-        return lost
-
-
-@dataclass(frozen=True)
-class AlongSteps:
-    """Steps along the track from one usable epoch to the next, shapes (m,), and the errors at their ends.
-
-    `path_m` by GNSS, `odometer_m` and the change of speed `speed_mps` by the corrected odometer; `jitter_s`: how the
-    stamps scatter; `digits_m`: how coarsely positions are written down; `white_m2_per_s`: variance that the odometer's
-    distance gathers in a second; `reading`: what its rows scatter beside.
-    """
-
-    dt_s: Floats
-    path_m: Floats
-    odometer_m: Floats
-    speed_mps: Floats
-    sigma_m: Floats
-    jitter_s: Floats | float
-    white_m2_per_s: Floats | float
-    scale_sigma: Floats
-    latency_sigma_s: Floats
-    digits_m: Floats
-    reading: Reading | None = None
-
-
-def along_axis(
-    epoch: npt.NDArray[np.int64], fresh: Bools, steps: AlongSteps, shares: Floats, taus_s: Floats
-) -> AxisSeries:
-    """Increments of GNSS minus odometer (DIAG eq. 1-3), with what scale and latency leave uncertain."""
-    dt = steps.dt_s
-    memoryless_m = np.hypot(steps.jitter_s * steps.odometer_m / dt, steps.digits_m)
-    return AxisSeries(
-        epoch=epoch,
-        fresh=fresh,
-        border=np.zeros(dt.size, dtype=np.bool_),
-        dt_s=dt,
-        rate_mps=(steps.path_m - steps.odometer_m) / dt,
-        **along_errors(steps.sigma_m, memoryless_m, dt, shares, taus_s, steps.reading),
-        white_m2=steps.white_m2_per_s * dt,
-        border_m2=np.zeros(dt.size),
-        steady_mps=steps.scale_sigma * steps.odometer_m / dt,
-        latency_mps=steps.latency_sigma_s * steps.speed_mps / dt,
-    )
+def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
+    """Shares of the position variance and correlation times [s] of the Gauss-Markov errors (DIAG Table 1)."""
+    shares = [config.ionosphere_share, config.troposphere_share, config.orbit_clock_share, config.user_share]
+    taus = [config.ionosphere_tau_s, config.troposphere_tau_s, config.orbit_clock_tau_s, config.user_tau_s]
+    return np.array(shares), np.array(taus)
 
 
 def decorrelation_of(dt_s: Floats, taus_s: Floats) -> Floats:

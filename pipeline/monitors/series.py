@@ -8,17 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.alignment.odometer_filter import error_model
-from pipeline.monitors.axis import (
-    AlongSteps,
-    AxisSeries,
-    Reading,
-    along_axis,
-    calibrated,
-    decorrelation_of,
-    with_memory,
-)
-from schemas.arrays import Bools, Floats
+from pipeline.monitors.along import AlongEpochs, along_series
+from pipeline.monitors.axis import AxisSeries, decorrelation_of, error_model, with_memory
+from pipeline.odometry.odometry import Increments
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 
 NO_POSITION = "no position"
@@ -49,8 +42,8 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     builder = _Builder(epochs, t_s, config)
     return (
         Axis("along", builder.along(along_reasons), along_reasons),
-        Axis("cross", builder.across(matched, "cross_track_m", "sigma_cross_m", "digits_cross_m"), matched),
-        Axis("up", builder.across(up_reasons, "vertical_m", "sigma_up_m", "digits_up_m"), up_reasons),
+        Axis("cross", builder.across(matched, "cross_track_m", "calibrated_cross_m", "digits_cross_m"), matched),
+        Axis("up", builder.across(up_reasons, "vertical_m", "calibrated_up_m", "digits_up_m"), up_reasons),
     )
 
 
@@ -84,42 +77,32 @@ class _Builder:
         self._survey_default_m = config.matching.survey_sigma_default_m
         self._wander_m, self._wander_length_m = config.monitors.survey_wander_m, config.monitors.survey_wander_length_m
         self._shares, self._taus_s = error_model(config.monitors)
-        self._monitors = config.monitors
+        self._config = config
 
-    def _column(self, name: str, rows: npt.NDArray[np.int64]) -> Floats:
+    def _column(self, name: str, rows: Ints) -> Floats:
         values: Floats = self._epochs[name].to_numpy().astype(np.float64)[rows]
         return values
-
-    def _sigma(self, name: str, rows: npt.NDArray[np.int64]) -> Floats:
-        """Position sigma of the axis [m]."""
-        return calibrated(self._column(name, rows), self._monitors)
 
     def along(self, reasons: pl.Series) -> AxisSeries:
         rows = np.flatnonzero(reasons.is_null().to_numpy())
         if rows.size == 0:
             return _empty(self._shares.size + 1)
-        dt, fresh = self._time_steps(rows)
-        stretch = self._epochs["odometer_stretch"].to_numpy()[rows]
-        fresh |= _changes(stretch)
-        steps = AlongSteps(
-            dt_s=dt,
-            path_m=_steps(self._column("along_m", rows)),
-            odometer_m=_steps(self._column("odometer_m", rows)),
-            speed_mps=_steps(self._column("speed_mps", rows)),
-            sigma_m=self._sigma("sigma_along_m", rows),
+        odometer = Increments(_steps(self._column("odometer_m", rows)), _steps(self._column("speed_mps", rows)))
+        epochs = AlongEpochs(
+            epoch=rows,
+            t_s=self._t_s[rows],
+            along_m=self._column("along_m", rows),
+            segment=self._epochs["odometer_segment"].to_numpy()[rows],
+            sigma_m=self._column("calibrated_along_m", rows),
+            digits_m=self._column("digits_along_m", rows),
             jitter_s=self._column("stamp_jitter_s", rows),
-            white_m2_per_s=self._column("odometer_white_m2_per_s", rows),
             scale_sigma=self._column("scale_sigma", rows),
             latency_sigma_s=self._column("latency_sigma_s", rows),
-            digits_m=self._column("digits_along_m", rows),
-            reading=self._reading(rows),
+            white_m2_per_s=self._column("odometer_white_m2_per_s", rows),
+            rows_m=self._column("odometer_rows_m", rows),
+            period_s=float(self._epochs["odometer_period_s"][0]),
         )
-        return along_axis(rows, fresh, steps, self._shares, self._taus_s)
-
-    def _reading(self, rows: npt.NDArray[np.int64]) -> Reading | None:
-        """Noise of the odometer's rows, where they have some."""
-        sigma_m = self._column("odometer_reading_m", rows)
-        return Reading(sigma_m, float(self._epochs["odometer_period_s"][0])) if sigma_m.any() else None
+        return along_series(epochs, odometer, self._config)
 
     def across(self, reasons: pl.Series, position: str, sigma: str, digits: str) -> AxisSeries:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""
@@ -129,7 +112,7 @@ class _Builder:
         dt, fresh = self._time_steps(rows)
         border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
         survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
-        sigmas = [*np.outer(np.sqrt(self._shares), self._sigma(sigma, rows))]
+        sigmas = [*np.outer(np.sqrt(self._shares), self._column(sigma, rows))]
         decorrelations = [*decorrelation_of(dt, self._taus_s)]
         coarse = self._column(digits, rows), np.ones(rows.size)
         for error, decorrelation in (self._chord_error(rows), self._wander(rows), coarse):
@@ -150,18 +133,18 @@ class _Builder:
             latency_mps=zero,
         )
 
-    def _turned_mps(self, rows: npt.NDArray[np.int64]) -> Floats:
+    def _turned_mps(self, rows: Ints) -> Floats:
         """What one sigma of the error along the track makes across it while a curve turns the axes [m/s]."""
         turning = self._column("curvature_per_m", rows) * self._column("speed_mps", rows)
-        return np.nan_to_num(turning) * self._sigma("sigma_along_m", rows)
+        return np.nan_to_num(turning) * self._column("calibrated_along_m", rows)
 
-    def _wander(self, rows: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
+    def _wander(self, rows: Ints) -> tuple[Floats, Floats]:
         """How a 2-D survey of no stated accuracy wanders along its elements [m], and its decorrelation."""
         unstated = np.isnan(self._column("survey_sigma_m", rows)) & np.isnan(self._column("vertical_m", rows))
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
         return np.where(unstated, self._wander_m, 0.0), -np.expm1(-way / self._wander_length_m)
 
-    def _chord_error(self, rows: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
+    def _chord_error(self, rows: Ints) -> tuple[Floats, Floats]:
         """The polyline's chord error [m] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
         curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))
@@ -169,7 +152,7 @@ class _Builder:
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
         return error, -np.expm1(-way / np.maximum(length, 1.0))
 
-    def _time_steps(self, rows: npt.NDArray[np.int64]) -> tuple[Floats, Bools]:
+    def _time_steps(self, rows: Ints) -> tuple[Floats, Bools]:
         """Time since the row before [s] (1 s stands in where there is none) and rows that nothing leads to."""
         dt = np.diff(self._t_s[rows], prepend=self._t_s[rows[0]] - 1.0)
         fresh = dt > self._gap_reset_s

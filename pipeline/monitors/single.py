@@ -68,7 +68,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
     t_s = (epochs["t"].dt.timestamp("ns") - epochs["t"].dt.timestamp("ns")[0]).to_numpy() * 1e-9
     velocity = floats(epochs, "velocity_along_mps")
     usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
-    first, span = _window(t_s, usable, epochs["odometer_stretch"].to_numpy())
+    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy())
     total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
     by_doppler = (total - total[first]) / span
     odometer = floats(epochs, "odometer_m")
@@ -78,7 +78,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
     variance = (
         config.monitors.doppler_sigma_mps**2
         + floats(epochs, "odometer_white_m2_per_s") / span
-        + 2.0 * (floats(epochs, "odometer_reading_m") / span) ** 2
+        + 2.0 * (floats(epochs, "odometer_rows_m") / span) ** 2
         + (floats(epochs, "scale_sigma") * speed) ** 2
         + ((floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))) * change / span) ** 2
     )

@@ -1,4 +1,7 @@
-"""The odometer of a run, made once: distance over time in continuity segments, with its noise."""
+"""The odometer of a run, made once: distance over time in continuity segments, with its noise.
+
+In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry`, handed to every stage. No files.
+"""
 
 from pipeline.odometry.odometry import Odometry, odometry_of
 

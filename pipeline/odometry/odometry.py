@@ -4,108 +4,284 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.odometry.odometer import OdometerTrack, odometer_track
-from pipeline.odometry.scatter import play_m, with_play
-from schemas.arrays import Bools, Floats, Ints
-from schemas.config import Configuration, Vehicle
+from pipeline.odometry.curves import filled_in
+from pipeline.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
+from pipeline.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
+from pipeline.odometry.rows import leaps, ways_between
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
+from schemas.config import AlignConfig, Configuration, Vehicle
 
-_SPEED_WINDOW_S = 1.0
+# Speeds are means over this time: the noise of single rows is no speed.
+SPEED_WINDOW_S = 1.0
+
+
+class Way(NamedTuple):
+    """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known."""
+
+    distance_m: Floats
+    variance_m2: Floats
+
+
+class Increments(NamedTuple):
+    """Corrected distance [m] and change of speed [m/s] from the instant before; zero at the first."""
+
+    distance_m: Floats
+    speed_mps: Floats
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the distance is off by: it gathers `white_m2_per_s` in a second; single rows have noise beside.
+
+    `counter_m`: the step of a counter [m], 0 where there is none.
+    """
+
+    white_m2_per_s: float
+    quantisation: QuantisationNoise = NO_QUANTISATION
+    counter_m: float = 0.0
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Distance over time in continuity segments, with its noise. Instants are int64 nanoseconds, distances metres.
+    """Distance over time in continuity segments, with its noise.
 
-    Distances are as recorded (`scale`, true over recorded distance, is not applied) and grow with the path once
-    `oriented`. `scale_sigma` belongs to `scale`; both are None unless the vehicle file gives them.
+    Instants are int64 nanoseconds. Distances [m] are as recorded, but for `between` and `increments`, and grow with the
+    path once `oriented`. `t_s` and `distance_m` are samples (rows, and what was filled in between), in seconds since
+    `epoch_ns`; `segment` counts sample by sample how often the distance was lost before; `pause[i]` marks a pause of
+    the recording between samples i and i+1, inside which nothing is interpolated; `slip`: as the odometer reports.
+    `scale` is true over recorded distance, by the vehicle file when that gives its sigma too, else None.
+    `leaps_ns`: rows to which the recorded distance leaps farther than a train can drive.
     """
 
-    track: OdometerTrack
+    epoch_ns: int
+    t_s: Floats
+    distance_m: Floats
+    segment: Ints
+    pause: Bools
+    slip: Bools
+    noise: Noise
     deadband_mps: float
+    period_s: float = 0.0
     scale: float | None = None
     scale_sigma: float | None = None
+    leaps_ns: tuple[int, ...] = ()
 
     @property
     def begin_ns(self) -> int:
-        """The first row."""
-        return self.track.epoch_ns
+        """The first sample."""
+        return self.epoch_ns
 
     @property
     def end_ns(self) -> int:
-        """The last row."""
-        return self.track.epoch_ns + int(np.ceil(self.track.t_s[-1] * 1e9))
+        """The last sample."""
+        return self.epoch_ns + int(float(self.t_s[-1]) * NS_PER_S) + 1
 
     def oriented(self, sign: int) -> Odometry:
         """The same odometer, growing with the path; `sign` is +1 or -1."""
-        return replace(self, track=self.track.oriented(sign))
+        return self if sign > 0 else replace(self, distance_m=-self.distance_m)
+
+    def seconds(self, t_ns: Ints) -> Floats:
+        """Instants on the odometer's own scale [s]."""
+        return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
 
     def known_at(self, t_ns: Ints) -> Bools:
-        """Whether the distance is known: between two rows without a pause, none of which reports slip."""
-        return self.track.known_at(self._seconds(t_ns))
+        """Whether the distance is known: between two samples without a pause, none of which reports slip."""
+        return self.known_at_s(self.seconds(t_ns))
 
     def segment_at(self, t_ns: Ints) -> Ints:
         """Number of the continuity segment: distances can be compared only where it is the same."""
-        return self.track.stretch_at(self._seconds(t_ns))
+        return self.segment_at_s(self.seconds(t_ns))
 
     def slip_at(self, t_ns: Ints) -> Bools:
-        """Whether the odometer itself reports slip or slide in the row at the instant, or in one next to it."""
-        t_s, rows = self._seconds(t_ns), self.track.t_s
-        after = np.searchsorted(rows, t_s, side="left").clip(0, rows.size - 1)
-        before = np.where(rows[after] == t_s, after, np.maximum(after - 1, 0))
-        inside = (t_s >= rows[0]) & (t_s <= rows[-1])
-        return np.asarray(inside & (self.track.slip[before] | self.track.slip[after]))
+        """Whether the odometer itself reports slip or slide at the instant, or in a row next to it."""
+        t_s = self.seconds(t_ns)
+        before, after = self._around(t_s)
+        return np.asarray(self._inside(t_s) & (self.slip[before] | self.slip[after]))
 
     def distance_at(self, t_ns: Ints) -> Floats:
         """Distance at these instants [m], as recorded; NaN where it is not known."""
-        t_s = self._seconds(t_ns)
-        return np.where(self.track.known_at(t_s), self.track.distance_at(t_s), np.nan)
+        t_s = self.seconds(t_ns)
+        return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
 
     def speed_at(self, t_ns: Ints) -> Floats:
         """Mean speed over the second before [m/s], as recorded; NaN where the distance is not known."""
-        t_s = self._seconds(t_ns)
-        return np.where(self.track.known_at(t_s), self.track.speed_at(t_s), np.nan)
+        t_s = self.seconds(t_ns)
+        return np.where(self.known_at_s(t_s), self.speed_at_s(t_s), np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
-        """Way driven since the first row [m], turns included; a best guess where the distance is not known.
+        """Way driven since the first row [m], turns included, as recorded; a best guess where it is not known.
 
-        Quantisation noise is neither way nor turn, and noise at standstill adds up to no more than it moves the place.
+        Quantisation noise is neither way nor turn, and noise at standstill adds up to no more than it leaves the place.
         """
-        return np.interp(self._seconds(t_ns), self.track.t_s, self._driven[0])
+        return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
         """Time since the first row in which the train moved [s]."""
-        return np.interp(self._seconds(t_ns), self.track.t_s, self._driven[1])
+        return np.interp(self.seconds(t_ns), *self._moving_s)
 
-    def _seconds(self, t_ns: Ints) -> Floats:
-        return self.track.seconds(t_ns)
+    def moved(self, t_ns: Ints) -> Bools:
+        """Per step from an instant to the next: whether the train moved for more than half of it; shape (n - 1,).
+
+        The one movement test: mean speed beyond the dead band, over a second at least (DOMAIN section 2).
+        """
+        return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
+
+    def between(self, begin_ns: Ints, end_ns: Ints) -> Way:
+        """True distance from some instants to others, and its variance; the one answer to "how far".
+
+        s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
+        (sigma_s D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
+        """
+        scale, scale_sigma = self.scale or 1.0, self.scale_sigma or 0.0
+        same = self.segment_at(begin_ns) == self.segment_at(end_ns)
+        recorded = np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
+        moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))
+        rows_m2 = self.row_sigma_m(self.seconds(begin_ns)) ** 2 + self.row_sigma_m(self.seconds(end_ns)) ** 2
+        variance = scale**2 * (self.noise.white_m2_per_s * moving_s + rows_m2) + (scale_sigma * recorded) ** 2
+        return Way(scale * recorded, variance)
+
+    def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
+        """Along-track increments between consecutive instants, both ends with the estimates in use at the later one.
+
+        `scale`: true over recorded distance; `latency_s`: by how much the position at an instant is older.
+        """
+        t_s = self.seconds(t_ns)
+        now = t_s - latency_s
+        before = np.concatenate([now[:1], t_s[:-1] - latency_s[1:]])
+        distance = scale * (self.distance_at_s(now) - self.distance_at_s(before))
+        return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
+
+    def known_at_s(self, t_s: Floats) -> Bools:
+        """`known_at` in seconds on the odometer's own scale, as the functions below: for estimates of latency."""
+        before, after = self._around(t_s)
+        paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
+        known: Bools = self._inside(t_s) & ~paused & ~self.slip[before] & ~self.slip[after]
+        return known
+
+    def segment_at_s(self, t_s: Floats) -> Ints:
+        index = np.searchsorted(self.t_s, t_s, side="right") - 1
+        segment: Ints = self.segment[index.clip(0, self.t_s.size - 1)]
+        return segment
+
+    def distance_at_s(self, t_s: Floats) -> Floats:
+        """Distance [m], also where it is not known: the best guess, and outside the recording the end value."""
+        return np.interp(t_s, self.t_s, self.distance_m)
+
+    def speed_at_s(self, t_s: Floats) -> Floats:
+        """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
+        start = np.maximum(t_s - SPEED_WINDOW_S, self.t_s[0])
+        span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, 1e-9)
+        speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
+        return speed
+
+    def row_sigma_m(self, t_s: Floats) -> Floats:
+        """Standard deviation of the quantisation noise at these times [m]."""
+        if not self.noise.quantisation:
+            return np.zeros(t_s.size)
+        return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
+
+    def _inside(self, t_s: Floats) -> Bools:
+        inside: Bools = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        return inside
+
+    def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
+        """Samples before and after each time, twice the same where it is that of a sample."""
+        after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
+        before = np.where(self.t_s[after] == t_s, after, np.maximum(after - 1, 0))
+        return before, after
 
     @cached_property
-    def _driven(self) -> tuple[Floats, Floats]:
-        """Way driven [m] and time moving [s] up to each row."""
-        t_s, noise = self.track.t_s, self.track.reading
-        width_m = play_m(np.sqrt(noise.variance_m2(self.track.speed_at(t_s))))
-        held = with_play(self.track.distance_m, width_m) if noise else self.track.distance_m
-        step_s = np.diff(t_s)
-        half_s, centre = 0.5 * np.maximum(step_s, _SPEED_WINDOW_S), 0.5 * (t_s[1:] + t_s[:-1])
-        begin, end = np.interp(centre - half_s, t_s, held), np.interp(centre + half_s, t_s, held)
-        moving = np.abs(end - begin) > self.deadband_mps * 2.0 * half_s
-        # Of a stand only its net way counts, for the noise of its steps would add up.
-        edge = np.flatnonzero(np.diff(moving, prepend=~moving[:1]))
-        lengths = np.diff(edge, append=moving.size)
-        net = np.abs(held[edge + lengths] - held[edge])
-        way = np.where(moving, np.abs(np.diff(held)), np.repeat(net / lengths, lengths))
-        return np.append(0.0, np.cumsum(way)), np.append(0.0, np.cumsum(np.where(moving, step_s, 0.0)))
+    def _width_m(self) -> Floats:
+        """Hysteresis of each sample."""
+        return hysteresis_m(self.row_sigma_m(self.t_s))
+
+    @cached_property
+    def _moving_s(self) -> tuple[Floats, Floats]:
+        """Times [s], and the time moving up to each [s]."""
+        at_s, at_m = self.t_s, self.distance_m
+        if self.noise.quantisation:
+            at_s, at_m = evenly_driven(at_s, at_m, self._width_m, self.deadband_mps)
+        moving = moving_steps(at_s, at_m, self.deadband_mps, SPEED_WINDOW_S)
+        return at_s, _sums(np.where(moving, np.diff(at_s), 0.0))
+
+    @cached_property
+    def _travelled_m(self) -> Floats:
+        """Way driven up to each sample."""
+        if self.noise.quantisation:
+            return driven_m(self.distance_m, self._width_m)
+        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, SPEED_WINDOW_S)
+        return driven_or_left_m(self.distance_m, moving)
 
 
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
-    """The odometer of a cleaned stream (CONTRACT section 1), as recorded; None without at least two rows."""
+    """The odometer of a cleaned stream (CONTRACT section 1), as recorded; None without at least two rows.
+
+    Distance from the recorded distance where there is one, else from speed (trapezoids). A pause longer than
+    `odometer_gap_s` (and than `odometer_gap_periods`) loses the way of speed-only odometry: the speeds before and after
+    it give the best guess, but a new continuity segment begins. A cumulative distance carries over it. Slip that the
+    odometer itself reports loses the way too, and so does a leap of the distance where no speed tells the way.
+    `odometer_sigma_mps` is the white noise at 1 Hz; a larger declared `sigma_speed_mps`, taken as independent from row
+    to row, replaces it.
+    """
     if stream is None or stream.height < 2:
         return None
-    track = odometer_track(stream, config.align.odometer_gap_s, config.monitors.odometer_sigma_mps)
-    known = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
-    scale = (vehicle.odometer_scale, vehicle.odometer_scale_sigma) if known else (None, None)
-    return Odometry(track, config.matching.deadband_mps, *scale)
+    align = config.align
+    t_ns, speed = times_ns(stream), floats(stream, "speed_mps")
+    t_s: Floats = ((t_ns - int(t_ns[0])) * 1e-9).astype(np.float64)
+    dt_s = np.diff(t_s)
+    period_s = float(np.median(dt_s))
+    limit_s = max(align.odometer_gap_s, align.odometer_gap_periods * period_s)
+    way_m, counted = ways_between(t_s, floats(stream, "distance_m"), speed, limit_s, align)
+    unknown = np.isnan(way_m)
+    pause, slip = unknown | (dt_s > limit_s), truths(stream["slip"])
+    lost = (pause & ~counted) | slip[1:]
+    distance_m, segment = _sums(np.where(unknown, 0.0, way_m)), _sums(lost.astype(np.float64)).astype(np.int64)
+    white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
+    noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, align) if counted.any() else None
+    apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
+    if apart.size:
+        t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
+        segment, pause, slip = segment[row], pause[row[:-1]], slip[row]
+    in_file = vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None
+    return Odometry(
+        epoch_ns=int(t_ns[0]),
+        t_s=t_s,
+        distance_m=distance_m,
+        segment=segment,
+        pause=pause,
+        slip=slip,
+        noise=noise or Noise(white_m2_per_s),
+        deadband_mps=config.matching.deadband_mps,
+        period_s=period_s,
+        scale=vehicle.odometer_scale if in_file else None,
+        scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
+        leaps_ns=_leaps_ns(stream, align),
+    )
+
+
+def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig) -> Noise:
+    """Noise of a recorded distance, of whose ways those to the next row are `whole` (rows - 1,)."""
+    counter_m = count_step_m(distance_m, whole, config)
+    return Noise(white_m2_per_s, quantisation_noise(t_s, distance_m, whole, white_m2_per_s, config), counter_m)
+
+
+def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
+    """Variance that the distance gathers in a second by the recorded sigma of the speed [m^2/s]; 0 without one."""
+    declared = stream["sigma_speed_mps"].median()
+    return float(declared) ** 2 * period_s if isinstance(declared, float) else 0.0
+
+
+def _leaps_ns(stream: pl.DataFrame, config: AlignConfig) -> tuple[int, ...]:
+    t_ns = times_ns(stream)
+    leap = leaps(np.diff(floats(stream, "distance_m")), np.diff(t_ns) / NS_PER_S, config)
+    return tuple(t_ns[1:][leap].tolist())
+
+
+def _sums(steps: Floats) -> Floats:
+    """Sums of the steps before each row; 0 at the first."""
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -8,6 +8,12 @@ import numpy as np
 import polars as pl
 from scipy.signal import lfilter
 
+from pipeline.alignment.align import align
+from pipeline.odometry import odometry_of
+from pipeline.odometry.polarity import polarity
+from schemas.arrays import floats, times_ns
+from schemas.config import Configuration, Vehicle
+
 SHARES = (0.083, 0.014, 0.150, 0.752)
 TAUS_S = (360.0, 1800.0, 3600.0, 100.0)
 
@@ -103,3 +109,18 @@ def odometer_of(t_s, distance_m=None, speed_mps=None, slip=None):
             "slip": pl.Series(nothing if slip is None else slip, dtype=pl.Boolean),
         }
     )
+
+
+def odometry_from(odometer, vehicle=None, config=None):
+    """The odometer of a stream, as recorded."""
+    return odometry_of(odometer, vehicle or Vehicle(), config or Configuration())
+
+
+def align_run(epochs, odometer, vehicle, config):
+    """The epochs aligned with an odometer that the first metres turned to growing path."""
+    found = odometry_from(odometer, vehicle, config)
+    if found is not None:
+        placed = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
+        path_m = np.where(placed, floats(epochs, "path_m"), np.nan)
+        found = found.oriented(polarity(found, times_ns(epochs), path_m, config.matching.orientation_distance_m))
+    return align(epochs, found, vehicle, config)

@@ -7,11 +7,11 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at
+from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, odometer_at
 from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from schemas.config import Configuration, Vehicle
-from tests.align.straight import Straight, distance, run, times
+from tests.align.straight import Straight, align_run, distance, odometry_from, run, times
 
 CONFIG = Configuration()
 FACTOR = threshold_factor(1e-7)
@@ -33,7 +33,7 @@ def test_threshold_factor_is_the_two_sided_quantile():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_clean_run_without_vehicle_file_raises_no_alarm_and_finds_the_scale(seed):
-    aligned = align(*run(REAL, seed), Vehicle(), CONFIG)
+    aligned = align_run(*run(REAL, seed), Vehicle(), CONFIG)
     assert alarms(aligned) == []
     scale, scale_sigma, latency_s, latency_sigma_s = aligned.select(
         "odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"
@@ -46,7 +46,8 @@ def test_a_clean_run_without_vehicle_file_raises_no_alarm_and_finds_the_scale(se
 def test_constant_speed_tells_no_latency_and_the_filter_knows_it():
     cruising = Straight(duration_s=900.0, latency_s=0.1, cruise_s=2000.0)
     found = pl.concat(
-        align(*run(cruising, seed), Vehicle(), CONFIG).select("latency_s", "latency_sigma_s")[-1] for seed in range(12)
+        align_run(*run(cruising, seed), Vehicle(), CONFIG).select("latency_s", "latency_sigma_s")[-1]
+        for seed in range(12)
     )
     away = (found["latency_s"] - 0.1) / found["latency_sigma_s"]
     assert float((away**2).mean() ** 0.5) < 1.5
@@ -55,14 +56,14 @@ def test_constant_speed_tells_no_latency_and_the_filter_knows_it():
 
 def test_braking_after_a_long_cruise_raises_no_alarm():
     plan = Straight(duration_s=1900.0, period_s=1.0, latency_s=0.25, cruise_s=1800.0)
-    assert [seed for seed in range(10) if alarms(align(*run(plan, seed), Vehicle(), CONFIG))] == []
+    assert [seed for seed in range(10) if alarms(align_run(*run(plan, seed), Vehicle(), CONFIG))] == []
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("rate_mps", [0.5, -0.5])
 def test_a_drift_after_five_kilometres_is_detected_before_the_position_failure(seed, rate_mps):
     begin_s = 200.0
-    aligned = align(*run(REAL, seed, lambda t: rate_mps * np.maximum(t - begin_s, 0.0)), Vehicle(), CONFIG)
+    aligned = align_run(*run(REAL, seed, lambda t: rate_mps * np.maximum(t - begin_s, 0.0)), Vehicle(), CONFIG)
     assert aligned["path_m"].filter(aligned["t"].dt.timestamp("ns") < begin_s * 1e9)[-1] > 5_000.0
     first = alarms(aligned)[0]
     assert begin_s <= seconds(aligned, first) < begin_s + 20.0 / abs(rate_mps)
@@ -70,12 +71,12 @@ def test_a_drift_after_five_kilometres_is_detected_before_the_position_failure(s
 
 def test_scale_error_and_latency_would_alarm_if_they_were_taken_as_zero():
     wrong = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
-    assert alarms(align(*run(REAL, 1), wrong, CONFIG))
+    assert alarms(align_run(*run(REAL, 1), wrong, CONFIG))
 
 
 def test_the_vehicle_file_is_used_as_it_is():
     vehicle = Vehicle(odometer_scale=1.004, odometer_scale_sigma=2e-4, gnss_latency_s=0.08, gnss_latency_sigma_s=0.01)
-    aligned = align(*run(REAL, 2), vehicle, CONFIG)
+    aligned = align_run(*run(REAL, 2), vehicle, CONFIG)
     assert aligned["odometer_scale"].unique().to_list() == [1.004]
     assert aligned["scale_sigma"].unique().to_list() == [2e-4]
     assert aligned["latency_s"].unique().to_list() == [0.08]
@@ -84,38 +85,38 @@ def test_the_vehicle_file_is_used_as_it_is():
 
 def test_estimates_use_the_past_only():
     epochs, odometer = run(REAL, 3)
-    whole = align(epochs, odometer, Vehicle(), CONFIG)
+    whole = align_run(epochs, odometer, Vehicle(), CONFIG)
     cut = 3_000
     end = epochs["t"][cut]
-    part = align(epochs[:cut], odometer.filter(pl.col("t") <= end), Vehicle(), CONFIG)
+    part = align_run(epochs[:cut], odometer.filter(pl.col("t") <= end), Vehicle(), CONFIG)
     names = ["odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"]
     assert_frame_equal(part.select(names), whole[:cut].select(names), check_exact=True)
 
 
 def test_learning_stands_still_under_an_alarm_that_persists():
-    aligned = align(*run(REAL, 4, lambda t: np.where(t >= 300.0, 45.0, 0.0)), Vehicle(), CONFIG)
+    aligned = align_run(*run(REAL, 4, lambda t: np.where(t >= 300.0, 45.0, 0.0)), Vehicle(), CONFIG)
     after = aligned.filter(pl.col("t").dt.timestamp("ns") >= 300 * 10**9)
     assert after["odometer_scale"].n_unique() == 1
     assert after["odometer_scale"][0] == pytest.approx(1.004, abs=1e-3)
 
 
 def test_learning_goes_on_after_a_jump_there_and_back():
-    aligned = align(*run(REAL, 5, lambda t: np.where((t >= 300.0) & (t < 303.0), 500.0, 0.0)), Vehicle(), CONFIG)
+    aligned = align_run(*run(REAL, 5, lambda t: np.where((t >= 300.0) & (t < 303.0), 500.0, 0.0)), Vehicle(), CONFIG)
     after = aligned.filter(pl.col("t").dt.timestamp("ns") >= 400 * 10**9)
     assert after["odometer_scale"].n_unique() > 10
     assert aligned["odometer_scale"][-1] == pytest.approx(1.004, abs=1e-3)
 
 
 def test_an_odometer_that_falls_while_the_path_grows_is_turned_round():
-    plain = align(*run(Straight(), 6), Vehicle(), CONFIG)
-    turned = align(*run(Straight(polarity=-1), 6), Vehicle(), CONFIG)
+    plain = align_run(*run(Straight(), 6), Vehicle(), CONFIG)
+    turned = align_run(*run(Straight(polarity=-1), 6), Vehicle(), CONFIG)
     names = ["odometer_scale", "odometer_m", "speed_mps", "direction"]
     assert_frame_equal(plain.select(names), turned.select(names), abs_tol=1e-9, rel_tol=0.0)
 
 
 def test_epochs_beyond_the_odometer_say_so():
     epochs, odometer = run(Straight(duration_s=100.0), 7)
-    aligned = align(epochs, odometer.filter(pl.col("t").dt.timestamp("ns") < 60 * 10**9), Vehicle(), CONFIG)
+    aligned = align_run(epochs, odometer.filter(pl.col("t").dt.timestamp("ns") < 60 * 10**9), Vehicle(), CONFIG)
     late = aligned.filter(pl.col("t").dt.timestamp("ns") > 61 * 10**9)
     assert late["odometer_reason"].unique().to_list() == [BEYOND_SPAN]
     assert late["odometer_m"].null_count() == late.height
@@ -123,7 +124,7 @@ def test_epochs_beyond_the_odometer_say_so():
 
 def test_without_odometer_speed_comes_from_positions():
     epochs, _ = run(Straight(duration_s=200.0, sigma_m=0.01), 8)
-    aligned = align(epochs, None, Vehicle(), CONFIG)
+    aligned = align_run(epochs, None, Vehicle(), CONFIG)
     assert aligned["odometer_reason"].unique().to_list() == [NO_ODOMETER]
     assert aligned["odometer_m"].null_count() == aligned.height
     assert aligned["speed_mps"][-1] == pytest.approx(40.0, abs=0.2)
@@ -132,10 +133,10 @@ def test_without_odometer_speed_comes_from_positions():
 def test_time_may_start_anywhere():
     epochs, odometer = run(REAL, 9)
     shift = pl.duration(days=400)
-    later = align(
+    later = align_run(
         epochs.with_columns(pl.col("t") + shift), odometer.with_columns(pl.col("t") + shift), Vehicle(), CONFIG
     )
-    plain = align(epochs, odometer, Vehicle(), CONFIG)
+    plain = align_run(epochs, odometer, Vehicle(), CONFIG)
     assert_frame_equal(plain.drop("t"), later.drop("t"), check_exact=True)
 
 
@@ -143,11 +144,11 @@ def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
     epochs, odometer = run(Straight(duration_s=200.0, polarity=-1, scale=1.004), 10)
     vehicle = Vehicle(odometer_scale=1.004, gnss_latency_s=0.0)
     gap = epochs.filter((pl.col("t").dt.timestamp("ns") < 100 * 10**9) | (pl.col("t").dt.timestamp("ns") > 120 * 10**9))
-    aligned = align(gap, odometer, vehicle, CONFIG)
+    aligned = align_run(gap, odometer, vehicle, CONFIG)
     at = times(np.array([0.5, 90.05, 110.0, 150.0, 300.0]))
     start = distance(np.array([1.0, 200.0]))[0]
     expected = distance(np.array([0.5, 90.05, 110.0, 150.0, 200.0]))[:4] - start
-    found = odometer_at(at, aligned, odometer, CONFIG).to_list()
+    found = odometer_at(at, aligned, odometry_from(odometer, vehicle, CONFIG).oriented(-1)).to_list()
     assert found[4] is None
     np.testing.assert_allclose(found[:4], expected, atol=2.5)
 
@@ -155,7 +156,7 @@ def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
 def test_what_cannot_be_compared_freezes_the_learning() -> None:
     epochs, odometer = run(REAL, 7)
     unknown = pl.int_range(pl.len()).is_between(3000, 3100)
-    aligned = align(
+    aligned = align_run(
         epochs.with_columns(sigma_along_m=pl.when(~unknown).then("sigma_along_m")), odometer, Vehicle(), CONFIG
     )
     scale = aligned["odometer_scale"]
@@ -167,8 +168,8 @@ def test_learning_counts_with_the_calibrated_sigma():
     epochs, odometer = run(REAL, seed=3)
     overstated = epochs.with_columns(pl.col("sigma_along_m") * 3.0)
     calibrated = CONFIG.model_copy(update={"monitors": CONFIG.monitors.model_copy(update={"sigma_slope": 1.0 / 3.0})})
-    stated = align(epochs, odometer, Vehicle(), CONFIG)
-    found = align(overstated, odometer, Vehicle(), calibrated)
+    stated = align_run(epochs, odometer, Vehicle(), CONFIG)
+    found = align_run(overstated, odometer, Vehicle(), calibrated)
     learned = ["odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"]
     assert_frame_equal(found.select(learned), stated.select(learned), rel_tol=1e-9)
-    assert stated["scale_sigma"][-1] < align(overstated, odometer, Vehicle(), CONFIG)["scale_sigma"][-1]
+    assert stated["scale_sigma"][-1] < align_run(overstated, odometer, Vehicle(), CONFIG)["scale_sigma"][-1]

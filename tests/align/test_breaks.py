@@ -9,11 +9,10 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.alignment.align import align
-from pipeline.alignment.odometer_filter import ScaleLatencyFilter, error_model, moved_m2, prior_of
-from pipeline.odometry.odometer import odometer_track
+from pipeline.alignment.odometer_filter import ScaleLatencyFilter, moved_m2, prior_of
+from pipeline.monitors.axis import error_model
 from schemas.config import Configuration, Vehicle
-from tests.align.straight import Straight, distance, odometer_of, run, times
+from tests.align.straight import Straight, align_run, distance, odometer_of, odometry_from, run, times
 
 CONFIG = Configuration()
 REAL = Straight(duration_s=900.0, period_s=1.0, scale=1.004, latency_s=0.08)
@@ -30,7 +29,7 @@ def learned(seed, missing=(), fault=None, plan=REAL, vehicle=None):
     epochs, odometer = run(plan, seed, fault)
     t_s = seconds(epochs)
     kept = ~np.any([(t_s > begin) & (t_s < end) for begin, end in missing], axis=0) if missing else t_s >= 0.0
-    return align(epochs.filter(pl.Series(kept)), odometer, vehicle or Vehicle(), CONFIG)
+    return align_run(epochs.filter(pl.Series(kept)), odometer, vehicle or Vehicle(), CONFIG)
 
 
 @cache
@@ -107,7 +106,7 @@ def test_stamps_that_scatter_are_no_breaks():
     for seed in SEEDS:
         epochs, odometer = run(REAL, seed)
         late_s = np.random.default_rng(seed).uniform(0.0, 0.7, epochs.height)
-        aligned = align(epochs.with_columns(times(seconds(epochs) + late_s)), odometer, Vehicle(), CONFIG)
+        aligned = align_run(epochs.with_columns(times(seconds(epochs) + late_s)), odometer, Vehicle(), CONFIG)
         ratios.append(aligned["scale_sigma"][-1] / plain_sigma(seed))
     assert np.median(ratios) < 1.3
 
@@ -136,11 +135,11 @@ def test_after_an_alarm_learning_goes_on_where_the_position_came_back():
 def test_what_the_odometer_loses_while_positions_go_on_is_no_break_of_theirs():
     epochs, odometer = run(REAL, 3)
     slip = pl.Series("slip", (seconds(odometer) > 400.0) & (seconds(odometer) < 403.0))
-    slipped = align(epochs, odometer.with_columns(slip), Vehicle(), CONFIG)
-    plain = align(epochs, odometer, Vehicle(), CONFIG)
+    slipped = align_run(epochs, odometer.with_columns(slip), Vehicle(), CONFIG)
+    plain = align_run(epochs, odometer, Vehicle(), CONFIG)
     assert slipped["scale_sigma"][-1] < 1.6 * plain["scale_sigma"][-1]
     outage = (seconds(epochs) > 390.0) & (seconds(epochs) < 410.0)
-    both = align(epochs.filter(pl.Series(~outage)), odometer.with_columns(slip), Vehicle(), CONFIG)
+    both = align_run(epochs.filter(pl.Series(~outage)), odometer.with_columns(slip), Vehicle(), CONFIG)
     assert both["scale_sigma"][-1] > 1.2 * slipped["scale_sigma"][-1]
 
 
@@ -156,10 +155,10 @@ def test_learning_over_tunnels_uses_the_past_only():
     epochs, odometer = run(REAL, 5, fault)
     t_s = seconds(epochs)
     epochs = epochs.filter(pl.Series(~np.any([(t_s > begin) & (t_s < end) for begin, end in tunnels], axis=0)))
-    whole = align(epochs, odometer, Vehicle(), CONFIG)
+    whole = align_run(epochs, odometer, Vehicle(), CONFIG)
     for cut_s in (195.0, 300.0, 440.0, 700.0):
         before = epochs.filter(pl.Series(seconds(epochs) <= cut_s))
-        part = align(before, odometer.filter(pl.Series(seconds(odometer) <= cut_s)), Vehicle(), CONFIG)
+        part = align_run(before, odometer.filter(pl.Series(seconds(odometer) <= cut_s)), Vehicle(), CONFIG)
         assert part.select(LEARNED).equals(whole[: part.height].select(LEARNED))
 
 
@@ -167,9 +166,9 @@ def test_learning_on_after_an_alarm_knows_nothing_of_a_later_tunnel():
     epochs, odometer = run(replace(REAL, duration_s=1200.0), 4, steps_out(30.0, 0.0))
     t_s = seconds(epochs)
     epochs = epochs.filter(pl.Series((t_s <= 800.0) | (t_s >= 870.0)))
-    whole = align(epochs, odometer, Vehicle(), CONFIG)
+    whole = align_run(epochs, odometer, Vehicle(), CONFIG)
     before = epochs.filter(pl.Series(seconds(epochs) <= 790.0))
-    part = align(before, odometer.filter(pl.Series(seconds(odometer) <= 790.0)), Vehicle(), CONFIG)
+    part = align_run(before, odometer.filter(pl.Series(seconds(odometer) <= 790.0)), Vehicle(), CONFIG)
     assert part.select(LEARNED).equals(whole[: part.height].select(LEARNED))
     assert part["scale_sigma"][-1] < part.filter(pl.Series(seconds(part) <= 400.0))["scale_sigma"][-1]
 
@@ -177,13 +176,13 @@ def test_learning_on_after_an_alarm_knows_nothing_of_a_later_tunnel():
 def filter_at_rest():
     """A filter that has seen five minutes without error, its state, and the odometer's distance after `gap_s`."""
     t_s = np.arange(0.0, 500.0, 0.5)
-    track = odometer_track(odometer_of(t_s, distance(t_s)), 1.0, 0.05)
-    learner = ScaleLatencyFilter(*error_model(CONFIG.monitors), track)
+    odometry = odometry_from(odometer_of(t_s, distance(t_s)))
+    learner = ScaleLatencyFilter(*error_model(CONFIG.monitors), odometry, CONFIG.align)
     at_s = np.arange(20.0, 320.0)
-    path_m = track.distance_at(at_s)
+    path_m = odometry.distance_at_s(at_s)
     state = learner.start(prior_of(Vehicle(), CONFIG.align), 20.0, float(path_m[0]))
     joints = learner.run(state, at_s, path_m, np.ones(at_s.size), 0.0)
-    return learner, learner.after(state, joints[-1], float(at_s[-1])), track
+    return learner, learner.after(state, joints[-1], float(at_s[-1])), odometry
 
 
 def resumed(gap_s, beside_m, jitter_s=0.0):
@@ -193,14 +192,14 @@ def resumed(gap_s, beside_m, jitter_s=0.0):
 
 def resumed_from(learner, state, gap_s, beside_m, jitter_s=0.0):
     t_s = state.t_s + gap_s
-    path_m = float(learner.track.distance_at(np.array([t_s]))[0]) + beside_m
+    path_m = float(learner.odometry.distance_at_s(np.array([t_s]))[0]) + beside_m
     return learner.resume(state, t_s, path_m, 1.0, jitter_s, 20.0)
 
 
 def seen_at(learner, state, beside_m, sigma_m=1.0):
     """The joint state once the position at the state's own time is learned from."""
     at_s = np.array([state.t_s])
-    return learner.run(state, at_s, learner.track.distance_at(at_s) + beside_m, np.full(1, sigma_m), 0.0)[-1]
+    return learner.run(state, at_s, learner.odometry.distance_at_s(at_s) + beside_m, np.full(1, sigma_m), 0.0)[-1]
 
 
 def test_stamps_that_scatter_tell_less_of_a_move():

@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.alignment.odometer_filter import error_model
 from pipeline.calibration.vehicle import Observations, estimate_run, pooled
-from pipeline.odometry.odometer import CountedRows, OdometerTrack
-from schemas.config import MonitorConfig
+from pipeline.monitors.axis import error_model
+from pipeline.odometry.odometry import Noise, Odometry
+from pipeline.odometry.quantisation import count_step_m, quantisation_noise
+from schemas.config import Configuration, MonitorConfig
 
 SHARES, TAUS_S = error_model(MonitorConfig())
 SCALE, LATENCY_S, SIGMA_M = 1.004, 0.12, 1.2
 
 
-def simulated_run(seed: int, duration_s: int = 1500, moving: bool = True) -> tuple[Observations, OdometerTrack]:
+def simulated_run(seed: int, duration_s: int = 1500, moving: bool = True) -> tuple[Observations, Odometry]:
     """A train that speeds up and brakes between 5 and 45 m/s; odometer at 10 Hz, positions at 2 Hz."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration_s, 0.1)
@@ -33,7 +34,8 @@ def simulated_run(seed: int, duration_s: int = 1500, moving: bool = True) -> tup
         error += np.sqrt(share) * SIGMA_M * unit
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
     none = np.zeros(t.size, dtype=bool)
-    track = OdometerTrack(0, t, true / SCALE + walk, np.zeros(t.size, dtype=np.int64), none[1:], none, 0.05**2)
+    segment = np.zeros(t.size, dtype=np.int64)
+    track = Odometry(0, t, true / SCALE + walk, segment, none[1:], none, Noise(0.05**2), 0.3)
     return Observations(at, position, np.full(at.size, SIGMA_M)), track
 
 
@@ -81,9 +83,7 @@ def test_louder_noise_than_stated_widens_the_uncertainty() -> None:
 def test_lost_distance_is_bridged_by_separate_offsets() -> None:
     seen, track = simulated_run(5)
     jump = (track.t_s >= 700.0).astype(np.int64)
-    broken = OdometerTrack(
-        0, track.t_s, track.distance_m + 300.0 * jump, jump, track.pause, track.slip, track.white_rate_m2_per_s
-    )
+    broken = replace(track, distance_m=track.distance_m + 300.0 * jump, segment=jump)
     whole, parts = (estimate_run(seen, one, SHARES, TAUS_S) for one in (track, broken))
     assert whole is not None
     assert parts is not None
@@ -109,12 +109,15 @@ def test_pooling_by_hand() -> None:
     assert (alone.value, alone.sigma) == (pytest.approx(3.0), pytest.approx(0.4))
 
 
-def with_rows(track: OdometerTrack, kind: str, size_m: float, seed: int) -> OdometerTrack:
+def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     """The track by counts of this size, or with noise of it in every row."""
     noise = np.random.default_rng(seed).normal(0.0, size_m, track.t_s.size)
     rows = np.floor(track.distance_m / size_m) * size_m if kind == "counts" else track.distance_m + noise
-    counted = CountedRows(track.t_s, rows, np.ones(rows.size - 1, dtype=bool))
-    return replace(track, distance_m=rows, period_s=0.1, counted=counted)
+    whole = np.ones(rows.size - 1, dtype=bool)
+    align, white_m2_per_s = Configuration().align, track.noise.white_m2_per_s
+    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, align)
+    noise_of_rows = Noise(white_m2_per_s, found, count_step_m(rows, whole, align))
+    return replace(track, distance_m=rows, period_s=0.1, noise=noise_of_rows)
 
 
 ROWS = [("counts", 5.0), ("noise", 0.5)]

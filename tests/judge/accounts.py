@@ -49,7 +49,8 @@ def _failures(rung: Rung) -> list[str]:
     """Failures and hazardous time lie between what was surely in use and what may have been."""
     wrong = rung.epochs.judgement == "wrong"
     surely, at_most = rung.in_use
-    least, most = longest_s(wrong & surely, rung.span_s), float(rung.span_s[wrong & at_most].sum())
+    # Before the first epoch there is none to count from.
+    least, most = longest_s((wrong & surely)[1:], rung.span_s[1:]), float(rung.span_s[wrong & at_most].sum())
     told, failures = rung.row["hazardous_max_s"], rung.number("failures")
     hazardous = 0.0 if told is None else rung.number("hazardous_max_s")
     found = []
@@ -70,7 +71,9 @@ def _share_unknown(rung: Rung, surely: Bools, at_most: Bools) -> list[str]:
         float(rung.span_s[unknown & use].sum()) / all_s for use, all_s in zip((surely, at_most), total, strict=True)
     ]
     low, high, told = min(shares), max(shares), rung.row["share_unknown"]
-    close = 0.005 + 5.0 / len(moving)  # to which epoch a span belongs is not fixed for a share
+    # To which of its two epochs a span belongs is not fixed for a share: one epoch at each end and at each gap.
+    gaps = 2 + int((np.diff(rung.epochs.time_s) > rung.span_s.max()).sum())
+    close = 0.005 + 1.5 * gaps * float(rung.span_s.max()) / min(total)
     if isinstance(told, float) and low - close <= told <= high + close:
         return []
     return [f"share_unknown is {told}, the epochs say {low:.4f} to {high:.4f}"]

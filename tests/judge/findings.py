@@ -27,8 +27,9 @@ CI_LIMIT_M = 14.0
 GATE = 0.99
 MARGIN_M = 0.6  # interpolation between samples and the survey's chords; noise of the evidence ends below 3 sigma
 BESIDE_MARGIN_M = 8.0  # a neighbour is not exactly as long as the track beside it
-TURNING_MPS = 0.5  # slower than this the direction of travel may be told either way
+TURNING_MPS = 1.2  # slower than this the direction of travel may be told either way (dead band, odometer averaging)
 APART_M = 3.0  # tracks nearer than this to each other (at a switch) are not told apart
+AT_JOINT_M = 25.0  # where the train or its interval may be on either side of a switch
 RUNGS = ("reference", "balise", "odometer")
 
 
@@ -267,13 +268,23 @@ def _decided(rung: Rung) -> list[str]:
     heard, at = seconds(reference["t"]), rung.journey.judged_at_s(kind.time_s)
     after = np.clip(np.searchsorted(heard, at), 1, len(heard) - 1)
     covered = (heard[after] - heard[after - 1] < 2.0) & (at >= heard[0]) & (at <= heard[-1]) & kind.sure & ~kind.beside
-    alone = np.isinf(kind.apart_m) | ((kind.apart_m > APART_M) & (6 * band < 10 * kind.apart_m))
+    alone = ~_at_switch(rung, kind) & (6 * band < 10 * kind.apart_m)
     beyond = covered & (np.abs(kind.error_m) > LIMIT_M + band) & (kind.judgement != "wrong")
     within = covered & alone & (np.abs(kind.error_m) < LIMIT_M - band) & (kind.judgement != "right")
     return [
         *(kind.told(at, "the reference shows it beyond the limit") for at in _first(beyond)),
         *(kind.told(at, "the reference shows it within the limit") for at in _first(within)),
     ]
+
+
+def _at_switch(rung: Rung, kind: Judgements) -> Bools:
+    """Two tracks are too near to each other there, or become one within the reach of a reference."""
+    ends = [element.base_m[[0, -1]] for element in rung.journey.world.ground.elements if element.name == "neighbour"]
+    starts = rung.journey.world.ground.route.starts_m
+    joints = starts[np.isin(starts, [starts[np.argmin(np.abs(starts - end))] for pair in ends for end in pair])]
+    way = rung.journey.true_way_m(kind.time_s)
+    near = np.any([np.abs(way - joint) < AT_JOINT_M for joint in joints] or [np.zeros(len(way), bool)], axis=0)
+    return np.asarray(near | (kind.apart_m <= APART_M))
 
 
 def _ladder(stronger: Rung, weaker: Rung) -> list[str]:

@@ -69,11 +69,11 @@ def epochs_of(
         on_track=pl.lit(True),
         fix_valid=path.is_not_null(),
         gate_probability=pl.lit(1.0),
-        sigma_along_m=pl.lit(1.0),
+        position_sigma_m=pl.lit(1.0),
         confidence_m=pl.lit(6.18),
         odometer_m=odometer,
         direction=pl.lit(1, pl.Int8),
-        odometer_stretch=pl.lit(0, pl.Int64),
+        odometer_segment=pl.lit(0, pl.Int64),
     )
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()

@@ -190,7 +190,7 @@ def test_noise_at_standstill_on_a_balise_detects_it_once() -> None:
 def test_rearmed_after_ten_metres_or_three_sigma(sigma_m: float, rows: int) -> None:
     # Passed at 110 m, 13.6 m on to 123.6 m, and back over it: 3 sigma is 13.5 and 13.8 m.
     at_m = [90.0, 100.0, 108.0, 115.0, 123.6, 115.0, 108.0, 100.0, 90.0]
-    epochs = epochs_of(at_m, sigma_along_m=[sigma_m] * len(at_m), confidence_m=[6.0] * len(at_m))
+    epochs = epochs_of(at_m, position_sigma_m=[sigma_m] * len(at_m), confidence_m=[6.0] * len(at_m))
     assert run(epochs, balises_at(V1)).passages.height == rows
 
 

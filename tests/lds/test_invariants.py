@@ -52,7 +52,7 @@ class Chaos:
     def replayed(self, shift_s: int = 0) -> LdsResult:
         later = pl.col("t") + pl.duration(seconds=shift_s)
         stretch = self.stretch[: len(self.path_m)]
-        epochs = epochs_of(self.path_m, self.odometer_m, odometer_stretch=stretch).with_columns(later)
+        epochs = epochs_of(self.path_m, self.odometer_m, odometer_segment=stretch).with_columns(later)
         balises = balises_at(self.places, kind=self.kinds, linked=self.linked)
         reads = reads_at(self.reads).with_columns(later)
         return run(epochs, balises, ScriptedBank(self.fails, blind=self.blind), reads)

@@ -8,8 +8,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.matching import Match, match
+from pipeline.odometry import odometry_of
 from schemas.arrays import Floats
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site
 from tests.matching.ladder import degrees
@@ -96,4 +97,5 @@ def matched(
     vehicle: Vehicle | None = None,
     reads: pl.DataFrame | None = None,
 ) -> Match:
-    return match(fixes, distance, place, vehicle or Vehicle(), MatchingConfig(), FixSigma(), reads)
+    odometry = odometry_of(distance, vehicle or Vehicle(), Configuration())
+    return match(fixes, odometry, place, vehicle or Vehicle(), MatchingConfig(), FixSigma(), reads)

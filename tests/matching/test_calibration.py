@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.matching import match
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from pipeline.odometry import odometry_of
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from tests.matching.ladder import journey, ladder, matched_lateral_m
 
 SITE = ladder()
@@ -17,7 +18,14 @@ def claims(seeds: range, sigma_m: float) -> tuple[np.ndarray, np.ndarray, np.nda
     posterior, gate, right = [], [], []
     for seed in seeds:
         trip = journey(seed, sigma_m)
-        epochs = match(trip.fixes, trip.odometer, SITE, Vehicle(), MatchingConfig(), FixSigma()).epochs
+        epochs = match(
+            trip.fixes,
+            odometry_of(trip.odometer, Vehicle(), Configuration()),
+            SITE,
+            Vehicle(),
+            MatchingConfig(),
+            FixSigma(),
+        ).epochs
         posterior.append(epochs["path_probability"].to_numpy())
         gate.append(epochs["gate_probability"].to_numpy())
         right.append(np.abs(matched_lateral_m(epochs) - trip.lateral_m) < 1.0)

@@ -6,14 +6,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.alignment.align import NO_ODOMETER, align
+from pipeline.alignment.align import NO_ODOMETER
 from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
 from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged
 from schemas.config import Configuration, Vehicle
 from schemas.tables import BANK_MONITORS
-from tests.align.straight import Straight, epochs_of, odometer_of, run
+from tests.align.straight import Straight, align_run, epochs_of, odometer_of, run
 
 CONFIG = Configuration()
 FACTOR = threshold_factor(1e-7)
@@ -21,7 +21,7 @@ KNOWN = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
 
 
 def bank_of(epochs, odometer=None, config=CONFIG, vehicle=KNOWN):
-    return MonitorBank(align(epochs, odometer, vehicle, config), {}, config, FACTOR)
+    return MonitorBank(align_run(epochs, odometer, vehicle, config), {}, config, FACTOR)
 
 
 def table(bank):
@@ -159,7 +159,7 @@ def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
     epochs, odometer = steady(5)
     path = epochs["path_m"].to_numpy().copy()
     path[2:] += 4.0
-    aligned = align(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
+    aligned = align_run(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
     bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config, FACTOR)}, config, FACTOR)
     result = table(bank)
     assert result["along_raw_reason"].unique().to_list() == [DISABLED]
@@ -177,14 +177,14 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
     odometer_t = np.arange(0.0, 20.0, 0.05)
     slip = 5.0 * np.clip(odometer_t - 10.0, 0.0, 1.0)
     epochs = epochs_of(t, 20.0 * t, velocity_along_mps=np.full(t.size, 20.0))
-    aligned = align(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
+    aligned = align_run(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
     result = doppler_monitor(aligned, CONFIG, FACTOR)
     fails = [t[k] for k in range(t.size) if result["state"][k] == "fail"]
     assert 10.0 < fails[0] < 10.5
     assert fails[-1] < 12.1
     assert result["value"][120] == pytest.approx(-1.0, abs=4.1)
     without = doppler_monitor(
-        align(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG, FACTOR
+        align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG, FACTOR
     )
     assert without["reason"].unique().to_list() == [NO_VELOCITY]
 

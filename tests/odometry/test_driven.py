@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.odometry.scatter import play_m, way_m, with_play, without_scatter
+from pipeline.odometry.driven import evenly_driven, hysteresis_m, way_m, with_hysteresis
 from pipeline.stages import replay
 from tests.replay.journeys import VEHICLE, journey
 
@@ -33,20 +33,20 @@ SHUNTING = {
 }
 
 
-def test_play_by_hand():
+def test_hysteresis_by_hand():
     rows = np.array([0.0, 0.8, -0.7, 3.0, 2.5, 1.5, 0.5, 5.0, np.nan, 6.0])
-    held = with_play(rows, np.full(10, 1.0))
+    held = with_hysteresis(rows, np.full(10, 1.0))
     np.testing.assert_array_equal(held, [0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 1.5, 4.0, np.nan, 5.0])
 
 
-def test_without_play_the_distance_is_as_it_is():
+def test_without_hysteresis_the_distance_is_as_it_is():
     rows = np.cumsum(np.random.default_rng(1).normal(size=50))
-    np.testing.assert_array_equal(with_play(rows, np.zeros(50)), rows)
+    np.testing.assert_array_equal(with_hysteresis(rows, np.zeros(50)), rows)
     assert way_m(rows, np.zeros(50)) == pytest.approx(np.abs(np.diff(rows)).sum())
 
 
 def test_way_to_and_fro_by_hand():
-    """100 m there and 40 m back; what scatters within the play adds nothing."""
+    """100 m there and 40 m back; what scatters within the hysteresis adds nothing."""
     there, back = np.linspace(0.0, 100.0, 201), np.linspace(99.5, 60.0, 80)
     rows = np.concatenate([there, back]) + 0.8 * (-1.0) ** np.arange(281)
     # The extremes of the rows are the way: 0.8 m beyond on either side of the turn, and at the end.
@@ -58,7 +58,7 @@ def test_a_stand_ends_where_the_rows_leave_it():
     t = np.arange(0.0, 60.0, 0.1)
     driven = np.maximum(t - 30.0, 0.0)
     rows = driven + np.random.default_rng(2).normal(0.0, 0.1, t.size)
-    at_s, at_m = without_scatter(t, rows, play_m(np.full(t.size, 0.1)), 0.3)
+    at_s, at_m = evenly_driven(t, rows, hysteresis_m(np.full(t.size, 0.1)), 0.3)
     speed = np.interp(t + 0.5, at_s, at_m) - np.interp(t - 0.5, at_s, at_m)
     began_s = t[np.flatnonzero(speed > 0.3)[0]]
     assert began_s == pytest.approx(30.0, abs=0.7)

@@ -1,4 +1,4 @@
-"""Noise of single rows of an odometer's distance, measured from the rows themselves.
+"""Quantisation noise: what single rows of an odometer's distance are off by, measured from the rows themselves.
 
 A counter of whole metres, a recorder that stamps on receipt, or noise of the reading: the distance of a row is off by
 some of it, the next by something else, and nothing adds up. At 10 Hz a counter of half metres so seems to change its
@@ -10,30 +10,26 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.ingest.written_steps import step_of
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import AlignConfig
 
 # Over so long, or over so many rows where that is longer, the way of a train is a curve of third degree.
 _SPAN_S = 2.0
 _MOST_ROWS, _FEWEST_ROWS = 16, 8
 _DEGREE = 3
-# Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
-_FARTHEST_S = 1.5
 # Enough for the median, however long the run is; with fewer it is chance.
-_STRETCHES, _FEWEST_STRETCHES = 400, 8
+_PIECES, _FEWEST_PIECES = 400, 8
 _MOVED_M = 1.0
 # By how much the higher half of the speeds has to be above the lower one.
 _APART = 1.5
-# Finer counters are no worse than their white noise; less than the other is rounding.
-_LEAST_STEP_M, _ROUNDED_M = 0.05, 1e-3
-# Scatter is noise of the rows where it is beyond so many times what the increments' white noise makes of them.
-_BEYOND = 2.0
+# Less is rounding of decimal numbers.
+_ROUNDED_M = 1e-3
 
 
 @dataclass(frozen=True)
-class ReadingNoise:
+class QuantisationNoise:
     """Variance [m^2] of a row at standstill, and by how much it grows with the square of the speed [s^2]."""
 
     still_m2: float = 0.0
@@ -46,59 +42,69 @@ class ReadingNoise:
         return self.still_m2 > 0.0 or self.moving_s2 > 0.0
 
 
-def reading_noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float) -> ReadingNoise:
+NO_QUANTISATION = QuantisationNoise()
+
+
+def quantisation_noise(
+    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig
+) -> QuantisationNoise:
     """What rows scatter about smooth curves beyond what white noise of the increments explains.
 
-    `whole` (rows - 1,): ways between rows that are recorded. Medians over stretches in which the train moves, so that
+    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves, so that
     slips do not count; of lower and higher speeds where these differ enough to tell stamps from counts. Noise that is
     less than what the white noise makes of the same rows counts as none. A counter has the noise of its step at least:
     at a speed at which each row gains as many steps as the last it does not show, until it does.
     """
-    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s)
-    return replace(scatter, still_m2=max(scatter.still_m2, count_step_m(distance_m, whole) ** 2 / 12.0))
+    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, config)
+    return replace(scatter, still_m2=max(scatter.still_m2, count_step_m(distance_m, whole, config) ** 2 / 12.0))
 
 
-def count_step_m(distance_m: Floats, whole: Bools) -> float:
-    """The step of a counter [m], 0 where there is none worth a word."""
+def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float:
+    """The step of a counter [m], 0 where there is none, or one finer than `counter_step_m`."""
     ways = np.abs(np.diff(distance_m)[whole])
-    return step_of(ways, ways, _LEAST_STEP_M, _ROUNDED_M)
+    return step_of(ways, ways, config.counter_step_m, _ROUNDED_M)
 
 
-def _scatter_beyond(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float) -> ReadingNoise:
+def _scatter_beyond(
+    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig
+) -> QuantisationNoise:
     """What the rows show of their noise."""
-    rows = _moving_stretches(t_s, distance_m, whole)
-    if len(rows) < _FEWEST_STRETCHES:
-        return ReadingNoise()
+    rows = _moving_pieces(t_s, distance_m, whole, config.straight_s)
+    if len(rows) < _FEWEST_PIECES:
+        return QuantisationNoise()
     since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
     found, explained = _scatter(since_s, ways, white_m2_per_s)
     speeds = np.abs(ways[:, -1]) / since_s[:, -1]
     fast = speeds > np.median(speeds)
     low_mps, high_mps = (float(np.median(speeds[part])) if part.any() else 0.0 for part in (~fast, fast))
-    if fast.sum() < _FEWEST_STRETCHES or high_mps < _APART * low_mps:
-        return ReadingNoise(_beyond(found, explained))
-    low_m2, high_m2 = (_beyond(found[part], explained[part]) for part in (~fast, fast))
+    if fast.sum() < _FEWEST_PIECES or high_mps < _APART * low_mps:
+        return QuantisationNoise(_beyond(found, explained, config))
+    low_m2, high_m2 = (_beyond(found[part], explained[part], config) for part in (~fast, fast))
     moving_s2 = max(high_m2 - low_m2, 0.0) / (high_mps**2 - low_mps**2)
-    return ReadingNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
+    return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
 
 
-def _moving_stretches(t_s: Floats, distance_m: Floats, whole: Bools) -> npt.NDArray[np.int64]:
-    """Rows of stretches without a gap in which the train moves, spread over the run; shape (stretches, rows)."""
+def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, farthest_s: float) -> Ints:
+    """Rows of pieces without a gap in which the train moves, spread over the run; shape (pieces, rows).
+
+    Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
+    """
     period_s = float(np.median(np.diff(t_s)))
-    if period_s > _FARTHEST_S or period_s <= 0.0:
+    if period_s > farthest_s or period_s <= 0.0:
         return np.zeros((0, 1), dtype=np.int64)
     count = int(np.clip(np.ceil(_SPAN_S / period_s) + 1, _FEWEST_ROWS, _MOST_ROWS))
     stride = max(1, round(_SPAN_S / period_s / (count - 1)))
     length = (count - 1) * stride
-    starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _STRETCHES))
+    starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _PIECES))
     broken = np.concatenate([[0], np.cumsum(~whole)])
     moves = np.abs(distance_m[starts + length] - distance_m[starts]) > _MOVED_M
     starts = starts[moves & (broken[starts + length] == broken[starts])]
-    chosen: npt.NDArray[np.int64] = starts[:, None] + stride * np.arange(count)
+    chosen: Ints = starts[:, None] + stride * np.arange(count)
     return chosen
 
 
 def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Floats, Floats]:
-    """Variance about the curves [m^2] of each stretch, and what white noise of the increments makes of it."""
+    """Variance about the curves [m^2] of each piece, and what white noise of the increments makes of it."""
     count = since_s.shape[1]
     powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
     curves, _ = np.linalg.qr(powers)
@@ -110,7 +116,7 @@ def _scatter(since_s: Floats, way_m: Floats, white_m2_per_s: float) -> tuple[Flo
     return found / free, white_m2_per_s * left / free
 
 
-def _beyond(found_m2: Floats, explained_m2: Floats) -> float:
+def _beyond(found_m2: Floats, explained_m2: Floats, config: AlignConfig) -> float:
     """The median of what is found where it is not explained [m^2], else none."""
     found, explained = float(np.median(found_m2)), float(np.median(explained_m2))
-    return found - explained if found > _BEYOND * explained else 0.0
+    return found - explained if found > config.quantisation_factor * explained else 0.0

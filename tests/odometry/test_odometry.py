@@ -5,31 +5,31 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.odometry.odometer import odometer_track, polarity
-from tests.align.straight import odometer_of
+from pipeline.odometry.polarity import polarity
+from tests.align.straight import odometer_of, odometry_from
 
 
 def test_distance_is_interpolated_and_never_extrapolated():
-    track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=[100.0, 110.0, 130.0]), 1.0, 0.05)
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[100.0, 110.0, 130.0]))
     at = np.array([-0.1, 0.0, 0.5, 1.5, 2.0, 2.1])
-    assert track.known_at(at).tolist() == [False, True, True, True, True, False]
-    np.testing.assert_allclose(track.distance_at(at)[1:5], [0.0, 5.0, 20.0, 30.0])
+    assert odometry.known_at_s(at).tolist() == [False, True, True, True, True, False]
+    np.testing.assert_allclose(odometry.distance_at_s(at)[1:5], [0.0, 5.0, 20.0, 30.0])
 
 
 def test_speed_alone_is_integrated_and_guessed_over_a_pause():
     frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], speed_mps=[10.0, 12.0, 10.0, 10.0, 10.0])
-    track = odometer_track(frame, 1.0, 0.05)
-    np.testing.assert_allclose(track.distance_m, [0.0, 5.5, 11.0, 51.0, 56.0])
-    assert track.stretch.tolist() == [0, 0, 0, 1, 1]
-    assert track.known_at(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
+    odometry = odometry_from(frame)
+    np.testing.assert_allclose(odometry.distance_m, [0.0, 5.5, 11.0, 51.0, 56.0])
+    assert odometry.segment.tolist() == [0, 0, 0, 1, 1]
+    assert odometry.known_at_s(np.array([0.7, 1.0, 3.0, 5.0])).tolist() == [True, True, False, True]
 
 
 def test_a_cumulative_distance_carries_over_a_pause_but_not_inside_it():
     frame = odometer_of([0.0, 0.5, 1.0, 5.0, 5.5], distance_m=[0.0, 5.0, 10.0, 50.0, 55.0])
-    track = odometer_track(frame, 1.0, 0.05)
-    assert track.stretch.tolist() == [0, 0, 0, 0, 0]
-    assert track.known_at(np.array([1.0, 3.0, 5.0])).tolist() == [True, False, True]
-    np.testing.assert_allclose(track.distance_at(np.array([5.0])), 50.0)
+    odometry = odometry_from(frame)
+    assert odometry.segment.tolist() == [0, 0, 0, 0, 0]
+    assert odometry.known_at_s(np.array([1.0, 3.0, 5.0])).tolist() == [True, False, True]
+    np.testing.assert_allclose(odometry.distance_at_s(np.array([5.0])), 50.0)
 
 
 def test_distance_and_speed_by_turns_are_carried_between_their_own_rows():
@@ -37,9 +37,9 @@ def test_distance_and_speed_by_turns_are_carried_between_their_own_rows():
     t = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
     distance = [0.0, nan, 10.0, nan, 22.0, nan, 36.0]
     speed = [nan, 11.0, nan, 12.0, nan, 13.0, nan]
-    track = odometer_track(odometer_of(t, distance_m=distance, speed_mps=speed), 1.0, 0.05)
-    np.testing.assert_allclose(track.distance_m, [0.0, 5.0, 10.0, 16.0, 22.0, 29.0, 36.0])
-    assert track.known_at(np.array(t)).all()
+    odometry = odometry_from(odometer_of(t, distance_m=distance, speed_mps=speed))
+    np.testing.assert_allclose(odometry.distance_m, [0.0, 5.0, 10.0, 16.0, 22.0, 29.0, 36.0])
+    assert odometry.known_at_s(np.array(t)).all()
 
 
 def test_a_distance_by_turns_carries_over_a_pause_between_any_rows():
@@ -47,59 +47,59 @@ def test_a_distance_by_turns_carries_over_a_pause_between_any_rows():
     t = [0.0, 0.5, 1.0, 1.5, 8.0, 8.5, 9.0]
     distance = [0.0, nan, 10.0, nan, nan, 80.0, nan]
     speed = [nan, 10.0, nan, 10.0, 12.0, nan, 12.0]
-    track = odometer_track(odometer_of(t, distance_m=distance, speed_mps=speed), 1.0, 0.05)
-    assert track.stretch.tolist() == [0] * 7
+    odometry = odometry_from(odometer_of(t, distance_m=distance, speed_mps=speed))
+    assert odometry.segment.tolist() == [0] * 7
     # A straight line of speeds over the pause would be 71.5 m; the counter gained 59 m.
-    np.testing.assert_allclose(track.distance_m, [0.0, 5.0, 10.0, 15.0, 74.0, 80.0, 86.0])
-    assert track.known_at(np.array([1.5, 4.0, 8.0])).tolist() == [True, False, True]
+    np.testing.assert_allclose(odometry.distance_m, [0.0, 5.0, 10.0, 15.0, 74.0, 80.0, 86.0])
+    assert odometry.known_at_s(np.array([1.5, 4.0, 8.0])).tolist() == [True, False, True]
 
 
 def test_rows_too_far_apart_are_not_carried():
     nan = np.nan
     frame = odometer_of(np.arange(5.0), distance_m=[0.0, nan, nan, nan, 40.0], speed_mps=[nan, 10.0, nan, 12.0, nan])
-    track = odometer_track(frame, 1.0, 0.05)
-    assert track.known_at(np.array([0.5, 1.5, 2.5, 3.5])).tolist() == [False, True, True, False]
-    np.testing.assert_allclose(np.diff(track.distance_m)[1:3], [10.5, 11.5])
+    odometry = odometry_from(frame)
+    assert odometry.known_at_s(np.array([0.5, 1.5, 2.5, 3.5])).tolist() == [False, True, True, False]
+    np.testing.assert_allclose(np.diff(odometry.distance_m)[1:3], [10.5, 11.5])
 
 
 def test_a_missing_distance_beside_a_speed_is_driven():
     """The counter was set to zero in the second that it does not report: no way was run backwards."""
     frame = odometer_of([0.0, 0.5, 1.0, 1.5, 2.0], distance_m=[100.0, 105.0, np.nan, 0.0, 5.0], speed_mps=[10.0] * 5)
-    np.testing.assert_allclose(odometer_track(frame, 1.0, 0.05).distance_m, [0.0, 5.0, 10.0, 15.0, 20.0])
+    np.testing.assert_allclose(odometry_from(frame).distance_m, [0.0, 5.0, 10.0, 15.0, 20.0])
 
 
 def test_reported_slip_is_no_distance():
     frame = odometer_of([0.0, 0.5, 1.0, 1.5], distance_m=[0.0, 5.0, 20.0, 25.0], slip=[False, False, True, False])
-    track = odometer_track(frame, 1.0, 0.05)
-    assert track.known_at(np.array([0.2, 0.7, 1.2, 1.5])).tolist() == [True, False, False, True]
-    assert track.stretch[0] != track.stretch[3]
+    odometry = odometry_from(frame)
+    assert odometry.known_at_s(np.array([0.2, 0.7, 1.2, 1.5])).tolist() == [True, False, False, True]
+    assert odometry.segment[0] != odometry.segment[3]
 
 
 def test_a_noisier_odometer_than_configured_counts():
     frame = odometer_of([0.0, 0.5, 1.0], speed_mps=[10.0, 10.0, 10.0]).with_columns(sigma_speed_mps=0.4)
-    assert odometer_track(frame, 1.0, 0.05).white_rate_m2_per_s == pytest.approx(0.4**2 * 0.5)
-    assert odometer_track(frame.with_columns(sigma_speed_mps=0.01), 1.0, 0.05).white_rate_m2_per_s == 0.05**2
+    assert odometry_from(frame).noise.white_m2_per_s == pytest.approx(0.4**2 * 0.5)
+    assert odometry_from(frame.with_columns(sigma_speed_mps=0.01)).noise.white_m2_per_s == 0.05**2
 
 
 @pytest.mark.parametrize(
     ("reads", "expected"), [([0.0, 15.0, 30.0], 1), ([0.0, -15.0, -30.0], -1), ([0.0, 0.0, 0.0], 1)]
 )
 def test_polarity_comes_from_the_first_twenty_metres(reads, expected):
-    track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=reads), 1.0, 0.05)
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=reads))
     t = np.array([0.0, 1.0, 2.0])
-    assert polarity(track, t, np.array([500.0, 515.0, 530.0]), 20.0) == expected
+    assert polarity(odometry, np.round(1e9 * t).astype(np.int64), np.array([500.0, 515.0, 530.0]), 20.0) == expected
 
 
 def test_speed_is_the_mean_over_the_second_before():
-    track = odometer_track(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 30.0]), 1.0, 0.05)
-    np.testing.assert_allclose(track.speed_at(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 20.0, 15.0])
+    odometry = odometry_from(odometer_of([0.0, 1.0, 2.0], distance_m=[0.0, 10.0, 30.0]))
+    np.testing.assert_allclose(odometry.speed_at_s(np.array([0.5, 1.0, 2.0, 1.5])), [10.0, 10.0, 20.0, 15.0])
 
 
 def test_a_leap_in_the_first_metres_does_not_turn_the_odometer_round():
     t = np.arange(0.0, 10.0, 0.1)
-    track = odometer_track(odometer_of(t, distance_m=5.0 * t), 1.0, 0.05)
+    odometry = odometry_from(odometer_of(t, distance_m=5.0 * t))
     path = 5.0 * t - np.where((t > 3.9) & (t < 4.2), 300.0, 0.0)
-    assert polarity(track, t, path, 20.0) == 1
+    assert polarity(odometry, np.round(1e9 * t).astype(np.int64), path, 20.0) == 1
 
 
 @pytest.mark.parametrize("speed", [None, 10.0])
@@ -115,14 +115,14 @@ def test_a_counter_that_is_reset_or_runs_over_drives_nowhere(reads, leap, speed)
     forth = 1.0 if reads[1] > reads[0] else -1.0
     t = 0.5 * np.arange(6.0)
     speeds = None if speed is None else [forth * speed] * 6
-    track = odometer_track(odometer_of(t, distance_m=reads, speed_mps=speeds), 1.0, 0.05)
-    known = track.known_at(t[:-1] + 0.25)
+    odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
+    known = odometry.known_at_s(t[:-1] + 0.25)
     if speed is None:
-        assert track.stretch.tolist() == [0] * leap + [1] * (6 - leap)
+        assert odometry.segment.tolist() == [0] * leap + [1] * (6 - leap)
         assert known.tolist() == [index != leap - 1 for index in range(5)]
     else:
-        np.testing.assert_allclose(track.distance_m, forth * 5.0 * np.arange(6.0))
-        assert (track.stretch == 0).all()
+        np.testing.assert_allclose(odometry.distance_m, forth * 5.0 * np.arange(6.0))
+        assert (odometry.segment == 0).all()
         assert known.all()
 
 
@@ -134,9 +134,9 @@ def test_a_counter_that_is_reset_in_a_pause_loses_the_way(speed):
     speeds = np.full(t.size, 10.0) if speed else None
     if speed == "by turns":
         reads, speeds = np.where(turns, np.nan, reads), np.where(turns, speeds, np.nan)
-    track = odometer_track(odometer_of(t, distance_m=reads, speed_mps=speeds), 1.0, 0.05)
-    assert track.stretch.tolist() == [0] * 20 + [1] * 20
-    assert np.diff(track.distance_m).min() >= 0.0
+    odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=speeds))
+    assert odometry.segment.tolist() == [0] * 20 + [1] * 20
+    assert np.diff(odometry.distance_m).min() >= 0.0
 
 
 def test_a_spike_of_the_counter_is_passed_over():
@@ -144,18 +144,18 @@ def test_a_spike_of_the_counter_is_passed_over():
     reads = 5.0 * np.arange(7.0)
     for row in (1, 3, 5):
         spiked = reads + 500.0 * (np.arange(7) == row)
-        track = odometer_track(odometer_of(t, distance_m=spiked), 1.0, 0.05)
-        np.testing.assert_allclose(track.distance_m, reads)
-        assert (track.stretch == 0).all()
-        assert track.known_at(t).all()
+        odometry = odometry_from(odometer_of(t, distance_m=spiked))
+        np.testing.assert_allclose(odometry.distance_m, reads)
+        assert (odometry.segment == 0).all()
+        assert odometry.known_at_s(t).all()
 
 
 def test_what_a_fast_train_drives_over_gaps_and_bunched_stamps_is_no_leap():
     t = np.array([0.0, 0.5, 0.501, 0.502, 1.5, 21.5, 22.0])
     reads = np.array([0.0, 50.0, 60.0, 70.0, 150.0, 2150.0, 2200.0])
-    track = odometer_track(odometer_of(t, distance_m=reads), 1.0, 0.05)
-    np.testing.assert_allclose(track.distance_m, reads)
-    assert (track.stretch == 0).all()
+    odometry = odometry_from(odometer_of(t, distance_m=reads))
+    np.testing.assert_allclose(odometry.distance_m, reads)
+    assert (odometry.segment == 0).all()
 
 
 @pytest.mark.parametrize("with_speed", [False, True])
@@ -168,15 +168,15 @@ def test_between_rows_far_apart_the_way_follows_the_speeds(sign, with_speed):
 
     t = np.arange(0.0, 41.0, 4.0)
     speeds = sign * np.minimum(t, 20.0) if with_speed else None
-    track = odometer_track(odometer_of(t, distance_m=way(t), speed_mps=speeds), 1.0, 0.05)
+    odometry = odometry_from(odometer_of(t, distance_m=way(t), speed_mps=speeds))
     at = np.arange(0.0, 40.0, 0.1)
-    assert track.known_at(at).all()
-    np.testing.assert_allclose(track.distance_at(t), way(t), atol=1e-9)
-    off = np.abs(track.distance_at(at) - way(at)).max()
+    assert odometry.known_at_s(at).all()
+    np.testing.assert_allclose(odometry.distance_at_s(t), way(t), atol=1e-9)
+    off = np.abs(odometry.distance_at_s(at) - way(at)).max()
     straight = np.abs(np.interp(at, t, way(t)) - way(at)).max()
     assert straight == pytest.approx(2.0, abs=0.01)
     assert off < (0.05 if with_speed else 0.7)
-    assert (np.diff(sign * track.distance_m) >= 0.0).all()
+    assert (np.diff(sign * odometry.distance_m) >= 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -196,9 +196,7 @@ def test_speeds_that_contradict_the_way_fill_in_nothing(period_s, wrong):
     reads, speeds = np.interp(t, fine, way), np.interp(t, fine, speed)
     frames = (odometer_of(t, distance_m=reads, speed_mps=given) for given in (None, speeds, wrong(speeds)))
     inside = fine <= t[-1]
-    without, right, misled = (
-        np.abs(odometer_track(frame, 1.0, 0.05).distance_at(fine) - way)[inside].max() for frame in frames
-    )
+    without, right, misled = (np.abs(odometry_from(frame).distance_at_s(fine) - way)[inside].max() for frame in frames)
     straight = np.abs(np.interp(fine, t, reads) - way)[inside].max()
     assert right < without < straight
     assert misled < straight
@@ -209,23 +207,21 @@ def test_a_speed_of_another_unit_or_sign_tells_no_way_over_a_leap(factor):
     t = 0.5 * np.arange(40.0)
     reads = np.where(t < 10.0, 1000.0 + 10.0 * t, 10.0 * (t - 10.0))
     for noisy, lost in ((1.1, 0), (factor, 1)):
-        track = odometer_track(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40), 1.0, 0.05)
-        assert track.stretch[-1] == lost
+        odometry = odometry_from(odometer_of(t, distance_m=reads, speed_mps=[10.0 * noisy] * 40))
+        assert odometry.segment[-1] == lost
 
 
 def test_a_standstill_between_rows_far_apart_stays_one():
-    track = odometer_track(
+    odometry = odometry_from(
         odometer_of([0.0, 4.0, 8.0, 12.0], distance_m=[0.0, 30.0, 30.0, 60.0], speed_mps=[9.0, 2.0, 2.0, 9.0]),
-        1.0,
-        0.05,
     )
-    np.testing.assert_allclose(track.distance_at(np.arange(4.0, 8.1, 0.25)), 30.0)
+    np.testing.assert_allclose(odometry.distance_at_s(np.arange(4.0, 8.1, 0.25)), 30.0)
 
 
 def test_nothing_is_filled_in_where_the_way_is_lost():
     frame = odometer_of(
         [0.0, 2.0, 4.0, 6.0, 26.0, 28.0], speed_mps=[10.0] * 6, slip=[False, False, True, False, False, False]
     )
-    track = odometer_track(frame, 1.0, 0.05)
-    assert track.known_at(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
-    assert track.stretch_at(np.array([1.0, 5.0, 27.0])).tolist() == [0, 1, 2]
+    odometry = odometry_from(frame)
+    assert odometry.known_at_s(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
+    assert odometry.segment_at_s(np.array([1.0, 5.0, 27.0])).tolist() == [0, 1, 2]

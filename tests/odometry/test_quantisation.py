@@ -6,17 +6,18 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.alignment.increments import most_scatter_m, reading_of
 from pipeline.figures.bounds import threshold_factor
-from pipeline.monitors.axis import AlongSteps, Reading, along_axis, run_axis
-from pipeline.odometry.odometer import odometer_track
-from pipeline.odometry.reading import ReadingNoise, count_step_m
+from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
+from pipeline.monitors.axis import run_axis
+from pipeline.odometry.odometry import Increments
+from pipeline.odometry.quantisation import QuantisationNoise, count_step_m
 from pipeline.stages import replay
 from schemas.config import Configuration
-from tests.align.straight import odometer_of
+from tests.align.straight import align_run, epochs_of, odometer_of, odometry_from
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey
 
 WHITE_MPS = 0.05
+CONFIG = Configuration()
 
 
 def way(at_s):
@@ -28,7 +29,7 @@ def way(at_s):
 
 
 def noise_of(t_s, distance_m, **columns):
-    return odometer_track(odometer_of(t_s, distance_m=distance_m, **columns), 1.0, WHITE_MPS).reading
+    return odometry_from(odometer_of(t_s, distance_m=distance_m, **columns)).noise.quantisation
 
 
 def walk(t_s, seed=1):
@@ -56,13 +57,15 @@ def test_counts_scatter_by_their_step_over_root_twelve(step_m, rate_hz):
 def test_a_counter_is_known_by_its_step():
     ways = np.concatenate([[0.0], np.cumsum(0.5 * np.tile([3, 1, 0, 3, 2, 5], 4))])
     whole = np.ones(ways.size - 1, dtype=bool)
-    assert count_step_m(ways, whole) == 0.5
-    assert count_step_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways), whole) == pytest.approx(0.5, rel=1e-5)
-    assert count_step_m(ways / 50.0, whole) == 0.0
-    assert count_step_m(ways + 0.1 * np.sin(ways), whole) == 0.0
+    assert count_step_m(ways, whole, CONFIG.align) == 0.5
+    assert count_step_m(ways - 1000.0 * (ways > 10.0) + 1e-7 * np.sin(ways), whole, CONFIG.align) == pytest.approx(
+        0.5, rel=1e-5
+    )
+    assert count_step_m(ways / 50.0, whole, CONFIG.align) == 0.0
+    assert count_step_m(ways + 0.1 * np.sin(ways), whole, CONFIG.align) == 0.0
     lost = ways + 0.2 * (np.arange(ways.size) > 7)
-    assert count_step_m(lost, whole) == 0.0
-    assert count_step_m(lost, whole & (np.arange(whole.size) != 7)) == 0.5
+    assert count_step_m(lost, whole, CONFIG.align) == 0.0
+    assert count_step_m(lost, whole & (np.arange(whole.size) != 7), CONFIG.align) == 0.5
 
 
 def test_a_smooth_way_at_few_speeds_is_no_counter():
@@ -95,7 +98,8 @@ def test_what_the_white_noise_explains_is_left_out(seed):
     rng = np.random.default_rng(seed)
     walked = np.cumsum(rng.normal(0.0, 0.45 * np.sqrt(0.05), t.size))
     frame = odometer_of(t, distance_m=way(t) + walked + rng.normal(0.0, 0.2, t.size))
-    found = odometer_track(frame, 1.0, 0.45).reading
+    noisy = Configuration.model_validate({"monitors": {"odometer_sigma_mps": 0.45}})
+    found = odometry_from(frame, config=noisy).noise.quantisation
     assert np.sqrt(found.variance_m2(10.0)) == pytest.approx(0.2, rel=0.12)
 
 
@@ -128,9 +132,9 @@ def test_slips_and_standstill_do_not_count():
 
 def test_too_few_rows_or_rows_too_far_apart_tell_nothing():
     short = np.arange(0.0, 12.0, 0.05)
-    assert noise_of(short, np.floor(20.0 * short)) == ReadingNoise()
+    assert noise_of(short, np.floor(20.0 * short)) == QuantisationNoise()
     sparse = np.arange(0.0, 500.0, 2.0)
-    assert noise_of(sparse, np.floor(way(sparse))) == ReadingNoise()
+    assert noise_of(sparse, np.floor(way(sparse))) == QuantisationNoise()
 
 
 @pytest.mark.parametrize("step_m", [0.5, 1.0, 2.0])
@@ -171,10 +175,19 @@ def test_no_more_noise_enters_than_leaves_the_failure_limit_seen():
     assert threshold_factor(1e-7) * np.sqrt(2.0) * most_m == pytest.approx(config.hazards.failure_limit_m)
     t = np.arange(0.0, 500.0, 0.1)
     for step_m, expected_m in ((5.0, 5.0 / np.sqrt(12.0)), (20.0, most_m)):
-        track = odometer_track(odometer_of(t, distance_m=np.floor(way(t) / step_m) * step_m), 1.0, WHITE_MPS)
-        found = reading_of(track, np.array([100.0, 400.0]), config)
-        assert found is not None
-        assert found.sigma_m == pytest.approx(expected_m, rel=0.35 if step_m == 5.0 else 1e-9)
+        odometer = odometer_of(t, distance_m=np.floor(way(t) / step_m) * step_m)
+        aligned = align_run(
+            epochs_of(np.array([100.0, 300.0, 400.0]), way([100.0, 300.0, 400.0])), odometer, VEHICLE, config
+        )
+        found_m = aligned["odometer_rows_m"].to_numpy()
+        assert found_m == pytest.approx(expected_m, rel=0.35 if step_m == 5.0 else 1e-9)
+
+
+def standing(t_s, along_m, period_s):
+    """Epochs of a train that stands, whose only noise is that of the odometer's rows, 1 m."""
+    zero, one = np.zeros(t_s.size), np.ones(t_s.size)
+    index = np.arange(t_s.size)
+    return AlongEpochs(index, t_s, along_m, 0 * index, zero, zero, 0.0, zero, zero, 0.0, one, period_s)
 
 
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.13, 0.5, 1.0, 1.4, 5.0])
@@ -184,10 +197,7 @@ def test_no_statistic_has_more_noise_of_the_rows_than_its_sigma(step_s, period_s
     rows = np.arange(0.0, count * step_s + 2.0 * period_s, period_s)
     at = np.arange(count) * step_s
     errors = np.interp(at, rows, np.random.default_rng(1).normal(0.0, 1.0, rows.size))
-    steps_s, zero, one = np.full(count, step_s), np.zeros(count), np.ones(count)
-    reading = Reading(one, period_s)
-    steps = AlongSteps(steps_s, np.diff(errors, prepend=errors[0]), *[zero] * 8, reading=reading)
-    series = along_axis(np.arange(count), at == 0.0, steps, np.ones(1), np.ones(1))
+    series = along_series(standing(at, errors, period_s), Increments(np.zeros(count), np.zeros(count)), CONFIG)
     result, _ = run_axis(series, np.array(Configuration().monitors.ewma_alphas[:2]))
     spread = result.value[count // 5 :].std(axis=0) / result.sigma[-1]
     assert (spread < 1.06).all()
@@ -232,5 +242,6 @@ def test_the_scale_is_learned_with_rows_that_scatter_and_no_surer_than_it_is(rec
 
 
 def test_between_rows_a_straight_line_changes_with_the_square_of_the_step():
-    changed = Reading(np.ones(4), 1.0).decorrelation(np.array([0.1, 0.5, 1.0, 3.0]))
-    np.testing.assert_allclose(changed, [0.02, 0.25, 1.0, 1.0])
+    at = np.cumsum([0.0, 0.1, 0.5, 1.0, 3.0])
+    series = along_series(standing(at, np.zeros(5), 1.0), Increments(np.zeros(5), np.zeros(5)), CONFIG)
+    np.testing.assert_allclose(series.decorrelation[1:, -1], [0.02, 0.25, 1.0, 1.0])

@@ -1,0 +1,88 @@
+"""The along-track axis: the one builder of increments of GNSS minus odometer (DIAG eq. 1-3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.figures.bounds import threshold_factor
+from pipeline.monitors.axis import AxisSeries, decorrelation_of, error_model, with_memory
+from pipeline.odometry.odometry import Increments
+from schemas.arrays import Floats, Ints
+from schemas.config import Configuration
+
+# Half of the fastest average's memory: so the variance of all averages is that of rows up to 5 s apart, or above it.
+_LASTS_S = 5.0
+
+
+@dataclass(frozen=True)
+class AlongEpochs:
+    """Epochs with a position and an odometer, in order, and the errors there; all arrays of one length m.
+
+    `epoch`: row among all epochs; `segment`: the odometer's continuity segment; `sigma_m`: of the Gauss-Markov errors;
+    `digits_m`: how coarsely positions are written down; `jitter_s`: how the stamps scatter about the receiver's clock;
+    `scale_sigma`, `latency_sigma_s`: of the estimates in use; `white_m2_per_s`: what the odometer's distance gathers in
+    a second; `rows_m`: quantisation noise of its rows, `period_s` apart.
+    """
+
+    epoch: Ints
+    t_s: Floats
+    along_m: Floats
+    segment: Ints
+    sigma_m: Floats
+    digits_m: Floats
+    jitter_s: Floats | float
+    scale_sigma: Floats
+    latency_sigma_s: Floats
+    white_m2_per_s: Floats | float
+    rows_m: Floats
+    period_s: float
+
+
+def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuration) -> AxisSeries:
+    """Increments from each epoch to the next, with what scale and latency leave uncertain."""
+    dt = np.diff(epochs.t_s, prepend=epochs.t_s[0] - 1.0)
+    fresh = (dt > config.align.gap_reset_s) | (np.diff(epochs.segment, prepend=epochs.segment[0]) != 0)
+    fresh[0] = True
+    zero = np.zeros(dt.size)
+    shares, taus_s = error_model(config.monitors)
+    memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
+    sigmas = [np.outer(np.sqrt(shares), epochs.sigma_m), np.abs(memoryless_m)]
+    decorrelations = [decorrelation_of(dt, taus_s), np.ones(dt.size)]
+    if epochs.rows_m.any():
+        sigmas.append(epochs.rows_m)
+        decorrelations.append(_rows_decorrelation(dt, epochs.period_s))
+    return AxisSeries(
+        epoch=epochs.epoch,
+        fresh=fresh,
+        border=np.zeros(dt.size, dtype=np.bool_),
+        dt_s=dt,
+        rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[0]) - odometer.distance_m) / dt,
+        **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T),
+        white_m2=epochs.white_m2_per_s * dt,
+        border_m2=zero,
+        steady_mps=epochs.scale_sigma * odometer.distance_m / dt,
+        latency_mps=epochs.latency_sigma_s * odometer.speed_mps / dt,
+    )
+
+
+def _rows_decorrelation(dt_s: Floats, period_s: float) -> Floats:
+    """1 - phi of the rows' noise over these steps: none is left from row to row; between them little changes.
+
+    The square is what a step changes on a straight line between two rows. Errors that change so little and at random
+    would last for `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than `_LASTS_S`.
+    """
+    changed = np.minimum(dt_s / max(period_s, 1e-9), 1.0) ** 2
+    lost: Floats = np.maximum(changed, np.minimum(dt_s / _LASTS_S, 1.0))
+    return lost
+
+
+def most_scatter_m(config: Configuration) -> float:
+    """The largest deviation of an odometer's row, or of digits, that the thresholds allow for [m].
+
+    With more, a position that leaves its place by the failure limit would be no more than rows of the odometer, or the
+    digits, make of it. Alarms of a record that scatters by more are its own, but no failure passes.
+    """
+    factor = threshold_factor(config.monitors.false_alarm_probability)
+    return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

@@ -1,0 +1,105 @@
+"""The odometer's distance without quantisation noise, which is neither way nor turn.
+
+A train that stands beside the edge of two counts, or whose odometer's reading is noisy, drives to and fro in the rows
+alone. The distance follows them with a hysteresis as wide as they scatter, so that only what leaves it counts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.figures.bounds import SURE_SIGMAS
+from schemas.arrays import Bools, Floats
+
+# Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
+_NEAR_SIGMAS = 2.0
+
+
+def hysteresis_m(sigma_m: Floats) -> Floats:
+    """By how much the distance may leave what is held of it before it has moved [m]."""
+    return SURE_SIGMAS * sigma_m
+
+
+def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
+    """The distance with a hysteresis to both sides [m], causal; NaN where it is not known.
+
+    Behind a movement it stays `width_m` back, and turns once the distance came back by twice that.
+    """
+    held = np.full(distance_m.size, np.nan)
+    rows = np.flatnonzero(np.isfinite(distance_m))
+    if rows.size == 0:
+        return held
+    at = float(distance_m[rows[0]])
+    low, high = (distance_m - width_m)[rows].tolist(), (distance_m + width_m)[rows].tolist()
+    values = []
+    for least, most in zip(low, high, strict=True):
+        at = min(max(at, least), most)
+        values.append(at)
+    held[rows] = values
+    return held
+
+
+def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
+    """Way driven up to each row, to and fro [m], by a known distance that scatters within the hysteresis."""
+    steps = np.diff(with_hysteresis(distance_m, width_m))
+    moves = np.flatnonzero(steps)
+    turns = moves[1:][np.sign(steps[moves[1:]]) != np.sign(steps[moves[:-1]])]
+    # A turn shows once the distance came back by the whole width.
+    ways = np.abs(steps)
+    ways[turns] += 2.0 * width_m[turns + 1]
+    return np.concatenate([[0.0], np.cumsum(ways)])
+
+
+def way_m(distance_m: Floats, width_m: Floats) -> float:
+    """Way driven, to and fro [m], to the last row."""
+    beyond_m = distance_m[-1] - with_hysteresis(distance_m, width_m)[-1]
+    return float(driven_m(distance_m, width_m)[-1] + abs(beyond_m))
+
+
+def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s: float) -> Bools:
+    """Per step between samples: mean speed beyond the dead band, over `window_s` at least, centred on the step."""
+    half_s, centre_s = 0.5 * np.maximum(np.diff(t_s), window_s), 0.5 * (t_s[1:] + t_s[:-1])
+    begin_m, end_m = (np.interp(at_s, t_s, distance_m) for at_s in (centre_s - half_s, centre_s + half_s))
+    moving: Bools = np.abs(end_m - begin_m) > deadband_mps * 2.0 * half_s
+    return moving
+
+
+def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
+    """Way driven up to each sample [m]; of a stand only how far its place was left, for its noise would add up."""
+    way = np.abs(np.diff(distance_m))
+    first = np.flatnonzero(np.diff(moving, prepend=~moving[:1]))
+    steps = np.diff(first, append=moving.size)
+    stand = np.repeat(np.arange(first.size), steps)
+    away = np.abs(distance_m[1:] - np.repeat(distance_m[first], steps))
+    # The farthest so far within each stand: offsets that grow from one to the next keep them apart.
+    apart = (away.max() + 1.0) * stand
+    left = np.maximum.accumulate(away + apart) - apart
+    fresh = np.zeros(moving.size, dtype=np.bool_)
+    fresh[first] = True
+    since = np.where(fresh, left, np.diff(left, prepend=0.0))
+    return np.concatenate([[0.0], np.cumsum(np.where(moving, way, since))])
+
+
+def evenly_driven(t_s: Floats, distance_m: Floats, width_m: Floats, least_mps: float) -> tuple[Floats, Floats]:
+    """Times and distances [m] between which the train drove evenly, after the fact; slower than this it stood.
+
+    From one row that moves the held distance to the next. Where that is a stand, it moved no sooner than from the last
+    row about where it stood.
+    """
+    held = with_hysteresis(distance_m, width_m)
+    steps = np.diff(held, prepend=np.nan)
+    # A width that falls with the speed moves what is held too, but not the train.
+    moves = np.flatnonzero((steps != 0) & (np.diff(distance_m, prepend=np.nan) != 0))
+    at_s, at_m = t_s[moves].tolist(), distance_m[moves].tolist()
+    gaps, ways = np.diff(t_s[moves]), np.abs(np.diff(distance_m[moves]))
+    # A turn, and the first way, show after the hysteresis alone.
+    turned = steps[moves[1:]] * np.nan_to_num(steps[moves[:-1]]) <= 0
+    stood = ways - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * gaps
+    for gap in np.flatnonzero(stood & (gaps > 0))[::-1].tolist():
+        between = slice(int(moves[gap]), int(moves[gap + 1]))
+        stood_m = float(np.median(distance_m[between]))
+        near = np.abs(distance_m[between] - stood_m) <= _NEAR_SIGMAS / SURE_SIGMAS * width_m[between]
+        last = between.start + int(np.flatnonzero(near)[-1]) if near.any() else between.start
+        at_s.insert(gap + 1, float(t_s[last]))
+        at_m.insert(gap + 1, stood_m)
+    return np.array([*at_s, t_s[-1]]), np.array([*at_m, at_m[-1]])

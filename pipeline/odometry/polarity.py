@@ -1,0 +1,40 @@
+"""The odometer's sign against growing path, set once per solution from its first metres (DOMAIN section 2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.odometry.odometry import Odometry
+from schemas.arrays import Floats, Ints
+
+_STARTS = 40
+
+
+def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) -> int:
+    """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
+
+    `path_m` grows in the direction of that same movement (DOMAIN section 2), so GNSS decides once, over these
+    metres only: starts every metre have a vote each, so that a leap of the
+    position in between does not turn the odometer round. A run that never moves so far is judged by its largest
+    movement.
+    """
+    recorded_m = odometry.distance_at(t_ns)
+    usable = np.flatnonzero(np.isfinite(path_m) & np.isfinite(recorded_m))
+    if usable.size < 2:
+        return 1
+    odometer, path = recorded_m[usable], path_m[usable]
+    way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
+    window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
+    # Starts a fixed way apart: a long stand before the departure has one vote, not thousands.
+    starts = np.unique(np.searchsorted(way, np.linspace(0.0, 2.0 * distance_m, _STARTS)))
+    starts = starts[starts < min(window, way.size)]
+    votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
+    return -1 if sum(votes) < 0 else 1
+
+
+def _side(odometer: Floats, path: Floats, distance_m: float) -> int:
+    """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0) over these metres."""
+    moved = odometer - odometer[0]
+    far = np.flatnonzero(np.abs(moved) >= distance_m)
+    end = int(far[0]) if far.size else int(np.argmax(np.abs(moved)))
+    return int(np.sign(moved[end] * (path[end] - path[0])))

@@ -1,0 +1,115 @@
+"""The way from each recorded row of an odometer to the next: by its distance where that tells it, else by its speeds.
+
+Where rows hold the one or the other by turns (two sensors in one stream), each is carried between its own rows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from schemas.arrays import Bools, Floats
+from schemas.config import AlignConfig
+
+
+class Ways(NamedTuple):
+    """Per step from a row to the next: way [m], NaN where not known, and whether the recorded distance told it."""
+
+    way_m: Floats
+    counted: Bools
+
+
+def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
+    """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
+
+    A leap of the distance is no way: there the speeds tell it where they agree with the distance elsewhere. Over a
+    pause longer than `limit_s` a counter tells what it gained, also where rows are by turns.
+    """
+    dt_s = np.diff(t_s)
+    distance_m = _without_spikes(t_s, distance_m, config)
+    recorded_m = np.diff(distance_m)
+    leap = leaps(recorded_m, dt_s, config)
+    recorded = np.where(leap, np.nan, recorded_m)
+    driven = _trusted(_driven(speed_mps, dt_s), recorded, leap, config)
+    step = np.where(np.isnan(recorded), driven, recorded)
+    unknown = np.isnan(step)
+    if not unknown.any():
+        return Ways(step, ~np.isnan(recorded))
+    carried_m = np.diff(_carried(t_s, distance_m, limit_s))
+    leap = leaps(carried_m, dt_s, config)
+    recorded = np.where(unknown & ~leap, carried_m, recorded)
+    driven = _trusted(_driven(_carried(t_s, speed_mps, limit_s), dt_s), recorded, leap, config)
+    recorded = _over_pauses(t_s, distance_m, recorded, driven, dt_s > limit_s, config)
+    counted = ~np.isnan(recorded)
+    return Ways(np.where(counted, recorded, driven), counted)
+
+
+def leaps(way_m: Floats, dt_s: Floats, config: AlignConfig) -> Bools:
+    """Ways that are longer than any train can drive in these times: the counter was reset, ran over or lied."""
+    leap: Bools = np.abs(way_m) > config.fastest_mps * dt_s + config.bunched_stamps_m
+    return leap
+
+
+def _without_spikes(t_s: Floats, distance_m: Floats, config: AlignConfig) -> Floats:
+    """The distance without single rows from which it leaps back to where it was."""
+    leap = leaps(np.diff(distance_m), np.diff(t_s), config)
+    if not leap.any():
+        return distance_m
+    over = leap[1:] & leap[:-1] & ~leaps(distance_m[2:] - distance_m[:-2], t_s[2:] - t_s[:-2], config)
+    cleaned = distance_m.copy()
+    cleaned[1:-1][over] = np.nan
+    return cleaned
+
+
+def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignConfig) -> Floats:
+    """Ways by the speeds; none over leaps where they do not agree with what the counter tells elsewhere.
+
+    A unit, a sign or the sensor may be wrong.
+    """
+    both = np.isfinite(recorded_m) & np.isfinite(driven_m)
+    if not leap.any() or not both.any():
+        return driven_m
+    recorded, driven = recorded_m[both], driven_m[both]
+    apart_m, most_m = abs(recorded.sum() - driven.sum()), config.speed_agreement * np.abs(recorded).sum()
+    return driven_m if apart_m <= most_m else np.where(leap, np.nan, driven_m)
+
+
+def _driven(speed_mps: Floats, dt_s: Floats) -> Floats:
+    steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * dt_s
+    return steps
+
+
+def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
+    """Values between known rows no further apart than the limit by straight lines; NaN elsewhere."""
+    known = np.flatnonzero(np.isfinite(values))
+    if known.size < 2:
+        return values
+    after = np.searchsorted(known, np.arange(values.size)).clip(1, known.size - 1)
+    near = t_s[known[after]] - t_s[known[after - 1]] <= limit_s
+    inside = (t_s >= t_s[known[0]]) & (t_s <= t_s[known[-1]])
+    return np.where(
+        np.isfinite(values), values, np.where(near & inside, np.interp(t_s, t_s[known], values[known]), np.nan)
+    )
+
+
+def _over_pauses(
+    t_s: Floats, distance_m: Floats, recorded_m: Floats, driven_m: Floats, pause: Bools, config: AlignConfig
+) -> Floats:
+    """Recorded steps, and over a pause between rows without a distance what the counter gained around it.
+
+    The counter's last row before the pause and its first after it tell, less the steps to and from the pause. A
+    missing distance beside a speed is no pause: there the counter may have been set to zero. Nor does it tell where it
+    was reset in the pause itself.
+    """
+    known = np.flatnonzero(np.isfinite(distance_m))
+    steps = np.where(np.isnan(recorded_m), driven_m, recorded_m)
+    result = recorded_m.copy()
+    for gap in np.flatnonzero(pause & np.isnan(recorded_m)).tolist():
+        after = int(np.searchsorted(known, gap, side="right"))
+        if 0 < after < known.size:
+            begin, end = int(known[after - 1]), int(known[after])
+            beside, gained = np.delete(steps[begin:end], gap - begin), distance_m[end] - distance_m[begin]
+            leap = leaps(gained, t_s[end] - t_s[begin], config)
+            result[gap] = np.nan if leap else gained - beside.sum()
+    return result
