@@ -183,7 +183,7 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
     lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
+    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path, found.odometer_sign)
     return _Ride(seen, found, aligned, lds)
 
 

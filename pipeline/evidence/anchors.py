@@ -20,6 +20,8 @@ from schemas.enums import BaliseKind, Evidence
 _ON_ELEMENT_M = 0.5
 # Net elements of the own way so far before or after a sample are the same track [m].
 _SAME_WAY_M = 100.0
+# So much way together says which way the odometer counts (DOMAIN section 2) [m].
+_TURNED_M = 20.0
 
 Pairs = tuple[Ints, Ints]
 
@@ -77,12 +79,16 @@ def _on_own_way(legs: tuple[Route, ...], leg: Ints, path_m: Floats, sample: Ints
 
 @dataclass(frozen=True)
 class Coverage:
-    """Reference samples `first` to `last`, no two neighbours farther apart than a straight line reaches."""
+    """Reference samples `first` to `last`, no two neighbours farther apart than a straight line reaches.
+
+    `facing`: how the train ran over the net elements of both anchors as the odometer counted up, where it moved.
+    """
 
     first: int
     last: int
     begin: Anchor
     end: Anchor
+    facing: tuple[int, int] | None
 
 
 def coverages(
@@ -98,7 +104,28 @@ def coverages(
     places = [reference.place(sample) for sample in ends.tolist()]
     anchors = _anchors(reference.t_ns[ends], places, reference.sigma_m[ends], Evidence.REFERENCE, odometry)
     pairs = zip(anchors[: len(firsts)], anchors[len(firsts) :], strict=True)
-    return [Coverage(first, last, begin, end) for first, last, (begin, end) in zip(firsts, lasts, pairs, strict=True)]
+    return [
+        Coverage(first, last, begin, end, _facing(reference, first, last, odometry))
+        for first, last, (begin, end) in zip(firsts, lasts, pairs, strict=True)
+    ]
+
+
+def _facing(
+    reference: ReferencePlaces, first: int, last: int, odometry: OdometerReadings | None
+) -> tuple[int, int] | None:
+    """Orientation of the first and last sample's net elements in which the odometer counts up."""
+    part = slice(first, last + 1)
+    readings, path_m = Readings.of(odometry, reference.t_ns[part]), reference.path_m[part]
+    step_m, counted_m = np.diff(path_m), np.diff(readings.distance_m)
+    whole = (np.diff(readings.segment) == 0) & (np.diff(reference.leg[part]) == 0) & np.isfinite(counted_m)
+    together_m = float((np.sign(step_m) * counted_m)[whole].sum())
+    if abs(together_m) < _TURNED_M:
+        return None
+    ends = []
+    for sample in (first, last):
+        element, _, sense = reference.legs[int(reference.leg[sample])].locate(reference.path_m[[sample]])
+        ends.append(2 * int(element[0]) + int(sense[0] * together_m < 0.0))
+    return ends[0], ends[1]
 
 
 def read_anchors(

@@ -27,7 +27,7 @@ class Solution:
     """One solution as it was recorded and replayed.
 
     `fixes`: its positions as recorded; `epochs`: matched, aligned and monitored, with the LDS columns; `crossings` and
-    `passages`: of the LDS; `balises`: those on the path.
+    `passages`: of the LDS; `balises`: those on the path; `odometer_sign`: +1 where the recorded odometer grows with it.
     """
 
     name: str
@@ -37,6 +37,7 @@ class Solution:
     passages: pl.DataFrame
     balises: pl.DataFrame
     path: TravelledPath
+    odometer_sign: int
 
 
 @dataclass(frozen=True)
@@ -72,12 +73,6 @@ class Bench:
     @cached_property
     def readings(self) -> Readings:
         return Readings.of(self.odometry, self.at_ns)
-
-    @cached_property
-    def sign(self) -> int:
-        """+1 where the recorded odometer grows with the path, set with the path itself."""
-        along = np.diff(floats(self.epochs, "odometer_m")) * np.diff(self.readings.distance_m)
-        return -1 if np.nansum(along) < 0.0 else 1
 
     @cached_property
     def path_m(self) -> Floats:
@@ -151,7 +146,9 @@ class Bench:
         found = judge_positions(positions, self.evidence.at(at_ns, self.stood), self.legs, hazards)
         readings = Readings.of(self.odometry, at_ns)
         figures, limit_m = self.evidence.figures, hazards.failure_limit_m
-        carried = carried_forward(self._own_anchors, readings, self.sign, self.stood, figures, limit_m)
+        carried = carried_forward(
+            self._own_anchors, readings, self.solution.odometer_sign, self.stood, figures, limit_m
+        )
         return with_own_anchors(found, positions, carried, hazards)
 
     @cached_property

@@ -75,7 +75,7 @@ def _series(bench: Bench, used_s: Floats) -> Series:
     row = np.flatnonzero(bench.positions.known)
     by_reference = bench.judged.kind == KINDS.index(Evidence.REFERENCE)
     train_m = np.where(by_reference, bench.train_m, np.nan)[row]
-    odometer_m = bench.sign * bench.evidence.figures.scale * bench.readings.distance_m[row]
+    odometer_m = bench.solution.odometer_sign * bench.evidence.figures.scale * bench.readings.distance_m[row]
     gap_s = linking_gap_s(nominal_period_s(bench.t_ns), bench.config.lds.crossing_gap_s)
     t_ns, path_m = bench.t_ns[row], bench.path_m[row]
     steps = steps_of(t_ns, path_m, train_m, odometer_m, bench.readings.segment[row], gap_s)

@@ -73,7 +73,7 @@ class Odometry:
 
     @property
     def begin_ns(self) -> int:
-        """The first row."""
+        """The first sample."""
         return self.epoch_ns
 
     @property

@@ -49,8 +49,9 @@ def _failures(rung: Rung) -> list[str]:
     """Failures and hazardous time lie between what was surely in use and what may have been."""
     wrong = rung.epochs.judgement == "wrong"
     surely, at_most = rung.in_use
-    # Before the first epoch there is none to count from.
-    least, most = longest_s((wrong & surely)[1:], rung.span_s[1:]), float(rung.span_s[wrong & at_most].sum())
+    # Before the first epoch, and before a return, nothing was in use: that time may count or not.
+    before = np.concatenate([[False], at_most[:-1]])
+    least, most = longest_s(wrong & surely, rung.span_s * before), float(rung.span_s[wrong & at_most].sum())
     told, failures = rung.row["hazardous_max_s"], rung.number("failures")
     hazardous = 0.0 if told is None else rung.number("hazardous_max_s")
     found = []

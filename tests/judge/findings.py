@@ -298,12 +298,13 @@ def _pair(stronger: Rung, strong: Judgements, weaker: Rung, weak: Judgements) ->
     shown = _shown(weaker, weak) if weaker.name == "odometer" else np.zeros(len(weak.time_s), bool)
     better = stronger.journey.world.better
     band = 6 * max(1.0, better.sigma_m if better is not None else 1.0)
+    switch = _at_switch(weaker, weak)
     for at in np.flatnonzero(weak.judgement != "unknown"):
         alike = np.abs(strong.time_s - weak.time_s[at]) < 1e-3
         alike &= (np.abs(strong.place_m - weak.place_m[at]) < 1.0) & (strong.beside == weak.beside[at])
         for other in np.flatnonzero(alike)[:1]:
             said, again = strong.judgement[other], weak.judgement[at]
-            near = said == "unknown" and abs(abs(weak.error_m[at]) - LIMIT_M) < band
+            near = said == "unknown" and (switch[at] or abs(abs(weak.error_m[at]) - LIMIT_M) < band)
             if said != again and not near and not shown[at]:
                 found.append(weak.told(int(at), f"with {stronger.name} it is {said}"))
     return found[:3]

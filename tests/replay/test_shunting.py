@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-
 from pipeline.lds.telegrams import place_reads
+
 from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
 from schemas.inputs import Balises, Gnss, Odometer
