@@ -171,6 +171,8 @@ class MonitorConfig(Settings):
     doppler_sigma_mps: Positive = 0.1
     survey_wander_m: NonNegative = 0.3
     survey_wander_length_m: Positive = 100.0
+    # Between two epochs a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
+    sigma_step_factor: Positive = 1.5
     sigma_intercept_m: NonNegative = 0.0
     sigma_slope: Positive = 1.0
     channel_reference: str | None = None
