@@ -11,6 +11,7 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.bounds import threshold_factor
+from pipeline.figures.evidence_notes import reading_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
@@ -219,6 +220,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.odometry,
         context.config.align.straight_s,
     )
+    notes = (*notes, *reading_notes(ride.aligned, context.config))
     return SolutionResults(
         solution=name,
         epochs=epochs,
