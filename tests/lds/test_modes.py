@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.lds import LdsResult
 from schemas.tables import Epochs, Passages
-from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, reads_at, run, steps, told
+from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, run, steps, told
 
 FAR = {"V9": 1e6}
 V1 = {"V1": 110.0}
