@@ -148,6 +148,7 @@ def demo(
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
     page = write_demo(result, out / "tables")
     if not quiet:
+        print(result.head)
         show_table(result.checks, "What was injected, expected and found")
         print(f"\nThe trial is in {out}, its tables in {out / 'tables'}, the report is {page}.")
     raise typer.Exit(OK if result.agrees else RUNS_NOT_OK)
@@ -471,10 +472,11 @@ def _assess(out: str, config: Path | None, as_json: bool) -> None:
     if as_json:
         _print_json({"statements": found.statements, **found.tables})
         return
+    print(found.statements[0] + "\n")
     for name, table in for_reading(found.tables).items():
         show_table(table, name)
         print()
-    print("\n".join(found.statements))
+    print("\n".join(found.statements[1:]))
 
 
 def _status_of(summary: Summary) -> int:
@@ -492,19 +494,22 @@ def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> Non
 
     rows = outcome_rows(summary)
     if as_json:
+        told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
-        _print_json({**figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
+        _print_json({**told, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
     elif quiet:
         for outcome in summary.outcomes:
             if outcome.status is not RunStatus.OK:
                 print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
     else:
-        shown = rows if rows.height <= _SHOWN_RUNS else rows.filter(rows["status"] != "ok").head(_SHOWN_RUNS)
+        print(summary_line(summary))
+        remarkable = rows.filter((rows["verdict"] != "safe") | (rows["status"] != "ok"))
+        shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
         if shown.height:
             show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))
-        if (more := summary.planned - summary.left - summary.count(RunStatus.OK) - shown.height) > 0:
-            print(f"{more} more that are not ok: see replay.log beside the tables.")
-        print(f"{summary_line(summary)}. Tables are in {out}.")
+        if (more := remarkable.height - shown.height) > 0:
+            print(f"{more} more that are not safe: see replay.log beside the tables.")
+        print(f"Tables are in {out}.")
 
 
 if __name__ == "__main__":

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 
 import polars as pl
 
 from datasets.expectation import ExpectedHazard, ExpectedRun
 from datasets.scenario import RunSpec
+from pipeline.figures.verdict import word_of, worst_verdict
 from schemas.errors import ConfigError
 from schemas.run import RunLog, RunTables
 
@@ -33,11 +34,12 @@ class Check:
 
 
 def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[Check]:
-    """Each expectation of a run against its tables: hazards, their onset, balises, alarms, odometer scale."""
+    """Each expectation of a run against its tables, its verdict first: hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
         raise ConfigError("says nothing of what has to be found", place=f"scenario: run {spec.id}")
     injected = describe_faults(run.faults)
     pairs = [
+        ("verdict", spec.expected.verdict.value, word_of(worst_verdict(tables.runs["verdict"].to_list()))),
         ("status", "ok", _one_of(tables.runs["status"].to_list())),
         *_hazards(spec.expected, tables.hazards),
         *_onsets(spec, run, tables.hazards),
@@ -103,16 +105,17 @@ def _hazard_text(hazard: ExpectedHazard) -> str:
 def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
     names = ("hazard", "failure_mode", "timing", "balise_ids", "accepted_ids", "detected")
     text = _words(*(row[name] for name in names))
-    early_s = row["time_since_failure_s"]
-    if expected is not None and expected.before_failure is not None and isinstance(early_s, float):
-        text += ", before the failure" if early_s < 0.0 else ", behind the failure"
+    if expected is not None and expected.before_failure is not None:
+        detected, failure = row["t_detected"], row["t_failure"]
+        known = isinstance(detected, datetime) and isinstance(failure, datetime)
+        text += ", before the failure" if known and detected < failure else ", behind the failure"  # type: ignore[operator]
     return text if row["caused_by"] is None else f"{text}, caused by {row['caused_by']}"
 
 
 def _words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
     lists = [" ".join(ids) or "-" if isinstance(ids, list | tuple) else "-" for ids in (hit, accepted)]
     seen = "detected" if detected else "not detected"
-    return f"{hazard} {mode} {timing}: {lists[0]}, accepted {lists[1]}, {seen}"
+    return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {seen}"
 
 
 def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:

@@ -13,6 +13,7 @@ from datasets.comparison import Check, checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign.finish import write_campaign
+from pipeline.figures.verdict import CampaignHead, head_of, worst_verdict
 from pipeline.ingest.run import read_run
 from pipeline.report import write_report
 from pipeline.results.store import write_config, write_run
@@ -33,6 +34,11 @@ class DemoResult:
     site: Site
     checks: pl.DataFrame
     tables: tuple[RunTables, ...]
+
+    @property
+    def head(self) -> CampaignHead:
+        """The worst verdict of the runs, and their counts."""
+        return head_of(worst_verdict(one.runs["verdict"].to_list()) for one in self.tables)
 
     @property
     def agrees(self) -> bool:

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from schemas.config import NonNegative, Positive, Settings
-from schemas.enums import FailureMode, Hazard, PassageStatus, Timing
+from schemas.enums import FailureMode, Hazard, PassageStatus, RunVerdict, Timing
 
 
 class ExpectedHazard(Settings):
@@ -24,12 +24,13 @@ class ExpectedHazard(Settings):
 
 
 class ExpectedRun(Settings):
-    """What must be found in one run: all hazards in order, the status of each balise on the path, alarms.
+    """What must be found in one run: its verdict, all hazards in order, the status of each balise on the path, alarms.
 
     `passages` names for each balise the status of all its rows; `once` are balises with exactly one row.
     `alarms`: `none`, `true` (at least one, none of them false) or `false` (at least one, all of them false).
     """
 
+    verdict: RunVerdict
     hazards: tuple[ExpectedHazard, ...] = ()
     passages: dict[str, PassageStatus]
     once: tuple[str, ...] = ()

@@ -50,8 +50,8 @@ def _late_detections(row: dict[str, Any], trial: RandomTrial, period_s: float) -
     if is_step and not (detected and row["time_to_detect_s"] <= period):
         return [f"step detected after {row['time_to_detect_s']} s"]
     is_ramp = trial.kind == "ramp" and row["t_failure"] is not None
-    if is_ramp and not (detected and row["time_since_failure_s"] <= 0.0):
-        return [f"ramp detected {row['time_since_failure_s']} s after the failure"]
+    if is_ramp and not (detected and row["t_detected"] <= row["t_failure"]):
+        return [f"ramp detected at {row['t_detected']}, the failure was at {row['t_failure']}"]
     return []
 
 

@@ -9,37 +9,33 @@ import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
 from pipeline.alignment.increments import most_scatter_m
+from pipeline.evidence import Evidence, evidence_of
+from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.bounds import threshold_factor
-from pipeline.figures.evidence_notes import evidence_notes, motion_notes, reading_notes, return_notes, undiagnosed_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
-from pipeline.hazards import Case, HazardResult, classify, establish_truth, places_between, with_unoffered
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
+from pipeline.judge.bench import Bench, Solution
+from pipeline.judge.judge import Judged, judge
 from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
+from pipeline.matching.reference import match_reference
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.channels import on_path_of
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
-from pipeline.motion import Motion, motion_of, void_evidence
-from pipeline.results.provenance import provenance
-from schemas.arrays import Floats, Ints
+from pipeline.odometry import Odometry, odometry_of
+from pipeline.results.provenance import Provenance, provenance
+from pipeline.track.network import Network
+from pipeline.track.route import site_network
+from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.conform import conform, shaped
-from schemas.enums import BaliseKind, Evidence
+from schemas.enums import VehicleFigures
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
-
-
-@dataclass(frozen=True)
-class _Solution:
-    """Tables of one solution."""
-
-    epochs: pl.DataFrame
-    result: HazardResult
-    summary: pl.DataFrame
 
 
 @dataclass(frozen=True)
@@ -51,43 +47,75 @@ class _Context:
     vehicle: Vehicle
     config: Configuration
     counts: CleanCounts
+    odometry: Odometry | None
+    evidence: Evidence
     factor: float
 
 
 @dataclass(frozen=True)
-class _Ride:
-    """One solution on its way, before anything is known of the truth.
+class _Part:
+    """Tables of one solution."""
 
-    `balises`: those on the path; `aligned`: epochs before the monitors; `monitored`: with their columns and those of
-    the LDS; `telegrams`: reads of physical balises, none where the run has no such stream.
-    """
-
-    solution: str
-    fixes: pl.DataFrame
-    found: Match
-    balises: pl.DataFrame
-    aligned: pl.DataFrame
-    monitored: pl.DataFrame
-    telegrams: pl.DataFrame | None
-    lds: LdsResult
+    tables: dict[str, pl.DataFrame]
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
-    """Replay one recorded run: match, align, monitor, detect balises, classify hazards, summarise.
+    """Replay one recorded run: match, align, monitor, detect balises, judge, summarise.
 
     `run` as `pipeline.ingest.read_run` yields it, `site` as `read_site` does. A solution that cannot be replayed has
     a failed row and leaves the others alone; raises `InputError` where none can be.
     """
-    config = config or Configuration()
-    cleaned, counts = clean(run)
-    factor = threshold_factor(config.monitors.false_alarm_probability)
-    context = _Context(cleaned, site, vehicle or Vehicle(), config, counts, factor)
+    context = _context(run, site, vehicle or Vehicle(), config or Configuration())
     matches, errors = _matches(context)
     parts = [
         _failed(context, name, errors[name]) if name in errors else _replay_solution(context, name, matches)
-        for name in cleaned.solutions()
+        for name in context.run.solutions()
     ]
     return _tables(run.run_id, parts)
+
+
+def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> _Context:
+    """The run in order, its odometer, and what is known of where the train was."""
+    cleaned, counts = clean(run)
+    odometry = odometry_of(cleaned.odometer, vehicle, config)
+    network = site_network(site)
+    reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
+    evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, vehicle, config)
+    factor = threshold_factor(config.monitors.false_alarm_probability)
+    return _Context(cleaned, site, vehicle, config, counts, odometry, evidence, factor)
+
+
+def _reference_places(
+    run: RunLog, site: Site, odometry: Odometry | None, network: Network, vehicle: Vehicle, config: Configuration
+) -> ReferencePlaces | None:
+    """The reference on the network, by itself; none where the run has none, or it comes near no track."""
+    if run.reference is None or run.reference.is_empty():
+        return None
+    default_m = config.hazards.reference_sigma_m
+    found = match_reference(run.reference, site, config.matching, default_m, run.balise_reads)
+    if found is None:
+        return None
+    rivals = found.rivals(config.hazards.rival_probability)
+    index = network.track.index
+    sample = np.repeat(np.arange(len(rivals)), np.diff(rivals.first))
+    element = np.array([index[name] for name in rivals.ids], dtype=np.int64)[rivals.element]
+    sigma_m = floats(run.reference.with_columns(pl.col("sigma_m").fill_null(default_m)), "sigma_m")
+    facing = _faces(found, odometry, config.matching.orientation_distance_m)
+    ahead_m = facing * vehicle.gnss_antenna_ahead_m
+    return ReferencePlaces.of(found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track)
+
+
+def _faces(found: Match, odometry: Odometry | None, distance_m: float) -> int:
+    """+1 where the leading end faces along growing path: the odometer grows over the first movement."""
+    if odometry is None:
+        return 1
+    path_m = floats(found.epochs, "path_m")
+    counted = odometry.distance_at(times_ns(found.epochs))
+    known = np.flatnonzero(np.isfinite(path_m) & np.isfinite(counted))
+    far = known[np.abs(counted[known] - counted[known[:1]]) >= distance_m]
+    if far.size == 0:
+        return 1
+    return 1 if (counted[far[0]] - counted[known[0]]) * (path_m[far[0]] - path_m[known[0]]) >= 0.0 else -1
 
 
 def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:
@@ -121,35 +149,39 @@ def _match(context: _Context, solution: str) -> Match:
     )
 
 
-def _failed(context: _Context, solution: str, error: InputError) -> _Solution:
+def _failed(context: _Context, solution: str, error: InputError) -> _Part:
     """A solution without content but for the row that says why."""
     made = provenance(context.run, context.site, context.vehicle, context.config)
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    result = HazardResult(nothing["hazards"], nothing["alarms"], nothing["passages"], nothing["epochs"].select([]))
-    return _Solution(nothing["epochs"], result, failed_row(str(error), made, solution))
+    return _Part(nothing | {"runs": failed_row(str(error), made, solution)})
 
 
-def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Solution:
+def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Part:
+    """One solution: what the train made of it, then what the judge says of that."""
     ride = _ride(context, solution, matches)
-    case, motion = _case(context, ride)
-    result = classify(case)
-    epochs = pl.concat([case.epochs, result.epochs_columns], how="horizontal")
-    results = SolutionResults(
-        solution=solution,
-        epochs=epochs,
-        passages=result.passages,
-        hazards=result.hazards,
-        alarms=result.alarms,
-        motion=motion,
-        evidence=_evidence(case.truth),
-        alignment=_alignment(ride.aligned),
-        counts=context.counts.solutions[solution],
-        ingest=context.run.notes,
-        ambiguous_stretches=ride.found.ambiguous.height,
-        notes=(*_notes(context, ride, case.truth, result, epochs), *motion_notes(motion, epochs)),
+    bench = Bench(ride.solution, context.evidence, context.odometry, context.vehicle, context.config)
+    judged = judge(bench, context.run.reference, context.run.faults)
+    epochs = pl.concat([ride.solution.epochs, judged.epochs_columns], how="horizontal")
+    row = summarise(_results(context, ride, judged, epochs), context.config, _made(context))
+    return _Part(
+        {
+            "hazards": judged.hazards,
+            "passages": judged.passages,
+            "alarms": judged.alarms,
+            "epochs": epochs,
+            "runs": row,
+        }
     )
-    made = provenance(context.run, context.site, context.vehicle, context.config)
-    return _Solution(epochs, result, summarise(results, context.config, made))
+
+
+@dataclass(frozen=True)
+class _Ride:
+    """One solution as the train saw it, before anything is known of the truth."""
+
+    solution: Solution
+    found: Match
+    aligned: pl.DataFrame
+    lds: LdsResult
 
 
 def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
@@ -162,9 +194,9 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
     reads = _reads_on_odometer(context, aligned)
     lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
-    telegrams = None if reads is None else lds.crossings.filter(pl.col("kind") == BaliseKind.PHYSICAL.value)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    return _Ride(solution, fixes, found, balises, aligned, monitored, telegrams, lds)
+    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
+    return _Ride(seen, found, aligned, lds)
 
 
 def _reads_on_odometer(context: _Context, aligned: pl.DataFrame) -> pl.DataFrame | None:
@@ -175,50 +207,38 @@ def _reads_on_odometer(context: _Context, aligned: pl.DataFrame) -> pl.DataFrame
     return reads.with_columns(odometer_at(reads["t"], aligned, odometer, context.config))
 
 
-def _case(context: _Context, ride: _Ride) -> tuple[Case, Motion]:
-    """The ride with the truth beside it, how the train moved by it, and what it passed unoffered."""
-    config = context.config
-    reference = _reference_on_path(context, ride.found, ride.aligned)
-    reads = None if ride.telegrams is None else ride.telegrams.drop_nulls("path_m")
-    truth = establish_truth(ride.monitored, reference, reads, ride.lds.passages, config)
-    motion = motion_of(ride.monitored, truth, config)
-    epochs = ride.monitored.with_columns(motion.columns())
-    between = _between(context, ride.aligned, truth, reference, reads)
-    passages = with_unoffered(ride.lds.passages, epochs, truth, ride.balises, config.lds, ride.solution, between)
-    case = Case(
-        solution=ride.solution,
+def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFrame) -> SolutionResults:
+    name, counts = ride.solution.name, context.counts.solutions[ride.solution.name]
+    notes = run_notes(context.run, context.site, counts, ride.solution.fixes, ride.found, ride.lds, context.vehicle)
+    return SolutionResults(
+        solution=name,
         epochs=epochs,
-        truth=truth,
-        passages=passages,
-        balises=ride.balises,
-        faults=context.run.faults,
-        locate=ride.found.path.locate,
-        config=config,
-        between=between,
-        void=void_evidence(motion, epochs, truth, passages),
-    )
-    return case, motion
-
-
-def _notes(
-    context: _Context, ride: _Ride, truth: pl.DataFrame, result: HazardResult, epochs: pl.DataFrame
-) -> tuple[str, ...]:
-    """What the reader should know beside the figures."""
-    limit_m = context.config.hazards.failure_limit_m
-    counts = context.counts.solutions[ride.solution]
-    return (
-        *run_notes(context.run, context.site, counts, ride.fixes, ride.found, ride.lds, context.vehicle),
-        *reading_notes(ride.aligned, context.config),
-        *evidence_notes(ride.aligned, truth, limit_m),
-        *return_notes(epochs, result.hazards, limit_m),
-        *undiagnosed_notes(epochs, result.passages),
+        passages=judged.passages,
+        hazards=judged.hazards,
+        alarms=judged.alarms,
+        failures=judged.failures,
+        distance_m=judged.distance_m,
+        evidence=judged.evidence,
+        vehicle=_figures_from(context),
+        odometer_contradicted=context.evidence.contradicted,
+        alignment=_alignment(ride.aligned),
+        counts=counts,
+        ingest=context.run.notes,
+        ambiguous_stretches=ride.found.ambiguous.height,
+        notes=notes,
     )
 
 
-def _evidence(truth: pl.DataFrame) -> Evidence | None:
-    """The kind of evidence that most epochs rest on."""
-    kinds = truth["evidence"].drop_nulls().value_counts(sort=True)
-    return Evidence(kinds["evidence"][0]) if kinds.height else None
+def _made(context: _Context) -> Provenance:
+    return provenance(context.run, context.site, context.vehicle, context.config)
+
+
+def _figures_from(context: _Context) -> VehicleFigures:
+    """Where scale and latency come from (DOMAIN section 5.4)."""
+    if context.odometry is None:
+        return VehicleFigures.NONE
+    given = context.vehicle.odometer_scale is not None and context.vehicle.gnss_latency_s is not None
+    return VehicleFigures.FILE if given else VehicleFigures.LEARNED
 
 
 def _alignment(aligned: pl.DataFrame) -> Alignment:
@@ -249,67 +269,10 @@ def _single_monitors(
     }
 
 
-def _reference_on_path(context: _Context, found: Match, aligned: pl.DataFrame) -> pl.DataFrame | None:
-    """The reference stream as path positions of the balise antenna, as the epochs are.
-
-    Where the path comes back to a place, the epochs around say which passage of it is meant.
-    """
-    reference = context.run.reference
-    if reference is None:
-        return None
-    leg, near_path_m = _places_near(reference["t"], aligned) or (None, None)
-    places = found.path.project(
-        reference["latitude_deg"], reference["longitude_deg"], reference["height_m"], leg, near_path_m
-    )
-    return reference.select(
-        "t",
-        pl.Series("path_m", places.path_m - found.antenna_ahead_m, nan_to_null=True),
-        pl.Series("cross_track_m", places.cross_m, nan_to_null=True),
-        pl.Series("vertical_m", places.vertical_m - context.vehicle.antenna_height_m, nan_to_null=True),
-        "sigma_m",
-    )
-
-
-def _places_near(times: pl.Series, aligned: pl.DataFrame) -> tuple[Ints, Floats] | None:
-    """Leg and path position [m] of the epoch next in time to each instant; None in a run without a position."""
-    placed = aligned.drop_nulls(["leg", "path_m"])
-    if placed.is_empty():
-        return None
-    stamps, at = placed["t"].dt.timestamp("ns").to_numpy(), times.dt.timestamp("ns").to_numpy()
-    after = np.searchsorted(stamps, at).clip(0, stamps.size - 1)
-    before = np.maximum(after - 1, 0)
-    rows = np.where(np.abs(stamps[before] - at) <= np.abs(stamps[after] - at), before, after)
-    return placed["leg"].to_numpy().astype(np.int64)[rows], placed["path_m"].to_numpy()[rows]
-
-
-def _between(
-    context: _Context,
-    aligned: pl.DataFrame,
-    truth: pl.DataFrame,
-    reference: pl.DataFrame | None,
-    reads: pl.DataFrame | None,
-) -> pl.DataFrame | None:
-    """Places inside gaps of the positions, by the streams that go on there."""
-    odometer = context.run.odometer
-
-    def counted(times: pl.Series) -> pl.Series:
-        unknown = pl.Series("odometer_m", [None] * times.len(), dtype=pl.Float64)
-        return unknown if odometer is None else odometer_at(times, aligned, odometer, context.config)
-
-    return places_between(aligned, truth, reference, reads, odometer, counted)
-
-
-def _tables(run_id: str, solutions: list[_Solution]) -> RunTables:
-    return RunTables(
-        run_id=run_id,
-        hazards=_table("hazards", [part.result.hazards for part in solutions]),
-        passages=_table("passages", [part.result.passages for part in solutions]),
-        alarms=_table("alarms", [part.result.alarms for part in solutions]),
-        epochs=_table("epochs", [part.epochs for part in solutions]),
-        runs=_table("runs", [part.summary for part in solutions]),
-    )
-
-
-def _table(name: str, parts: list[pl.DataFrame]) -> pl.DataFrame:
+def _tables(run_id: str, parts: list[_Part]) -> RunTables:
     """Rows of all solutions, by the contract."""
-    return conform(pl.concat([shaped(part, TABLES[name]) for part in parts]), TABLES[name])
+    whole = {
+        name: conform(pl.concat([shaped(part.tables[name], table) for part in parts]), table)
+        for name, table in TABLES.items()
+    }
+    return RunTables(run_id=run_id, **whole)

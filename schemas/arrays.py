@@ -36,3 +36,15 @@ def flags(frame: pl.DataFrame, column: str) -> Bools:
 def truths(series: pl.Series) -> Bools:
     """Booleans, null as false."""
     return (series.fill_null(False) if series.null_count() else series).to_numpy().astype(np.bool_, copy=False)
+
+
+def runs_of(mask: Bools) -> tuple[Ints, Ints]:
+    """First and last index of every run of true values."""
+    edges = np.diff(np.concatenate(([False], mask, [False])).astype(np.int8))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+
+
+def spans_of(mask: Bools) -> list[tuple[int, int]]:
+    """The runs of true values as pairs of first and last index."""
+    firsts, lasts = runs_of(mask)
+    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))

@@ -34,8 +34,9 @@ def _spread(name: str, meaning: str) -> dict[str, dy.Column]:
 def _level_columns(level: str) -> dict[str, dy.Column]:
     return {
         f"allowed_{level}_s": real("s", f"allowed T_D of the service level {level} (TVB eq. 7)", min=0),
-        f"within_{level}": count(f"failures negated within the allowed T_D of {level}"),
-        f"verdict_{level}": one_of(ThrVerdict, f"kept, exceeded, nothing to judge, or no truth, for {level}"),
+        f"within_{level}": count(f"failures within the allowed T_D of {level}, what is unknown included"),
+        f"exceeded_{level}": count(f"failures beyond the allowed T_D of {level}; of the rest it cannot be said"),
+        f"verdict_{level}": one_of(ThrVerdict, f"kept, exceeded, no failure, or unknown, for {level}"),
     }
 
 
@@ -47,9 +48,12 @@ def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
 @lru_cache(maxsize=8)
 def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
-    columns |= _estimate("hazard_rate", "faults per hour", "1/h", "_per_h")
-    columns |= _estimate("missed_share", "share of failures not negated within the budget")
-    columns |= _estimate("unsafe_share", "share of `accepted_judged` beyond the failure limit")
+    columns["faults"] = count("faults in the hazard table; the rows that belong to one fault count once")
+    columns |= _estimate("hazard_rate", "faults per hour judged by a reference or balise reads", "1/h", "_per_h")
+    columns["missed"] = count("faults with a failure that no monitor found by t_failure + budget")
+    columns |= _estimate("missed_share", "share of missed ones, of the faults with a failure that a truth judged")
+    columns |= _estimate("beyond_budget_share", "share of failures beyond the budget, of those where that is known")
+    columns |= _estimate("unsafe_share", "share of `accepted_judged` that are `unsafe_accepted`")
     columns |= _estimate("outage_rate", "outages per hour", "1/h", "_per_h")
     for level in levels:
         columns |= _level_columns(level)
@@ -78,11 +82,13 @@ def _campaign_balises_schema() -> type[dy.Schema]:
         **_estimate("deletion_rate", "share of passages with the failure mode deletion"),
         "insertions": count("rows with the ETCS failure mode insertion"),
         "linking_errors": count("linking errors at it"),
-        "accepted_judged": count("acceptances whose location error a reference or balise reads tell"),
-        "unsafe_accepted": count("acceptances beyond the failure limit, by any evidence"),
-        **_estimate("unsafe_rate", "share of judged acceptances beyond the failure limit"),
+        "accepted_judged": count("acceptances judged right or wrong by a reference or balise reads"),
+        "unsafe_accepted": count("acceptances judged wrong, by any evidence"),
+        "unproven_accepted": count("acceptances of which the evidence cannot say whether the position was right"),
+        **_estimate("unsafe_rate", "share of judged acceptances that are wrong"),
         "suspect_after_the_fact": count("accepted between a fault's onset and its detection"),
-        **_spread("location_error", "location error of judged acceptances"),
+        "location_error_count": count("acceptances whose location error is known to 5 m: what follows is of these"),
+        **_spread("location_error", "location error of acceptances"),
     }
     doc = "One row per balise and solution over all runs of the campaign."
     return type("CampaignBalises", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
@@ -96,9 +102,9 @@ def _accuracy_schema() -> type[dy.Schema]:
         "solution": text("solution"),
         "grouped_by": text("what the group has in common: all, netelement_id or speed_band_kmh"),
         "group": text("the net element or speed band"),
-        "accepted_judged": count("acceptances whose location error a reference or balise reads tell"),
-        **_spread("location_error", "location error of judged acceptances"),
-        "location_error_median_m": real("m", "median location error of judged acceptances"),
+        "location_error_count": count("acceptances whose location error is known to 5 m: all figures are of these"),
+        **_spread("location_error", "location error of acceptances"),
+        "location_error_median_m": real("m", "median location error of acceptances"),
         "location_accuracy_m": real("m", "smallest Q_LOCACC among them; each is held against its own", min=0),
         "location_accuracy_max_m": real("m", "largest Q_LOCACC among them", min=0),
         "within_location_accuracy": count("of these within Q_LOCACC"),
@@ -124,24 +130,36 @@ def _figures_schema() -> type[dy.Schema]:
         "runs_failed": count("runs that could not be, with this solution or before any was known"),
         "runs_partial": count("of the replayed runs those whose log is damaged; what was read of them counts"),
         "hours": real("h", "recorded time", min=0),
-        "hours_with_evidence": real("h", "time with a known error, by any evidence", min=0),
+        "runs_unsafe": count("runs with the verdict unsafe"),
+        "runs_unproven": count("runs with the verdict unproven"),
+        "runs_safe": count("runs with the verdict safe"),
+        "hours_with_evidence": real("h", "time judged right or wrong, by any evidence", min=0),
         "hours_with_truth": real("h", "of this in runs judged by a reference or balise reads", min=0),
         "hazards": count("faults; the rows that belong to one fault count once"),
-        **_estimate("hazard_rate", "faults per hour with evidence", "1/h", "_per_h"),
-        "failures": count("faults with a position failure"),
-        "missed": count("of these not negated within the budget"),
-        "failures_judged": count("of the failures those that a reference or balise reads tell"),
-        "missed_judged": count("of these not negated within the budget"),
-        **_estimate("missed_share", "share of judged failures not negated within the budget"),
-        "missed_rate_upper_per_h": real("1/h", "one-sided 95 % upper bound of missed failures per hour", min=0),
+        "hazards_judged": count("of these those that a reference or balise reads tell"),
+        **_estimate("hazard_rate", "faults per hour, both by a reference or balise reads", "1/h", "_per_h"),
+        "missed": count("faults with a failure that no monitor found by t_failure + budget"),
+        "missed_known": count("faults with a failure that a reference or balise reads tell"),
+        "missed_judged": count("of these missed"),
+        **_estimate("missed_share", "share of missed ones of these"),
+        "failures": count("stretches judged wrong in use, whether they hit a VB or not"),
+        "failures_within_budget": count("of these within the budget"),
+        "failures_beyond_budget": count("of these beyond the budget; of the rest it cannot be said"),
+        "failures_judged": count("failures, by a reference or balise reads, of which it can be said"),
+        "beyond_budget_judged": count("of these beyond the budget"),
+        **_estimate("beyond_budget_share", "share of failures beyond the budget of these"),
+        "beyond_budget_rate_upper_per_h": real(
+            "1/h", "one-sided 95 % upper bound of failures not shown to be within the budget, per hour", min=0
+        ),
         "hours_judged": real("h", "judged time in runs whose alarms all have a verdict", min=0),
         "false_alarms": count("false alarms in it"),
         **_estimate("false_alarm_rate", "false alarms per judged hour", "1/h", "_per_h"),
         "accepted": count("virtual balises accepted"),
-        "accepted_judged": count("of these with a location error that a reference or balise reads tell"),
-        "unsafe_judged": count("of the judged ones beyond the failure limit"),
-        **_estimate("unsafe_share", "share of judged acceptances beyond the failure limit"),
-        "unsafe_accepted": count("accepted beyond the failure limit by any evidence"),
+        "accepted_judged": count("of these judged right or wrong by a reference or balise reads"),
+        "unsafe_judged": count("of the judged ones wrong"),
+        **_estimate("unsafe_share", "share of judged acceptances that are wrong"),
+        "unsafe_accepted": count("accepted ones judged wrong, by any evidence"),
+        "unproven_accepted": count("accepted ones that the evidence cannot judge"),
         "outages": count("stretches without a usable position"),
         **_estimate("outage_rate", "outages per hour", "1/h", "_per_h"),
         "trusted_losses": count("how often a valid, confident, unambiguous position was lost"),
@@ -166,8 +184,8 @@ def _figures_schema() -> type[dy.Schema]:
             for kind in STANFORD
         },
         "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
-        "hours_needed": real("h", "hours that show THR_VB at 95 % with this many misses", min=0),
-        "hours_still_needed": real("h", "of these still to run without a further miss", min=0),
+        "hours_needed": real("h", "hours that show THR_VB at 95 % with so many failures not within the budget", min=0),
+        "hours_still_needed": real("h", "of these still to run without a further one", min=0),
     }
     doc = "One row per solution: what the campaign measured, with exact bounds, and what it cannot show."
     return type("CampaignFigures", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
@@ -182,17 +200,18 @@ class CampaignDetection(dy.Schema):
     solution = text("solution")
     service_level = text("service level of the configuration")
     allowed_s = real("s", "allowed T_D", min=0)
-    failures = count("faults with a position failure")
-    within = count("of these negated within the allowed T_D")
-    failures_judged = count("of the failures those that a reference or balise reads tell")
-    within_judged = count("of these negated within the allowed T_D")
-    within_share = real("1", "share of judged failures negated within it", min=0)
-    within_share_low = real("1", "share of judged failures negated within it: lower 95 % bound", min=0)
-    within_share_high = real("1", "share of judged failures negated within it: upper 95 % bound", min=0)
-    never_negated = count("failures that were never negated; the quantiles leave them out")
+    failures = count("stretches judged wrong in use, whether they hit a VB or not")
+    within = count("of these within the allowed T_D, what is unknown included")
+    exceeded = count("of these beyond the allowed T_D; of the rest it cannot be said")
+    failures_judged = count("failures, by a reference or balise reads, of which it can be said")
+    within_judged = count("of these within the allowed T_D")
+    within_share = real("1", "share of these within it", min=0)
+    within_share_low = real("1", "share of these within it: lower 95 % bound", min=0)
+    within_share_high = real("1", "share of these within it: upper 95 % bound", min=0)
     hazardous_median_s = real("s", "median of the hazardous time", min=0)
     hazardous_p95_s = real("s", "95 % of the hazardous time", min=0)
     hazardous_max_s = real("s", "longest hazardous time", min=0)
+    hazardous_may_max_s = real("s", "the longest with the time that is unknown", min=0)
     detected = count("faults that a monitor detected")
     time_to_detect_median_s = real("s", "median of T_D")
     time_to_detect_p95_s = real("s", "95 % of T_D")
@@ -207,11 +226,12 @@ class CampaignLevels(dy.Schema):
     service_level = text("service level of the configuration")
     allowed_s = real("s", "allowed T_D of the level", min=0)
     evidence = one_of(Evidence, "what served as truth", nullable=True)
-    failures = count("faults with a position failure")
-    within = count("of these negated within the allowed T_D")
-    never_negated = count("of these never negated")
-    hazardous_max_s = real("s", "longest hazardous time of those negated", min=0)
-    verdict = one_of(ThrVerdict, "kept, exceeded, no failure to judge, or no truth")
+    failures = count("stretches judged wrong in use, whether they hit a VB or not")
+    within = count("of these within the allowed T_D, what is unknown included")
+    exceeded = count("of these beyond the allowed T_D; of the rest it cannot be said")
+    hazardous_max_s = real("s", "longest hazardous time", min=0)
+    hazardous_may_max_s = real("s", "the longest with the time that is unknown", min=0)
+    verdict = one_of(ThrVerdict, "kept, exceeded, no failure, or unknown where the evidence does not say")
     receiver_needs_s = real("s", "period of the epochs and negation: the least that any fault takes", min=0)
     receiver_quick_enough = flag("that is within the allowed T_D (TVB section 5)", nullable=True)
 

@@ -89,15 +89,23 @@ class MatchingConfig(Settings):
     """Map matching (DOMAIN section 2; Newson & Krumm 2009)."""
 
     reach_m: Positive = 50.0
+    # A position is on the track within so many standard deviations of position, survey and bias together.
+    on_track_sigmas: Positive = 3.0
     survey_sigma_default_m: Positive = 1.0
-    bias_sigma_m: Positive = 2.0
+    # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
+    # What of a position's variance outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
+    slow_share: Annotated[Number, Field(ge=0, lt=1)] = 0.247
+    # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
+    sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
+    table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     ambiguity_probability: Probability = 0.99
     heading_sigma_deg: Positive = 10.0
     heading_min_speed_mps: Positive = 2.0
     transition_scale_m: Positive = 5.0
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
+    # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
     survey_correlation_m: Positive = 200.0
     outlier_probability: Probability = 1e-4
@@ -191,6 +199,7 @@ class HazardConfig(Settings):
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
     reference_gap_s: Positive = 2.0
+    rival_probability: Probability = 0.001
     balise_read_sigma_m: Positive = 1.0
     known_error_m: Positive = 5.0
     unknown_share_limit: Probability = 0.01

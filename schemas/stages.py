@@ -56,3 +56,16 @@ class Judged(dy.Schema):
     error_along_m = real("m", "the middle of both where reference or balise tell it to `known_error_m`")
     judgement = one_of(Judgement, "right, wrong or unknown")
     wrong_track = flag("the position, unambiguous, is on a net element that the evidence excludes")
+
+
+class Failures(dy.Schema):
+    """One row per failure: a stretch judged wrong in use, whether it crosses a VB or not (DOMAIN section 5.3)."""
+
+    t_onset = instant("begin of the fault")
+    t_failure = instant("begin of the position failure", nullable=True)
+    t_end = instant("end of the episode")
+    hazardous_s = real("s", "time judged wrong in use, over the whole episode", nullable=False, min=0)
+    hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
+    within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
+    wrong_track = flag("the position was on a net element that the evidence excludes")
+    hazard_id = dy.Int64(nullable=True, min=0, description="first hazard row of the episode; null where it hit no VB")

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
-from pipeline.figures.known_counts import known_counts
+from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.figures.verdict import worst_verdict
 from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.config import digest_of
-from schemas.enums import RunStatus
+from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
 from schemas.tables import TABLES
@@ -25,13 +26,14 @@ from schemas.version import SOFTWARE
 class RunOutcome:
     """What became of one run. `defect` is ours, with its `trace`; everything else is the input's.
 
-    `attempts` is more than one where workers were lost over it; `hazards` and `missed_detections` are None where
-    nothing could be judged.
+    `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
+    over it; `hazards` and `missed_detections` are None where nothing could be judged.
     """
 
     run_id: str
     status: RunStatus
     error: str | None = None
+    verdict: RunVerdict | None = None
     skipped: bool = False
     defect: bool = False
     trace: str | None = None
@@ -104,15 +106,16 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) 
     """The outcome that the rows of a run's `runs` table tell."""
     errors = runs["error"].drop_nulls().to_list()
     judged = known_counts(runs).drop_nulls("missed_detections")
-    counts = judged.select(pl.sum("hazards_1a", "hazards_1b", "hazards_shift", "missed_detections")).row(0)
+    *hazards, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
     return RunOutcome(
         run_id=job.run_id,
         status=worst(runs),
         error=errors[0] if errors else None,
+        verdict=worst_verdict(runs["verdict"].to_list()),
         seconds=seconds,
         log_bytes=log_bytes,
-        hazards=sum(counts[:3]) if judged.height else None,
-        missed_detections=counts[3] if judged.height else None,
+        hazards=sum(hazards) if judged.height else None,
+        missed_detections=missed if judged.height else None,
         peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     )
 

@@ -19,6 +19,7 @@ from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
 from pipeline.campaign.tally import Tally, loss_line, outcome_line, summary_line
 from pipeline.campaign.watch import Summary, Watch
+from pipeline.figures.verdict import word_of
 from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
 from schemas.version import SOFTWARE
@@ -80,7 +81,15 @@ class JsonWatch(_Spoken):
         self._tally.add(outcome)
         names = ("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections")
         told = {name: getattr(outcome, name) for name in names}
-        self._say("run", {**told, "seconds": round(outcome.seconds, 3), **self._tally.figures()})
+        self._say(
+            "run",
+            {
+                "verdict": word_of(outcome.verdict),
+                **told,
+                "seconds": round(outcome.seconds, 3),
+                **self._tally.figures(),
+            },
+        )
 
     def lost(self, run_id: str, attempt: int) -> None:
         self._say("lost", {"run_id": run_id, "attempt": attempt})

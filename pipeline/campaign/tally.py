@@ -9,6 +9,7 @@ import polars as pl
 
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.watch import Summary
+from pipeline.figures.verdict import word_of
 from pipeline.results.terminal import duration_text
 from schemas.enums import RunStatus
 
@@ -69,9 +70,11 @@ def _rounded(value: float | None) -> float | None:
 
 
 def outcome_line(outcome: RunOutcome) -> str:
-    """One run in one line."""
+    """One run in one line, its verdict first."""
     how = "skipped, " if outcome.skipped else ""
-    text = f"{outcome.run_id}: {how}{outcome.status.value}"
+    word, status = word_of(outcome.verdict), outcome.status.value
+    beside = "" if outcome.status is RunStatus.OK or status == word else f", {status}"
+    text = f"{outcome.run_id}: {how}{word}{beside}"
     if outcome.error:
         text += f": {outcome.error}"
     elif not outcome.skipped:
@@ -87,17 +90,18 @@ def loss_line(run_id: str, attempt: int) -> str:
 
 
 def summary_line(summary: Summary) -> str:
-    """A campaign in one line."""
+    """A campaign in one line, its verdict first."""
     counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
-    text = f"{len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
+    text = f"{summary.head}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
     if summary.skipped:
         text += f" ({summary.skipped} of them complete before)"
     return f"{text}; {duration_text(summary.seconds)}"
 
 
 def outcome_rows(summary: Summary) -> pl.DataFrame:
-    """A campaign as a table: one row per run that was reached."""
+    """A campaign as a table: one row per run that was reached, its verdict first."""
     kinds = {
+        "verdict": pl.String,
         "run_id": pl.String,
         "status": pl.String,
         "hazards": pl.Int64,
@@ -107,5 +111,8 @@ def outcome_rows(summary: Summary) -> pl.DataFrame:
         "attempts": pl.Int64,
         "error": pl.String,
     }
-    rows = [tuple(getattr(outcome, name) for name in kinds) for outcome in summary.outcomes]
+    rows = [
+        (word_of(outcome.verdict), *(getattr(outcome, name) for name in list(kinds)[1:]))
+        for outcome in summary.outcomes
+    ]
     return pl.DataFrame(rows, schema=kinds, orient="row")

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
+from pipeline.figures.verdict import CampaignHead, head_of
 from schemas.enums import RunStatus
 
 
@@ -18,6 +19,11 @@ class Summary:
     planned: int
     outcomes: tuple[RunOutcome, ...]
     seconds: float
+
+    @property
+    def head(self) -> CampaignHead:
+        """The worst verdict of the runs that were reached, and their counts."""
+        return head_of(outcome.verdict for outcome in self.outcomes)
 
     def count(self, status: RunStatus) -> int:
         return sum(outcome.status == status for outcome in self.outcomes)

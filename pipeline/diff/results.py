@@ -39,6 +39,12 @@ class RunDiff:
     def same(self) -> bool:
         return not (self.hazards or self.differences)
 
+    @property
+    def findings(self) -> list[HazardChange | Difference]:
+        """All that changed, the verdict first."""
+        verdicts = [item for item in self.differences if item.column == "verdict"]
+        return [*verdicts, *self.hazards, *(item for item in self.differences if item not in verdicts)]
+
     def as_dict(self) -> dict[str, object]:
         return {
             "run_id": self.run_id,
@@ -65,7 +71,7 @@ class ResultDiff:
         """For people: one line per finding, the verdict last."""
         lines = [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
         for run in self.runs:
-            lines += [f"{run.run_id}:", *(f"  {finding}" for finding in (*run.hazards, *run.differences))]
+            lines += [f"{run.run_id}:", *(f"  {finding}" for finding in run.findings)]
         lines += [f"note: {note}" for note in self.notes]
         verdict = "all the same" if not self.runs else f"{len(self.runs)} changed"
         alone = [f"{len(runs)} only in {name}" for runs, name in ((self.only_in_a, "A"), (self.only_in_b, "B")) if runs]

@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.export.messages import ERROR, INFO, WARNING
-from schemas.enums import PassageStatus
+from schemas.enums import Judgement, PassageStatus
 
 Row = Mapping[str, Any]
 Entry = tuple[int, int, str, str]
@@ -35,7 +35,7 @@ def hazard_text(row: Row) -> str:
     """One line on a hazard."""
     size = "of unknown size" if row["size_m"] is None else f"of {row['size_m']:.1f} m"
     hit = ", ".join(row["balise_ids"]) or "no VB"
-    accepted = f", accepted: {', '.join(row['accepted_ids'])}" if row["accepted_ids"] else ""
+    accepted = f", accepted despite the fault: {', '.join(row['accepted_ids'])}" if row["accepted_ids"] else ""
     found = "detected" if row["detected"] else "not detected"
     return f"{row['hazard']} {size}, {row['failure_mode']}, {found}, hits {hit}{accepted}, suspect: {row['suspect']}"
 
@@ -58,9 +58,16 @@ def passage_entries(passages: pl.DataFrame) -> list[Entry]:
         if t_ns is None:
             continue
         error = "" if row["location_error_m"] is None else f", location error {row['location_error_m']:.2f} m"
-        level = INFO if row["status"] == PassageStatus.ACCEPTED else WARNING
-        entries.append((t_ns, level, row["balise_id"], f"{row['status']}{error}"))
+        judged = "" if row["judgement"] is None else f", position {row['judgement']}"
+        entries.append((t_ns, _passage_level(row), row["balise_id"], f"{row['status']}{judged}{error}"))
     return entries
+
+
+def _passage_level(row: Row) -> int:
+    """An error where a wrong position was accepted."""
+    if row["status"] != PassageStatus.ACCEPTED:
+        return WARNING
+    return ERROR if row["judgement"] == Judgement.WRONG else INFO
 
 
 def _plain(frame: pl.DataFrame) -> list[dict[str, Any]]:

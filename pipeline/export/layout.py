@@ -15,7 +15,7 @@ def layout_json(solution: str, with_positions: bool) -> str:
     panels: dict[str, Panel] = {
         "StateTransitions!states": _states(solution),
         "RosOut!hazards": {"searchTerms": [], "minLogLevel": 1, "topicToRender": f"/{solution}/hazards"},
-        "Plot!position": _plot([f"/{solution}/lds.{name}" for name in ("error_along_m", "confidence_m")]),
+        "Plot!position": _plot([f"/{solution}/lds.{name}" for name in ("error_low_m", "error_high_m", "confidence_m")]),
         "Plot!speed": _plot([f"/{solution}/lds.{name}" for name in ("speed_mps", "exposure_s")]),
         **{f"Plot!{axis}": _monitors(solution, [f"{axis}_{scale}" for scale in SCALES]) for axis in AXES},
         "Plot!others": _monitors(solution, list(OTHER_MONITORS)),
@@ -45,7 +45,7 @@ def _stack(names: list[str]) -> str | dict[str, Any]:
 
 
 def _states(solution: str) -> Panel:
-    names = ("lds_mode", "lds_state", "tvb", "alarm")
+    names = ("lds_mode", "lds_state", "judgement", "tvb", "alarm")
     paths = [{"value": f"/{solution}/lds.{name}", "timestampMethod": "receiveTime"} for name in names]
     return {"paths": paths, "isSynced": True}
 

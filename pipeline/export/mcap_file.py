@@ -28,8 +28,9 @@ _NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _FRAME = "wgs84"
 _LDS = (
     "t", "netelement_id", "measure_m", "path_m", "odometer_m", "speed_mps", "cross_track_m", "vertical_m", "on_track",
-    "path_probability", "confidence_m", "error_along_m", "error_cross_m", "error_up_m", "alarm", "lds_mode",
-    "lds_state", "tvb", "lrvb_id", "distance_from_lrvb_m", "doubt_over_m", "doubt_under_m", "exposure_s",
+    "path_probability", "confidence_m", "error_along_m", "error_low_m", "error_high_m", "judgement", "error_cross_m",
+    "error_up_m", "alarm", "lds_mode", "lds_state", "tvb", "in_use", "lrvb_id", "distance_from_lrvb_m",
+    "doubt_over_m", "doubt_under_m", "exposure_s",
 )  # fmt: skip
 
 

@@ -10,53 +10,58 @@ from collections.abc import Callable
 import polars as pl
 
 from pipeline.figures.bounds import Estimate, clopper_pearson, poisson_rate
-from pipeline.figures.run_figures import is_passage
-from pipeline.hazards.independent import independent_episodes
+from pipeline.figures.independent import independent_episodes
+from pipeline.figures.levels import is_proven, level_counts, level_verdict
+from pipeline.figures.run_figures import is_passage, judged
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
-from schemas.config import Configuration, SafetyConfig
+from schemas.config import Configuration
 from schemas.conform import conform
-from schemas.enums import TRUTH, BaliseKind, FailureMode, LinkingError, PassageStatus, RunStatus, ThrVerdict
+from schemas.enums import TRUTH, BaliseKind, FailureMode, Judgement, LinkingError, PassageStatus
 
 SPEED_BAND_KMH = 40.0
 
 _RUN = ["run_id", "solution"]
 
 
-def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
-    """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
-    known_h = pl.col("evidence_s").fill_null(0.0) / 3600.0
-    counted = ("faults", "failures", "missed", *(f"within_{level}" for level in safety.service_levels))
+def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3).
+
+    Shares are of what is known by a reference or balise reads; what is not known stands beside them.
+    """
+    faults = _faults_per_run(hazards)
+    by_truth = pl.col("evidence").is_in(TRUTH).fill_null(value=False)
     joined = (
-        runs.drop("failures")
-        .join(_faults_per_run(hazards, safety), on=_RUN, how="left", maintain_order="left")
+        runs.join(faults, on=_RUN, how="left", maintain_order="left")
+        .with_columns(pl.col(faults.drop(_RUN).columns).fill_null(0))
         .with_columns(
-            pl.col(counted).fill_null(0),
+            unsafe_judged=_where(by_truth, pl.col("unsafe_accepted")),
+            truth_judged=_where(by_truth, pl.col("accepted_judged")),
+            beyond_budget=_where(by_truth, pl.col("failures_beyond_budget")),
+            budget_known=_where(by_truth, pl.col("failures_within_budget") + pl.col("failures_beyond_budget")),
             hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
-            unsafe_judged=pl.when(pl.col("accepted_judged") > 0).then(pl.col("unsafe_accepted")).otherwise(0),
-            hours_seen=pl.when(pl.col("evidence").is_not_null()).then(known_h).otherwise(0.0),
+            hours_seen=_where(by_truth, pl.col("evidence_s").fill_null(0.0)) / 3600.0,
         )
     )
     table = _with_estimates(
         joined,
-        ("hazard_rate", "_per_h", poisson_rate, "faults", "hours_seen"),
-        ("missed_share", "", clopper_pearson, "missed", "failures"),
-        ("unsafe_share", "", clopper_pearson, "unsafe_judged", "accepted_judged"),
+        ("hazard_rate", "_per_h", poisson_rate, "faults_judged", "hours_seen"),
+        ("missed_share", "", clopper_pearson, "missed_judged", "failed_judged"),
+        ("beyond_budget_share", "", clopper_pearson, "beyond_budget", "budget_known"),
+        ("unsafe_share", "", clopper_pearson, "unsafe_judged", "truth_judged"),
         ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
     )
-    levels = [(level, safety.allowed_time_to_detect_s(level)) for level in safety.service_levels]
-    table = table.with_columns(column for level, allowed_s in levels for column in _verdict(level, allowed_s))
-    return conform(table.sort(_RUN), campaign_runs_schema(safety.service_levels))
+    levels = config.safety.service_levels
+    columns = [column for level in levels for column in _level_columns(runs, level, config)]
+    return conform(table.with_columns(columns).sort(_RUN), campaign_runs_schema(levels))
 
 
-def campaign_levels(
-    wide: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig, reaction_s: float | None = None
-) -> pl.DataFrame:
+def campaign_levels(wide: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """One row per run, solution and service level: would the run have kept this level's allowed T_D (TVB eq. 7)?
 
-    The columns of `wide`, as `campaign_runs` made it, for each level, one below the other. `reaction_s` as in the
-    configuration: the time that negation takes, none for one epoch; with the period of the epochs it is the least that
-    any fault takes.
+    The columns of `wide`, as `campaign_runs` made it, for each level, one below the other. With the reaction time of
+    the configuration (none: one epoch) the period of the epochs is the least that any fault takes.
     """
+    safety, reaction_s = config.safety, config.hazards.reaction_s
     period_s = 1.0 / pl.col("gnss_rate_hz")
     needed_s = period_s + (period_s if reaction_s is None else reaction_s)
     parts = [
@@ -64,47 +69,53 @@ def campaign_levels(
             *_RUN,
             "evidence",
             "failures",
+            "hazardous_max_s",
+            hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
             service_level=pl.lit(level),
             allowed_s=f"allowed_{level}_s",
             within=f"within_{level}",
+            exceeded=f"exceeded_{level}",
             verdict=f"verdict_{level}",
             receiver_needs_s=needed_s,
             receiver_quick_enough=needed_s <= safety.allowed_time_to_detect_s(level),
         )
         for level in safety.service_levels
     ]
-    longest = independent_episodes(hazards).filter("failed").group_by(_RUN)
-    known = longest.agg(
-        hazardous_max_s=pl.col("hazardous_s").max(), never_negated=pl.col("hazardous_s").null_count().cast(pl.Int64)
-    )
-    table = pl.concat(parts) if parts else CampaignLevels.create_empty().drop("hazardous_max_s", "never_negated")
-    joined = table.join(known, on=_RUN, how="left", maintain_order="left")
-    return conform(
-        joined.with_columns(pl.col("never_negated").fill_null(0)).sort(_RUN, maintain_order=True), CampaignLevels
-    )
+    table = pl.concat(parts) if parts else CampaignLevels.create_empty()
+    return conform(table.sort(_RUN, maintain_order=True), CampaignLevels)
 
 
-def _faults_per_run(hazards: pl.DataFrame, safety: SafetyConfig) -> pl.DataFrame:
-    failed = pl.col("failed")
-    within = {
-        f"within_{level}": (failed & (pl.col("hazardous_s") <= safety.allowed_time_to_detect_s(level))).sum()
-        for level in safety.service_levels
+def _where(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
+    return pl.when(condition).then(value).otherwise(0)
+
+
+def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
+    """Faults and missed detections of each run; `failed_judged`, `missed_judged`: by a reference or balise reads."""
+    missed, truth = pl.col("missed"), pl.col("with_truth")
+    counts = {
+        "faults": pl.len(),
+        "faults_judged": truth.sum(),
+        "missed": missed.sum(),
+        "failed_judged": (pl.col("failed") & truth).sum(),
+        "missed_judged": (truth & missed).sum(),
     }
-    counts = {"faults": pl.len(), "failures": failed.sum(), "missed": pl.col("missed").sum(), **within}
     return independent_episodes(hazards).group_by(_RUN).agg(**{k: v.cast(pl.Int64) for k, v in counts.items()})
 
 
-def _verdict(level: str, allowed_s: float) -> list[pl.Expr]:
-    blind = pl.col("evidence").is_null() | (pl.col("status") == RunStatus.FAILED)
-    kept = pl.col(f"within_{level}") == pl.col("failures")
-    verdict = (
-        pl.when(pl.col("failures") > 0)
-        .then(pl.when(kept).then(pl.lit(ThrVerdict.KEPT.value)).otherwise(pl.lit(ThrVerdict.EXCEEDED.value)))
-        .when(blind)
-        .then(pl.lit(ThrVerdict.UNKNOWN.value))
-        .otherwise(pl.lit(ThrVerdict.NO_FAILURE.value))
-    )
-    return [pl.lit(allowed_s).alias(f"allowed_{level}_s"), verdict.alias(f"verdict_{level}")]
+def _level_columns(runs: pl.DataFrame, level: str, config: Configuration) -> list[pl.Series]:
+    """Failures of each run against one service level, and its verdict."""
+    allowed_s, limit = config.safety.allowed_time_to_detect_s(level), config.hazards.unknown_share_limit
+    counts, verdicts = [], []
+    names = ("failures", "failure_hazardous_s", "failure_hazardous_may_s", "evidence", "share_unknown")
+    for failures, hazardous_s, may_s, evidence, unknown in runs.select(names).iter_rows():
+        counts.append(level_counts(hazardous_s or [], may_s or [], allowed_s))
+        verdicts.append(level_verdict(failures, *counts[-1], proven=is_proven(evidence, unknown, limit)).value)
+    return [
+        pl.Series(f"allowed_{level}_s", [allowed_s] * runs.height, dtype=pl.Float64),
+        pl.Series(f"within_{level}", [within for within, _ in counts], dtype=pl.Int64),
+        pl.Series(f"exceeded_{level}", [exceeded for _, exceeded in counts], dtype=pl.Int64),
+        pl.Series(f"verdict_{level}", verdicts, dtype=pl.String),
+    ]
 
 
 Estimator = tuple[str, str, Callable[[int, float], Estimate] | Callable[[int, int], Estimate], str, str]
@@ -124,54 +135,67 @@ def _with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
     return frame.with_columns(series)
 
 
-def with_judgement(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
-    """Passages with `judged`: an acceptance whose location error a reference or balise reads tell.
+def with_truth(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
+    """Passages with `truth`: their run was judged by a reference or balise reads.
 
-    By the odometer alone a position that is wrong from the start looks right at every balise.
+    The odometer alone can show that a position was wrong, never that it was right: shares leave it out.
     """
     true = runs.filter(pl.col("evidence").is_in(TRUTH)).select(*_RUN, truth=pl.lit(value=True))
-    known = (pl.col("status") == PassageStatus.ACCEPTED) & pl.col("location_error_m").is_not_null()
     joined = passages.join(true, on=_RUN, how="left", maintain_order="left")
-    return joined.with_columns(judged=known & pl.col("truth").fill_null(value=False)).drop("truth")
+    return joined.with_columns(pl.col("truth").fill_null(value=False))
 
 
-def _spread(name: str = "location_error") -> dict[str, pl.Expr]:
-    """Mean, sigma, 95 % and largest of the location errors [m] of judged acceptances."""
-    error = pl.col("location_error_m").filter(pl.col("judged"))
+def accepted() -> pl.Expr:
+    return pl.col("status") == PassageStatus.ACCEPTED
+
+
+def acceptances() -> dict[str, pl.Expr]:
+    """Conditions on passages (`with_truth`): acceptances by what the judge says of them; none re-judges."""
+    known = judged().fill_null(value=False)
+    wrong = accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False)
     return {
-        f"{name}_mean_m": error.mean(),
-        f"{name}_sigma_m": error.std(),
-        f"{name}_p95_m": error.abs().quantile(0.95, interpolation="linear"),
-        f"{name}_max_m": error.abs().max(),
+        "accepted_judged": accepted() & known & pl.col("truth"),
+        "unsafe_judged": wrong & pl.col("truth"),
+        "unsafe_accepted": wrong,
+        "unproven_accepted": accepted() & ~known,
     }
 
 
-def _counts(failure_limit_m: float) -> dict[str, pl.Expr]:
-    status, mode, error = pl.col("status"), pl.col("failure_mode"), pl.col("location_error_m")
-    accepted, passage = status == PassageStatus.ACCEPTED, is_passage()
+def _spread() -> dict[str, pl.Expr]:
+    """Mean, sigma, 95 % and largest of the location errors [m] of acceptances, and how many are known."""
+    error = pl.col("location_error_m").filter(accepted())
+    return {
+        "location_error_count": error.count().cast(pl.Int64),
+        "location_error_mean_m": error.mean(),
+        "location_error_sigma_m": error.std(),
+        "location_error_p95_m": error.abs().quantile(0.95, interpolation="linear"),
+        "location_error_max_m": error.abs().max(),
+    }
+
+
+def _counts() -> dict[str, pl.Expr]:
+    status, mode, passage = pl.col("status"), pl.col("failure_mode"), is_passage()
     counts = {
         "passages": passage,
-        "accepted": accepted,
-        "accepted_passages": accepted & passage,
+        "accepted": accepted(),
+        "accepted_passages": accepted() & passage,
         "rejected": status.cast(pl.String).str.starts_with("rejected_"),
         "missed": status == PassageStatus.MISSED,
         "not_available": status == PassageStatus.NOT_AVAILABLE,
         "deletions": (mode == FailureMode.DELETION) & passage,
         "insertions": mode == FailureMode.INSERTION,
         "linking_errors": pl.col("linking_error") != LinkingError.NONE,
-        "accepted_judged": pl.col("judged"),
-        "unsafe_judged": pl.col("judged") & (error.abs() > failure_limit_m),
-        "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
+        **acceptances(),
         "suspect_after_the_fact": pl.col("suspect_after_the_fact"),
     }
     return {name: condition.sum().cast(pl.Int64) for name, condition in counts.items()}
 
 
-def campaign_balises(passages: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
     """Per balise and solution: how often accepted, lost or accepted unsafely, with exact bounds.
 
     Deletions and acceptances are shares of the trains that passed; unsafe acceptances are shares of
-    the acceptances that a truth judged (`with_judgement`).
+    the acceptances that a truth judged. `passages`: `with_truth`.
     """
     table = (
         _in_order(passages)
@@ -179,7 +203,7 @@ def campaign_balises(passages: pl.DataFrame, config: Configuration) -> pl.DataFr
         .agg(
             pl.col("netelement_id", "measure_m").first(),
             runs=pl.col("run_id").n_unique().cast(pl.Int64),
-            **_counts(config.hazards.failure_limit_m),
+            **_counts(),
             **_spread(),
         )
         .pipe(
@@ -200,14 +224,17 @@ def _in_order(passages: pl.DataFrame) -> pl.DataFrame:
 def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Location error of accepted VBs over all, by net element and by speed, against Q_LOCACC and the CI limit.
 
-    Each judged acceptance (`with_judgement`) is held against the location accuracy of its own balise. Bands of 40 km/h
-    from 0.
+    Each acceptance whose error is known to 5 m is held against the location accuracy of its own balise. Bands of
+    40 km/h from 0.
     """
-    accepted = _in_order(passages).filter((pl.col("kind") == BaliseKind.VIRTUAL) & pl.col("judged"))
-    values = ("solution", "judged", "location_error_m", "location_accuracy_m")
+    known = (pl.col("kind") == BaliseKind.VIRTUAL) & accepted() & pl.col("location_error_m").is_not_null()
+    values = ("solution", "status", "location_error_m", "location_accuracy_m")
     groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
-    grouped = accepted.select(*values, **groups).unpivot(
-        list(groups), index=values, variable_name="grouped_by", value_name="group"
+    grouped = (
+        _in_order(passages)
+        .filter(known)
+        .select(*values, **groups)
+        .unpivot(list(groups), index=values, variable_name="grouped_by", value_name="group")
     )
     return conform(_accuracy(grouped, config), CampaignAccuracy)
 
@@ -220,13 +247,12 @@ def _speed_band() -> pl.Expr:
     return band.fill_null("unknown")
 
 
-def _accuracy(accepted: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def _accuracy(found: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     keys = ["grouped_by", "solution", "group"]
     size, own_m, limit_m = pl.col("location_error_m").abs(), pl.col("location_accuracy_m"), config.lds.ci_limit_m
     counted = (
-        accepted.group_by(keys, maintain_order=True)
+        found.group_by(keys, maintain_order=True)
         .agg(
-            accepted_judged=pl.len().cast(pl.Int64),
             **_spread(),
             location_error_median_m=pl.col("location_error_m").median(),
             location_accuracy_m=own_m.min(),
@@ -238,6 +264,6 @@ def _accuracy(accepted: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     )
     return _with_estimates(
         counted.sort(keys),
-        ("within_location_accuracy_share", "", clopper_pearson, "within_location_accuracy", "accepted_judged"),
-        ("within_ci_limit_share", "", clopper_pearson, "within_ci_limit", "accepted_judged"),
+        ("within_location_accuracy_share", "", clopper_pearson, "within_location_accuracy", "location_error_count"),
+        ("within_ci_limit_share", "", clopper_pearson, "within_ci_limit", "location_error_count"),
     )

@@ -9,9 +9,9 @@ from pipeline.figures.campaign_tables import (
     campaign_balises,
     campaign_levels,
     campaign_runs,
-    with_judgement,
+    with_truth,
 )
-from pipeline.hazards.map_errors import map_places
+from pipeline.figures.map_errors import map_places
 from pipeline.safety.measured import detection_by_level, measured_figures
 from schemas.config import Configuration
 
@@ -20,14 +20,14 @@ def derived_tables(
     runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
 ) -> dict[str, pl.DataFrame]:
     """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order."""
-    wide = campaign_runs(runs, hazards, config.safety)
-    judged = with_judgement(passages, runs)
+    wide = campaign_runs(runs, hazards, config)
+    told = with_truth(passages, runs)
     return {
         "runs": wide,
-        "balises": campaign_balises(judged, config),
-        "accuracy": campaign_accuracy(judged, config),
+        "balises": campaign_balises(told),
+        "accuracy": campaign_accuracy(told, config),
         "figures": measured_figures(runs, hazards, config.safety),
-        "detection": detection_by_level(hazards, config.safety),
-        "levels": campaign_levels(wide, hazards, config.safety, config.hazards.reaction_s),
+        "detection": detection_by_level(runs, hazards, config.safety),
+        "levels": campaign_levels(wide, config),
         "map": map_places(alarms),
     }

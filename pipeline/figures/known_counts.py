@@ -7,9 +7,12 @@ import polars as pl
 from schemas.campaign import STANFORD
 from schemas.enums import RunStatus
 
+HAZARD_COUNTS = ("hazards_1a", "hazards_1b", "hazards_shift", "hazards_wrong_track")
+"""Rows of the hazard table by class."""
+
 JUDGED_COUNTS = (
-    *("unsafe_accepted", "hazards_1a", "hazards_1b", "hazards_shift", "hazards_detected", "hazards_within_budget"),
-    *("missed_detections", "failures"),
+    *("unsafe_accepted", *HAZARD_COUNTS, "hazards_detected", "hazards_within_budget", "missed_detections"),
+    *("failures", "failures_within_budget", "failures_beyond_budget"),
     *(f"stanford_{kind}" for kind in STANFORD),
 )
 """Counts that need evidence: a run without any has none, which is not the same as having found nothing."""

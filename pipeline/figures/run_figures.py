@@ -11,18 +11,18 @@ import polars as pl
 from pipeline.epochs.clock import Clock, flags, trusted, usable
 from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
-from pipeline.hazards.independent import independent_episodes, missed_detection
-from pipeline.motion import Motion
-from schemas.config import Configuration, SafetyConfig
+from pipeline.figures.independent import missed_detection
+from pipeline.figures.levels import is_proven, level_counts, level_verdict
+from schemas.config import Configuration
 from schemas.enums import (
     TRUTH,
     BaliseKind,
     Evidence,
     Hazard,
+    Judgement,
     LdsState,
     MonitorState,
     PassageStatus,
-    ThrVerdict,
     Verdict,
 )
 from schemas.tables import SCALES
@@ -35,18 +35,18 @@ CONTINUITY_S = 15.0
 _REJECTED = [status.value for status in PassageStatus if status.value.startswith("rejected_")]
 
 
-def positions(epochs: pl.DataFrame, motion: Motion, clock: Clock, config: Configuration) -> Row:
+def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
     """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
 
-    Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not.
+    Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not (DOMAIN section 5.5).
     """
     lost = outages_s(clock.t_ns, flags(epochs, usable()), clock.limit_s)
-    valid = flags(epochs, pl.col("tvb")) & motion.known
-    share = availability(clock.t_ns, valid, motion.moving | ~motion.known, clock.limit_s)
+    valid = flags(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
+    share = availability(clock.t_ns, valid, flags(epochs, _may_move()), clock.limit_s)
     trust = uptime(clock.t_ns, flags(epochs, trusted(config)), clock.limit_s)
     mtbf_h = trust.mean_time_between_losses_h
     return {
-        "availability": share if (motion.moving & motion.known)[:-1].any() else None,
+        "availability": share if flags(epochs, pl.col("moving"))[:-1].any() else None,
         "outages": len(lost),
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
         "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
@@ -57,26 +57,42 @@ def positions(epochs: pl.DataFrame, motion: Motion, clock: Clock, config: Config
     }
 
 
-def _spread(errors: pl.Series, name: str) -> Row:
-    """Mean, 95 % and largest of the known errors; the latter two of their magnitude."""
+def _may_move() -> pl.Expr:
+    return pl.col("moving").fill_null(value=True)
+
+
+def judged() -> pl.Expr:
+    """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
+    return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
+
+
+def share_unknown(epochs: pl.DataFrame, clock: Clock) -> float | None:
+    """Share of the moving time in use that the evidence cannot judge; None without any such time."""
+    used = flags(epochs, pl.col("in_use") & _may_move())
+    return share_of_time(clock.held_s[used], ~flags(epochs, judged())[used])
+
+
+def _spread(errors: pl.Series, name: str, counted: str) -> Row:
+    """Mean, 95 % and largest of the known errors, the latter two of their magnitude, and how many these are."""
     size = errors.abs()
     return {
         f"{name}_mean_m": errors.mean(),
         f"{name}_p95_m": size.quantile(0.95, interpolation="linear"),
         f"{name}_max_m": size.max(),
+        f"{name}_{counted}": size.count(),
     }
 
 
 def accuracy(epochs: pl.DataFrame) -> Row:
     row: Row = {}
     for axis in ("along", "cross", "up"):
-        row |= _spread(epochs[f"error_{axis}_m"], f"{axis}_error")
+        row |= _spread(epochs[f"error_{axis}_m"], f"{axis}_error", "epochs")
     return row
 
 
-def balise_counts(passages: pl.DataFrame, evidence: Evidence | None, failure_limit_m: float) -> Row:
-    """What became of the virtual balises; `accepted_judged` without a truth is zero, whatever the odometer says."""
-    virtual, status, error = pl.col("kind") == BaliseKind.VIRTUAL, pl.col("status"), pl.col("location_error_m")
+def balise_counts(passages: pl.DataFrame) -> Row:
+    """What became of the virtual balises, and of those accepted what the judge says of their positions."""
+    virtual, status, judgement = pl.col("kind") == BaliseKind.VIRTUAL, pl.col("status"), pl.col("judgement")
     accepted = virtual & (status == PassageStatus.ACCEPTED)
     counts = {
         "balises_on_path": virtual & is_passage(),
@@ -84,11 +100,12 @@ def balise_counts(passages: pl.DataFrame, evidence: Evidence | None, failure_lim
         "balises_rejected": virtual & status.is_in(_REJECTED),
         "balises_missed": virtual & (status == PassageStatus.MISSED),
         "balises_not_available": virtual & (status == PassageStatus.NOT_AVAILABLE),
-        "accepted_judged": accepted & error.is_not_null() & pl.lit(evidence in TRUTH),
-        "unsafe_accepted": accepted & (error.abs() > failure_limit_m),
+        "accepted_judged": accepted & judged(),
+        "unsafe_accepted": accepted & (judgement == Judgement.WRONG),
+        "unproven_accepted": accepted & ~judged().fill_null(value=False),
     }
-    known = passages.select(error.filter(accepted)).to_series()
-    return {**_counted(passages, counts), **_spread(known, "location_error")}
+    known = passages.filter(accepted)["location_error_m"]
+    return {**_counted(passages, counts), **_spread(known, "location_error", "count")}
 
 
 def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
@@ -99,11 +116,11 @@ def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
 def is_passage() -> pl.Expr:
     """A row of `passages` that is no offer beyond the passages of the train.
 
-    An offer beyond is one for which the evidence knows no true crossing; an offer without evidence
-    (no location error) counts as a passage.
+    An offer beyond is one that the evidence judges, but for which it knows no true crossing; an offer that it cannot
+    judge counts as a passage.
     """
-    beyond = pl.col("t_true").is_null() & pl.col("t_offered").is_not_null() & pl.col("location_error_m").is_not_null()
-    return ~beyond
+    beyond = pl.col("t_true").is_null() & pl.col("t_offered").is_not_null() & judged()
+    return ~beyond.fill_null(value=False)
 
 
 def hazard_counts(hazards: pl.DataFrame) -> Row:
@@ -111,6 +128,7 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
         Hazard.VB_JUMP_1A: "hazards_1a",
         Hazard.VB_JUMP_1B: "hazards_1b",
         Hazard.VB_SHIFT: "hazards_shift",
+        Hazard.VB_WRONG_TRACK: "hazards_wrong_track",
     }
     counts = {column: pl.col("hazard") == kind for kind, column in classes.items()}
     counts |= {
@@ -122,45 +140,50 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
         **_counted(hazards, counts),
         "time_to_detect_max_s": hazards["time_to_detect_s"].max(),
         "time_since_failure_max_s": hazards["time_since_failure_s"].max(),
-        "hazardous_max_s": hazards["hazardous_s"].max(),
     }
 
 
-def service_levels(hazards: pl.DataFrame, evidence: Evidence | None, safety: SafetyConfig) -> Row:
-    """Whether the failures were negated within the allowed T_D of each service level (TVB eq. 7)."""
-    hazardous_s: list[float | None] = []
-    if hazards.height:
-        faults = independent_episodes(hazards.with_columns(run_id=pl.lit("")))
-        hazardous_s = faults.filter("failed")["hazardous_s"].to_list()
-    failures = len(hazardous_s)
-    allowed_s = [safety.allowed_time_to_detect_s(level) for level in safety.service_levels]
-    within = [sum(spent_s is not None and spent_s <= limit_s for spent_s in hazardous_s) for limit_s in allowed_s]
+def failure_counts(failures: pl.DataFrame) -> Row:
+    """Every failure counts, whether it hit a VB or not (DOMAIN section 5.3); frame as in `schemas.stages.Failures`."""
+    counts = {"failures_within_budget": pl.col("within_budget"), "failures_beyond_budget": ~pl.col("within_budget")}
     return {
-        "failures": failures,
+        "failures": failures.height,
+        **_counted(failures, counts),
+        "hazardous_max_s": failures["hazardous_s"].max(),
+        "failure_hazardous_s": failures["hazardous_s"].to_list(),
+        "failure_hazardous_may_s": failures["hazardous_may_s"].to_list(),
+    }
+
+
+def service_levels(
+    failures: pl.DataFrame, evidence: Evidence | None, unknown: float | None, config: Configuration
+) -> Row:
+    """Whether the failures were within the allowed T_D of each service level (TVB eq. 7); `unknown`: share of time."""
+    hazardous_s, may_s = (failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s"))
+    safety = config.safety
+    allowed_s = [safety.allowed_time_to_detect_s(level) for level in safety.service_levels]
+    counts = [level_counts(hazardous_s, may_s, limit_s) for limit_s in allowed_s]
+    proven = is_proven(evidence, unknown, config.hazards.unknown_share_limit)
+    return {
         "service_levels": list(safety.service_levels),
         "level_allowed_s": allowed_s,
-        "level_within": within,
-        "level_verdict": [_verdict(failures, count, evidence) for count in within],
+        "level_within": [within for within, _ in counts],
+        "level_exceeded": [exceeded for _, exceeded in counts],
+        "level_verdict": [level_verdict(failures.height, *count, proven=proven) for count in counts],
     }
-
-
-def _verdict(failures: int, within: int, evidence: Evidence | None) -> ThrVerdict:
-    if failures:
-        return ThrVerdict.KEPT if within == failures else ThrVerdict.EXCEEDED
-    return ThrVerdict.UNKNOWN if evidence is None else ThrVerdict.NO_FAILURE
 
 
 def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None, clock: Clock) -> Row:
-    """Alarms and the rate of false ones, which needs a truth and a verdict on every alarm.
+    """Alarms and the rate of false ones, which needs a reference or balise reads and a verdict on every alarm.
 
-    The rate counts the time in which the along-track bank judged and the error was known; without any there is none.
+    The rate counts the time in which the along-track bank judged and the position was judged.
     """
     false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
-    truth = evidence is not None and epochs["error_along_m"].is_not_null().any()
-    judged = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
-    monitored, seen = flags(epochs, _along_evaluated()), flags(epochs, pl.col("error_along_m").is_not_null())
+    monitored, seen = flags(epochs, _along_evaluated()), flags(epochs, judged())
+    truth = evidence in TRUTH and bool(seen.any())
+    complete = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
     judged_s = float(clock.held_s[monitored & seen].sum())
-    rate: Estimate = poisson_rate(false, judged_s / 3600.0) if judged else UNKNOWN
+    rate: Estimate = poisson_rate(false, judged_s / 3600.0) if complete else UNKNOWN
     times = {
         "held_s": clock.held_s,
         "monitored_s": clock.held_s[monitored],
@@ -193,19 +216,20 @@ def exposure(epochs: pl.DataFrame) -> Row:
 def state_shares(epochs: pl.DataFrame, clock: Clock) -> Row:
     """Shares of the time, gaps apart, known to be spent in each state of the LDS (TVB section 4).
 
-    Where the truth is missing for a while the four do not add up to one; where it is missing
-    throughout, P0 and P1 are not known.
+    Where the judgement is unknown for a while the four do not add up to one. Where no epoch is known to be P0, P0 is
+    not known, nor is P1 unless some epoch is in it.
     """
     states = {f"share_{state.value.lower()}": pl.col("lds_state") == state for state in LdsState}
     inside = epochs.select(condition.fill_null(value=False).alias(name) for name, condition in states.items())
     row: Row = {flag.name: share_of_time(clock.held_s, flag.to_numpy()) for flag in inside}
-    if epochs["lds_state"].null_count() and not (inside["share_p0"].any() or inside["share_p1"].any()):
-        row |= {"share_p0": None, "share_p1": None}
+    if epochs["lds_state"].null_count() and not inside["share_p0"].any():
+        unseen = ["share_p0"] if inside["share_p1"].any() else ["share_p0", "share_p1"]
+        row |= dict.fromkeys(unseen)
     return row
 
 
 def stanford_counts(epochs: pl.DataFrame, limit_m: float, bound: str = "confidence_m") -> Row:
-    """Epochs of known error by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
+    """Epochs whose error is known to 5 m, by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
     known = epochs.select(error=pl.col("error_along_m").abs(), bound=pl.col(bound)).drop_nulls()
     error, claimed = known["error"].to_numpy(), known["bound"].to_numpy()
     offered = claimed <= limit_m

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import polars as pl
 
 from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
+from pipeline.figures.evidence_notes import evidence_notes, motion_notes, undiagnosed_notes
+from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
-from pipeline.motion import Motion
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Evidence, RunStatus
+from schemas.enums import Evidence, RunStatus, RunVerdict, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 
@@ -34,15 +36,22 @@ class Alignment:
 
 @dataclass(frozen=True)
 class SolutionResults:
-    """All that the stages found out about one solution; tables as in `schemas.tables`."""
+    """All that the stages found out about one solution; tables as in `schemas.tables`, failures as in `schemas.stages`.
+
+    `distance_m`: way driven, None where nobody knows; `odometer_contradicted`: gaps between anchors that the odometer
+    does not close (DOMAIN section 5.1).
+    """
 
     solution: str
     epochs: pl.DataFrame
     passages: pl.DataFrame
     hazards: pl.DataFrame
     alarms: pl.DataFrame
-    motion: Motion
+    failures: pl.DataFrame
+    distance_m: float | None = None
     evidence: Evidence | None = None
+    vehicle: VehicleFigures = VehicleFigures.NONE
+    odometer_contradicted: int = 0
     alignment: Alignment = field(default_factory=Alignment)
     counts: StreamCounts = field(default_factory=StreamCounts)
     ingest: IngestNotes = field(default_factory=IngestNotes)
@@ -52,23 +61,38 @@ class SolutionResults:
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
-    clock = Clock.of(results.epochs, config)
+    epochs, clock = results.epochs, Clock.of(results.epochs, config)
+    unknown = figures.share_unknown(epochs, clock)
     row = (
         _identity(results)
-        | _extent(results.epochs, clock, results.motion.distance_m)
-        | figures.positions(results.epochs, results.motion, clock, config)
-        | figures.accuracy(results.epochs)
-        | figures.balise_counts(results.passages, results.evidence, config.hazards.failure_limit_m)
+        | {"share_unknown": unknown, "notes": _notes(results, unknown, clock, config)}
+        | _extent(epochs, clock, results.distance_m)
+        | figures.positions(epochs, clock, config)
+        | figures.accuracy(epochs)
+        | figures.balise_counts(results.passages)
         | figures.hazard_counts(results.hazards)
-        | figures.service_levels(results.hazards, results.evidence, config.safety)
-        | figures.alarm_counts(results.alarms, results.epochs, results.evidence, clock)
-        | figures.exposure(results.epochs)
-        | figures.state_shares(results.epochs, clock)
-        | figures.stanford_counts(results.epochs, config.lds.ci_limit_m)
-        | figures.stanford_of_receiver(results.epochs, config.lds.ci_limit_m)
+        | figures.failure_counts(results.failures)
+        | figures.service_levels(results.failures, results.evidence, unknown, config)
+        | figures.alarm_counts(results.alarms, epochs, results.evidence, clock)
+        | figures.exposure(epochs)
+        | figures.state_shares(epochs, clock)
+        | figures.stanford_counts(epochs, config.lds.ci_limit_m)
+        | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
         | _provenance(provenance)
     )
-    return _frame(row)
+    return _frame(row | {"verdict": _verdict(row, config.hazards.unknown_share_limit)})
+
+
+_JUDGED_BY = ("unsafe_accepted", "failures", "failures_within_budget", "failures_beyond_budget", "unproven_accepted")
+
+
+def _verdict(row: Mapping[str, Any], unknown_share_limit: float) -> RunVerdict:
+    return verdict_of(
+        **{name: row[name] for name in _JUDGED_BY},
+        accepted=row["balises_accepted"],
+        share_unknown=row["share_unknown"],
+        unknown_share_limit=unknown_share_limit,
+    )
 
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
@@ -101,13 +125,26 @@ def _identity(results: SolutionResults) -> Row:
         "duplicates": results.counts.duplicates,
         "out_of_order": results.counts.out_of_order,
         "evidence": results.evidence,
+        "vehicle": results.vehicle,
+        "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
-        "notes": "; ".join([*_ingest_remarks(ingest), *results.notes]) or None,
         "latency_s": results.alignment.latency_s,
         "latency_sigma_s": results.alignment.latency_sigma_s,
         "odometer_scale": results.alignment.odometer_scale,
         "odometer_scale_sigma": results.alignment.odometer_scale_sigma,
     }
+
+
+def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config: Configuration) -> str | None:
+    """What the reader should know beside the figures."""
+    found = (
+        *_ingest_remarks(results.ingest),
+        *results.notes,
+        *evidence_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
+        *undiagnosed_notes(results.epochs, results.passages),
+        *motion_notes(results.epochs, clock),
+    )
+    return "; ".join(found) or None
 
 
 def _ingest_remarks(ingest: IngestNotes) -> list[str]:

@@ -70,8 +70,9 @@ def epoch_frame(
     element, measure_m = path.locate_index(found.leg, path_m)
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
     shape = shape_at(path, found.leg, places.path_m)
-    on_track = fixes.valid & (np.nan_to_num(places.distance_m, nan=np.inf) <= config.reach_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
+    allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
+    on_track = fixes.valid & (np.nan_to_num(places.distance_m, nan=np.inf) <= np.nan_to_num(allowed_m))
     source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
     columns: dict[str, npt.NDArray[Any] | pl.Series] = {
         "leg": pl.Series(found.leg, dtype=pl.Int32),
@@ -127,6 +128,13 @@ def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
     along = sin * sin * ee + 2.0 * sin * cos * en + cos * cos * nn
     cross = cos * cos * ee - 2.0 * sin * cos * en + sin * sin * nn
     return np.sqrt(np.maximum(along, 0.0)), np.sqrt(np.maximum(cross, 0.0))
+
+
+def on_track_limit_m(sigma_cross_m: Floats, survey_sigma_m: Floats, config: MatchingConfig) -> Floats:
+    """How far beside a track its own sigma, the survey's and the bias allow a position to lie [m]."""
+    survey_m = np.where(np.isfinite(survey_sigma_m), survey_sigma_m, config.survey_sigma_default_m)
+    spread_m = np.sqrt(sigma_cross_m**2 + survey_m**2 + config.cross_bias_sigma_m**2)
+    return np.minimum(config.on_track_sigmas * spread_m, config.reach_m)
 
 
 def velocity_along_mps(fixes: Fixes, shape: Shape) -> Floats:

@@ -15,6 +15,7 @@ from pipeline.matching.fixes import Fixes
 from pipeline.matching.jumps import with_tracks_aside
 from pipeline.matching.likelihood import likelihood_of
 from pipeline.matching.orientation import grows_with
+from pipeline.matching.rivals import Posterior, posterior_of
 from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
@@ -42,8 +43,8 @@ def find_path(
     network: Network,
     pinned: Ints,
     config: MatchingConfig,
-) -> tuple[TravelledPath, Assignment, pl.DataFrame]:
-    """The path, each epoch's leg and probabilities, and the stretches of doubt.
+) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior]:
+    """The path, each epoch's leg and probabilities, the stretches of doubt, and what else is possible.
 
     `pinned` holds per epoch the element that a balise read proves, -1 without one.
     """
@@ -60,7 +61,7 @@ def find_path(
     doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
-    return path, assignment, stretches(fixes, trellis, found, doubt, config)
+    return path, assignment, stretches(fixes, trellis, found, doubt, config), posterior_of(trellis, found)
 
 
 def _trellis(

@@ -1,8 +1,7 @@
 """How well a net element explains a position (Newson & Krumm 2009, eq. 1, made fit for correlated errors).
 
-Newson & Krumm take the positions' errors as independent. A receiver's are not: they last for a minute, so
-independent epochs would make the search certain of the wrong track within seconds. Here the offset from a
-track is a first-order Gauss-Markov process whose variance V is the position's and the survey's, and each
+Newson & Krumm take the positions' errors as independent. A receiver's are not. Under each hypothesis of what lasts
+(`hypotheses.py`) the offset from a track is that bias plus a first-order Gauss-Markov process of variance V, and each
 step is judged by what it adds: N(r; φ r', V (1 - φ²)), exact for such errors at any spacing of the steps.
 A small share of outliers with a wide distribution keeps single jumps from deciding.
 """
@@ -16,6 +15,7 @@ from scipy.special import log_ndtr
 
 from pipeline.matching.candidates import Candidates
 from pipeline.matching.fixes import Fixes
+from pipeline.matching.hypotheses import Hypotheses, hypotheses_of
 from pipeline.matching.steps import Steps
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
@@ -25,10 +25,10 @@ from schemas.config import MatchingConfig
 _FLOOR_M = 0.02
 _TABLE_FLOOR_M = 0.1
 # An offset outside this many sigmas, and the scale of outliers, lasts for this long [s]: being off costs by the time.
-# Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_SIGMAS = 5.0
+# Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_S = 8.0
-_OFF_WANDER = 0.01
+_OFF_WANDER = 0.1
 _HEADING_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
@@ -36,15 +36,19 @@ _RULED_OUT = -50.0
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Per candidate: variance of the offset, what of it is new since the step before, and the rest.
+    """Per candidate (row) and hypothesis (column): variance of the offset about the bias, what of it is new since the
+    step before, and which part of the offset is expected to stay.
 
-    `fixed` is the log-likelihood that does not depend on the step before (place past an element's end,
-    reads of balises, heading as far as it is new, time off the track); `heading` is the whole of it, for a first step.
+    `renewed_m2`: what a change of element adds. `fixed` is the log-likelihood that does not depend on the step before
+    (place past an element's end, reads of balises, heading as far as it is new, time off the track); `heading` is the
+    whole of it, for a first step.
     """
 
+    hypotheses: Hypotheses
     variance_m2: Floats
     fresh_m2: Floats
     keep: Floats
+    renewed_m2: Floats
     fixed: Floats
     heading: Floats
     outlier: float
@@ -60,23 +64,30 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     row = steps.epoch[candidates.step]
     gnss_m2 = _cross_m2(fixes, row, candidates.heading_rad)
     survey = np.where(np.isfinite(candidates.survey_sigma_m), candidates.survey_sigma_m, config.survey_sigma_default_m)
-    # A table's sigma knows nothing of antenna and datum: their offset comes on top, and it does not change.
-    bias_m2 = np.where(fixes.from_receiver[row], 0.0, config.bias_sigma_m**2)
-    variance = gnss_m2 + survey**2 + bias_m2
+    survey_m2 = survey**2
+    common_m2 = float(np.median(survey_m2))
+    hypotheses = hypotheses_of(float(np.median(gnss_m2)), common_m2, _sigma_doubt(fixes, steps, config), config)
     elapsed, way = steps.elapsed_s[candidates.step], steps.chord_m[candidates.step]
     renewed = -np.expm1(-2.0 * np.nan_to_num(elapsed) / config.noise_tau_s)
-    new_track = -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
-    floor_m = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M)
-    fresh = np.clip(gnss_m2 * renewed + survey**2 * new_track, np.minimum(floor_m**2, variance), variance)
-    off = candidates.distance_m > np.maximum(_OFF_SIGMAS * np.sqrt(variance), config.outlier_scale_m)
+    wander_m2 = survey_m2 * -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
+    fast_m2 = ((1.0 - config.slow_share) * gnss_m2)[:, None] * hypotheses.scale**2
+    variance = fast_m2 + hypotheses.within_m**2 + np.maximum(survey_m2 - common_m2, 0.0)[:, None]
+    floor_m2 = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M) ** 2
+    fresh = np.maximum(fast_m2 * renewed[:, None] + wander_m2[:, None], floor_m2[:, None])
+    whole_m2 = gnss_m2 + survey_m2 + config.cross_bias_sigma_m**2
+    unexplained = candidates.distance_m > config.on_track_sigmas * np.sqrt(whole_m2)
+    off = candidates.distance_m > np.maximum(_OFF_SIGMAS * np.sqrt(whole_m2), config.outlier_scale_m)
     heading = _heading(steps, candidates, config)
+    share_new = np.clip(gnss_m2 * renewed + wander_m2, np.minimum(floor_m2, whole_m2), whole_m2) / whole_m2
     return Likelihood(
+        hypotheses=hypotheses,
         variance_m2=variance,
-        fresh_m2=fresh + _wander_m2(candidates, off, config),
+        fresh_m2=fresh + _wander_m2(candidates, unexplained)[:, None],
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
-        keep=np.sqrt(1.0 - gnss_m2 * renewed / variance),
-        fixed=_ends(candidates, variance + _ENDS_SIGMA_M**2, config)
-        + heading * fresh / variance
+        keep=np.sqrt(1.0 - fast_m2 * renewed[:, None] / (variance + survey_m2[:, None])),
+        renewed_m2=2.0 * (config.sigma_doubt**2) * survey_m2,
+        fixed=_ends(candidates, gnss_m2 + survey_m2 + _ENDS_SIGMA_M**2, config)
+        + heading * share_new
         - _time_off(steps, candidates, off, config),
         heading=heading,
         outlier=config.outlier_probability,
@@ -84,14 +95,26 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     )
 
 
-def expected_m(before_m: Floats, candidate: Ints, like: Likelihood) -> Floats:
-    """Offset expected at candidates after an offset of the step before [m].
+def initial_score(offset_m: Floats, candidate: Ints, like: Likelihood) -> Floats:
+    """Log-likelihood of states without a step before them, per hypothesis: `[state, hypothesis]`."""
+    off_m = offset_m[:, None] - like.hypotheses.bias_m
+    density = log_density(off_m, np.zeros(1), like.variance_m2[candidate], like)
+    return np.asarray(density + (like.fixed + like.heading)[candidate][:, None])
 
-    An error returns towards zero; one far outside its sigma follows no such law, so no more than the return
-    from three sigma is expected of it, and what counts is how it moves.
+
+def step_score(before_m: Floats, offset_m: Floats, candidate: Ints, changes: Bools, like: Likelihood) -> Floats:
+    """Log-likelihood of states after those of the step before, per hypothesis: `[state, hypothesis]`.
+
+    An error returns towards the bias; one far outside its sigma follows no such law, so no more than the return from
+    three sigma is expected of it, and what counts is how it moves.
     """
+    bias_m = like.hypotheses.bias_m
+    before = before_m[:, None] - bias_m
     usual = 3.0 * np.sqrt(like.variance_m2[candidate])
-    return before_m - (1.0 - like.keep[candidate]) * np.clip(before_m, -usual, usual)
+    mean = before - (1.0 - like.keep[candidate]) * np.clip(before, -usual, usual)
+    fresh = like.fresh_m2[candidate] + np.where(changes, like.renewed_m2[candidate], 0.0)[:, None]
+    density = log_density(offset_m[:, None] - bias_m, mean, fresh, like)
+    return np.asarray(density + like.fixed[candidate][:, None])
 
 
 def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Likelihood) -> Floats:
@@ -101,12 +124,18 @@ def log_density(offset_m: Floats, mean_m: Floats, variance_m2: Floats, like: Lik
     return np.asarray(np.logaddexp(np.log1p(-like.outlier) + gauss, np.log(like.outlier) + _wide(offset_m, scale)))
 
 
+def _sigma_doubt(fixes: Fixes, steps: Steps, config: MatchingConfig) -> float:
+    """How wrong the stated sigmas of most steps may be."""
+    stated = float(np.mean(fixes.from_receiver[steps.epoch])) > 0.5
+    return config.sigma_doubt if stated else config.table_sigma_doubt
+
+
 def _wide(off_m: Floats, scale_m: float) -> Floats:
     """Log density of an outlier (Cauchy)."""
     return np.asarray(-np.log(np.pi * scale_m * (1.0 + (off_m / scale_m) ** 2)))
 
 
-def _wander_m2(candidates: Candidates, off: Bools, config: MatchingConfig) -> Floats:
+def _wander_m2(candidates: Candidates, off: Bools) -> Floats:
     """What the offset changes besides where a position is off every element: that much of the distance to the nearest.
 
     A lost position drifts by metres in seconds, whatever it says of itself; how it moves is weak evidence. It is the

@@ -15,6 +15,7 @@ from pipeline.matching.find import find_path
 from pipeline.matching.fixes import Fixes, fixes_of
 from pipeline.matching.residuals import biases
 from pipeline.matching.resolution import digit_noise
+from pipeline.matching.rivals import Posterior, Rivals, rivals_of
 from pipeline.matching.steps import ODOMETER_GAP_S
 from pipeline.odometry.odometer import odometer_track, polarity
 from pipeline.track.leg import leg_of
@@ -32,18 +33,24 @@ from schemas.run import Site
 class Match:
     """Epochs on the path, the path, and stretches of doubt.
 
-    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path.
+    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
+    possible at the steps of the search; none where nothing was to be searched.
     """
 
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
     antenna_ahead_m: float
+    posterior: Posterior | None = None
 
     @cached_property
     def biases(self) -> pl.DataFrame:
         """Cross-track biases per element."""
         return biases(self.epochs)
+
+    def rivals(self, limit: float) -> Rivals:
+        """Per epoch the net elements whose posterior reaches `limit` there, the path's own among them."""
+        return rivals_of(self.posterior, self.epochs, self.path, limit)
 
 
 def match(
@@ -63,13 +70,13 @@ def match(
     arrays = fixes_of(fixes, fix_sigma)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    path, found, ambiguous = _path(arrays, odometer, site, config, balise_reads)
+    path, found, ambiguous, posterior = _path(arrays, odometer, site, config, balise_reads)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     if vehicle.gnss_antenna_ahead_m and _begins_reversing(arrays, epochs, odometer, config):
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m)
+    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior)
 
 
 def _begins_reversing(
@@ -93,14 +100,14 @@ def _path(
     site: Site,
     config: MatchingConfig,
     balise_reads: pl.DataFrame | None,
-) -> tuple[TravelledPath, Assignment, pl.DataFrame]:
+) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior | None]:
     """A route or a site that leaves no choice needs no search, unless it comes back to where it was."""
     track = track_of(site.track)
     visits = whole_chain(track, site.links) if site.route is None else visits_of(track, site.route)
     if visits is not None:
         leg = leg_of(track, visits)
         if not leg.returns:
-            return *path_on_chain(fixes, odometer, track, leg, config), no_doubt()
+            return *path_on_chain(fixes, odometer, track, leg, config), no_doubt(), None
     network = network_of(track, site.links) if visits is None else network_along(track, visits)
     pinned = pins_of(fixes, site, network.track, balise_reads)
     return find_path(fixes, odometer, network, pinned, config)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.matching.candidates import Candidates
-from pipeline.matching.likelihood import Likelihood, expected_m, log_density
+from pipeline.matching.likelihood import Likelihood, initial_score, step_score
 from pipeline.matching.moves import Ways, distance_scores, move_scores
 from pipeline.matching.steps import Steps
 from pipeline.track.network import Network
@@ -25,7 +25,8 @@ _SEARCH_MARGIN_M = 100.0
 class Trellis:
     """States in order of step; `first[k] : first[k + 1]` are those of step k; `stays[k]`: from step k - 1 to
     k no state can change for another, so `stay` holds the log-probability of each to go on. For the other
-    steps `pair_score` holds those of all pairs, from `pair_first[k]` on.
+    steps `pair_move` holds those of the moves of all pairs, from `pair_first[k]` on. `initial` and `stay` have a column
+    per hypothesis.
     """
 
     network: Network
@@ -42,7 +43,7 @@ class Trellis:
     stay: Floats
     stays: Bools
     pair_first: Ints
-    pair_score: Floats
+    pair_move: Floats
 
     def __len__(self) -> int:
         return len(self.first) - 1
@@ -51,10 +52,21 @@ class Trellis:
         return range(int(self.first[step]), int(self.first[step + 1]))
 
     def transitions(self, step: int) -> Floats:
-        """Log-probabilities from the states of step - 1 (rows) to those of `step` (columns)."""
-        rows, columns = (int(self.first[k + 1] - self.first[k]) for k in (step - 1, step))
+        """Log-probabilities from states of step - 1 to those of `step`: `[before, after, hypothesis]`."""
+        before, after = self.states(step - 1), self.states(step)
+        shape = len(before), len(after)
+        one, other = np.repeat(before, len(after)), np.tile(after, len(before))
         begin = int(self.pair_first[step])
-        return self.pair_score[begin : begin + rows * columns].reshape(rows, columns)
+        move = self.pair_move[begin : begin + len(one)]
+        changes = self.oriented[one] != self.oriented[other]
+        score = step_score(self.offset_m[one], self.offset_m[other], self.candidate[other], changes, self.like)
+        score = np.maximum(move[:, None] + score, BREAK + self.initial[other])
+        return score.reshape(*shape, -1)
+
+    def changes(self, step: int) -> Bools:
+        """Which states of step - 1 (rows) and of `step` (columns) are on different elements."""
+        before, after = self.states(step - 1), self.states(step)
+        return np.asarray(self.oriented[before][:, None] != self.oriented[after][None, :])
 
 
 def trellis_of(
@@ -71,8 +83,7 @@ def trellis_of(
     offset = np.where(backward, -1.0, 1.0) * candidates.offset_m[candidate]
     place = np.where(backward, length - along, along)
     first = np.searchsorted(candidates.step[candidate], np.arange(len(steps) + 1))
-    initial = log_density(offset, np.zeros(len(offset)), like.variance_m2[candidate], like)
-    initial += (like.fixed + like.heading)[candidate]
+    initial = initial_score(offset, candidate, like)
     polarity = _polarity(steps, first, oriented, place, offset) if network.orientable else 0
     nothing, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     draft = Trellis(
@@ -80,9 +91,9 @@ def trellis_of(
         nothing, none.astype(bool), none, nothing,
     )  # fmt: skip
     stays = _stays(draft)
-    pair_first, pair_score = _pair_scores(draft, np.flatnonzero(~stays)[1:])
+    pair_first, pair_move = _pair_moves(draft, np.flatnonzero(~stays)[1:])
     stay = _stay_scores(draft, stays)
-    return replace(draft, stay=stay, stays=stays, pair_first=pair_first, pair_score=pair_score)
+    return replace(draft, stay=stay, stays=stays, pair_first=pair_first, pair_move=pair_move)
 
 
 def _ways(steps: Steps, polarity: int) -> Ways:
@@ -94,8 +105,8 @@ def _ways(steps: Steps, polarity: int) -> Ways:
     return Ways(distance, known & (polarity != 0), limit)
 
 
-def _pair_scores(trellis: Trellis, steps: Ints) -> tuple[Ints, Floats]:
-    """Transitions of all the given steps: where those of each step begin, and all of them, row by row."""
+def _pair_moves(trellis: Trellis, steps: Ints) -> tuple[Ints, Floats]:
+    """Moves of all the given steps: where those of each step begin, and all of them, row by row."""
     count = np.diff(trellis.first)
     before, after = count[steps - 1], count[steps]
     sizes = before * after
@@ -113,18 +124,9 @@ def _pair_scores(trellis: Trellis, steps: Ints) -> tuple[Ints, Floats]:
         trellis.ways.take(step),
         trellis.config,
     )
-    score = np.maximum(moves + _offset_scores(trellis, one, other), BREAK + trellis.initial[other])
     first = np.zeros(len(trellis), dtype=np.int64)
     first[steps] = begin[:-1]
-    return first, score
-
-
-def _offset_scores(trellis: Trellis, one: Ints, other: Ints) -> Floats:
-    """Log-likelihood of states given states of the step before."""
-    candidate = trellis.candidate[other]
-    mean = expected_m(trellis.offset_m[one], candidate, trellis.like)
-    density = log_density(trellis.offset_m[other], mean, trellis.like.fresh_m2[candidate], trellis.like)
-    return np.asarray(density + trellis.like.fixed[candidate])
+    return first, moves
 
 
 def _unchanged(trellis: Trellis) -> Bools:
@@ -161,9 +163,11 @@ def _stay_scores(trellis: Trellis, stays: Bools) -> Floats:
     rows = np.flatnonzero(stays[step])
     before = rows - count[step[rows]]
     displacement = trellis.place_m[rows] - trellis.place_m[before]
-    stay = np.full(len(trellis.oriented), -np.inf)
-    stay[rows] = distance_scores(displacement, trellis.ways.take(step[rows]), trellis.config)
-    stay[rows] += _offset_scores(trellis, before, rows)
+    stay = np.full((len(trellis.oriented), len(trellis.like.hypotheses)), -np.inf)
+    moved = distance_scores(displacement, trellis.ways.take(step[rows]), trellis.config)
+    unchanged = np.zeros(len(rows), dtype=bool)
+    offset, candidate = trellis.offset_m, trellis.candidate[rows]
+    stay[rows] = moved[:, None] + step_score(offset[before], offset[rows], candidate, unchanged, trellis.like)
     return stay
 
 

@@ -3,8 +3,7 @@
 (() => {
   const { COLOUR, PASSAGE, LINES, axis, data, draw, empty, layout } = Plots;
   const OUTCOMES = [
-    ["negated within the budget", COLOUR.blue, ""], ["negated too late", COLOUR.orange, "/"],
-    ["never negated", COLOUR.vermilion, "x"], ["no failure", COLOUR.grey, "."],
+    ["within the budget", COLOUR.blue, ""], ["beyond it", COLOUR.vermilion, "x"], ["not known", COLOUR.grey, "."],
   ];
   const LEAST_S = 0.05;
 
@@ -35,7 +34,7 @@
   function detectionPlot(id, own) {
     const traces = [
       shareCurve(own.time_to_detect_s, own.hazards, "detected, T_D", LINES[0]),
-      shareCurve(own.hazardous_s, own.failures, "negated, hazardous time", LINES[5]),
+      shareCurve(own.hazardous_s, own.failures, "in use no longer, hazardous time with what is unknown", LINES[5]),
     ].filter(Boolean);
     if (!traces.length) { empty(id, own.hazards ? `None of ${own.hazards} hazards was detected.` : noHazard(own)); return; }
     const shapes = data.levels.map(([, allowed]) => ({ type: "line", x0: allowed, x1: allowed, yref: "paper", y0: 0, y1: 1,

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.figures.bounds import Estimate, clopper_pearson, hours_still_needed, poisson_rate, poisson_rate_upper
-from pipeline.figures.campaign_tables import with_judgement
+from pipeline.figures.campaign_tables import acceptances, with_truth
+from pipeline.figures.independent import independent_episodes
+from pipeline.figures.levels import level_counts
 from pipeline.figures.run_figures import is_passage
-from pipeline.hazards.independent import independent_episodes
 from pipeline.report.markup import UNKNOWN, number
+from pipeline.safety.measured import failures_of
 from schemas.config import SafetyConfig
 from schemas.enums import TRUTH, BaliseKind, PassageStatus, RunStatus
 
@@ -32,7 +34,6 @@ def headline(
     hazards: pl.DataFrame,
     passages: pl.DataFrame,
     safety: SafetyConfig,
-    failure_limit_m: float,
 ) -> list[Figure]:
     """Figures of one solution; every table holds that solution's rows of all runs. `failed`: runs that could not be
     replayed with it.
@@ -42,8 +43,9 @@ def headline(
     runs = runs.filter(pl.col("status") != RunStatus.FAILED)
     return [
         *_extent(runs, failed),
-        *_hazard_figures(runs, hazards, safety),
-        *_balise_figures(with_judgement(passages, runs), failure_limit_m),
+        *_failure_figures(runs, safety),
+        *_hazard_figures(runs, hazards),
+        *_balise_figures(with_truth(passages, runs)),
         _false_alarms(runs),
     ]
 
@@ -67,70 +69,86 @@ def _extent(runs: pl.DataFrame, failed: int) -> list[Figure]:
     ]
 
 
-def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame, safety: SafetyConfig) -> list[Figure]:
-    """Rates count faults, not rows, over the hours in which there was evidence to see them by; what substantiates a
-    THR are hours with a truth alone (reference or balises).
+def _truth_hours(runs: pl.DataFrame) -> float:
+    return _total(runs.filter(pl.col("evidence").is_in(TRUTH)), "evidence_s") / 3600.0
+
+
+def _failure_figures(runs: pl.DataFrame, safety: SafetyConfig) -> list[Figure]:
+    """Failures against the budget; against a THR every one counts that is not shown to be within it, over the hours
+    judged by a reference or balise reads.
     """
-    seen = _total(runs.filter(pl.col("evidence").is_not_null()), "evidence_s") / 3600.0
-    hours = _total(runs.filter(pl.col("evidence").is_in(TRUTH)), "evidence_s") / 3600.0
-    faults = independent_episodes(hazards)
-    failures = faults.filter(pl.col("failed"))
-    missed = failures.filter(pl.col("missed")).height
-    judged = failures.filter(pl.col("with_truth"))
-    share = clopper_pearson(judged.filter(pl.col("missed")).height, judged.height)
-    upper = poisson_rate_upper(missed, hours)
-    needed = hours_still_needed(safety.thr_vb_per_h, missed, hours)
+    seen, hours = _total(runs, "evidence_s") / 3600.0, _truth_hours(runs)
+    failures, within, beyond = (
+        int(_total(runs, name)) for name in ("failures", "failures_within_budget", "failures_beyond_budget")
+    )
+    open_cases = failures - within
+    upper, needed = poisson_rate_upper(open_cases, hours), hours_still_needed(safety.thr_vb_per_h, open_cases, hours)
     claim = "" if upper is None else f"; one-sided 95 %: below {number(upper)} /h"
     return [
-        Figure("hours with evidence", f"{number(seen)} h", f"{number(hours)} h of these by reference or balises"),
+        Figure("hours judged", f"{number(seen)} h", f"{number(hours)} h of these by reference or balises"),
         Figure(
-            "faults that led to hazards",
-            f"{faults.height} in {hazards.height} rows",
-            _rate(poisson_rate(faults.height, seen)),
+            "position failures in use",
+            f"{failures}, {beyond} beyond the budget",
+            f"{within} within it, {open_cases - beyond} not known; those not within it per hour by reference or balises"
+            f" {_rate(poisson_rate(open_cases, hours))}{claim}",
         ),
         Figure(
-            "missed detections",
-            f"{missed} of {failures.height} with a failure",
-            f"of the {judged.height} judged by a truth {_share(share)}; against the hours by reference or balises"
-            f" {_rate(poisson_rate(missed, hours))}{claim}",
+            "longest hazardous time",
+            _seconds(runs["hazardous_max_s"].max()),
+            "judged wrong in use, from the epoch before",
         ),
         Figure(
             "to substantiate the THR of a VB",
             f"{needed:.3g} h more",
-            f"by reference or balises, without a further missed detection, for {safety.thr_vb_per_h:g} /h",
+            f"by reference or balises, without a further failure, for {safety.thr_vb_per_h:g} /h",
+        ),
+    ]
+
+
+def _hazard_figures(runs: pl.DataFrame, hazards: pl.DataFrame) -> list[Figure]:
+    """Faults, not rows; rate and share are of those that a reference or balise reads tell."""
+    faults = independent_episodes(hazards)
+    judged = faults.filter("with_truth")
+    known = judged.filter("failed")
+    share = clopper_pearson(int(known["missed"].sum()), known.height)
+    return [
+        Figure(
+            "faults that led to hazards",
+            f"{faults.height} in {hazards.height} rows",
+            f"{judged.height} by reference or balises: {_rate(poisson_rate(judged.height, _truth_hours(runs)))}",
+        ),
+        Figure(
+            "missed detections",
+            f"{faults['missed'].sum()} of {faults['failed'].sum()} with a failure",
+            f"of the {known.height} judged by a truth {_share(share)}",
         ),
         Figure(
             "longest time to detect",
             _seconds(hazards["time_to_detect_s"].max()),
             f"of the {hazards['detected'].sum()} hazards detected; {(~hazards['detected']).sum()} were not",
         ),
-        Figure(
-            "longest hazardous time",
-            _seconds(failures["hazardous_s"].max()),
-            f"from failure to negation; {failures['hazardous_s'].null_count()} failures were never negated",
-        ),
     ]
 
 
-def _balise_figures(passages: pl.DataFrame, failure_limit_m: float) -> list[Figure]:
+def _balise_figures(passages: pl.DataFrame) -> list[Figure]:
     virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
-    accepted = virtual.filter(pl.col("status") == PassageStatus.ACCEPTED)
-    passages_known = virtual.filter(is_passage())
-    through = passages_known.filter(pl.col("status") == PassageStatus.ACCEPTED)
-    judged = accepted.filter(pl.col("judged"))
-    seen = accepted.filter(pl.col("location_error_m").abs() > failure_limit_m).height
-    unsafe = judged.filter(pl.col("location_error_m").abs() > failure_limit_m).height
+    met = virtual.filter(is_passage())
+    through = met.filter(pl.col("status") == PassageStatus.ACCEPTED)
+    counts = virtual.select(condition.sum().alias(name) for name, condition in acceptances().items()).row(0, named=True)
+    judged, unsafe, seen, unproven = (
+        counts[name] for name in ("accepted_judged", "unsafe_judged", "unsafe_accepted", "unproven_accepted")
+    )
     return [
         Figure(
             "VBs accepted",
-            f"{through.height} of {passages_known.height} passages",
-            _share(clopper_pearson(through.height, passages_known.height)),
+            f"{through.height} of {met.height} passages",
+            _share(clopper_pearson(through.height, met.height)),
         ),
         Figure(
-            "accepted beyond the failure limit",
-            f"{unsafe} of {judged.height} judged by a truth",
-            f"{_share(clopper_pearson(unsafe, judged.height))}; {accepted.height - judged.height} more not judged by"
-            f" one, {seen - unsafe} of these beyond it by the odometer",
+            "accepted despite a wrong position",
+            f"{unsafe} of {judged} judged by a truth",
+            f"{_share(clopper_pearson(unsafe, judged))}; {seen - unsafe} more by the odometer alone; of {unproven}"
+            " accepted ones nothing says whether the position was right",
         ),
     ]
 
@@ -148,28 +166,28 @@ def _false_alarms(runs: pl.DataFrame) -> Figure:
 
 @dataclass(frozen=True)
 class LevelFigures:
-    """What the hazards with a failure come to against one service level's allowed T_D."""
+    """What the failures come to against one service level's allowed T_D; `share`: within it, judged by a truth."""
 
     level: str
     allowed_s: float
     within: int
-    late: int
-    never: int
+    exceeded: int
+    unknown: int
     share: Estimate
 
 
-def level_figures(hazards: pl.DataFrame, safety: SafetyConfig) -> list[LevelFigures]:
-    """Hazardous time of each fault with a failure against the allowed T_D of each service level (TVB eq. 7)."""
-    failures = independent_episodes(hazards).filter(pl.col("failed"))
-    negated = failures.filter(pl.col("hazardous_s").is_not_null())
+def level_figures(runs: pl.DataFrame, safety: SafetyConfig) -> list[LevelFigures]:
+    """Hazardous time of each failure against the allowed T_D of each service level (TVB eq. 7)."""
+    failures = failures_of(runs)
     rows = []
     for level in safety.service_levels:
         allowed_s = safety.allowed_time_to_detect_s(level)
-        within = negated.filter(pl.col("hazardous_s") <= allowed_s).height
-        never = failures.height - negated.height
-        judged = failures.filter(pl.col("with_truth"))
-        share = clopper_pearson(judged.filter(pl.col("hazardous_s") <= allowed_s).height, judged.height)
-        rows.append(LevelFigures(level, allowed_s, within, negated.height - within, never, share))
+        whole, judged = (
+            level_counts(part["hazardous_s"].to_list(), part["hazardous_may_s"].to_list(), allowed_s)
+            for part in (failures, failures.filter("by_truth"))
+        )
+        share = clopper_pearson(judged[0], sum(judged))
+        rows.append(LevelFigures(level, allowed_s, *whole, failures.height - sum(whole), share))
     return rows
 
 

@@ -10,15 +10,16 @@ from typing import Any
 import polars as pl
 
 from pipeline.campaign.outcome import worst
-from pipeline.figures.known_counts import known_counts
+from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.figures.verdict import head_of, run_verdicts, word_of
 from pipeline.report.architectures import architectures_section, map_section
 from pipeline.report.availability import availability_map
 from pipeline.report.campaign_figures import Figure, headline, level_figures, share_text
-from pipeline.report.markup import Cell, badge, cell, figure, link, number, page, pairs, section, table
+from pipeline.report.markup import Cell, badge, cell, figure, link, number, page, pairs, section, table, verdict_head
 from pipeline.report.packing import Json, script_json
 from pipeline.report.run_page import Made, hazard_hash
-from pipeline.safety.measured import failed_runs
-from schemas.enums import Hazard, RunStatus
+from pipeline.safety.measured import failed_runs, failures_of
+from schemas.enums import TRUTH, Hazard, RunStatus, RunVerdict
 
 Row = Mapping[str, Any]
 
@@ -39,11 +40,13 @@ class Campaign:
 
 
 _RUN_COLUMNS = (
+    ("share_unknown", "share unknown"),
     ("duration_s", "duration [s]"), ("distance_m", "distance [m]"), ("availability", "availability"),
     ("evidence", "evidence"), ("hazards", "hazards"), ("hazards_detected", "detected"),
     ("missed_detections", "missed detections"), ("time_to_detect_max_s", "T_D max [s]"),
     ("hazardous_max_s", "hazardous max [s]"), ("balises_accepted", "VBs accepted"),
     ("balises_on_path", "VBs passed"), ("unsafe_accepted", "unsafe accepted"),
+    ("unproven_accepted", "unproven accepted"), ("failures", "failures"), ("failures_within_budget", "within budget"),
     ("location_error_p95_m", "location error 95 % [m]"), ("along_error_p95_m", "error along 95 % [m]"),
     ("alarms", "alarms"), ("false_alarms", "false alarms"), ("exposure_max_s", "exposure max [s]"),
     ("outages", "outages"),
@@ -51,14 +54,14 @@ _RUN_COLUMNS = (
 _HAZARD_COLUMNS = (
     ("failure_mode", "ETCS failure"), ("size_m", "size [m]"), ("t_onset", "onset"), ("monitor", "detected by"),
     ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
-    ("within_budget", "within budget"), ("balise_ids", "VBs hit"), ("accepted_ids", "accepted all the same"),
-    ("suspect", "suspect"),
+    ("hazardous_may_s", "with what is unknown [s]"), ("within_budget", "within budget"), ("balise_ids", "VBs hit"),
+    ("accepted_ids", "accepted despite the fault"), ("suspect", "suspect"),
 )  # fmt: skip
 _PLOTS = (
-    ("classes", "Hazards by class", "Negated within the budget, too late, never; no failure: the error stayed "
-     "below the failure limit or a row that follows from another."),
-    ("detection", "Time to detect", "Share of all hazards detected, and of all failures negated, by then; vertical "
-     "lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never detected."),
+    ("classes", "Hazards by class", "Within the budget, beyond it, not known."),
+    ("detection", "Time to detect", "Share of all hazards detected by then, and of all failures in use no longer; "
+     "vertical lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never "
+     "detected."),
     ("location", "Location error at VBs", "Positive: offered early. Offers by what became of them."),
     ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; crosses are hazards."),
 )  # fmt: skip
@@ -82,7 +85,10 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
         ],
         "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
     }
-    heading = f"<h1>Campaign of {campaign.runs['run_id'].n_unique()} runs</h1>"
+    verdicts = run_verdicts(campaign.runs)
+    head = head_of(verdicts.values())
+    counts = ", ".join(f"{count} {name}" for name, count in head.counts().items())
+    heading = verdict_head(head.word, f"{counts}.") + f"<h1>Campaign of {len(verdicts)} runs</h1>"
     return page("Campaign · balise", heading, "\n".join(body), script_json(data), "assets", "campaign.js")
 
 
@@ -98,24 +104,27 @@ def _run_counts(runs: pl.DataFrame) -> str:
 
 
 def _runs_table(campaign: Campaign) -> str:
-    order = {status.value: place for place, status in enumerate((RunStatus.FAILED, RunStatus.PARTIAL, RunStatus.OK))}
+    order = {RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
+    failed = 1
     runs = (
         known_counts(campaign.runs)
         .with_columns(
-            hazards=pl.col("hazards_1a") + pl.col("hazards_1b") + pl.col("hazards_shift"),
-            order=pl.col("status").cast(pl.String).replace_strict(order, return_dtype=pl.Int64),
+            hazards=pl.sum_horizontal(HAZARD_COUNTS, ignore_nulls=False),
+            order=pl.col("verdict").cast(pl.String).replace_strict(order, default=failed, return_dtype=pl.Int64),
         )
         .sort("order", "run_id", "solution")
     )
     rows = []
     for row in runs.iter_rows(named=True):
         name = Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"]))
-        status = Cell(str(row["status"]), str(row["order"]), badge(str(row["status"])))
+        word = word_of(row["verdict"])
+        verdict = Cell(word, str(row["order"]), badge(word))
+        status = Cell(str(row["status"]), str(row["status"]), badge(str(row["status"])))
         reason = cell("; ".join(text for text in (row["error"], row["notes"]) if text) or None)
         figures = [cell(row[key]) for key, _ in _RUN_COLUMNS]
-        rows.append([name, status, reason, cell(row["solution"] or None), *figures])
-    titles = ["run", "status", "reason or notes", "solution", *(title for _, title in _RUN_COLUMNS)]
-    return table("table-runs", "Runs, failed ones first", titles, rows)
+        rows.append([verdict, name, status, reason, cell(row["solution"] or None), *figures])
+    titles = ["verdict", "run", "status", "reason or notes", "solution", *(title for _, title in _RUN_COLUMNS)]
+    return table("table-runs", "Runs, unsafe and failed ones first", titles, rows)
 
 
 def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool) -> str:
@@ -126,7 +135,6 @@ def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool
         hazards,
         _only(campaign.passages, name),
         made.config.safety,
-        made.config.hazards.failure_limit_m,
     )
     title = f"Solution {name}" if several else "Figures"
     note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
@@ -135,7 +143,7 @@ def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool
         title,
         _headline(figures),
         note,
-        _levels(key, hazards, made),
+        _levels(key, _only(campaign.runs, name), made),
         *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
         _hazards_table(key, hazards, campaign),
     )
@@ -149,27 +157,25 @@ def _headline(figures: list[Figure]) -> str:
     return f'<dl class="headline">{items}</dl>'
 
 
-def _levels(key: str, hazards: pl.DataFrame, made: Made) -> str:
+def _levels(key: str, runs: pl.DataFrame, made: Made) -> str:
     rows = [
         [
             cell(row.level),
             cell(row.allowed_s, 4),
-            *(cell(count) for count in (row.within, row.late, row.never)),
+            *(cell(count) for count in (row.within, row.exceeded, row.unknown)),
             cell(share_text(row.share)),
         ]
-        for row in level_figures(hazards, made.config.safety)
+        for row in level_figures(runs, made.config.safety)
     ]
     titles = [
         "service level",
         "allowed T_D [s]",
-        "negated within it",
-        "too late",
-        "never negated",
+        "within it",
+        "beyond it",
+        "not known",
         "share within it, by a truth",
     ]
-    return table(
-        f"table-levels-{key}", "Faults with a position failure against the allowed T_D (TVB eq. 7)", titles, rows
-    )
+    return table(f"table-levels-{key}", "Position failures in use against the allowed T_D (TVB eq. 7)", titles, rows)
 
 
 def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
@@ -188,22 +194,20 @@ def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
     return {
         "classes": [[kind.value, *_outcomes(hazards.filter(pl.col("hazard") == kind))] for kind in Hazard],
         "runs": runs.height,
-        "runs_with_truth": runs["evidence"].is_not_null().sum(),
+        "runs_with_truth": runs["evidence"].is_in(TRUTH).sum(),
         "hazards": hazards.height,
-        "failures": hazards["t_failure"].is_not_null().sum(),
+        "failures": int(runs["failures"].sum()),
         "time_to_detect_s": _sorted(hazards.filter(pl.col("detected"))["time_to_detect_s"]),
-        "hazardous_s": _sorted(hazards.filter(pl.col("t_negated").is_not_null())["hazardous_s"]),
+        "hazardous_s": _sorted(failures_of(runs)["hazardous_may_s"]),
         "location": _location(passages),
         "map": availability_map(_only(campaign.pieces, name), hazards, made.site),
     }
 
 
 def _outcomes(hazards: pl.DataFrame) -> list[int]:
-    """Within the budget, too late, never negated, no failure."""
-    failed = hazards.filter(pl.col("t_failure").is_not_null())
-    never = failed.filter(pl.col("t_negated").is_null()).height
-    within = failed.filter(pl.col("within_budget").fill_null(value=False)).height
-    return [within, failed.height - within - never, never, hazards.height - failed.height]
+    """Within the budget, beyond it, not known."""
+    within = hazards["within_budget"]
+    return [int((within == held).sum()) for held in (True, False)] + [within.null_count()]
 
 
 def _sorted(values: pl.Series) -> list[float]:

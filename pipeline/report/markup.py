@@ -98,6 +98,11 @@ def badge(status: str) -> str:
     return f'<span class="badge {escape(status)}">{escape(status)}</span>'
 
 
+def verdict_head(word: str, text: str) -> str:
+    """The verdict as the first words of a page, coloured by it."""
+    return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong> {escape(text)}</p>'
+
+
 def page(title: str, heading: str, body: str, data: str, assets: str, script: str) -> str:
     """A whole page. The policy forbids every request a script could make; styles and scripts lie beside it."""
     policy = "connect-src 'none'; font-src 'none'; frame-src 'none'; object-src 'none'; form-action 'none'"

@@ -13,6 +13,7 @@ const Plots = (() => {
     linked: [COLOUR.blue, "", ""], initialising: [COLOUR.sky, "", "."], odometry: [COLOUR.orange, "", "/"],
     fail_safe: [COLOUR.vermilion, "", "x"],
     TVB: [COLOUR.blue, "", ""], "no TVB": [COLOUR.orange, "", "/"],
+    right: [COLOUR.blue, "", ""], unknown: [COLOUR.grey, "", "-"], wrong: [COLOUR.vermilion, "", "x"],
     "no alarm": [COLOUR.pale, "", ""], alarm: [COLOUR.vermilion, "", "x"],
     pass: [COLOUR.blue, "", ""], not_evaluated: [COLOUR.pale, "", "-"], fail: [COLOUR.vermilion, "", "x"],
   };

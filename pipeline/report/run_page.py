@@ -11,6 +11,7 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.figures.known_counts import known_counts
+from pipeline.figures.verdict import word_of, worst_verdict
 from pipeline.report.architectures import architectures_section
 from pipeline.report.markup import (
     Cell,
@@ -22,11 +23,12 @@ from pipeline.report.markup import (
     pairs,
     section,
     table,
+    verdict_head,
 )
 from pipeline.report.packing import Json, script_json
 from pipeline.report.plan_view import plan_data
 from pipeline.report.run_columns import ALARM_COLUMNS, HAZARD_COLUMNS, PASSAGE_COLUMNS, PLOTS
-from pipeline.report.run_summary import figures, levels
+from pipeline.report.run_summary import figures, levels, verdict_reasons
 from pipeline.report.series import moments_of, reasons, time_data
 from pipeline.report.stanford import stanford_data
 from pipeline.safety.side_by_side import Key, side_by_side_table
@@ -66,8 +68,21 @@ def run_page(
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
     status = "".join(badge(status) for status in dict.fromkeys(str(row["status"]) for row in rows))
-    heading = f"<p>{link('../index.html', 'Campaign')}</p><h1>Run {escape(tables.run_id)} {status}</h1>"
+    title = f"<p>{link('../index.html', 'Campaign')}</p><h1>Run {escape(tables.run_id)} {status}</h1>"
+    heading = _verdict(rows, made.config) + title
     return page(f"{tables.run_id} · balise", heading, body, script_json(data), "../assets", "run.js")
+
+
+def _verdict(rows: Sequence[Row], config: Configuration) -> str:
+    """The worst verdict of the solutions, and what it follows from."""
+    limit = config.hazards.unknown_share_limit
+    reasons = [
+        f"{row['solution']}: {word_of(row['verdict'])}, {verdict_reasons(row, limit)}."
+        if row["verdict"] is not None
+        else f"{row['solution'] or 'run'}: failed."
+        for row in rows
+    ]
+    return verdict_head(word_of(worst_verdict(row["verdict"] for row in rows)), " ".join(reasons))
 
 
 def _limits(config: Configuration) -> Json:
@@ -178,10 +193,12 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
             return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
         if run["evidence"] not in TRUTH:
             return (
-                '<p class="notice partial">No hazard was found, but the odometer alone sees errors beyond its'
-                " confidence only, and none that a virtual balise accepted in the wrong place hides.</p>"
+                '<p class="notice partial">No hazard was found, but the odometer alone can only show that a position'
+                " was wrong, never that it was right.</p>"
             )
-        return f'<p class="none">No hazard was found; truth was taken from: {escape(str(run["evidence"]))}.</p>'
+        share = run["share_unknown"]
+        left = "; no position was in use" if share is None else f"; {share:.1%} of the moving time in use is not judged"
+        return f'<p class="none">No hazard was found; judged by: {escape(str(run["evidence"]))}{left}.</p>'
     rows = []
     for row in hazards.iter_rows(named=True):
         title = f"{row['hazard_id']} {row['hazard']}"

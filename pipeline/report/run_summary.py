@@ -34,6 +34,26 @@ def figures(row: Row) -> str:
     return pairs([*values, *rest])
 
 
+def verdict_reasons(row: Row, unknown_share_limit: float) -> str:
+    """Why the verdict is what it is: the counts that it follows from (DOMAIN section 5.4)."""
+    undecided = row["failures"] - row["failures_within_budget"] - row["failures_beyond_budget"]
+    share = row["share_unknown"]
+    reasons = [
+        (row["unsafe_accepted"], "{} VBs accepted despite a wrong position"),
+        (row["failures_beyond_budget"], "{} position failures in use beyond the budget"),
+        (row["unproven_accepted"], "{} VBs accepted of which nothing says whether the position was right"),
+        (undecided, "{} position failures of which nothing says whether they were within the budget"),
+    ]
+    said = [text.format(count) for count, text in reasons if count]
+    if share is None:
+        said.append("no position was in use while the train moved")
+    elif share > unknown_share_limit:
+        said.append(f"{share:.1%} of the moving time in use cannot be judged")
+    if not row["balises_accepted"]:
+        said.append("no VB was accepted")
+    return "; ".join(said) or "every acceptance was right, and every position failure within the budget"
+
+
 def _stanford(row: Row, prefix: str) -> str:
     """Counts of the along-track Stanford diagram in words."""
     counts = [(kind, row[f"{prefix}_{kind}"]) for kind in STANFORD]
@@ -44,10 +64,15 @@ def _stanford(row: Row, prefix: str) -> str:
 
 def levels(key: str, run: Row) -> str:
     """What the run would be worth at each service level (TVB eq. 7)."""
-    columns = ("service_levels", "level_allowed_s", "level_within", "level_verdict")
+    columns = ("service_levels", "level_allowed_s", "level_within", "level_exceeded", "level_verdict")
     rows = [
-        [cell(level), cell(allowed_s, 4), cell(f"{within} of {run['failures']}"), cell(verdict.replace("_", " "))]
-        for level, allowed_s, within, verdict in zip(*(run[name] or [] for name in columns), strict=True)
+        [
+            cell(level),
+            cell(allowed_s, 4),
+            *(cell(count) for count in (within, exceeded, run["failures"] - within - exceeded)),
+            cell(verdict.replace("_", " ")),
+        ]
+        for level, allowed_s, within, exceeded, verdict in zip(*(run[name] or [] for name in columns), strict=True)
     ]
-    titles = ["service level", "allowed T_D [s]", "failures negated within it", "verdict"]
+    titles = ["service level", "allowed T_D [s]", "failures within it", "beyond it", "not known", "verdict"]
     return table(f"table-levels-{key}", "Position failures against the allowed T_D (TVB eq. 7)", titles, rows)

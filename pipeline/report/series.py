@@ -11,7 +11,7 @@ from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
 from pipeline.report.decimate import Band, band, detail_rows, kept_rows
 from pipeline.report.packing import Json, packed
 from schemas.arrays import Bools, Floats, Ints
-from schemas.enums import LdsMode, LdsState, MonitorState
+from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
 from schemas.tables import MONITORS
 
 SERIES = (
@@ -105,9 +105,11 @@ def _states(epochs: pl.DataFrame) -> list[tuple[str, str, Sequence[str], Ints]]:
     """Name, group and states from harmless to bad, and the code of each epoch."""
     modes = (NO_EPOCH, LdsMode.LINKED, LdsMode.INITIALISING, LdsMode.ODOMETRY, LdsMode.FAIL_SAFE)
     states = (NO_EPOCH, LdsState.P0, UNKNOWN, LdsState.P3, LdsState.P2, LdsState.P1)
+    judgements = (NO_EPOCH, Judgement.RIGHT, Judgement.UNKNOWN, Judgement.WRONG)
     rows: list[tuple[str, str, Sequence[str], Ints]] = [
         ("LDS mode", "lds", modes, _codes(epochs["lds_mode"], modes)),
         ("LDS state", "lds", states, _codes(epochs["lds_state"], states)),
+        ("judgement", "lds", judgements, _codes(epochs["judgement"], judgements)),
         ("TVB", "lds", (NO_EPOCH, "TVB", "no TVB"), 2 - epochs["tvb"].cast(pl.Int64).to_numpy()),
         ("alarm", "lds", (NO_EPOCH, "no alarm", "alarm"), 1 + epochs["alarm"].cast(pl.Int64).to_numpy()),
     ]

@@ -14,7 +14,7 @@ import polars as pl
 
 from pipeline.campaign.plan import software_digest
 from pipeline.campaign.workers import each
-from pipeline.hazards.map_errors import map_places
+from pipeline.figures.map_errors import map_places
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, run_page

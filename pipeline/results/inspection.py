@@ -8,7 +8,8 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from pipeline.figures.known_counts import known_counts
+from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.results import store
 from pipeline.site.describe import describe_site
@@ -23,9 +24,10 @@ from schemas.run import STREAMS, Finding
 
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
-    *("run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability", "evidence"),
-    *("balises_on_path", "balises_accepted", "unsafe_accepted", "hazards_1a", "hazards_1b", "hazards_shift"),
-    *("missed_detections", "alarms", "false_alarms", "error"),
+    *("verdict", "run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability"),
+    *("evidence", "vehicle", "share_unknown", "balises_on_path", "balises_accepted", "unsafe_accepted"),
+    *("unproven_accepted", "failures", "failures_within_budget", *HAZARD_COUNTS, "missed_detections"),
+    *("alarms", "false_alarms", "error"),
 )
 
 
@@ -106,8 +108,10 @@ def inspect_site(path: Address, result: Address | None = None) -> dict[str, pl.D
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:
-    """The runs of a result in their main figures; null what nobody could count."""
-    return {"Runs": known_counts(store.read_table(path, "runs").select(_RUN_COLUMNS).collect())}
+    """The verdict of a result, and its runs in their main figures; null what nobody could count."""
+    runs = store.read_table(path, "runs").select(_RUN_COLUMNS).collect()
+    head = head_of(run_verdicts(runs).values())
+    return {"Verdict": _figures({"verdict": head.word, **head.counts()}), "Runs": known_counts(runs)}
 
 
 def _figures(figures: Mapping[str, object]) -> pl.DataFrame:

@@ -7,10 +7,16 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.figures.derived_tables import derived_tables
-from pipeline.hazards.map_errors import map_suspects
+from pipeline.figures.map_errors import map_suspects
 from pipeline.results import catalogue, store
 from pipeline.results.terminal import tall
-from pipeline.safety.sentences import level_statements, plain_statements, reservations, slow_receivers
+from pipeline.safety.sentences import (
+    level_statements,
+    plain_statements,
+    reservations,
+    slow_receivers,
+    verdict_statement,
+)
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
 from pipeline.safety.tally import Tally
 from pipeline.storage.address import Address
@@ -20,7 +26,7 @@ from schemas.enums import TRUTH, RunStatus, ThrVerdict
 
 @dataclass(frozen=True)
 class Assessment:
-    """`statements` in words; `tables` by name."""
+    """`statements` in words, the verdict first; `tables` by name."""
 
     statements: list[str]
     tables: dict[str, pl.DataFrame]
@@ -52,6 +58,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         "map": derived["map"],
     }
     said = [
+        verdict_statement(runs),
         *reservations(runs, alarms),
         *slow_receivers(derived["levels"]),
         *plain_statements(derived["figures"]),
@@ -130,13 +137,14 @@ def alarm_causes(alarms: pl.DataFrame) -> pl.DataFrame:
 
 _SHORT = {
     "time_to_detect": (
-        *("solution", "service_level", "allowed_s", "failures", "within", "failures_judged", "within_judged"),
-        *("within_share_low", "within_share_high"),
-        *("never_negated", "hazardous_median_s", "hazardous_p95_s", "hazardous_max_s"),
+        *("solution", "service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged"),
+        *("within_judged", "within_share_low", "within_share_high"),
+        *("hazardous_median_s", "hazardous_p95_s", "hazardous_max_s", "hazardous_may_max_s"),
         *("time_to_detect_median_s", "time_to_detect_p95_s", "time_to_detect_max_s"),
     ),
     "accuracy": (
-        *("solution", "grouped_by", "group", "accepted_judged", "location_error_mean_m", "location_error_sigma_m"),
+        *("solution", "grouped_by", "group", "location_error_count", "location_error_mean_m"),
+        "location_error_sigma_m",
         *("location_error_p95_m", "location_error_max_m", "location_accuracy_m", "within_location_accuracy_share_low"),
         *("within_location_accuracy", "within_ci_limit"),
     ),

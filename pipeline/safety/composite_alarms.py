@@ -7,57 +7,68 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.epochs.timeline import nominal_period_s
-from pipeline.hazards.fails import AlarmSpan
+from pipeline.epochs.failure_log import AlarmEpisode
 from schemas.arrays import NS_PER_S
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
 
-# Streams rarely begin and end with the same epoch: so little without truth says nothing against it.
-_BLIND_S = 1.0
-
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two solutions: epochs, faults (`begin, end` [ns]), alarms, and whether a reference gives the truth."""
+    """One of the two solutions: epochs, faults (`begin, end` [ns]), alarms; `with_truth`: by reference or reads."""
 
     epochs: pl.DataFrame
     faults: pl.DataFrame
     alarms: pl.DataFrame
-    by_reference: bool
+    with_truth: bool
 
 
-def verdicts_of(spans: Sequence[AlarmSpan], sides: tuple[Side, Side], config: HazardConfig) -> list[Verdict]:
-    """True where a solution was wrong, false where both were right all along, unknown where the truth does not say."""
-    return [_verdict(span, sides, config) for span in spans]
+def verdicts_of(alarms: Sequence[AlarmEpisode], sides: tuple[Side, Side], config: HazardConfig) -> list[Verdict]:
+    """True where a solution was wrong, false where both were right all along, unknown where the evidence does not say.
+
+    The rule of the `alarms` table (DOMAIN section 5.3), asked of both solutions.
+    """
+    return [_verdict(alarm, sides, config) for alarm in alarms]
 
 
-def _verdict(span: AlarmSpan, sides: tuple[Side, Side], config: HazardConfig) -> Verdict:
-    found = [_of_side(span, side, config) for side in sides]
+def _verdict(alarm: AlarmEpisode, sides: tuple[Side, Side], config: HazardConfig) -> Verdict:
+    found = [_of_side(alarm, side, config) for side in sides]
     if Verdict.TRUE in found:
         return Verdict.TRUE
     return Verdict.UNKNOWN if Verdict.UNKNOWN in found else Verdict.FALSE
 
 
-def _of_side(span: AlarmSpan, side: Side, config: HazardConfig) -> Verdict:
-    if _known_wrong(span, side):
+def _of_side(alarm: AlarmEpisode, side: Side, config: HazardConfig) -> Verdict:
+    if _known_wrong(alarm, side):
         return Verdict.TRUE
-    since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
-    part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, span.end_ns))
-    positioned = part.filter(pl.col("path_m").is_not_null())
-    error, sigma = pl.col("error_along_m").abs(), pl.col("sigma_along_m").fill_null(0.0)
-    beyond = positioned.filter(error >= pl.max_horizontal(pl.lit(config.false_alarm_margin_m), 3.0 * sigma)).height
-    if beyond:
-        # What the odometer or balise reads carry has a doubt of its own, which the tables do not hold.
-        return Verdict.TRUE if side.by_reference else Verdict.UNKNOWN
-    period_s = nominal_period_s(side.epochs["t"].to_physical().to_numpy()) or 0.0
-    blind = positioned["error_along_m"].null_count() * period_s > _BLIND_S
-    return Verdict.UNKNOWN if blind or not positioned["error_along_m"].count() else Verdict.FALSE
+    since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
+    part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, alarm.end_ns))
+    found = part.filter(pl.col("path_m").is_not_null()).select(beyond=_beyond(config), below=_below(config))
+    if found["beyond"].any():
+        return Verdict.TRUE
+    silent = side.with_truth and found.height and found["below"].fill_null(value=False).all()
+    return Verdict.FALSE if silent else Verdict.UNKNOWN
 
 
-def _known_wrong(span: AlarmSpan, side: Side) -> bool:
+def _margin_m(config: HazardConfig) -> pl.Expr:
+    """Error that makes an alarm true [m] (DOMAIN section 5.3)."""
+    sigmas = (config.evidence_factor * pl.col("sigma_along_m").fill_null(0.0)).clip(upper_bound=config.failure_limit_m)
+    return pl.max_horizontal(pl.lit(config.false_alarm_margin_m), sigmas)
+
+
+def _beyond(config: HazardConfig) -> pl.Expr:
+    """The whole interval is beyond the margin on one side."""
+    return (pl.col("error_low_m") > _margin_m(config)) | (pl.col("error_high_m") < -_margin_m(config))
+
+
+def _below(config: HazardConfig) -> pl.Expr:
+    """The whole interval is within the margin."""
+    return (pl.col("error_low_m") >= -_margin_m(config)) & (pl.col("error_high_m") <= _margin_m(config))
+
+
+def _known_wrong(alarm: AlarmEpisode, side: Side) -> bool:
     """The replay found a fault at that time, or called an alarm then true."""
-    fault = (pl.col("begin") <= span.end_ns) & (pl.col("end").is_null() | (pl.col("end") >= span.start_ns))
-    alarm = (pl.col("t_start").to_physical() <= span.end_ns) & (pl.col("t_end").to_physical() >= span.start_ns)
-    true = side.alarms.filter(pl.col("verdict").cast(pl.String) == Verdict.TRUE.value).filter(alarm)
+    fault = (pl.col("begin") <= alarm.end_ns) & (pl.col("end").is_null() | (pl.col("end") >= alarm.start_ns))
+    meets = (pl.col("t_start").to_physical() <= alarm.end_ns) & (pl.col("t_end").to_physical() >= alarm.start_ns)
+    true = side.alarms.filter(pl.col("verdict").cast(pl.String) == Verdict.TRUE.value).filter(meets)
     return side.faults.filter(fault).height > 0 or true.height > 0

@@ -15,17 +15,22 @@ from pipeline.figures.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.hazards.independent import independent_episodes
+from pipeline.figures.independent import independent_episodes
+from pipeline.figures.levels import level_counts
 from pipeline.safety.tally import columns_of, continuity_columns
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
 from schemas.conform import conform, dtypes
-from schemas.enums import TRUTH, RunStatus
+from schemas.enums import TRUTH, RunStatus, RunVerdict
 
 Row = dict[str, object]
 
 _STATES = ("p0", "p1", "p2", "p3")
 _ROUNDING = 1e-9
+_SUMMED = (
+    *("failures", "failures_within_budget", "failures_beyond_budget", "unsafe_accepted", "unproven_accepted"),
+    *("outages", "trusted_losses"),
+)
 
 
 def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
@@ -35,10 +40,9 @@ def _table(rows: list[Row], contract: type[dy.Schema]) -> pl.DataFrame:
 def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
     """One row per solution over all runs: rates with exact two-sided 95 % bounds.
 
-    Takes the `runs` and `hazards` tables of the campaign with their `run_id`. Each fault counts once,
-    per hour with any evidence; missed detections are judged by the budget in their own rows. A THR is
-    substantiated by hours with a truth only (reference or balises): what the odometer alone lets see
-    has to exceed its confidence first.
+    Takes the `runs` and `hazards` tables of the campaign with their `run_id`. Rates and shares are of what a
+    reference or balise reads tell: the odometer alone can show that a position was wrong, never that it was right.
+    Against a THR every failure counts that is not shown to be within the budget.
     """
     done = runs.filter(pl.col("status") != RunStatus.FAILED)
     episodes = independent_episodes(hazards)
@@ -60,6 +64,7 @@ def failed_runs(runs: pl.DataFrame, solution: str) -> int:
 def _sums() -> Iterator[pl.Expr]:
     """What is added up over the runs of one solution; times in seconds."""
     evidence, evidence_s = pl.col("evidence"), pl.col("evidence_s").fill_null(0.0)
+    truth = evidence.is_in(TRUTH).fill_null(value=False)
     judged = pl.col("false_alarm_rate_per_h").is_not_null()
     yield pl.col("duration_s").fill_null(0.0).sum()
     yield evidence_s.filter(evidence.is_not_null()).sum().alias("seen_s")
@@ -67,10 +72,11 @@ def _sums() -> Iterator[pl.Expr]:
     yield pl.col("judged_s").fill_null(0.0).filter(judged).sum()
     yield pl.col("false_alarms").filter(judged).sum()
     yield (pl.col("status") == RunStatus.PARTIAL).sum().alias("runs_partial")
-    yield pl.col("unsafe_accepted").filter(evidence.is_in(TRUTH)).sum().alias("unsafe_judged")
-    yield pl.col(
-        "balises_accepted", "accepted_judged", "unsafe_accepted", "outages", "trusted_s", "trusted_losses"
-    ).sum()
+    for verdict in RunVerdict:
+        yield (pl.col("verdict") == verdict).sum().alias(f"runs_{verdict.value}")
+    for name in ("unsafe_accepted", "accepted_judged", "failures_within_budget", "failures_beyond_budget"):
+        yield pl.col(name).filter(truth).sum().name.suffix("_by_truth")
+    yield pl.col(*_SUMMED, "balises_accepted", "trusted_s").sum()
     yield pl.col(f"stanford_{kind}" for kind in STANFORD).filter(evidence.is_in(TRUTH)).sum()
     for kind in STANFORD:  # null where no such run has a protection level
         counts = pl.col(f"stanford_hpl_{kind}").filter(evidence.is_in(TRUTH))
@@ -100,76 +106,121 @@ def _shares(runs: pl.DataFrame) -> Row:
 def _figures(runs: pl.DataFrame, episodes: pl.DataFrame, thr_vb_per_h: float) -> Row:
     sums = runs.select(_sums()).row(0, named=True)
     hours, seen, truth, judged = (sums[f"{name}_s"] / 3600.0 for name in ("duration", "seen", "truth", "judged"))
-    failures, missed = int(episodes["failed"].sum()), int(episodes["missed"].sum())
-    judged_failures = episodes.filter(pl.col("failed") & pl.col("with_truth"))
-    missed_judged = int(judged_failures["missed"].sum())
-    same = ("runs_partial", "accepted_judged", "unsafe_judged", "unsafe_accepted", "outages", "trusted_losses")
+    same = (*_SUMMED, "runs_partial", *(f"runs_{verdict.value}" for verdict in RunVerdict), "false_alarms")
     return {
-        **{name: sums[name] for name in (*same, "false_alarms")},
+        **{name: sums[name] for name in same},
         "runs": runs.height,
         "hours": hours,
         "hours_with_evidence": seen,
         "hours_with_truth": truth,
-        "hazards": episodes.height,
-        **columns_of("hazard_rate", poisson_rate(episodes.height, seen), "_per_h"),
-        "failures": failures,
-        "missed": missed,
-        "failures_judged": judged_failures.height,
-        "missed_judged": missed_judged,
-        **columns_of("missed_share", clopper_pearson(missed_judged, judged_failures.height)),
-        "missed_rate_upper_per_h": poisson_rate_upper(missed, truth),
+        **_detections(episodes, truth),
+        **_against_budget(sums, truth, thr_vb_per_h),
         "hours_judged": judged,
         **columns_of("false_alarm_rate", poisson_rate(sums["false_alarms"], judged), "_per_h"),
         "accepted": sums["balises_accepted"],
-        **columns_of("unsafe_share", clopper_pearson(sums["unsafe_judged"], sums["accepted_judged"])),
+        "accepted_judged": sums["accepted_judged_by_truth"],
+        "unsafe_judged": sums["unsafe_accepted_by_truth"],
+        **columns_of(
+            "unsafe_share", clopper_pearson(sums["unsafe_accepted_by_truth"], sums["accepted_judged_by_truth"])
+        ),
         **columns_of("outage_rate", poisson_rate(sums["outages"], hours), "_per_h"),
         **continuity_columns(Uptime(sums["trusted_s"], sums["trusted_losses"])),
         **_shares(runs),
         **{name: count for name, count in sums.items() if name.startswith("stanford_")},
-        "thr_vb_per_h": thr_vb_per_h,
-        "hours_needed": hours_to_substantiate(thr_vb_per_h, missed),
-        "hours_still_needed": hours_still_needed(thr_vb_per_h, missed, truth),
     }
 
 
-def detection_by_level(hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
-    """Measured T_D and hazardous time against the allowed T_D of every service level (TVB eq. 7).
+def _detections(episodes: pl.DataFrame, truth_h: float) -> Row:
+    """Faults and missed detections; rate and share by a reference or balise reads."""
+    judged = episodes.filter(pl.col("with_truth"))
+    known = judged.filter("failed")
+    missed = int(known["missed"].sum())
+    return {
+        "hazards": episodes.height,
+        "hazards_judged": judged.height,
+        **columns_of("hazard_rate", poisson_rate(judged.height, truth_h), "_per_h"),
+        "missed": int(episodes["missed"].sum()),
+        "missed_known": known.height,
+        "missed_judged": missed,
+        **columns_of("missed_share", clopper_pearson(missed, known.height)),
+    }
 
-    Eq. 7 limits how long a hazardous position may stand, so `within` compares the hazardous time;
-    the quantiles leave out what was never negated or detected, which is counted beside them.
+
+def _against_budget(sums: Row, truth_h: float, thr_vb_per_h: float) -> Row:
+    """Failures against the budget, and against the THR those that are not shown to be within it."""
+    failures, within, by_truth, beyond = (
+        int(str(sums[name]))
+        for name in (
+            *("failures", "failures_within_budget", "failures_within_budget_by_truth"),
+            "failures_beyond_budget_by_truth",
+        )
+    )
+    return {
+        "failures_judged": by_truth + beyond,
+        "beyond_budget_judged": beyond,
+        **columns_of("beyond_budget_share", clopper_pearson(beyond, by_truth + beyond)),
+        "beyond_budget_rate_upper_per_h": poisson_rate_upper(failures - within, truth_h),
+        "thr_vb_per_h": thr_vb_per_h,
+        "hours_needed": hours_to_substantiate(thr_vb_per_h, failures - within),
+        "hours_still_needed": hours_still_needed(thr_vb_per_h, failures - within, truth_h),
+    }
+
+
+def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyConfig) -> pl.DataFrame:
+    """Hazardous time of every failure, and T_D of the faults, against the allowed T_D of each level (TVB eq. 7).
+
+    Eq. 7 limits how long a hazardous position may be in use, so the hazardous time is compared. The quantiles of T_D
+    leave out faults that were not detected.
     """
+    failures = failures_of(runs)
     episodes = independent_episodes(hazards)
-    parts = episodes.partition_by("solution", as_dict=True)
-    rows = [row for (solution,) in sorted(parts) for row in _by_level(parts[(solution,)], str(solution), config)]
+    solutions = sorted({*failures["solution"].to_list(), *episodes["solution"].to_list()})
+    rows = [
+        row
+        for name in solutions
+        for row in _by_level(name, failures.filter(solution=name), episodes.filter(solution=name), config)
+    ]
     return _table(rows, CampaignDetection)
 
 
-def _by_level(episodes: pl.DataFrame, solution: str, config: SafetyConfig) -> list[Row]:
-    hazardous_s = episodes["hazardous_s"].filter(episodes["failed"])
+def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
+    """One row per failure of all runs: `run_id, solution, by_truth, hazardous_s, hazardous_may_s`."""
+    by_truth = pl.col("evidence").is_in(TRUTH).fill_null(value=False)
+    listed = runs.filter(pl.col("failures") > 0).select(
+        "run_id",
+        "solution",
+        by_truth=by_truth,
+        hazardous_s="failure_hazardous_s",
+        hazardous_may_s="failure_hazardous_may_s",
+    )
+    return listed.explode("hazardous_s", "hazardous_may_s")
+
+
+def _by_level(solution: str, failures: pl.DataFrame, episodes: pl.DataFrame, config: SafetyConfig) -> list[Row]:
     same = {
         "solution": solution,
-        "failures": hazardous_s.len(),
-        "never_negated": hazardous_s.null_count(),
-        **_quantiles(hazardous_s, "hazardous"),
+        "failures": failures.height,
+        **_quantiles(failures["hazardous_s"], "hazardous"),
+        "hazardous_may_max_s": failures["hazardous_may_s"].max(),
         "detected": episodes["time_to_detect_s"].count(),
         **_quantiles(episodes["time_to_detect_s"], "time_to_detect"),
     }
-    return [
-        same | _against(episodes.filter("failed"), level, config.allowed_time_to_detect_s(level))
-        for level in config.service_levels
-    ]
+    return [same | _against(failures, level, config.allowed_time_to_detect_s(level)) for level in config.service_levels]
 
 
 def _against(failures: pl.DataFrame, level: str, allowed_s: float) -> Row:
-    judged = failures.filter("with_truth")
-    within, within_judged = (int((part["hazardous_s"] <= allowed_s).sum()) for part in (failures, judged))
+    whole, judged = (
+        level_counts(part["hazardous_s"].to_list(), part["hazardous_may_s"].to_list(), allowed_s)
+        for part in (failures, failures.filter("by_truth"))
+    )
     return {
         "service_level": level,
         "allowed_s": allowed_s,
-        "within": within,
-        "failures_judged": judged.height,
-        "within_judged": within_judged,
-        **columns_of("within_share", clopper_pearson(within_judged, judged.height)),
+        "within": whole[0],
+        "exceeded": whole[1],
+        "failures_judged": sum(judged),
+        "within_judged": judged[0],
+        **columns_of("within_share", clopper_pearson(judged[0], sum(judged))),
     }
 
 

@@ -6,11 +6,17 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.figures.verdict import head_of, run_verdicts
 from schemas.enums import RunStatus, Verdict
 
 Row = dict[str, object]
 
 _WORTH_SAYING_S = 1.0
+
+
+def verdict_statement(runs: pl.DataFrame) -> str:
+    """The verdict of the campaign with its counts: the first words of what is said."""
+    return f"{head_of(run_verdicts(runs).values())}."
 
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
@@ -52,8 +58,9 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
         if held_s - seen_s >= _WORTH_SAYING_S:
             without = rows["evidence"].null_count()
             said.append(
-                f"{solution}: for {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the error is not known"
-                f" ({without} of {rows.height} runs have no evidence at all): no rate of hazards counts this time."
+                f"{solution}: for {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h nothing says whether the"
+                f" position was right ({without} of {rows.height} runs have no evidence at all): no rate counts this"
+                " time."
             )
         open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
         if open_cases.height:
@@ -79,18 +86,19 @@ def slow_receivers(levels: pl.DataFrame) -> list[str]:
 
 
 def level_statements(detection: pl.DataFrame) -> list[str]:
-    """Per solution: how many failures were negated in the time that each service level allows."""
+    """Per solution: how many failures were in use no longer than each service level allows."""
     said = []
     for (solution,), rows in detection.filter(pl.col("failures") > 0).group_by("solution", maintain_order=True):
-        levels = [
-            f"{row['within']} within {row['allowed_s']:.4g} s ({row['service_level']}{_within_bounds(row)})"
-            for row in rows.iter_rows(named=True)
-        ]
-        failures, never = rows["failures"][0], rows["never_negated"][0]
-        said.append(
-            f"{solution}: of {failures} position failures {never} were never negated; " + ", ".join(levels) + "."
-        )
+        levels = [_level(row) for row in rows.iter_rows(named=True)]
+        said.append(f"{solution}: of {rows['failures'][0]} position failures in use " + ", ".join(levels) + ".")
     return said
+
+
+def _level(row: dict[str, Any]) -> str:
+    unknown = row["failures"] - row["within"] - row["exceeded"]
+    beside = f" and {unknown} unknown" if unknown else ""
+    level = f"{row['allowed_s']:.4g} s ({row['service_level']}{_within_bounds(row)})"
+    return f"{row['within']} within{beside} against {level}"
 
 
 def _within_bounds(row: dict[str, Any]) -> str:
@@ -106,43 +114,43 @@ def plain_statements(figures: pl.DataFrame) -> list[str]:
     return [_statement(row) for row in figures.iter_rows(named=True)]
 
 
-def _statement(row: Row) -> str:
+def _statement(row: dict[str, Any]) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
-    head = (
-        f"{row['solution']}: {row['missed']} missed detections of {row['failures']} position failures"
-        f" at virtual balises in {row['hours_with_evidence']:.6g} h with evidence, {row['hours_with_truth']:.6g} h of"
-        f" these with a truth (reference or balise reads).{_by_odometer(row)} {_acceptances(row)}"
-    )
+    head = " ".join([_failures(row), _missed(row), _acceptances(row)])
     if row["share_p1"]:
-        head += (
-            f" Beyond the failure limit and not negated, at a balise or not: {row['share_p1']:.3%} of the time in runs"
-            " with a truth."
-        )
+        head += f" Judged wrong and not negated: {row['share_p1']:.3%} of the time in runs with a truth."
     if row["hours_still_needed"] == 0.0:
         return f"{head} This substantiates a {claim}."
     return (
         f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with a truth and no"
-        f" further miss, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
+        f" further failure, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
     )
 
 
-def _by_odometer(row: Row) -> str:
-    failures, missed = (int(str(row[name])) - int(str(row[f"{name}_judged"])) for name in ("failures", "missed"))
-    if not failures:
-        return ""
+def _failures(row: dict[str, Any]) -> str:
+    within, beyond = row["failures_within_budget"], row["failures_beyond_budget"]
+    unknown = row["failures"] - within - beyond
+    beside = f", of {unknown} it cannot be said" if unknown else ""
     return (
-        f" {failures} of these failures, {missed} of them missed, were seen by the odometer alone, which hardly sees"
-        " what no monitor did: shares leave them out."
+        f"{row['solution']}: of {row['failures']} position failures in use, at a virtual balise or not, {within} were"
+        f" within the budget and {beyond} beyond it{beside}, in {row['hours_with_evidence']:.6g} h judged,"
+        f" {row['hours_with_truth']:.6g} h of these by a truth (reference or balise reads)."
     )
 
 
-def _acceptances(row: Row) -> str:
-    accepted, judged, unsafe, seen = (
-        int(str(row[name])) for name in ("accepted", "accepted_judged", "unsafe_judged", "unsafe_accepted")
-    )
-    said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} lay beyond the failure limit"
-    if accepted > judged:
-        said += f"; {accepted - judged} more were not judged by one"
+def _missed(row: dict[str, Any]) -> str:
+    known, missed = row["missed_known"], row["missed_judged"]
+    said = f"Of {known} faults with a failure that a truth judged {missed} were missed detections"
+    if row["missed"] > missed:
+        said += f"; {row['missed'] - missed} more were seen by the odometer alone, and shares leave them out"
+    return f"{said}."
+
+
+def _acceptances(row: dict[str, Any]) -> str:
+    judged, unsafe, seen = row["accepted_judged"], row["unsafe_judged"], row["unsafe_accepted"]
+    said = f"Of {judged} accepted virtual balises judged by a truth {unsafe} were accepted despite a wrong position"
     if seen > unsafe:
-        said += f", and {seen - unsafe} of these lay beyond it by the odometer"
+        said += f", and {seen - unsafe} more by the odometer alone"
+    if row["unproven_accepted"]:
+        said += f"; of {row['unproven_accepted']} accepted ones nothing says whether the position was right"
     return f"{said}."

@@ -13,16 +13,17 @@ from itertools import permutations
 import polars as pl
 
 from pipeline.epochs.clock import Clock, flags, trusted
+from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import held_s, uptime
 from pipeline.figures.bounds import threshold_factor
-from pipeline.hazards.fails import Fails, fails_of
+from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Side, verdicts_of
 from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
 from schemas.arrays import Bools
 from schemas.config import Configuration
-from schemas.enums import TRUTH, Evidence, MonitorState, RunStatus, Verdict
+from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
 
 COMPARISON = "channel"
@@ -31,7 +32,7 @@ _DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
 _ALONG = tuple(f"along_{scale}" for scale in SCALES)
 EPOCH_COLUMNS = (
     *("t", "solution", "netelement_id", "measure_m", "path_m", "on_track", "gate_probability", "confidence_m"),
-    *("sigma_along_m", "error_along_m"),
+    *("sigma_along_m", "error_low_m", "error_high_m", "judgement"),
     *(f"{name}_{part}" for name in _DIAGNOSIS for part in ("state", "value", "threshold")),
 )
 """Columns of the epochs that the comparison takes."""
@@ -45,7 +46,7 @@ class _Channel:
     """Epochs under one kind of diagnosis: its fails, where it judged, and where it worked."""
 
     clock: Clock
-    fails: Fails
+    fails: FailureLog
     judged: Bools
     working: Bools
     known: Bools
@@ -59,12 +60,11 @@ class _Solution:
     epochs: pl.DataFrame
     faults: pl.DataFrame
     alarms: pl.DataFrame
-    by_reference: bool
     with_truth: bool
 
     @property
     def side(self) -> Side:
-        return Side(self.epochs, self.faults, self.alarms, self.by_reference)
+        return Side(self.epochs, self.faults, self.alarms, self.with_truth)
 
 
 def side_by_side(
@@ -83,7 +83,7 @@ def side_by_side(
     for name, channel in channels.items():
         one = solutions[name]
         verdicts = _verdicts_in_table(channel.fails, one.alarms)
-        found[name, REACTIVE, None] = _tally(channel, _faults(one.faults, None, channel, config), verdicts)
+        found[name, REACTIVE, None] = _tally(channel, _faults(one.faults, None, channel), verdicts)
     for name, other in permutations(names, 2):
         found[name, COMPOSITE, other] = _composite(solutions[name], solutions[other], config)
         if name < other:
@@ -131,8 +131,7 @@ def _solution(
         epochs=epochs.filter(own).sort("t"),
         faults=_one_per_fault(hazards.filter(own)),
         alarms=alarms.filter(own),
-        by_reference=evidence == [Evidence.REFERENCE.value],
-        with_truth=evidence in ([Evidence.REFERENCE.value], [Evidence.BALISE.value]),
+        with_truth=len(evidence) == 1 and evidence[0] in TRUTH,
     )
 
 
@@ -173,7 +172,7 @@ def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally
     trust = pl.col("own_trusted") & pl.col("other_trusted")
     channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
     verdicts = verdicts_of(channel.fails.alarms, (one.side, other.side), config.hazards)
-    return _tally(channel, _faults(one.faults, other.faults, channel, config), verdicts)
+    return _tally(channel, _faults(one.faults, other.faults, channel), verdicts)
 
 
 def _channel(
@@ -186,15 +185,15 @@ def _channel(
 ) -> _Channel:
     """`epochs`: those of the solution, with the columns that `monitors`, `judged` and `position` take."""
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
-    fails = fails_of(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
+    fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
     seen = flags(epochs, judged)
     working = seen & flags(epochs, position)
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
-    known = flags(one.epochs, pl.col("error_along_m").is_not_null() & pl.lit(one.with_truth))
-    wrong = known & flags(one.epochs, pl.col("error_along_m").abs() > config.hazards.failure_limit_m)
+    known = flags(one.epochs, judged_epoch() & pl.lit(one.with_truth))
+    wrong = known & flags(one.epochs, pl.col("judgement") == Judgement.WRONG)
     return _Channel(clock, fails, seen, working, known, wrong)
 
 
@@ -227,7 +226,7 @@ def _redundant(one: _Channel, other: _Channel) -> Working:
     return Working(whole_s, min(up.up_s, whole_s), up.up_s, up.losses)
 
 
-def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel, config: Configuration) -> Faults:
+def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Faults:
     """`others`: faults of the other solution, so that common ones can be told apart."""
     hazards = failures = missed = common = common_missed = judged = missed_judged = 0
     delays: list[float] = []
@@ -235,7 +234,7 @@ def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel
     for begin, failure, end, budget_s, with_truth in faults.select(columns).iter_rows():
         last = int(channel.clock.t_ns[-1]) if end is None else end
         detected = _detected_ns(channel.fails, begin, last)
-        late = failure is not None and _is_late(detected, failure, budget_s, channel, config)
+        late = failure is not None and _is_late(detected, failure, budget_s)
         shared = failure is not None and others is not None and _overlaps(others, begin, last)
         hazards, failures, missed = hazards + 1, failures + (failure is not None), missed + late
         common, common_missed = common + shared, common_missed + (shared and late)
@@ -245,7 +244,7 @@ def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel
     return Faults(hazards, failures, missed, common, common_missed, tuple(delays), judged, missed_judged)
 
 
-def _detected_ns(fails: Fails, begin: int, last: int) -> int | None:
+def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
     """An alarm that stands at the onset detects at once, else the first fail until the fault's end."""
     if fails.standing_at(begin) is not None:
         return begin
@@ -253,13 +252,9 @@ def _detected_ns(fails: Fails, begin: int, last: int) -> int | None:
     return None if first is None else first[0]
 
 
-def _is_late(
-    detected: int | None, failure: int, budget_s: float | None, channel: _Channel, config: Configuration
-) -> bool:
-    reaction_s = config.hazards.reaction_s
-    if reaction_s is None:
-        reaction_s = channel.clock.period_s or 0.0
-    return detected is None or detected + round(reaction_s * 1e9) > failure + round((budget_s or 0.0) * 1e9)
+def _is_late(detected: int | None, failure: int, budget_s: float | None) -> bool:
+    """A missed detection: no fail by the failure + budget (DOMAIN section 5.3)."""
+    return detected is None or detected > failure + round((budget_s or 0.0) * 1e9)
 
 
 def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
@@ -267,7 +262,7 @@ def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
     return faults.filter(pl.col("failure").is_not_null() & meets).height > 0
 
 
-def _verdicts_in_table(fails: Fails, alarms: pl.DataFrame) -> list[Verdict]:
+def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:
     """Each alarm of the architecture has the verdict of the alarm of the replay that it began in."""
     spans = alarms.select(pl.col("t_start", "t_end").to_physical(), pl.col("verdict").cast(pl.String)).rows()
     return [

@@ -54,7 +54,7 @@ class Alarms:
 class Working:
     """Time with epochs, of this in work [s], and how often work was lost after it had gone on for `up_s`.
 
-    `truth_s`: time with a reference or balise reads; `wrong_s`: of this in work with an error beyond the failure limit,
+    `truth_s`: time judged right or wrong by a reference or balise reads; `wrong_s`: of this in work and judged wrong,
     whether it hit a virtual balise or not (the architecture's P1).
     """
 

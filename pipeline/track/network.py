@@ -126,7 +126,7 @@ def network_of(track: Track, links: pl.DataFrame) -> Network:
         back = way in (Navigability.BA.value, Navigability.BOTH.value)
         _add(successors[leaving[row]], Edge(entering[row], gap[row], there, back))
         _add(successors[entering[row] ^ 1], Edge(leaving[row] ^ 1, gap[row], back, there))
-    usable, orientable = _one_sheet(successors)
+    usable, orientable = oriented_sheet(successors)
     return Network(track, successors, usable, orientable)
 
 
@@ -139,7 +139,7 @@ def _add(edges: list[Edge], edge: Edge) -> None:
     edges.append(edge)
 
 
-def _one_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
+def oriented_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
     """Of each connected part one orientation; both where a loop lets trains come back turned round."""
     count = len(successors)
     here = np.repeat(np.arange(count), [len(edges) for edges in successors])

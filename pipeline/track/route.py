@@ -9,8 +9,9 @@ import polars as pl
 
 from pipeline.track.geodesy import points_of
 from pipeline.track.leg import Visit
-from pipeline.track.network import Edge, Network
-from pipeline.track.survey import Track, end_places, gaps_m
+from pipeline.track.network import Edge, Network, network_of, oriented_sheet
+from pipeline.track.survey import Track, end_places, gaps_m, track_of
+from schemas.run import Site
 
 # `Site.route` names directions as the site reader writes them: from an element's start to its end, or back.
 _FORWARD = "AB"
@@ -88,3 +89,24 @@ def _of_parts(track: Track, elements: list[int], parts: list[slice]) -> Track:
         sigma_m=track.sigma_m[rows],
         length_m=np.array([track.measure_m[part.stop - 1] - track.measure_m[part.start] for part in parts]),
     )
+
+
+def network_on(track: Track, visits: list[Visit]) -> Network:
+    """The net elements of a survey with no other relations than those that the route uses."""
+    successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
+    ends = end_places(track)
+    for here, there in itertools.pairwise(visits):
+        gap = float(
+            gaps_m(ends[[here.element], [int(here.forward)]], ends[[there.element], [int(not there.forward)]])[0]
+        )
+        leaving, entering = 2 * here.element + (not here.forward), 2 * there.element + (not there.forward)
+        for one, other in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
+            if all(edge.to != other for edge in successors[one]):
+                successors[one].append(Edge(other, gap, True, True))
+    return Network(track, successors, *oriented_sheet(successors))
+
+
+def site_network(site: Site) -> Network:
+    """The network of a site; where it gives a route, of that alone."""
+    track = track_of(site.track)
+    return network_of(track, site.links) if site.route is None else network_on(track, visits_of(track, site.route))

@@ -14,13 +14,13 @@ from rich.console import Console
 from pipeline.campaign import Plan, RunOutcome, Summary, progress, tally
 from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
 from pipeline.campaign.tally import Tally
-from schemas.enums import RunStatus
+from schemas.enums import RunStatus, RunVerdict
 from tests.campaign.compare import command, plan_of, run
 from tests.conftest import SmallTrial
 
-OK = RunOutcome("a", RunStatus.OK, seconds=2.0)
+OK = RunOutcome("a", RunStatus.OK, verdict=RunVerdict.SAFE, seconds=2.0)
 BAD = RunOutcome("b", RunStatus.FAILED, "b.mcap: damaged")
-OLD = RunOutcome("c", RunStatus.OK, skipped=True)
+OLD = RunOutcome("c", RunStatus.OK, verdict=RunVerdict.UNSAFE, skipped=True)
 
 
 class Clock:
@@ -107,9 +107,20 @@ def test_log_beside_the_results(plan: Plan) -> None:
     lines = (Path(plan.out) / "replay.log").read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ ", line) for line in lines if line)
     assert lines[0].endswith("4 runs")
-    assert "a: ok in 2" in lines[1]
+    assert "a: safe in 2" in lines[1]
     assert "secret" not in "".join(lines)
-    assert "1 of 4 runs" in lines[-1]
+    assert "safe: 0 unsafe, 0 unproven, 1 safe, 0 failed; 1 of 4 runs" in lines[-1]
+
+
+def test_the_verdict_is_the_first_word() -> None:
+    summary = Summary(4, (OK, BAD, OLD), 5.0)
+    assert tally.summary_line(summary).startswith("unsafe: 1 unsafe, 0 unproven, 1 safe, 1 failed; 3 of 4 runs")
+    assert tally.outcome_line(OLD) == "c: skipped, unsafe"
+    partial = RunOutcome("d", RunStatus.PARTIAL, "cut off", verdict=RunVerdict.UNPROVEN)
+    assert tally.outcome_line(partial) == "d: unproven, partial: cut off"
+    rows = tally.outcome_rows(summary)
+    assert rows.columns[:3] == ["verdict", "run_id", "status"]
+    assert rows["verdict"].to_list() == ["safe", "failed", "unsafe"]
 
 
 @pytest.mark.parametrize(

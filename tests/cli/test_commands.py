@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -55,7 +56,7 @@ def result(small_trial: SmallTrial, tmp_path_factory: pytest.TempPathFactory) ->
 def test_replay_one_run(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
     said = balise("replay", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path / "out")
     assert said.status == 0
-    assert "1 of 1 runs: 1 ok, 0 partial, 0 failed" in said.out
+    assert re.match(r"(safe|unproven|unsafe): \d unsafe, \d unproven, \d safe, 0 failed; 1 of 1 runs: 1 ok", said.out)
     assert "\x1b[" not in said.out + said.err
     assert "\u2502" not in said.out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
@@ -83,7 +84,9 @@ def test_replay_as_json(balise: Balise, small_trial: SmallTrial, tmp_path: Path)
     assert said.status == 1
     assert {json.loads(line)["event"] for line in said.err.splitlines()} == {"progress", "run"}
     found = json.loads(said.out)
-    assert found["planned"] == 1
+    assert next(iter(found)) == "verdict"
+    assert found["verdicts"] == {"unsafe": 0, "unproven": 0, "safe": 0, "failed": 1}
+    assert (found["verdict"], found["planned"]) == ("failed", 1)
     assert [(run["run_id"], run["status"]) for run in found["runs"]] == [("bad", "failed")]
     assert "bad.mcap" in found["runs"][0]["error"]
 

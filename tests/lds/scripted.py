@@ -17,7 +17,7 @@ INSTANT = pl.Datetime("ns", "UTC")
 
 
 class ScriptedBank:
-    """Fails at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
+    """FailureLog at `fails`; of these `fast` also fails fast. `rings`: fails only until a restart."""
 
     def __init__(
         self,

@@ -6,8 +6,8 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.figures.bounds import clopper_pearson, poisson_rate
-from pipeline.hazards.independent import independent_episodes
+from pipeline.figures.bounds import clopper_pearson, poisson_rate, poisson_rate_upper
+from pipeline.figures.independent import independent_episodes
 from pipeline.safety import detection_by_level, measured_figures, plain_statements
 from schemas.config import SafetyConfig
 from schemas.tables import Runs
@@ -32,8 +32,19 @@ def runs(height: int, **columns: Any) -> pl.DataFrame:
         "evidence": "reference",
         "false_alarm_rate_per_h": 0.0,
         "false_alarms": 0,
+        "share_unknown": 0.0,
     }
     return with_run(table(Runs, height, **(plain | columns)), [f"r{k}" for k in range(height)])
+
+
+def failed(spent: list[list[tuple[float, float]]], **columns: Any) -> pl.DataFrame:
+    """Runs with their failures: hazardous time of each, for certain and with what is unknown [s]."""
+    frame = runs(len(spent), failures=[len(one) for one in spent], **columns)
+    lists = {
+        name: pl.Series([[pair[part] for pair in one] for one in spent], dtype=pl.List(pl.Float64))
+        for part, name in enumerate(("failure_hazardous_s", "failure_hazardous_may_s"))
+    }
+    return frame.with_columns(**lists)
 
 
 def fault(height: int, **columns: Any) -> pl.DataFrame:
@@ -42,24 +53,6 @@ def fault(height: int, **columns: Any) -> pl.DataFrame:
 
 
 NO_HAZARDS = fault(0)
-
-
-def test_rows_of_one_fault_are_one_event() -> None:
-    frame = fault(
-        5,
-        t_onset=[100 * NS, 100 * NS, 150 * NS, 900 * NS, None],
-        t_hazard=[110 * NS, 120 * NS, 150 * NS, 905 * NS, 905 * NS],
-        caused_by=[None, None, 0, None, None],
-        t_failure=[112 * NS, None, 150 * NS, None, 905 * NS],
-        t_negated=[113 * NS, None, None, None, None],
-        hazardous_s=[1.0, None, None, None, None],
-        time_to_detect_s=[12.0, 13.0, None, None, None],
-    )
-    events = independent_episodes(frame)
-    assert events["failed"].to_list() == [True, False, True]
-    assert events["missed"].to_list() == [False, False, True]
-    assert events["hazardous_s"].to_list() == [1.0, None, None]
-    assert events["time_to_detect_s"].to_list() == [13.0, None, None]
 
 
 def test_the_same_time_in_another_run_or_solution_is_another_event() -> None:
@@ -80,33 +73,46 @@ def test_rates_over_the_campaign() -> None:
         balises_accepted=[10, 5, 5, 5, 0, 5],
         accepted_judged=[10, 5, 0, 0, 0, 3],
         unsafe_accepted=[0, 1, 2, 0, 0, 0],
+        unproven_accepted=[0, 4, 3, 5, 0, 2],
+        failures=[2, 1, 1, 0, 0, 0],
+        failures_within_budget=[1, 0, 0, 0, 0, 0],
+        failures_beyond_budget=[1, 0, 1, 0, 0, 0],
+        verdict=["unsafe", "unsafe", "unsafe", "unproven", None, "unproven"],
         outages=[1, 0, 2, 0, 0, 0],
     )
     faults = fault(
         3,
         t_failure=[10 * NS, 120 * NS, None],
-        t_negated=[11 * NS, None, None],
-        hazardous_s=[1.0, None, None],
+        t_detected=[11 * NS, None, None],
+        time_since_failure_s=[1.0, None, None],
     )
     figures = measured_figures(catalogue, faults, CONFIG)
     found = figures.row(0, named=True)
     assert (found["runs"], found["runs_failed"], found["runs_partial"], found["hours"]) == (5, 1, 1, 5.0)
+    assert (found["runs_unsafe"], found["runs_unproven"], found["runs_safe"]) == (3, 2, 0)
     assert (found["hours_with_evidence"], found["hours_with_truth"], found["hours_judged"]) == (3.75, 1.75, 1.4)
-    rate = poisson_rate(3, 3.75)
-    assert (found["hazards"], found["hazard_rate_per_h"]) == (3, 0.8)
+    rate = poisson_rate(3, 1.75)
+    assert (found["hazards"], found["hazards_judged"], found["hazard_rate_per_h"]) == (3, 3, pytest.approx(3 / 1.75))
     assert (found["hazard_rate_low_per_h"], found["hazard_rate_high_per_h"]) == (rate.low, rate.high)
     share = clopper_pearson(1, 2)
-    assert (found["failures"], found["missed"], found["missed_share"]) == (2, 1, 0.5)
+    assert (found["missed"], found["missed_known"], found["missed_share"]) == (1, 2, 0.5)
     assert (found["missed_share_low"], found["missed_share_high"]) == (share.low, share.high)
+    # Of four failures one was within the budget; of one nobody can say, one was seen by the odometer alone.
+    assert (found["failures"], found["failures_within_budget"], found["failures_beyond_budget"]) == (4, 1, 2)
+    assert (found["failures_judged"], found["beyond_budget_share"]) == (2, 0.5)
+    assert found["beyond_budget_rate_upper_per_h"] == poisson_rate_upper(3, 1.75)
     assert (found["false_alarms"], found["false_alarm_rate_per_h"]) == (2, pytest.approx(2 / 1.4))
-    assert (found["accepted"], found["unsafe_accepted"], found["outages"]) == (30, 3, 3)
-    unsafe = clopper_pearson(1, 18)  # what no truth can judge is not safe
+    assert (found["accepted"], found["unsafe_accepted"], found["unproven_accepted"]) == (30, 3, 14)
+    unsafe = clopper_pearson(1, 18)  # what nothing can judge is not safe
     assert (found["accepted_judged"], found["unsafe_judged"], found["unsafe_share"]) == (18, 1, unsafe.value)
     assert (found["unsafe_share_low"], found["unsafe_share_high"]) == (unsafe.low, unsafe.high)
     (sentence,) = plain_statements(figures)
-    assert "in 3.75 h with evidence, 1.75 h of these with a truth (reference or balise reads)" in sentence
-    assert "Of 18 accepted virtual balises judged by a truth 1 lay beyond the failure limit; 12 more were" in sentence
-    assert "not judged by one, and 2 of these lay beyond it by the odometer." in sentence
+    assert (
+        "of 4 position failures in use, at a virtual balise or not, 1 were within the budget and 2 beyond" in sentence
+    )
+    assert "of 1 it cannot be said, in 3.75 h judged, 1.75 h of these by a truth" in sentence
+    assert "Of 18 accepted virtual balises judged by a truth 1 were accepted despite a wrong position" in sentence
+    assert "and 2 more by the odometer alone; of 14 accepted ones nothing says" in sentence
 
 
 def test_a_trial_without_a_miss_says_what_it_lacks() -> None:
@@ -114,9 +120,9 @@ def test_a_trial_without_a_miss_says_what_it_lacks() -> None:
     found = figures.row(0, named=True)
     assert found["hours_needed"] == pytest.approx(4.4713e9, rel=1e-4)
     assert found["hours_still_needed"] == found["hours_needed"] - 100.0
-    assert found["missed_rate_upper_per_h"] == pytest.approx(2.9957 / 100, rel=1e-4)
+    assert found["beyond_budget_rate_upper_per_h"] == pytest.approx(2.9957 / 100, rel=1e-4)
     (sentence,) = plain_statements(figures)
-    assert "0 missed detections of 0 position failures at virtual balises in 100 h" in sentence
+    assert "of 0 position failures in use, at a virtual balise or not, 0 were within the budget" in sentence
     assert "not negated" not in sentence
     assert "cannot substantiate" in sentence
     assert "4.47e+09 h" in sentence
@@ -131,16 +137,13 @@ def test_a_trial_that_is_long_enough_says_so() -> None:
 def test_a_position_wrong_between_balises_is_not_kept_quiet() -> None:
     """No virtual balise was hit, yet for 0.4 % of the time the position was wrong and in use."""
     figures = measured_figures(runs(2, held_s=3600.0, share_p1=[0.008, 0.0]), NO_HAZARDS, CONFIG)
-    assert (
-        "Beyond the failure limit and not negated, at a balise or not: 0.400% of the time in runs with a truth."
-        in plain_statements(figures)[0]
-    )
+    assert "Judged wrong and not negated: 0.400% of the time in runs with a truth." in plain_statements(figures)[0]
 
 
 def test_no_runs_no_rows() -> None:
     assert measured_figures(runs(0), NO_HAZARDS, CONFIG).height == 0
     assert measured_figures(runs(2, status="failed"), NO_HAZARDS, CONFIG).height == 0
-    assert detection_by_level(NO_HAZARDS, CONFIG).height == 0
+    assert detection_by_level(runs(0), NO_HAZARDS, CONFIG).height == 0
 
 
 def test_solutions_are_counted_apart() -> None:
@@ -152,25 +155,28 @@ def test_solutions_are_counted_apart() -> None:
 
 
 def test_shares_are_of_failures_that_a_truth_judged() -> None:
-    """Of an undetected failure the odometer sees nothing once a balise was accepted in the wrong place."""
+    """The odometer alone can show that a position was wrong, never that it was right."""
     faults = fault(
         4,
         evidence=["reference", "odometer", "odometer", "balise"],
         t_failure=[10 * NS, 110 * NS, 210 * NS, 310 * NS],
-        t_negated=[11 * NS, 111 * NS, 211 * NS, None],
-        hazardous_s=[1.0, 1.0, 1.0, None],
+        t_detected=[11 * NS, 111 * NS, None, None],
+        time_since_failure_s=[1.0, 1.0, None, None],
     )
-    blind = {"evidence": ["reference", "odometer"], "stanford_nominal": [5, 7], "stanford_hpl_nominal": [None, 7]}
-    figures = measured_figures(runs(2, **blind), faults, CONFIG)
+    columns = {"evidence": ["reference", "odometer"], "stanford_nominal": [5, 7], "stanford_hpl_nominal": [None, 7]}
+    catalogue = failed([[(1.0, 1.0), (0.2, 0.2), (0.2, 9.0)], [(3.0, 3.0)]], **columns)
+    figures = measured_figures(catalogue, faults, CONFIG)
     found, share = figures.row(0, named=True), clopper_pearson(1, 2)
-    assert (found["failures"], found["missed"], found["failures_judged"], found["missed_judged"]) == (4, 1, 2, 1)
+    assert (found["missed"], found["missed_known"], found["missed_judged"]) == (2, 2, 1)
     assert (found["missed_share"], found["missed_share_low"]) == (0.5, share.low)
     assert (found["stanford_nominal"], found["stanford_hpl_nominal"]) == (5, None)
     (sentence,) = plain_statements(figures)
-    assert "1 missed detections of 4 position failures" in sentence
-    assert "2 of these failures, 0 of them missed, were seen by the odometer alone" in sentence
-    row = detection_by_level(faults, CONFIG).row(0, named=True)
-    assert (row["failures"], row["within"], row["failures_judged"], row["within_judged"]) == (4, 3, 2, 1)
+    assert (
+        "Of 2 faults with a failure that a truth judged 1 were missed detections; 1 more were seen by the" in sentence
+    )
+    row = detection_by_level(catalogue, faults, CONFIG).row(1, named=True)  # LPV-200, 0.5025 s
+    assert (row["failures"], row["within"], row["exceeded"]) == (4, 1, 2)
+    assert (row["failures_judged"], row["within_judged"]) == (2, 1)
     assert (row["within_share"], row["within_share_high"]) == (0.5, share.high)
 
 
@@ -184,22 +190,19 @@ def test_a_run_fails_for_the_solution_that_failed_or_for_all() -> None:
 
 
 def test_measured_times_against_every_level() -> None:
-    """Hazardous times 0.2, 1.0, 20 s and one never negated, against 24.12, 0.5025, 1.675 and 100.5 s."""
-    faults = fault(
-        5,
-        t_failure=[5 * NS, 105 * NS, 205 * NS, 305 * NS, None],
-        hazardous_s=[0.2, 1.0, 20.0, None, None],
-        time_to_detect_s=[5.2, 6.0, 25.0, None, 2.0],
-    )
-    table = detection_by_level(faults, CONFIG)
+    """Hazardous times 0.2, 1.0, 20 s and 0.3 s that may be 30 s, against 24.12, 0.5025, 1.675 and 100.5 s."""
+    faults = fault(5, time_to_detect_s=[5.2, 6.0, 25.0, None, 2.0])
+    catalogue = failed([[(0.2, 0.2), (1.0, 1.0)], [(20.0, 20.0), (0.3, 30.0)]])
+    table = detection_by_level(catalogue, faults, CONFIG)
     assert table["service_level"].to_list() == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
-    assert table["within"].to_list() == [3, 1, 2, 3]
+    assert table["within"].to_list() == [3, 1, 2, 4]
+    assert table["exceeded"].to_list() == [0, 2, 1, 0]
     assert set(table["failures"]) == {4}
-    assert set(table["never_negated"]) == {1}
-    row = table.row(0, named=True)
-    assert (row["hazardous_median_s"], row["hazardous_max_s"]) == (1.0, 20.0)
+    row = table.row(1, named=True)
+    assert (row["hazardous_max_s"], row["hazardous_may_max_s"]) == (20.0, 30.0)
+    assert row["hazardous_median_s"] == pytest.approx(0.65)
     assert (row["detected"], row["time_to_detect_median_s"], row["time_to_detect_max_s"]) == (4, 5.6, 25.0)
-    bounds = clopper_pearson(3, 4)
+    bounds = clopper_pearson(1, 3)
     assert (row["within_share_low"], row["within_share_high"]) == (bounds.low, bounds.high)
 
 

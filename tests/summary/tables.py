@@ -5,9 +5,10 @@ from typing import Any
 import dataframely as dy
 import polars as pl
 
+from schemas.stages import Failures
 from schemas.tables import Alarms, Epochs, Hazards, Passages
 
-_DEFAULTS: dict[type, Any] = {dy.Bool: False, dy.String: "x", dy.List: [], dy.Int64: 0}
+_DEFAULTS: dict[type, Any] = {dy.Bool: False, dy.String: "x", dy.List: [], dy.Int64: 0, dy.Float64: 0.0}
 NS = 1_000_000_000
 
 
@@ -46,6 +47,9 @@ def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
         "error_along_m": 0.0,
         "tvb": True,
         "lds_state": "P0",
+        "judgement": "right",
+        "in_use": True,
+        "moving": True,
     }
     return table(Epochs, len(t_s), **(good | columns))
 
@@ -60,3 +64,8 @@ def hazards(height: int = 0, **columns: Any) -> pl.DataFrame:
 
 def alarms(height: int = 0, **columns: Any) -> pl.DataFrame:
     return table(Alarms, height, **columns)
+
+
+def failures(height: int = 0, **columns: Any) -> pl.DataFrame:
+    plain: dict[str, Any] = {"hazardous_s": 0.0, "hazardous_may_s": columns.get("hazardous_s", 0.0)}
+    return table(Failures, height, **(plain | columns))

@@ -18,7 +18,9 @@ from tests.summary.tables import NS, alarms, epochs, hazards, passages, table
 ACROSS = {"monitors": [["cross_raw"]], "verdict": "false", "suspect": "unknown", "netelement_id": "A"}
 
 
-def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, **found: Any) -> RunTables:
+def run_of(
+    run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = None, **found: Any
+) -> RunTables:
     rows: dict[str, Any] = {
         "solution": list(solutions),
         "status": "ok",
@@ -31,7 +33,11 @@ def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | 
         "false_alarms": 0,
         "false_alarm_rate_per_h": 0.0,
         "notes": notes,
-    }
+        "share_unknown": 0.0,
+        "verdict": "safe",
+        "failure_hazardous_s": [[]] * len(solutions),
+        "failure_hazardous_may_s": [[]] * len(solutions),
+    } | (counted or {})
     points = [20.0 * k for k in range(3)]
     stand = {"netelement_id": "A", "measure_m": points, "path_m": points, "sigma_along_m": 1.0}
     tables = {"hazards": hazards(), "alarms": alarms(), "passages": passages()} | found
@@ -47,13 +53,20 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Assessment:
         solution="primary",
         t_onset=0,
         t_failure=5 * NS,
-        t_negated=6 * NS,
-        hazardous_s=1.0,
+        t_detected=6 * NS,
+        time_since_failure_s=1.0,
         time_to_detect_s=5.9,
         budget_s=1.675,
     )
+    failed = {
+        "verdict": "unsafe",
+        "failures": 1,
+        "failures_beyond_budget": 1,
+        "failure_hazardous_s": [[1.0]],
+        "failure_hazardous_may_s": [[1.0]],
+    }
     across = alarms(1, solution="primary", measure_m=500.0, **ACROSS)
-    write_run(run_of("a", notes="faults were injected: ramp", hazards=fault, alarms=across), out, {})
+    write_run(run_of("a", notes="faults were injected: ramp", counted=failed, hazards=fault, alarms=across), out, {})
     write_run(run_of("b", alarms=across.with_columns(measure_m=540.0)), out, {})
     write_run(run_of("c", ("gps", "primary")), out, {})
     return assess(out)
@@ -63,6 +76,7 @@ def test_tables(found: Assessment) -> None:
     figures = {row["solution"]: row for row in found.tables["figures"].iter_rows(named=True)}
     assert (figures["primary"]["runs"], figures["gps"]["runs"]) == (3, 1)
     assert (figures["primary"]["hours_with_truth"], figures["primary"]["failures"]) == (3.0, 1)
+    assert (figures["primary"]["missed_known"], figures["primary"]["missed"]) == (1, 0)
     levels = found.tables["levels"].filter(solution="primary").select("service_level", "kept", "exceeded", "no_failure")
     assert levels.rows() == [
         ("npa", 1, 0, 2),
@@ -93,15 +107,18 @@ def test_the_map_is_the_suspect_where_runs_agree(found: Assessment) -> None:
 
 def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     said = found.statements
-    assert said[0].startswith("Faults were injected into 1 of 3 runs")
-    assert any(text.startswith("primary: 0 missed detections of 1 position failures") for text in said)
-    assert "lpv200; 95 %: 0.0% to 97.5%" in said[-1]
+    assert said[0] == "unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed."
+    assert said[1].startswith("Faults were injected into 1 of 3 runs")
+    assert any(
+        text.startswith("primary: of 1 position failures in use, at a virtual balise or not, 0") for text in said
+    )
+    assert "0 within against 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
 
 
 def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     write_run(run_of("whole"), tmp_path, {})
     assert not any(
-        "not known" in text or "partial" in text or "neither" in text for text in assess(tmp_path).statements
+        "nothing says" in text or "partial" in text or "neither" in text for text in assess(tmp_path).statements
     )
     blind = run_of("blind", alarms=alarms(1, solution="primary", verdict="unknown"))
     evidence = pl.lit(None, blind.runs.schema["evidence"])
@@ -113,27 +130,32 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     found = assess(tmp_path)
     said = found.statements
     assert set(found.tables["levels"].select("no_failure", "unknown", "no_truth").rows()) == {(2, 1, 1)}
-    assert said[0] == "1 of 3 runs are partial: what was read of them counts."
-    assert said[1].startswith("primary: for 1 of 3 h the error is not known (1 of 3 runs have no evidence at all)")
-    assert said[2].startswith("primary: 1 alarms in 1 runs are neither true nor false for want of evidence")
+    assert said[1] == "1 of 3 runs are partial: what was read of them counts."
+    assert said[2].startswith(
+        "primary: for 1 of 3 h nothing says whether the position was right (1 of 3 runs have no evidence at all)"
+    )
+    assert said[3].startswith("primary: 1 alarms in 1 runs are neither true nor false for want of evidence")
 
 
 def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
     half, lost = run_of("half", ("gps", "primary")), run_of("lost", ("",))
     status = pl.Series("status", ["failed", "ok"]).cast(half.runs.schema["status"])
-    write_run(RunTables(**{**vars(half), "runs": half.runs.with_columns(status)}), tmp_path, {})
-    failed = lost.runs.with_columns(status=pl.lit("failed", lost.runs.schema["status"]))
+    verdict = pl.Series("verdict", [None, "safe"]).cast(half.runs.schema["verdict"])
+    write_run(RunTables(**{**vars(half), "runs": half.runs.with_columns(status, verdict)}), tmp_path, {})
+    nothing = pl.lit(None, lost.runs.schema["verdict"])
+    failed = lost.runs.with_columns(status=pl.lit("failed", lost.runs.schema["status"]), verdict=nothing)
     write_run(RunTables(**{**vars(lost), "runs": failed}), tmp_path, {})
     said = assess(tmp_path).statements
-    assert said[0] == "1 of 2 runs failed and count nowhere."
-    assert said[1].startswith("gps: 1 of 2 runs failed with this solution alone and count nowhere")
+    assert said[0] == "unproven: 0 unsafe, 1 unproven, 0 safe, 1 failed."
+    assert said[1] == "1 of 2 runs failed and count nowhere."
+    assert said[2].startswith("gps: 1 of 2 runs failed with this solution alone and count nowhere")
 
 
 def test_receivers_too_slow_are_named(tmp_path: Path) -> None:
     slow = run_of("a")
     write_run(RunTables(**{**vars(slow), "runs": slow.runs.with_columns(gnss_rate_hz=1.0)}), tmp_path, {})
     said = assess(tmp_path).statements
-    assert "primary: epochs come too slowly for lpv200 in 1 runs" in said[0]
+    assert "primary: epochs come too slowly for lpv200 in 1 runs" in said[1]
     assert not any("npa" in text for text in said)
     write_config(tmp_path, Configuration.model_validate({"hazards": {"reaction_s": 0.1}}))
     assert sum("too slowly" in text for text in assess(tmp_path).statements) == 1

@@ -47,5 +47,9 @@ def test_inspected_result(tmp_path: Path) -> None:
     empty = {name: schema.create_empty() for name, schema in TABLES.items()}
     for run_id, row in (("blind", ROWS[1:2]), ("seen", ROWS[:1])):
         write_run(RunTables(run_id, **(empty | {"runs": row})), tmp_path, {})
-    runs = inspect_result(tmp_path)["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted")
+    inspected = inspect_result(tmp_path)
+    assert inspected["Verdict"].rows() == [
+        ("verdict", "failed"), ("unsafe", "0"), ("unproven", "0"), ("safe", "0"), ("failed", "2")
+    ]  # fmt: skip
+    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted")
     assert runs.rows() == [("blind", None, None, 7), ("seen", 0, 1, 8)]

@@ -11,21 +11,22 @@ from hypothesis import strategies as st
 
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import StreamCounts
-from pipeline.motion import motion_by_odometer
 from pipeline.results.provenance import Provenance
-from schemas.config import Configuration, HazardConfig, LdsConfig
-from schemas.enums import Evidence
+from schemas.config import Configuration, LdsConfig
+from schemas.enums import Evidence, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, SCALES, Runs
-from tests.summary.tables import NS, alarms, epochs, hazards, passages
+from tests.summary.tables import NS, alarms, epochs, failures, hazards, passages
 
 PROVENANCE = Provenance("c" * 64, "i" * 64, "balise 0.1.0")
 CONFIG = Configuration()
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    motion = motion_by_odometer(frame, CONFIG.matching.deadband_mps)
-    empty = SolutionResults("primary", frame, passages(), hazards(), alarms(), motion, evidence=Evidence.REFERENCE)
+    empty = SolutionResults(
+        "primary", frame, passages(), hazards(), alarms(), failures(), evidence=Evidence.REFERENCE,
+        vehicle=VehicleFigures.FILE,
+    )  # fmt: skip
     return replace(empty, **fields)
 
 
@@ -46,8 +47,10 @@ def test_columns_are_those_of_the_contract_in_order() -> None:
 
 
 def test_a_clean_minute() -> None:
-    found = row(epochs(seconds(61), cross_track_m=0.4))
-    assert found["status"] == "ok"
+    found = row(epochs(seconds(61), cross_track_m=0.4), distance_m=1200.0)
+    assert (found["verdict"], found["status"], found["vehicle"]) == ("unproven", "ok", "file")  # no VB was accepted
+    assert (found["share_unknown"], found["notes"]) == (0.0, None)
+    assert (found["along_error_epochs"], found["cross_error_epochs"], found["location_error_count"]) == (61, 0, 0)
     assert (found["duration_s"], found["distance_m"], found["epochs"]) == (60.0, 1200.0, 61)
     assert (found["gnss_rate_hz"], found["availability"], found["outages"]) == (1.0, 1.0, 0)
     assert (found["longest_outage_s"], found["cross_bias_m"]) == (0.0, 0.4)
@@ -75,6 +78,7 @@ def test_one_epoch() -> None:
 
 def test_a_failed_run() -> None:
     found = failed_row("run.mcap: no topic /gnss", PROVENANCE).row(0, named=True)
+    assert (found["verdict"], found["vehicle"], found["failure_hazardous_s"]) == (None, None, None)
     assert (found["status"], found["error"], found["solution"]) == ("failed", "run.mcap: no topic /gnss", "")
     assert (found["epochs"], found["missed_detections"], found["false_alarms"]) == (0, 0, None)
     assert found["availability"] is None
@@ -86,6 +90,18 @@ def test_damaged_input_is_partial() -> None:
     assert (found["status"], found["error"]) == ("partial", "chunk 7 is cut off")
     assert found["partial_until"].timestamp() == 42.0
     assert found["notes"] == "topics not used: /diag; map 12 m off"
+
+
+def test_what_the_evidence_cannot_see_is_said() -> None:
+    found = row(
+        epochs(seconds(3), judgement="unknown"), evidence=Evidence.ODOMETER, vehicle=VehicleFigures.LEARNED,
+        odometer_contradicted=2,
+    )  # fmt: skip
+    assert (found["vehicle"], found["odometer_contradicted"]) == ("learned", 2)
+    assert "never that it was right" in found["notes"]
+    assert "balise reads every 2 km and within 300 m of both ends" in found["notes"]
+    assert "does not close 2 gaps" in found["notes"]
+    assert "no vehicle file" in found["notes"]
 
 
 def test_what_cleaning_and_alignment_found() -> None:
@@ -143,37 +159,20 @@ class TestAvailability:
         assert row(epochs(t, tvb=tvb))["availability"] == pytest.approx(20 / 21)
 
     def test_standing_does_not_count(self) -> None:
-        odometer = [20.0 * min(k, 10) for k in range(31)]
-        tvb = [k < 5 for k in range(31)]
-        assert row(epochs(seconds(31), odometer_m=odometer, tvb=tvb))["availability"] == pytest.approx(0.5)
+        frame = epochs(seconds(31), moving=[k < 10 for k in range(31)], tvb=[k < 5 for k in range(31)])
+        assert row(frame)["availability"] == pytest.approx(0.5)
 
     def test_a_train_that_never_moved(self) -> None:
-        assert row(epochs(seconds(9), odometer_m=5.0, speed_mps=0.0))["availability"] is None
+        assert row(epochs(seconds(9), moving=False))["availability"] is None
+
+    def test_nobody_knows_whether_it_moved(self) -> None:
+        """10 s of 40 s: they count as moving without a TVB."""
+        found = row(epochs(seconds(41), moving=[None if 10 <= k < 20 else True for k in range(41)]))
+        assert found["availability"] == pytest.approx(30 / 40)
+        assert found["notes"].startswith("for 10 s nothing tells whether the train moved")
 
     def test_gap_while_moving_is_without_a_tvb(self) -> None:
         assert row(epochs([*seconds(11), *(30.0 + k for k in range(11))]))["availability"] == pytest.approx(20 / 40)
-
-    def test_odometer_unknown_speed_known(self) -> None:
-        speed = [10.0] * 4 + [0.1] * 7
-        tvb = [True] * 3 + [False] * 8
-        found = row(epochs(seconds(11), odometer_m=None, speed_mps=speed, tvb=tvb))
-        assert found["availability"] == pytest.approx(3 / 4)
-
-
-class TestDistance:
-    def test_there_and_back_by_the_odometer(self) -> None:
-        assert row(epochs(seconds(5), odometer_m=[0.0, 20.0, None, 40.0, 10.0]))["distance_m"] == 70.0
-
-    def test_without_odometer_noise_at_a_stop_adds_nothing(self) -> None:
-        path = [0.0, 10.0, 20.0, 20.6, 19.7, 20.2, 19.8, 30.0, 40.0]
-        direction = [1, 1, 1, None, None, None, None, 1, 1]
-        found = row(epochs(seconds(9), odometer_m=None, path_m=path, direction=direction))
-        assert found["distance_m"] == 40.0
-
-    def test_without_odometer_there_and_back(self) -> None:
-        path = [0.0, 10.0, 20.0, 21.0, 11.0, 1.0]
-        found = row(epochs(seconds(6), odometer_m=None, path_m=path, direction=[1, 1, 1, -1, -1, -1]))
-        assert found["distance_m"] == 40.0
 
 
 class TestShares:
@@ -186,8 +185,12 @@ class TestShares:
 
     def test_without_truth_only_the_negated_and_undiagnosed_are_known(self) -> None:
         state = [None, None, None, "P2", "P3", "P3", None, None, None]
-        found = row(epochs(seconds(9), lds_state=state, error_along_m=None), evidence=None)
+        found = row(epochs(seconds(9), lds_state=state, judgement="unknown"), evidence=None)
         assert [found[f"share_p{k}"] for k in range(4)] == [None, None, 1 / 8, 2 / 8]
+
+    def test_the_odometer_alone_shows_p1_and_never_p0(self) -> None:
+        found = row(epochs(seconds(5), lds_state=[None, "P1", None, None, None]), evidence=Evidence.ODOMETER)
+        assert [found[f"share_p{k}"] for k in range(4)] == [None, 1 / 4, 0.0, 0.0]
 
     def test_truth_lost_for_a_while_is_missing_from_the_sum(self) -> None:
         state = ["P0", "P0", None, None, "P0"]
@@ -236,80 +239,123 @@ class TestBalises:
         assert (found["balises_missed"], found["balises_not_available"]) == (1, 1)
 
     def test_an_offer_that_no_crossing_belongs_to_is_no_passage(self) -> None:
+        """Judged, and no true crossing: an offer beyond. Not judged: nobody knows, so it counts as a passage."""
         frame = passages(
-            3, t_offered=[1, 2, None], t_true=[1, None, 3], location_error_m=[0.1, 300.0, None],
-            status=["accepted", "rejected_window", "missed"],
+            4, t_offered=[1, 2, None, 4], t_true=[1, None, 3, None], judgement=["right", "wrong", None, "unknown"],
+            status=["accepted", "rejected_window", "missed", "accepted"],
         )  # fmt: skip
-        assert row(epochs(seconds(3)), passages=frame)["balises_on_path"] == 2
+        assert row(epochs(seconds(3)), passages=frame)["balises_on_path"] == 3
 
-    def test_unsafe_beyond_the_failure_limit_either_way(self) -> None:
+    def test_what_the_judge_says_of_acceptances_whatever_the_error(self) -> None:
+        """400 m off and called right, 0.1 m off and called wrong: the judge's word counts, not the error."""
         frame = passages(
-            5,
-            status=["accepted", "accepted", "accepted", "accepted", "rejected_window"],
-            location_error_m=[20.0, -20.1, 31.0, None, 400.0],
+            7,
+            status=["accepted"] * 6 + ["rejected_window"],
+            judgement=["right", "wrong", "wrong", "unknown", "right", None, "wrong"],
+            location_error_m=[400.0, 0.1, None, None, -1.0, None, 30.0],
         )
         found = row(epochs(seconds(3)), passages=frame)
-        assert (found["unsafe_accepted"], found["accepted_judged"]) == (2, 3)
-        assert row(epochs(seconds(3)), passages=frame, evidence=Evidence.BALISE)["accepted_judged"] == 3
-        for evidence in (Evidence.ODOMETER, None):  # which cannot tell a position right
-            assert row(epochs(seconds(3)), passages=frame, evidence=evidence)["accepted_judged"] == 0
-        assert found["location_error_mean_m"] == pytest.approx(10.3)
-        assert found["location_error_max_m"] == 31.0
-        wide = Configuration(hazards=HazardConfig(failure_limit_m=25.0))
-        assert row(epochs(seconds(3)), wide, passages=frame)["unsafe_accepted"] == 1
+        assert (found["balises_accepted"], found["accepted_judged"]) == (6, 4)
+        assert (found["unsafe_accepted"], found["unproven_accepted"]) == (2, 2)
+        assert (found["location_error_count"], found["location_error_max_m"]) == (3, 400.0)
+        assert found["location_error_mean_m"] == pytest.approx(399.1 / 3)
 
 
 class TestHazards:
     def test_classes_and_largest(self) -> None:
         frame = hazards(
-            4,
-            hazard=["VB_JUMP_1A", "VB_SHIFT", "VB_SHIFT", "VB_JUMP_1B"],
-            detected=[True, True, False, True],
-            within_budget=[True, False, None, True],
-            time_to_detect_s=[0.0, 9.5, None, 0.0],
-            time_since_failure_s=[-2.0, 3.0, None, None],
-            hazardous_s=[0.0, 4.0, 60.0, None],
+            5,
+            hazard=["VB_JUMP_1A", "VB_SHIFT", "VB_SHIFT", "VB_JUMP_1B", "VB_WRONG_TRACK"],
+            detected=[True, True, False, True, False],
+            within_budget=[True, False, None, True, None],
+            time_to_detect_s=[0.0, 9.5, None, 0.0, None],
+            time_since_failure_s=[-2.0, 3.0, None, None, None],
         )
         found = row(epochs(seconds(3)), hazards=frame)
-        assert [found[f"hazards_{kind}"] for kind in ("1a", "1b", "shift")] == [1, 1, 2]
+        assert [found[f"hazards_{kind}"] for kind in ("1a", "1b", "shift", "wrong_track")] == [1, 1, 2, 1]
         assert (found["hazards_detected"], found["hazards_within_budget"]) == (3, 2)
         assert (found["time_to_detect_max_s"], found["time_since_failure_max_s"]) == (9.5, 3.0)
-        assert found["hazardous_max_s"] == 60.0
 
     def test_missed_detection(self) -> None:
-        """Failure at 10 s, budget 1.675 s: negation up to 11.675 s is in time, later or never is not."""
-        negated = [9.0, 10.0, 11.675, 11.676, 60.0, None]
+        """Failure at 10 s, budget 1.675 s: a fail up to 11.675 s is in time, later or never is not."""
+        detected = [9.0, 10.0, 11.675, 11.676, 60.0, None]
         frame = hazards(
             7,
             t_failure=[10 * NS] * 6 + [None],
-            t_negated=[None if t is None else round(t * NS) for t in negated] + [None],
+            t_detected=[None if t is None else round(t * NS) for t in detected] + [None],
+            time_since_failure_s=[None if t is None else t - 10.0 for t in detected] + [None],
             budget_s=1.675,
         )
         assert row(epochs(seconds(3)), hazards=frame)["missed_detections"] == 3
 
-    def test_unknown_budget_is_no_leave(self) -> None:
-        frame = hazards(1, t_failure=[10 * NS], t_negated=[11 * NS], budget_s=None)
-        assert row(epochs(seconds(3)), hazards=frame)["missed_detections"] == 1
 
+class TestFailures:
+    """Every failure counts, whether a hazard row belongs to it or not."""
 
-class TestLevels:
+    def test_counts_and_longest(self) -> None:
+        frame = failures(
+            4,
+            hazardous_s=[0.4, 1.0, 60.0, 0.2],
+            hazardous_may_s=[0.4, 1.0, 60.0, 3.0],
+            within_budget=[True, False, False, None],
+        )
+        found = row(epochs(seconds(3)), failures=frame)
+        assert (found["failures"], found["failures_within_budget"], found["failures_beyond_budget"]) == (4, 1, 2)
+        assert found["hazardous_max_s"] == 60.0
+        assert found["failure_hazardous_may_s"] == [0.4, 1.0, 60.0, 3.0]
+
     def test_every_service_level(self) -> None:
         """Hazardous for 1 s and for 0.4 s: within NPA, EGNOS as observed and the horizontal SIS, not within LPV-200."""
-        frame = hazards(2, t_onset=[0, NS], t_failure=[NS, 9 * NS], t_negated=[2 * NS, 9 * NS], hazardous_s=[1.0, 0.4])
-        found = row(epochs(seconds(3)), hazards=frame)
-        assert found["failures"] == 2
+        found = row(epochs(seconds(3)), failures=failures(2, hazardous_s=[1.0, 0.4]))
         assert found["service_levels"] == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
         assert found["level_allowed_s"] == pytest.approx([24.12, 0.5025, 1.675, 100.5])
-        assert found["level_within"] == [2, 1, 2, 2]
+        assert (found["level_within"], found["level_exceeded"]) == ([2, 1, 2, 2], [0, 1, 0, 0])
         assert found["level_verdict"] == ["kept", "exceeded", "kept", "kept"]
 
-    def test_never_negated_keeps_none(self) -> None:
-        found = row(epochs(seconds(3)), hazards=hazards(1, t_onset=0, t_failure=NS))
-        assert found["level_verdict"] == ["exceeded"] * 4
+    def test_unknown_time_keeps_no_level_and_exceeds_none(self) -> None:
+        """0.4 s for certain, up to 3 s with what is unknown: only the levels of 24 s and 100 s are kept."""
+        found = row(epochs(seconds(3)), failures=failures(1, hazardous_s=[0.4], hazardous_may_s=[3.0]))
+        assert (found["level_within"], found["level_exceeded"]) == ([1, 0, 0, 1], [0] * 4)
+        assert found["level_verdict"] == ["kept", "unknown", "unknown", "kept"]
 
-    def test_no_failure_is_not_the_same_as_no_evidence(self) -> None:
+    def test_no_failure_is_said_only_where_next_to_nothing_is_unknown(self) -> None:
         assert row(epochs(seconds(3)))["level_verdict"] == ["no_failure"] * 4
-        assert row(epochs(seconds(3)), evidence=None)["level_verdict"] == ["unknown"] * 4
+        for evidence in (Evidence.ODOMETER, None):
+            assert row(epochs(seconds(3)), evidence=evidence)["level_verdict"] == ["unknown"] * 4
+        judgement = ["unknown"] * 3 + ["right"] * 98
+        found = row(epochs(seconds(101), judgement=judgement), evidence=Evidence.BALISE)
+        assert (found["share_unknown"], found["level_verdict"]) == (0.03, ["unknown"] * 4)
+
+
+ACCEPTED = {"status": "accepted", "judgement": "right"}
+
+
+class TestVerdict:
+    def test_safe(self) -> None:
+        assert row(epochs(seconds(3)), passages=passages(1, **ACCEPTED))["verdict"] == "safe"
+
+    def test_a_failure_that_hit_no_balise_is_unsafe(self) -> None:
+        frame = failures(1, hazardous_s=[9.0], within_budget=False)
+        assert row(epochs(seconds(3)), passages=passages(1, **ACCEPTED), failures=frame)["verdict"] == "unsafe"
+
+    def test_share_unknown_is_of_moving_time_in_use(self) -> None:
+        """100 s: unknown while standing for 30 s, while negated for 20 s, and 2 s of the 50 s that are left."""
+        judgement = ["unknown"] * 52 + ["right"] * 49
+        frame = epochs(
+            seconds(101),
+            judgement=judgement,
+            moving=[k >= 30 for k in range(101)],
+            in_use=[not 30 <= k < 50 for k in range(101)],
+        )
+        found = row(frame, passages=passages(1, **ACCEPTED))
+        assert (found["share_unknown"], found["verdict"]) == (0.04, "unproven")
+        assert "4.0% of the moving time in use cannot be judged" in found["notes"]
+        lenient = Configuration.model_validate({"hazards": {"unknown_share_limit": 0.04}})
+        assert row(frame, lenient, passages=passages(1, **ACCEPTED))["verdict"] == "safe"
+
+    def test_unknown_movement_counts_as_moving(self) -> None:
+        frame = epochs(seconds(5), judgement=["unknown", *["right"] * 4], moving=[None, *[True] * 4])
+        assert row(frame)["share_unknown"] == 0.25
 
 
 HOUR = seconds(3601)
@@ -337,13 +383,13 @@ class TestFalseAlarms:
         assert found["false_alarm_rate_per_h"] == 2.0
 
     def test_rate_counts_the_time_with_a_truth(self) -> None:
-        """The truth is known in the first half hour of the hour only."""
-        found = row(epochs(HOUR, error_along_m=[0.5] * 1800 + [None] * 1801), alarms=alarms(1, verdict="false"))
+        """The position is judged in the first half hour of the hour only."""
+        found = row(epochs(HOUR, judgement=["right"] * 1800 + ["unknown"] * 1801), alarms=alarms(1, verdict="false"))
         assert (found["monitored_s"], found["evidence_s"], found["judged_s"]) == (3600.0, 1800.0, 1800.0)
         assert found["false_alarm_rate_per_h"] == 2.0
 
     def test_not_known_without_truth(self) -> None:
-        found = row(epochs(HOUR, error_along_m=None), evidence=None, alarms=alarms(1, verdict="unknown"))
+        found = row(epochs(HOUR, judgement="unknown"), evidence=None, alarms=alarms(1, verdict="unknown"))
         assert (found["alarms"], found["false_alarms"], found["false_alarm_rate_per_h"]) == (1, None, None)
 
     def test_no_rate_while_an_alarm_is_not_judged(self) -> None:

@@ -1,0 +1,111 @@
+"""The failure log: which monitor failed first at each epoch, and the alarm episodes that the fails make up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from schemas.arrays import NS_PER_S, Bools, Ints, flags, times_ns, truths
+from schemas.enums import MonitorState
+from schemas.tables import MONITORS
+
+
+@dataclass(frozen=True)
+class AlarmEpisode:
+    """Fails less than the recovery time apart: first and last failing epoch, monitors in order of failing."""
+
+    first: int
+    last: int
+    start_ns: int
+    end_ns: int
+    monitors: tuple[str, ...]
+    peak_ratio: float
+
+
+@dataclass(frozen=True)
+class FailureLog:
+    """All epochs' times and where they are negated, the failing epochs with their first monitor, and the alarms."""
+
+    t_ns: Ints
+    negated: Bools
+    failing: Ints
+    first_monitor: tuple[str, ...]
+    alarms: tuple[AlarmEpisode, ...]
+
+    def first_in(self, begin_ns: int, end_ns: int) -> tuple[int, str] | None:
+        """First fail in `begin <= t < end`: time and monitor."""
+        stamps = self.t_ns[self.failing]
+        index = int(np.searchsorted(stamps, begin_ns))
+        if index == stamps.size or stamps[index] >= end_ns:
+            return None
+        return int(stamps[index]), self.first_monitor[index]
+
+    def standing_at(self, instant_ns: int) -> str | None:
+        """First monitor of the alarm that stands just before the instant, by its fails or by negation."""
+        spanning = [alarm for alarm in self.alarms if alarm.start_ns < instant_ns <= alarm.end_ns]
+        if spanning:
+            return spanning[0].monitors[0]
+        before = int(np.searchsorted(self.t_ns, instant_ns)) - 1
+        earlier = [alarm for alarm in self.alarms if alarm.end_ns < instant_ns]
+        if before >= 0 and self.negated[before] and earlier:
+            return earlier[-1].monitors[0]
+        return None
+
+    def failed_in(self, first: int, last: int) -> tuple[str, ...]:
+        """Monitors of all alarms that overlap the epochs `first..last`."""
+        overlapping = [alarm for alarm in self.alarms if alarm.first <= last and alarm.last >= first]
+        return tuple(dict.fromkeys(name for alarm in overlapping for name in alarm.monitors))
+
+    def start_within(self, begin_ns: int, end_ns: int) -> int | None:
+        """Start of the first alarm that came in `begin <= t < end`."""
+        return next((alarm.start_ns for alarm in self.alarms if begin_ns <= alarm.start_ns < end_ns), None)
+
+
+def failure_log(epochs: pl.DataFrame, recovery_s: float) -> FailureLog:
+    """Of one solution's epochs, with `negated`; monitors that the frame does not hold were not evaluated."""
+    t_ns = times_ns(epochs)
+    monitors = [name for name in MONITORS if f"{name}_state" in epochs.columns]
+    columns = [truths(epochs[f"{name}_state"] == MonitorState.FAIL.value) for name in monitors]
+    failed = np.column_stack(columns) if columns else np.zeros((t_ns.size, 0), np.bool_)
+    rows = np.flatnonzero(failed.any(axis=1))
+    matrix = failed[rows]
+    first = tuple(monitors[index] for index in matrix.argmax(axis=1).tolist()) if rows.size else ()
+    alarms = _alarms(epochs, t_ns, rows, matrix, monitors, recovery_s)
+    return FailureLog(t_ns, flags(epochs, "negated"), rows, first, alarms)
+
+
+def _alarms(
+    epochs: pl.DataFrame, t_ns: Ints, rows: Ints, matrix: Bools, monitors: list[str], recovery_s: float
+) -> tuple[AlarmEpisode, ...]:
+    if rows.size == 0:
+        return ()
+    breaks = np.flatnonzero(np.diff(t_ns[rows]) >= recovery_s * NS_PER_S) + 1
+    alarms = []
+    for part in np.split(np.arange(rows.size), breaks):
+        first, last = int(rows[part[0]]), int(rows[part[-1]])
+        names = _in_order(matrix[part], monitors)
+        peak = _peak(epochs[first : last + 1], names)
+        alarms.append(AlarmEpisode(first, last, int(t_ns[first]), int(t_ns[last]), names, peak))
+    return tuple(alarms)
+
+
+def _in_order(matrix: Bools, monitors: list[str]) -> tuple[str, ...]:
+    """Monitors that failed, by their first fail; those of one epoch in the order of the contract."""
+    failed = np.flatnonzero(matrix.any(axis=0))
+    by_time = sorted(failed.tolist(), key=lambda column: (int(matrix[:, column].argmax()), column))
+    return tuple(monitors[column] for column in by_time)
+
+
+def _peak(epochs: pl.DataFrame, monitors: tuple[str, ...]) -> float:
+    """Largest |value| / threshold where one of the monitors fails; 0 where neither is recorded."""
+    ratios = [
+        epochs.select(
+            (pl.col(f"{name}_value").abs() / pl.col(f"{name}_threshold"))
+            .filter((pl.col(f"{name}_state") == MonitorState.FAIL.value) & (pl.col(f"{name}_threshold") > 0))
+            .max()
+        ).item()
+        for name in monitors
+    ]
+    return max((float(ratio) for ratio in ratios if ratio is not None), default=0.0)

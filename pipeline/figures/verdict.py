@@ -1,0 +1,84 @@
+"""The verdict of a run, and what heads several solutions or runs (DOMAIN section 5.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import polars as pl
+
+from schemas.enums import RunStatus, RunVerdict
+
+
+def verdict_of(
+    *,
+    unsafe_accepted: int,
+    failures: int,
+    failures_within_budget: int,
+    failures_beyond_budget: int,
+    unproven_accepted: int,
+    accepted: int,
+    share_unknown: float | None,
+    unknown_share_limit: float,
+) -> RunVerdict:
+    """The worst that applies, from the counts and the share of one `runs` row (DOMAIN section 5.4).
+
+    A failure of which the evidence cannot say whether it was within the budget leaves the run unproven. So does a
+    `share_unknown` of None: the position was never in use while the train moved.
+    """
+    if unsafe_accepted or failures_beyond_budget:
+        return RunVerdict.UNSAFE
+    undecided = failures > failures_within_budget or unproven_accepted > 0
+    if undecided or not accepted or share_unknown is None or share_unknown > unknown_share_limit:
+        return RunVerdict.UNPROVEN
+    return RunVerdict.SAFE
+
+
+def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
+    """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
+    found = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
+    if RunVerdict.UNSAFE in found:
+        return RunVerdict.UNSAFE
+    if not found - {None}:
+        return None
+    return RunVerdict.SAFE if found == {RunVerdict.SAFE} else RunVerdict.UNPROVEN
+
+
+@dataclass(frozen=True)
+class CampaignHead:
+    """The verdict of a campaign, and how many runs have which; `failed`: no solution could be replayed."""
+
+    verdict: RunVerdict | None
+    unsafe: int
+    unproven: int
+    safe: int
+    failed: int
+
+    @property
+    def word(self) -> str:
+        return word_of(self.verdict)
+
+    def counts(self) -> dict[str, int]:
+        """Runs by verdict, worst first; failed ones last."""
+        return {"unsafe": self.unsafe, "unproven": self.unproven, "safe": self.safe, "failed": self.failed}
+
+    def __str__(self) -> str:
+        return f"{self.word}: " + ", ".join(f"{count} {name}" for name, count in self.counts().items())
+
+
+def word_of(verdict: RunVerdict | str | None) -> str:
+    """The first word of every report, table and summary."""
+    return RunStatus.FAILED.value if verdict is None else str(verdict)
+
+
+def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
+    """The head of a campaign from the verdicts of its runs."""
+    found = list(verdicts)
+    counts = {verdict.value: found.count(verdict) for verdict in RunVerdict}
+    return CampaignHead(worst_verdict(found), **counts, failed=found.count(None))
+
+
+def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
+    """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
+    listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
+    return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}

@@ -1,0 +1,170 @@
+"""What every question about one solution needs: its positions, the evidence, and the instants that they are held at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.evidence import Evidence
+from pipeline.evidence.accused import OwnAnchors, carried_forward
+from pipeline.evidence.carrying import Readings
+from pipeline.evidence.routes import Route, routes_of_path
+from pipeline.judge.in_use import unambiguous
+from pipeline.judge.judgement import Judgements, Positions, judge_positions, with_own_anchors
+from pipeline.judge.moving import stood_spans
+from pipeline.odometry import Odometry
+from pipeline.track.path import TravelledPath
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.config import Configuration, Vehicle
+from schemas.enums import BaliseKind, PassageStatus
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One solution as it was recorded and replayed.
+
+    `fixes`: its positions as recorded; `epochs`: matched, aligned and monitored, with the LDS columns; `crossings` and
+    `passages`: of the LDS; `balises`: those on the path.
+    """
+
+    name: str
+    fixes: pl.DataFrame
+    epochs: pl.DataFrame
+    crossings: pl.DataFrame
+    passages: pl.DataFrame
+    balises: pl.DataFrame
+    path: TravelledPath
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One solution before the judge."""
+
+    solution: Solution
+    evidence: Evidence
+    odometry: Odometry | None
+    vehicle: Vehicle
+    config: Configuration
+
+    @property
+    def epochs(self) -> pl.DataFrame:
+        return self.solution.epochs
+
+    @cached_property
+    def t_ns(self) -> Ints:
+        return times_ns(self.epochs)
+
+    def instants(self, t_ns: Ints) -> Ints:
+        """When positions of these stamps were true: less the latency of the vehicle file, 0 without one."""
+        return t_ns - round((self.vehicle.gnss_latency_s or 0.0) * NS_PER_S)
+
+    @cached_property
+    def at_ns(self) -> Ints:
+        return self.instants(self.t_ns)
+
+    @cached_property
+    def legs(self) -> list[Route]:
+        return routes_of_path(self.solution.path, self.evidence.network.track.index)
+
+    @cached_property
+    def readings(self) -> Readings:
+        return Readings.of(self.odometry, self.at_ns)
+
+    @cached_property
+    def sign(self) -> int:
+        """+1 where the recorded odometer grows with the path, set with the path itself."""
+        along = np.diff(floats(self.epochs, "odometer_m")) * np.diff(self.readings.distance_m)
+        return -1 if np.nansum(along) < 0.0 else 1
+
+    @cached_property
+    def path_m(self) -> Floats:
+        """Path positions of valid fixes, NaN elsewhere."""
+        return np.where(flags(self.epochs, "fix_valid"), floats(self.epochs, "path_m"), np.nan)
+
+    @cached_property
+    def odometer_moves(self) -> Bools:
+        """Per epoch whether the odometer says that the train moved to the next one."""
+        step_s, moving_s = np.diff(self.at_ns) / NS_PER_S, np.diff(self.readings.moving_s)
+        with np.errstate(invalid="ignore"):
+            moves = moving_s > 0.5 * step_s
+        return np.append(moves, moves[-1:])[: self.t_ns.size]
+
+    @cached_property
+    def odometer_told(self) -> Bools:
+        """Per epoch whether the odometer counted from it to the next one."""
+        segment = self.readings.segment
+        told = (segment[:-1] == segment[1:]) & (segment[1:] >= 0)
+        return np.append(told, told[-1:])[: self.t_ns.size]
+
+    @cached_property
+    def stood(self) -> list[tuple[int, int]]:
+        limit_m = self.config.hazards.failure_limit_m
+        return stood_spans(self.at_ns, self.path_m, self.odometer_moves, self.odometer_told, limit_m)
+
+    @cached_property
+    def positions(self) -> Positions:
+        """The positions of all epochs."""
+        epochs, index = self.epochs, self.evidence.network.track.index
+        element = epochs["netelement_id"].replace_strict(index, default=-1, return_dtype=pl.Int64).fill_null(-1)
+        return Positions(
+            element=np.where(np.isfinite(self.path_m), element.to_numpy(), -1),
+            measure_m=floats(epochs, "measure_m"),
+            leg=ints(epochs["leg"]),
+            path_m=self.path_m,
+            direction=ints(epochs["direction"], 1),
+            unambiguous=unambiguous(epochs, self.config),
+        )
+
+    @cached_property
+    def judged(self) -> Judgements:
+        """What the evidence says of every epoch."""
+        return self._judge(self.positions, self.at_ns)
+
+    @cached_property
+    def offers(self) -> pl.DataFrame:
+        """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them."""
+        return self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
+
+    @cached_property
+    def offers_judged(self) -> Judgements:
+        """What the evidence says of every offer: the balise against where the train was."""
+        offers = self.offers
+        telegram = (offers["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
+        index = self.evidence.network.track.index
+        sure = self.positions.unambiguous
+        positions = Positions(
+            element=offers["netelement_id"].replace_strict(index, default=-1, return_dtype=pl.Int64).to_numpy(),
+            measure_m=floats(offers, "measure_m"),
+            leg=ints(offers["leg"]),
+            path_m=floats(offers, "path_m"),
+            direction=self.positions.direction[ints(offers["before"])],
+            unambiguous=sure[ints(offers["before"])] & sure[ints(offers["epoch"])],
+        )
+        t_ns = times_ns(offers)
+        return self._judge(positions, np.where(telegram, t_ns, self.instants(t_ns)))
+
+    def _judge(self, positions: Positions, at_ns: Ints) -> Judgements:
+        hazards = self.config.hazards
+        found = judge_positions(positions, self.evidence.at(at_ns, self.stood), self.legs, hazards)
+        readings = Readings.of(self.odometry, at_ns)
+        figures, limit_m = self.evidence.figures, hazards.failure_limit_m
+        carried = carried_forward(self._own_anchors, readings, self.sign, self.stood, figures, limit_m)
+        return with_own_anchors(found, positions, carried, hazards)
+
+    @cached_property
+    def _own_anchors(self) -> OwnAnchors:
+        """Virtual balises that the LDS accepted."""
+        virtual = self.offers.filter(
+            (pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+            & (pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value)
+        ).sort("t")
+        return OwnAnchors(floats(virtual, "path_m"), Readings.of(self.odometry, self.instants(times_ns(virtual))))
+
+    @cached_property
+    def train_m(self) -> Floats:
+        """Path position of the train where reference or reads tell it closely enough [m], NaN elsewhere."""
+        known = self.judged.known_m(self.config.hazards.known_error_m)
+        return self.path_m - known * self.positions.direction

@@ -1,0 +1,252 @@
+"""The judge: one solution of a run against the evidence, in the order in which an assessor asks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.epochs.failure_log import FailureLog, failure_log
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.evidence.evidence import KINDS, NOTHING
+from pipeline.evidence.routes import Place
+from pipeline.judge.across import errors_across
+from pipeline.judge.alarms import Fault, alarms_table, margins_m
+from pipeline.judge.bench import Bench
+from pipeline.judge.episodes import Episode, Series, find_episodes
+from pipeline.judge.hazards import Draft, Travel, VirtualOffers, drafts_of
+from pipeline.judge.in_use import in_use_s
+from pipeline.judge.judgement import WRONG, judgement_words
+from pipeline.judge.jumps import find_jumps, steps_of
+from pipeline.judge.moving import moving_by_evidence
+from pipeline.judge.passages import Offers, passages_table, position_stamps, with_unoffered, within_spans
+from pipeline.judge.passings import Passing, train_passings
+from pipeline.judge.rows import failures_table, hazards_table
+from pipeline.judge.states import lds_states, odometer_beyond_confidence
+from pipeline.judge.suspect import Witnesses
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
+from schemas.enums import BaliseKind, Evidence, PassageStatus
+
+_LOOK_S = 1.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Tables of one solution by the contract; `epochs_columns`: those of the judge, row for row with the epochs.
+
+    `failures`: as in `schemas.stages`; `distance_m`: way driven; `evidence`: what most epochs rest on.
+    """
+
+    hazards: pl.DataFrame
+    alarms: pl.DataFrame
+    passages: pl.DataFrame
+    failures: pl.DataFrame
+    epochs_columns: pl.DataFrame
+    distance_m: float | None
+    evidence: Evidence | None
+
+
+def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | None) -> Judged:
+    """Judge one solution; `reference`: as recorded, for errors across the track; `faults`: what was injected."""
+    used_s = in_use_s(bench.epochs, bench.config)
+    log = failure_log(bench.epochs, bench.config.lds.recovery_s)
+    series = _series(bench, used_s)
+    offers = _virtual_offers(bench, series)
+    episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)
+    drafts = drafts_of(episodes, series, offers, _travel(bench, series), bench.config.hazards)
+    witnesses = _witnesses(bench)
+    spans = [(one.onset_ns, one.end_ns if one.detected_ns is None else one.detected_ns) for one in episodes]
+    passages = _passages(bench, drafts, offers, spans)
+    return Judged(
+        hazards=hazards_table(drafts, series, offers, passages, witnesses, bench),
+        alarms=_alarms(bench, log, witnesses, drafts),
+        passages=passages,
+        failures=failures_table(episodes, drafts, series, passages, bench),
+        epochs_columns=_epochs(bench, used_s, _odometer_wrong(bench), spans, reference),
+        distance_m=_distance_m(bench),
+        evidence=_evidence(bench),
+    )
+
+
+def _series(bench: Bench, used_s: Floats) -> Series:
+    """Valid positions with their jumps."""
+    row = np.flatnonzero(bench.positions.known)
+    by_reference = bench.judged.kind == KINDS.index(Evidence.REFERENCE)
+    train_m = np.where(by_reference, bench.train_m, np.nan)[row]
+    odometer_m = bench.sign * bench.evidence.figures.scale * bench.readings.distance_m[row]
+    gap_s = linking_gap_s(nominal_period_s(bench.t_ns), bench.config.lds.crossing_gap_s)
+    t_ns, path_m = bench.t_ns[row], bench.path_m[row]
+    steps = steps_of(t_ns, path_m, train_m, odometer_m, bench.readings.segment[row], gap_s)
+    jumps = find_jumps(steps, bench.positions.direction[row], bench.config.hazards)
+    sigma_m = floats(bench.epochs, "sigma_along_m")[row]
+    return Series(row, t_ns, bench.judged.take(row), used_s[row], sigma_m, jumps)
+
+
+def _virtual_offers(bench: Bench, series: Series) -> VirtualOffers:
+    rows = np.flatnonzero((bench.offers["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy())
+    offers = bench.offers[rows]
+    late = bench.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
+    return VirtualOffers(
+        offered=offers["offered"].to_numpy(),
+        balise_id=offers["balise_id"].to_list(),
+        t_ns=times_ns(offers),
+        number=np.searchsorted(series.row, ints(offers["epoch"])).clip(0, max(series.size - 1, 0)),
+        path_m=floats(offers, "path_m"),
+        judged=bench.offers_judged.take(rows),
+        beyond_window=offers["crossing_id"].is_in(late.drop_nulls().implode()).to_numpy(),
+        accepted=(offers["status"].cast(pl.String) == PassageStatus.ACCEPTED.value).fill_null(value=False).to_numpy(),
+    )
+
+
+def _marked(series: Series, offers: VirtualOffers) -> Bools:
+    """Valid positions that complete an offer judged wrong."""
+    marked = np.zeros(series.size, dtype=np.bool_)
+    marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
+    return marked
+
+
+def _travel(bench: Bench, series: Series) -> Travel:
+    row = series.row
+    return Travel(bench.path_m[row], bench.train_m[row], bench.positions.direction[row])
+
+
+def _witnesses(bench: Bench) -> Witnesses:
+    epochs = bench.epochs
+    stood = within_spans(bench.at_ns, bench.stood)
+    return Witnesses(
+        t_ns=bench.t_ns,
+        judged=bench.judged,
+        margin_m=margins_m(floats(epochs, "sigma_along_m"), bench.config.hazards),
+        path_m=bench.path_m,
+        odometer_m=floats(epochs, "odometer_m"),
+        velocity_mps=floats(epochs, "velocity_along_mps"),
+        contradicted=stood | _odometer_wrong(bench),
+        ambiguous=np.isfinite(bench.path_m) & ~bench.positions.unambiguous,
+    )
+
+
+def _odometer_wrong(bench: Bench) -> Bools:
+    """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
+    known = np.isfinite(bench.train_m)
+    half = np.where(known, 0.5 * (bench.judged.high_m - bench.judged.low_m), np.nan)
+    status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+    accepted = bench.offers.filter((status == PassageStatus.ACCEPTED.value) & (kind == BaliseKind.VIRTUAL.value))
+    odometer_m = floats(bench.epochs, "odometer_m")
+    at_ns = times_ns(accepted.sort("t"))
+    return odometer_beyond_confidence(bench.t_ns, odometer_m, bench.train_m, half, at_ns, bench.config.lds)
+
+
+def _passages(
+    bench: Bench, drafts: Sequence[Draft], offers: VirtualOffers, spans: Sequence[tuple[int, int]]
+) -> pl.DataFrame:
+    period_s = nominal_period_s(bench.t_ns)
+    gap_ns = round(linking_gap_s(period_s, bench.config.lds.crossing_gap_s) * NS_PER_S)
+    passings, forward = _train_passings(bench)
+    stamps = position_stamps(bench.epochs)
+    solution = bench.solution
+    passages = with_unoffered(solution.passages, passings, solution.balises, forward, stamps, gap_ns, solution.name)
+    return passages_table(passages, _offers(bench, drafts, offers), passings, bench.epochs, spans, gap_ns)
+
+
+def _offers(bench: Bench, drafts: Sequence[Draft], offers: VirtualOffers) -> Offers:
+    """All offers with the hazard that each belongs to; inserted: by a jump, on another track, or early and wrong."""
+    virtual = np.flatnonzero((bench.offers["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy())
+    hazard = np.full(bench.offers.height, NOTHING)
+    jumped = np.zeros(bench.offers.height, dtype=np.bool_)
+    for number, draft in reversed(list(enumerate(drafts))):
+        hazard[virtual[draft.hits]] = number
+        jumped[virtual[draft.crossed]] = True
+    judged = bench.offers_judged
+    early = (judged.code == WRONG) & ((judged.low_m > 0.0) | judged.wrong_track)
+    known_m = judged.known_m(bench.config.hazards.known_error_m)
+    return Offers(ints(bench.offers["crossing_id"]), judged, known_m, hazard, jumped | early)
+
+
+def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
+    """When the train passed each balise of the path, and how the path runs over its net element."""
+    index, balises = bench.evidence.network.track.index, bench.solution.balises.unique("balise_id", keep="first")
+    rows = balises.select("balise_id", "netelement_id", "measure_m", "path_m", "leg").rows()
+    places = {name: Place(index[element], measure) for name, element, measure, _, _ in rows}
+    forward = {}
+    for name, _, measure, path_m, leg in rows:
+        place = places[name]
+        _, sense = bench.legs[leg].coordinate(np.array([place.element]), np.array([measure]), np.array([path_m]))
+        forward[name] = int(sense[0]) or 1
+    at_ns = _look_at(bench)
+    evidence = bench.evidence.at(at_ns, bench.stood)
+    hazards = bench.config.hazards
+    return train_passings(at_ns, evidence, places, hazards.known_error_m, bench.config.lds.rearm_m), forward
+
+
+def _look_at(bench: Bench) -> Ints:
+    """The instants of the positions, and others between those that are far apart."""
+    at_ns = bench.at_ns
+    long = np.flatnonzero(np.diff(at_ns) > 1.5 * _LOOK_S * NS_PER_S)
+    between = [
+        np.arange(begin, end, round(_LOOK_S * NS_PER_S), dtype=np.int64)[1:]
+        for begin, end in zip(at_ns[long].tolist(), at_ns[long + 1].tolist(), strict=True)
+    ]
+    return np.unique(np.concatenate([at_ns, *between]))
+
+
+def _alarms(bench: Bench, log: FailureLog, witnesses: Witnesses, drafts: Sequence[Draft]) -> pl.DataFrame:
+    faults = [_fault(draft.episode, number) for number, draft in enumerate(drafts)]
+    places = bench.epochs.select("netelement_id", "measure_m")
+    return alarms_table(
+        bench.solution.name, log, witnesses, bench.positions.known, places, faults, bench.config.hazards
+    )
+
+
+def _fault(episode: Episode, hazard_id: int) -> Fault:
+    return Fault(episode.onset_ns, episode.end_ns, episode.detected_ns, hazard_id)
+
+
+def _epochs(
+    bench: Bench,
+    used_s: Floats,
+    odometer_wrong: Bools,
+    spans: Sequence[tuple[int, int]],
+    reference: pl.DataFrame | None,
+) -> pl.DataFrame:
+    config, judged = bench.config, bench.judged
+    heading = floats(bench.epochs, "heading_deg")
+    cross, up = errors_across(bench.solution.fixes, heading, bench.at_ns, reference, config.hazards.reference_gap_s)
+    by_reference = np.where(judged.kind == KINDS.index(Evidence.REFERENCE), bench.train_m, np.nan)
+    moving, sure = moving_by_evidence(
+        bench.at_ns, by_reference, bench.odometer_moves, bench.odometer_told, bench.stood, config.matching.deadband_mps
+    )
+    suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
+    known = np.isfinite(bench.path_m)
+    return pl.DataFrame(
+        [
+            pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
+            pl.Series("error_low_m", np.where(known, judged.low_m, np.nan), nan_to_null=True),
+            pl.Series("error_high_m", np.where(known, judged.high_m, np.nan), nan_to_null=True),
+            pl.Series("error_cross_m", cross, nan_to_null=True),
+            pl.Series("error_up_m", up, nan_to_null=True),
+            judgement_words(judged.code),
+            pl.Series("in_use", used_s > 0.0),
+            lds_states(bench.epochs, judged, odometer_wrong),
+            pl.Series("suspect_after_the_fact", suspect),
+            pl.select(pl.when(pl.Series(sure)).then(pl.Series(moving)).alias("moving")).to_series(),
+        ]
+    )
+
+
+def _distance_m(bench: Bench) -> float | None:
+    """Way driven: by the odometer, else by the reference, else by the positions; None where none of them tells."""
+    if bench.odometry is not None:
+        driven = bench.readings.travelled_m
+        scale = bench.epochs["odometer_scale"].drop_nulls()
+        return float(driven[-1] - driven[0]) * (scale[-1] if scale.len() else 1.0)
+    train = bench.train_m[np.isfinite(bench.train_m)]
+    place = train if train.size > 1 else bench.path_m[np.isfinite(bench.path_m)]
+    return float(np.abs(np.diff(place)).sum()) if place.size > 1 else None
+
+
+def _evidence(bench: Bench) -> Evidence | None:
+    """What most epochs rest on."""
+    kinds = bench.judged.kind[bench.judged.kind != NOTHING]
+    return KINDS[int(np.bincount(kinds).argmax())] if kinds.size else None

@@ -1,0 +1,208 @@
+"""What the evidence says of each passage: when the train was there, how wrong the offer was, what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from pipeline.judge.judgement import Judgements, judgement_words
+from pipeline.judge.passings import Passing
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
+from schemas.tables import Passages
+
+
+@dataclass(frozen=True)
+class Offers:
+    """The crossings that were offered, judged; arrays in their order. `mode`: failure mode by the hazards.
+
+    `hazard`: row of `hazards` that the crossing belongs to, -1 none.
+    """
+
+    crossing_id: Ints
+    judged: Judgements
+    known_m: Floats
+    hazard: Ints
+    inserted: Bools
+
+
+def passages_table(
+    passages: pl.DataFrame,
+    offers: Offers,
+    passings: dict[str, list[Passing]],
+    epochs: pl.DataFrame,
+    spans: Sequence[tuple[int, int]],
+    gap_ns: int,
+) -> pl.DataFrame:
+    """Passages of the LDS with the columns of the evidence; `spans`: from each fault's onset to its detection."""
+    offered = _of_crossings(passages, offers)
+    t_true = _assigned(passages, passings)
+    stamps = position_stamps(epochs)
+    positioned = _within_gap(stamps, ints(t_true), gap_ns) & t_true.is_not_null().to_numpy()
+    frame = passages.with_columns(
+        t_true.cast(pl.Datetime("ns", "UTC")).alias("t_true"),
+        *offered,
+        pl.Series("_positioned", positioned),
+        pl.Series("_suspect", _inside(passages, spans)),
+        _speeds(passages, t_true, epochs),
+    )
+    return _with_failures(frame).select(Passages.column_names())
+
+
+def position_stamps(epochs: pl.DataFrame) -> Ints:
+    """Times of the epochs with a position [ns]."""
+    return times_ns(epochs)[flags(epochs, "fix_valid") & np.isfinite(floats(epochs, "path_m"))]
+
+
+def _of_crossings(passages: pl.DataFrame, offers: Offers) -> list[pl.Series]:
+    """Judgement, error, hazard and insertion of the crossing that each passage rests on."""
+    order = np.argsort(offers.crossing_id)
+    own = passages["crossing_id"].fill_null(-1).to_numpy()
+    index = np.searchsorted(offers.crossing_id[order], own).clip(0, max(order.size - 1, 0))
+    row = order[index] if order.size else np.zeros(own.size, dtype=np.int64)
+    joined = (offers.crossing_id[row] == own) if order.size else np.zeros(own.size, dtype=np.bool_)
+    virtual = (passages["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
+
+    def taken(values: pl.Series, known: Bools) -> pl.Series:
+        filled = values.gather(row) if order.size else values.clear(own.size)
+        return pl.select(pl.when(pl.Series(known)).then(filled).alias(values.name)).to_series()
+
+    return [
+        taken(judgement_words(offers.judged.code), joined & virtual),
+        taken(pl.Series("location_error_m", offers.known_m, nan_to_null=True), joined),
+        taken(pl.Series("hazard_id", offers.hazard), joined & (offers.hazard[row] >= 0) if order.size else joined),
+        taken(pl.Series("_inserted", offers.inserted), joined).fill_null(value=False),
+    ]
+
+
+def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.Series:
+    """The true passing of each passage [ns]: the nearest in time to its offer or to its reckoning, each given once."""
+    about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
+    balises = passages["balise_id"].to_list()
+    pairs = sorted(
+        (abs(instant - t_ns), row, instant)
+        for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True))
+        if t_ns is not None
+        for instant, _, _ in passings.get(balise, ())
+    )
+    result: list[int | None] = [None] * len(balises)
+    taken: set[tuple[str, int]] = set()
+    for _, row, instant in pairs:
+        if result[row] is None and (balises[row], instant) not in taken:
+            result[row] = instant
+            taken.add((balises[row], instant))
+    return pl.Series("t_true", result, dtype=pl.Int64)
+
+
+def _within_gap(stamps: Ints, t_ns: Ints, gap_ns: int) -> Bools:
+    """Positions on both sides of each instant, no farther apart than a crossing is interpolated over."""
+    if stamps.size < 2:
+        return np.zeros(t_ns.size, dtype=np.bool_)
+    after = np.searchsorted(stamps, t_ns).clip(1, stamps.size - 1)
+    inside = (t_ns >= stamps[0]) & (t_ns <= stamps[-1])
+    return np.asarray(inside & (stamps[after] - stamps[after - 1] <= gap_ns))
+
+
+def _inside(passages: pl.DataFrame, spans: Sequence[tuple[int, int]]) -> Bools:
+    """Virtual balises accepted from a fault's onset on and before its detection."""
+    accepted = (passages["status"].cast(pl.String) == PassageStatus.ACCEPTED.value).to_numpy()
+    accepted &= (passages["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
+    t_ns = ints(passages["t_offered"].dt.timestamp("ns"))
+    return accepted & within_spans(t_ns, spans)
+
+
+def within_spans(t_ns: Ints, spans: Sequence[tuple[int, int]]) -> Bools:
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
+    for begin_ns, end_ns in spans:
+        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
+    return inside
+
+
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame) -> pl.Series:
+    """Speed of the train at the offer, else where it passed [m/s]."""
+    at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
+    stamps, speed = times_ns(epochs), np.abs(floats(epochs, "speed_mps"))
+    known = np.isfinite(speed)
+    if not known.any():
+        return pl.Series("speed_mps", [None] * passages.height, dtype=pl.Float64)
+    offset = int(stamps[0])
+    values = np.interp((ints(at) - offset) / 1e9, (stamps[known] - offset) / 1e9, speed[known])
+    return pl.select(pl.when(at.is_not_null()).then(pl.Series(values)).alias("speed_mps")).to_series()
+
+
+def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
+    """ETCS failure mode and cause: insertion where offered where it is not, deletion where not offered in time."""
+    beyond_window = (pl.col("odometer_distance_m") > pl.col("window_close_m")).fill_null(value=False)
+    offered, wrong = pl.col("t_offered").is_not_null(), (pl.col("judgement") == "wrong").fill_null(value=False)
+    absent = pl.col("status") == PassageStatus.NOT_AVAILABLE.value
+    insertion = offered & pl.col("_inserted")
+    deletion = absent | ~offered | beyond_window
+    by_position = (insertion | (beyond_window & wrong)) | (~offered & pl.col("_positioned"))
+    without = absent | (~offered & ~pl.col("_positioned"))
+    mode = pl.when(insertion).then(pl.lit(FailureMode.INSERTION.value)).when(deletion)
+    cause = pl.when(by_position & ~(absent & ~insertion)).then(pl.lit(Cause.POSITION.value)).when(without)
+    return frame.with_columns(
+        mode.then(pl.lit(FailureMode.DELETION.value))
+        .otherwise(pl.lit(FailureMode.NONE.value))
+        .cast(frame.schema["failure_mode"])
+        .alias("failure_mode"),
+        cause.then(pl.lit(Cause.NO_POSITION.value))
+        .otherwise(pl.lit(Cause.NONE.value))
+        .cast(frame.schema["cause"])
+        .alias("cause"),
+        pl.col("_suspect").alias("suspect_after_the_fact"),
+    )
+
+
+def with_unoffered(
+    passages: pl.DataFrame,
+    passings: dict[str, list[Passing]],
+    balises: pl.DataFrame,
+    forward: dict[str, int],
+    stamps: Ints,
+    gap_ns: int,
+    solution: str,
+) -> pl.DataFrame:
+    """One more passage for each virtual balise that the train passed and the LDS knows nothing of.
+
+    The LDS follows the position: before the first one, or where it is wrong at an end of the run, no window has closed
+    yet. `forward`: +1 where the path grows with the measure of the balise's net element; `stamps`: of valid positions.
+    """
+    given = set(zip(passages["balise_id"].to_list(), _assigned(passages, passings).to_list(), strict=True))
+    virtual = balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+    rows = [
+        _unoffered(balise, instant, sense * forward[balise["balise_id"]], _was_seen(stamps, instant, gap_ns), solution)
+        for balise in virtual.unique("balise_id", keep="first", maintain_order=True).iter_rows(named=True)
+        for instant, sense, clear in passings.get(balise["balise_id"], ())
+        if clear and (balise["balise_id"], instant) not in given
+    ]
+    if not rows:
+        return passages
+    schema = {name: pl.String if isinstance(kind, pl.Enum) else kind for name, kind in passages.schema.items()}
+    plain = {name: pl.Int64 if kind == pl.Datetime else kind for name, kind in schema.items()}
+    added = pl.DataFrame(rows, schema=plain).cast(passages.schema)
+    when = pl.coalesce("t_offered", "t_reckoned")
+    ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
+    return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
+
+
+def _was_seen(stamps: Ints, instant: int, gap_ns: int) -> bool:
+    return bool(_within_gap(stamps, np.array([instant]), gap_ns)[0])
+
+
+def _unoffered(balise: dict[str, object], instant: int, direction: int, seen: bool, solution: str) -> dict[str, object]:
+    own = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
+    return {name: balise[name] for name in own} | {
+        "solution": solution,
+        "direction": (Direction.GROWING if direction > 0 else Direction.FALLING).value,
+        "status": (PassageStatus.MISSED if seen else PassageStatus.NOT_AVAILABLE).value,
+        "linking_error": LinkingError.NONE.value,
+        "reaction": Reaction.NONE.value,
+        "failure_mode": FailureMode.DELETION.value,
+        "cause": Cause.NONE.value,
+        "suspect_after_the_fact": False,
+        "t_reckoned": instant,
+    }

@@ -1,0 +1,91 @@
+"""When the train itself passed each balise, by the evidence alone (CONTRACT section 3, `t_true`)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.evidence.evidence import Alternative, EvidenceSet
+from pipeline.evidence.routes import Place
+from schemas.arrays import Bools, Floats, Ints
+
+
+class Passing(NamedTuple):
+    """Instant [ns]; `sense` +1 where the train moved with the measure of the balise's net element, else -1.
+
+    `clear`: it came from beyond the re-arming distance and went on beyond it.
+    """
+
+    t_ns: int
+    sense: int
+    clear: bool
+
+
+def train_passings(
+    t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], known_to_m: float, rearm_m: float
+) -> dict[str, list[Passing]]:
+    """Passings of each balise in order of time, where the evidence leaves one track and the place to `known_to_m`.
+
+    `t_ns`: the instants of the evidence, in order, close enough for straight lines. A train that came no farther than
+    `rearm_m` from a balise since it passed it has not passed it again.
+    """
+    alone = _alone(evidence, t_ns.size)
+    names, spots = list(places), list(places.values())
+    elements = np.array([place.element for place in spots], dtype=np.int64)
+    measures = np.array([place.measure_m for place in spots])
+    found: dict[str, list[Passing]] = {name: [] for name in names}
+    for alternative in evidence.alternatives:
+        close = (alternative.high_m - alternative.low_m <= 2.0 * known_to_m) & alone[alternative.rows]
+        rows, at_m = alternative.rows[close], (0.5 * (alternative.low_m + alternative.high_m))[close]
+        for balise, visit_m, sense in _on_route(alternative, elements, measures, at_m):
+            instants = _crossed(t_ns, rows, at_m - visit_m, rearm_m)
+            found[names[balise]] += [one._replace(sense=one.sense * sense) for one in instants]
+    return {name: sorted(instants) for name, instants in found.items()}
+
+
+def _alone(evidence: EvidenceSet, size: int) -> Bools:
+    """Instants at which the train was on one track for sure."""
+    count = np.zeros(size, dtype=np.int64)
+    for alternative in evidence.alternatives:
+        count[alternative.rows] += 1
+    count[evidence.rival_row] += 1
+    alone: Bools = count == 1
+    return alone
+
+
+def _on_route(alternative: Alternative, elements: Ints, measures: Floats, at_m: Floats) -> list[tuple[int, float, int]]:
+    """Balises on the part of the route that the train covered: number, coordinate [m], sense of the measure."""
+    route, found = alternative.route, []
+    if at_m.size == 0:
+        return []
+    for visit in range(route.element.size):
+        inside = (elements == route.element[visit]) & (measures >= route.low_m[visit] - 0.5)
+        inside &= measures <= route.high_m[visit] + 0.5
+        for balise in np.flatnonzero(inside).tolist():
+            since = measures[balise] - route.low_m[visit]
+            forward = bool(route.forward[visit])
+            place_m = float(route.entry_m[visit] + (since if forward else route.high_m[visit] - measures[balise]))
+            if at_m.min() <= place_m <= at_m.max():
+                found.append((balise, place_m, 1 if forward else -1))
+    return found
+
+
+def _crossed(t_ns: Ints, rows: Ints, away_m: Floats, rearm_m: float) -> list[Passing]:
+    """Instants at which the train went from one side of the balise to the other, and which way."""
+    side = away_m >= 0.0
+    changes = np.flatnonzero((side[1:] != side[:-1]) & (np.diff(rows) == 1)) + 1
+    found: list[Passing] = []
+    armed_from = 0
+    for change in changes.tolist():
+        if found and float(np.abs(away_m[armed_from:change]).max(initial=0.0)) < rearm_m:
+            continue
+        before, after = float(away_m[change - 1]), float(away_m[change])
+        begin, end = int(t_ns[rows[change - 1]]), int(t_ns[rows[change]])
+        later = changes[changes > change]
+        beyond = away_m[change : int(later[0]) if later.size else away_m.size]
+        clear = min(np.abs(away_m[armed_from:change]).max(), np.abs(beyond).max()) >= rearm_m
+        instant = begin + round((end - begin) * before / (before - after))
+        found.append(Passing(instant, 1 if after > before else -1, bool(clear)))
+        armed_from = change
+    return found

@@ -1,0 +1,116 @@
+"""Sums and verdicts of a replay against a count of the tests' own (DOMAIN 5.2 to 5.4)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from schemas.config import Configuration
+
+if TYPE_CHECKING:
+    from tests.judge.findings import Bools, Rung
+
+BUDGET_S = Configuration().budget_s
+LIMIT_M = 20.0
+UNKNOWN_SHARE = 0.01
+CLEAR_M = 1.0  # beyond the limit by this much is beyond it for any evidence of this package
+ROUNDING_S = 1e-6
+
+
+def account_findings(rung: Rung) -> list[str]:
+    return [*_acceptances(rung), *_failures(rung), *_verdict(rung), *_states(rung)]
+
+
+def _acceptances(rung: Rung) -> list[str]:
+    accepted = (rung.offers["status"].cast(pl.String) == "accepted").to_numpy()
+    counts = {
+        "unsafe_accepted": int((accepted & (rung.passages.judgement == "wrong")).sum()),
+        "unproven_accepted": int((accepted & (rung.passages.judgement == "unknown")).sum()),
+    }
+    return [
+        f"runs.{name} is {rung.row[name]}, the passages hold {count}"
+        for name, count in counts.items()
+        if rung.row[name] != count
+    ]
+
+
+def longest_s(mask: Bools, span_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    """Longest stretch of it in time."""
+    best = run = 0.0
+    for inside, span in zip(mask, span_s, strict=True):
+        run = run + float(span) if inside else 0.0
+        best = max(best, run)
+    return best
+
+
+def _failures(rung: Rung) -> list[str]:
+    """Failures and hazardous time lie between what was surely in use and what may have been."""
+    wrong = rung.epochs.judgement == "wrong"
+    surely, at_most = rung.in_use
+    # Before the first epoch there is none to count from.
+    least, most = longest_s((wrong & surely)[1:], rung.span_s[1:]), float(rung.span_s[wrong & at_most].sum())
+    told, failures = rung.row["hazardous_max_s"], rung.number("failures")
+    hazardous = 0.0 if told is None else rung.number("hazardous_max_s")
+    found = []
+    if hazardous < least - ROUNDING_S or hazardous > most + ROUNDING_S:
+        found.append(f"hazardous_max_s is {told}, judged wrong in use is {least:.3f} to {most:.3f} s")
+    if (failures > 0) != (least > 0) and (failures > 0) != (most > 0):
+        found.append(f"failures is {failures:.0f}, judged wrong in use is {least:.3f} to {most:.3f} s")
+    return found + _share_unknown(rung, surely, at_most)
+
+
+def _share_unknown(rung: Rung, surely: Bools, at_most: Bools) -> list[str]:
+    moving = rung.tables.epochs["moving"].fill_null(True).to_numpy()
+    unknown = (rung.epochs.judgement == "unknown") & moving
+    total = [float(rung.span_s[use & moving].sum()) for use in (surely, at_most)]
+    if min(total) == 0:
+        return []
+    shares = [
+        float(rung.span_s[unknown & use].sum()) / all_s for use, all_s in zip((surely, at_most), total, strict=True)
+    ]
+    low, high, told = min(shares), max(shares), rung.row["share_unknown"]
+    # To which of its two epochs a span belongs is not fixed for a share: one epoch at each end and at each gap.
+    gaps = 2 + int((np.diff(rung.epochs.time_s) > rung.span_s.max()).sum())
+    close = 0.005 + 1.5 * gaps * float(rung.span_s.max()) / min(total)
+    if isinstance(told, float) and low - close <= told <= high + close:
+        return []
+    return [f"share_unknown is {told}, the epochs say {low:.4f} to {high:.4f}"]
+
+
+def _verdict(rung: Rung) -> list[str]:
+    verdict, row = rung.row["verdict"], rung.row
+    accepted = (rung.offers["status"].cast(pl.String) == "accepted").to_numpy()
+    offers, epochs = rung.passages, rung.epochs
+    surely, at_most = rung.in_use
+    beside = offers.beside & (offers.apart_m > 3.0)
+    wrong = accepted & ((np.abs(offers.error_m) > LIMIT_M + CLEAR_M) | beside)
+    failing = (np.abs(epochs.error_m) > LIMIT_M + CLEAR_M) & surely
+    failing_s, use_s = float(rung.span_s[failing].sum()), float(rung.span_s[surely].sum())
+    maybe = (np.abs(epochs.error_m) > LIMIT_M - CLEAR_M) | epochs.beside
+    maybe_accepted = accepted & ((np.abs(offers.error_m) > LIMIT_M - CLEAR_M) | offers.beside)
+    healthy = not (maybe & at_most).any() and not maybe_accepted.any()
+    unproven = (row["unsafe_accepted"], row["unproven_accepted"]) != (0, 0) or not accepted.any()
+    over = longest_s((epochs.judgement == "wrong") & surely, rung.span_s) > BUDGET_S + ROUNDING_S
+    share = row["share_unknown"]
+    rules = {
+        f"{int(wrong.sum())} VBs were accepted wrong by truth": verdict == "safe" and bool(wrong.any()),
+        f"{failing_s:.2f} s of failure in use by truth": verdict == "safe" and failing_s > BUDGET_S + 0.01 * use_s,
+        "nothing was wrong by truth": verdict == "unsafe" and healthy and rung.name != "odometer",
+        "an acceptance is wrong or unknown, or there is none": verdict == "safe" and unproven,
+        "a VB was accepted wrong": verdict != "unsafe" and row["unsafe_accepted"] != 0,
+        "a failure is longer than the budget": verdict != "unsafe" and over,
+        f"share_unknown is {share}": verdict == "safe" and not (isinstance(share, float) and share <= UNKNOWN_SHARE),
+        "the odometer alone proves nothing": verdict == "safe" and rung.name == "odometer",
+        "there is no verdict": verdict is None,
+    }
+    return [f"verdict is {verdict}, but {text}" for text, breached in rules.items() if breached]
+
+
+def _states(rung: Rung) -> list[str]:
+    """P0 and P1 follow the judgement."""
+    state = rung.tables.epochs["lds_state"].cast(pl.String).fill_null("null").to_numpy().astype(str)
+    judged = rung.epochs.judgement
+    bad = ((state == "P0") & (judged != "right")) | ((state == "P1") & (judged != "wrong"))
+    return [rung.epochs.told(int(at), f"its state is {state[at]}") for at in np.flatnonzero(bad)[:3]]

@@ -1,0 +1,61 @@
+"""The reference by itself on the network: where it was, and which tracks it leaves possible."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.matching.match import Match
+from pipeline.matching.reference import match_reference
+from schemas.arrays import Floats
+from schemas.config import MatchingConfig
+from schemas.run import Site
+from tests.matching.builders import line, run, site
+
+TRACKS = site(
+    {"a": line((0, 0), (1000, 0)), "b": line((1000, 0), (2000, 0)), "c": line((0, 4), (2000, 4))},
+    [("a", 1, "b", 0, "both")],
+)
+X_M = np.arange(100.0, 1900.0, 20.0)
+
+
+def placed(y_m: Floats, sigma_m: float | None, place: Site = TRACKS) -> Match | None:
+    sigma = pl.Series("sigma_m", [sigma_m] * len(X_M), dtype=pl.Float64)
+    stream = run(X_M, y_m).select("t", "latitude_deg", "longitude_deg", "height_m").with_columns(sigma)
+    return match_reference(stream, place, MatchingConfig(), 1.0)
+
+
+def test_an_exact_reference_leaves_one_track() -> None:
+    found = placed(0.0 * X_M, 0.05)
+    assert found is not None
+    assert np.allclose(found.epochs["path_m"], X_M, atol=1e-3)
+    rivals = found.rivals(0.001)
+    assert len(rivals) == len(X_M)
+    assert rivals.at(5) == ["a"]
+    assert rivals.at(len(X_M) - 5) == ["b"]
+
+
+@pytest.mark.parametrize("sigma_m", [2.0, None])
+def test_a_coarse_reference_leaves_both(sigma_m: float | None) -> None:
+    found = placed(np.full(len(X_M), 1.8), sigma_m)
+    assert found is not None
+    assert found.rivals(0.001).at(5) == ["a", "c"]
+
+
+def test_the_path_s_own_element_is_there_whatever_the_limit() -> None:
+    found = placed(np.full(len(X_M), 2.0), 2.0)
+    assert found is not None
+    rivals = found.rivals(0.999)
+    assert [rivals.at(k)[0] for k in range(len(X_M))] == found.epochs["netelement_id"].to_list()
+
+
+def test_on_one_chain_there_is_its_own_element_only() -> None:
+    found = placed(0.0 * X_M, 5.0, site({"a": line((0, 0), (2000, 0))}))
+    assert found is not None
+    assert found.rivals(0.001).at(3) == ["a"]
+
+
+def test_a_reference_beside_every_track_is_no_witness() -> None:
+    assert placed(np.full(len(X_M), 400.0), 1.0) is None
+    assert placed(np.full(len(X_M), np.nan), 1.0) is None
