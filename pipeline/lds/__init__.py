@@ -28,9 +28,10 @@ Where the sources leave a choice, this package reads them so:
   5 m alone would alarm on sound receivers.
 - Over an outage for which the bank begins anew (`align.gap_reset_s`) nobody looked on, and the expectation window is
   too wide to see what came of it: of 300 virtual balises that 20 runs passed after an outage of 90 s with the position
-  30 m off, the plain rules accept 300 and this one none. So the first usable position after it has to re-link (`relink`, the same
-  function): where GNSS minus odometer has moved, the linking distance monitor fails; where it cannot be told (no
-  vehicle file, distance lost), it is `not_evaluated` and the position is negated without an alarm until a telegram.
+  30 m off, the plain rules accept 300 and this one none. So the first usable position after it has to re-link
+  (`relink`, the same function): where GNSS minus odometer has moved, the linking distance monitor fails; where it
+  cannot be told (no vehicle file, distance lost), it is `not_evaluated` and the position is negated without an alarm
+  until a telegram.
 - A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """
