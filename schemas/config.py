@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
 from schemas.enums import Fix
@@ -204,7 +204,11 @@ class LdsConfig(Settings):
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
     crossing_gap_s: Positive = 1.0
     entry_from_unfitted_area: bool = False
+    # Instants at which the LDS begins anew, without LRVB and linking (DOMAIN section 4, initialisation).
+    starts_of_mission: tuple[AwareDatetime, ...] = ()
+    # Off: a negated position never returns (DOMAIN section 4).
     relink: bool = True
+    # A slow drift has moved the TVBs of the minutes before its alarm already: 9 m at 0.05 m/s in 180 s.
     anchor_lag_s: NonNegative = 300.0
 
 
