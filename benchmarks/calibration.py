@@ -17,7 +17,8 @@ from scipy.signal import lfilter
 
 from benchmarks.results import Figure
 from pipeline.matching import match
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from pipeline.odometry import odometry_of
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site
 
@@ -137,7 +138,8 @@ def stamps(t_s: np.ndarray) -> pl.Series:
 
 
 def claim(one: Trial) -> Claim:
-    found = match(one.fixes, one.odometer, one.site, Vehicle(), MatchingConfig(), FixSigma()).epochs
+    odometry = odometry_of(one.odometer, Vehicle(), Configuration())
+    found = match(one.fixes, odometry, one.site, Vehicle(), MatchingConfig(), FixSigma()).epochs
     right = bool((found["netelement_id"].str.head(1) == one.track).mean() > 0.5)
     gate, path = (found[f"{name}_probability"].drop_nulls() for name in ("gate", "path"))
     return Claim(float(gate.max() or 0.0), float(path.median() or 0.0), right)

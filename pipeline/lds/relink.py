@@ -10,7 +10,7 @@ on meanwhile.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import isfinite
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
+from pipeline.odometry.drift import drift_m2, relink_bound_m
 from schemas.arrays import NS_PER_S
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
@@ -130,10 +131,11 @@ class Relink:
         """
         waited_s = (int(self._journey.t_ns[k]) - anchor.t_ns) / NS_PER_S
         way_m = float(self._journey.travelled_m[k]) - anchor.travelled_m
-        variance_m2 = anchor.sigma_m**2 + float(self._journey.sigma_m[k]) ** 2
-        variance_m2 += self._limits.odometer_sigma_mps**2 * waited_s
-        variance_m2 += ((self._limits.odometer_scale_sigma or 0.0) * way_m) ** 2
-        return min(self._limits.failure_limit_m / 2.0, self._limits.threshold_factor * sqrt(variance_m2))
+        positions_m2 = anchor.sigma_m**2 + float(self._journey.sigma_m[k]) ** 2
+        limits = self._limits
+        scale_sigma = limits.odometer_scale_sigma or 0.0
+        variance_m2 = drift_m2(positions_m2, waited_s, way_m, limits.odometer_sigma_mps, scale_sigma)
+        return float(relink_bound_m(variance_m2, limits.threshold_factor, limits.failure_limit_m))
 
 
 Return = Literal["re-link", "initialisation"]

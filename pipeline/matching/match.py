@@ -80,8 +80,8 @@ def match(
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    epochs = epochs.with_columns(fixes["hpl_m"], *digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, odometer_sign=sign)
+    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
+    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, sign)
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:
