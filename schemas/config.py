@@ -108,6 +108,8 @@ class MatchingConfig(Settings):
     # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
     survey_correlation_m: Positive = 200.0
+    # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
+    estimated_drift: NonNegative = 0.1
     outlier_probability: Probability = 1e-4
     outlier_scale_m: Positive = 10.0
     step_distance_m: Positive = 10.0
