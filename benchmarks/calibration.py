@@ -8,6 +8,7 @@ the truth, double, or not stated at all. A run is one trial, since its claim har
 from __future__ import annotations
 
 import argparse
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from scipy.signal import lfilter
 from benchmarks.results import Figure
 from pipeline.matching import match
 from pipeline.odometry import odometry_of
+from schemas.arrays import floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.inputs import Links, Track
 from schemas.run import Site
@@ -100,7 +102,7 @@ def parallel(rng: np.random.Generator, tracks: dict[str, float], survey_m: float
     frames, links = [], []
     cuts = np.arange(0.0, LENGTH_M + 1.0, ELEMENT_M)
     for track, y in tracks.items():
-        for number, (start, end) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+        for number, (start, end) in enumerate(itertools.pairwise(cuts.tolist())):
             x = np.linspace(start, end, 31)
             latitude, longitude = degrees(x, np.full(31, y + survey_m * rng.normal()))
             columns = {"measure_m": x - start, "latitude_deg": latitude, "longitude_deg": longitude}
@@ -124,6 +126,7 @@ def fixes_at(x: np.ndarray, y: np.ndarray, t_s: np.ndarray, sigma_m: float | Non
         (0.0 * variance).alias("cov_en_m2"),
         variance.alias("cov_nn_m2"),
         pl.lit("sbas").alias("fix"),
+        pl.lit(None, dtype=pl.Float64).alias("hpl_m"),
     )
 
 
@@ -140,9 +143,9 @@ def stamps(t_s: np.ndarray) -> pl.Series:
 def claim(one: Trial) -> Claim:
     odometry = odometry_of(one.odometer, Vehicle(), Configuration())
     found = match(one.fixes, odometry, one.site, Vehicle(), MatchingConfig(), FixSigma()).epochs
-    right = bool((found["netelement_id"].str.head(1) == one.track).mean() > 0.5)
-    gate, path = (found[f"{name}_probability"].drop_nulls() for name in ("gate", "path"))
-    return Claim(float(gate.max() or 0.0), float(path.median() or 0.0), right)
+    right = bool(np.mean((found["netelement_id"].str.head(1) == one.track).to_numpy()) > 0.5)
+    gate, path = (np.nan_to_num(floats(found, f"{name}_probability")) for name in ("gate", "path"))
+    return Claim(float(gate.max()), float(np.median(path)), right)
 
 
 def claims(runs: int, seed: int) -> list[Claim]:

@@ -117,6 +117,7 @@ def journey(site: Site, noise_m: float = 1.0) -> tuple[pl.DataFrame, pl.DataFram
             "cov_en_m2": np.zeros(EPOCHS),
             "cov_nn_m2": np.full(EPOCHS, noise_m**2),
             "fix": ["sbas"] * EPOCHS,
+            "hpl_m": pl.Series([None] * EPOCHS, dtype=pl.Float64),
         }
     )
     odometer = pl.DataFrame({"t": t, "distance_m": distance * 1.002, "speed_mps": np.gradient(distance) * 10.0})

@@ -210,6 +210,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.odometry,
         context.config.align.straight_s,
     )
+    notes = (*notes, *reading_notes(ride.aligned, context.config))
     return SolutionResults(
         solution=name,
         epochs=epochs,

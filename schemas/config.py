@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
 from schemas.enums import Fix
@@ -108,6 +108,8 @@ class MatchingConfig(Settings):
     # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
     survey_correlation_m: Positive = 200.0
+    # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
+    estimated_drift: NonNegative = 0.1
     outlier_probability: Probability = 1e-4
     outlier_scale_m: Positive = 10.0
     step_distance_m: Positive = 10.0
@@ -206,7 +208,11 @@ class LdsConfig(Settings):
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
     crossing_gap_s: Positive = 1.0
     entry_from_unfitted_area: bool = False
+    # Instants at which the LDS begins anew, without LRVB and linking (DOMAIN section 4, initialisation).
+    starts_of_mission: tuple[AwareDatetime, ...] = ()
+    # Off: a negated position never returns (DOMAIN section 4).
     relink: bool = True
+    # A slow drift has moved the TVBs of the minutes before its alarm already: 9 m at 0.05 m/s in 180 s.
     anchor_lag_s: NonNegative = 300.0
 
 

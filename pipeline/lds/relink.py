@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
+from typing import Literal
 
 import numpy as np
 
@@ -137,6 +138,21 @@ class Relink:
         return float(relink_bound_m(variance_m2, limits.threshold_factor, limits.failure_limit_m))
 
 
+Return = Literal["re-link", "initialisation"]
+
+
+@dataclass(slots=True)
+class Negation:
+    """The position was not used from `first_epoch` on until `end_epoch` (`None`: to the end)."""
+
+    first_epoch: int
+    end_epoch: int | None = None
+    ended_by: Return | None = None
+
+    def end(self, k: int, by: Return) -> None:
+        self.end_epoch, self.ended_by = k, by
+
+
 class Recovery:
     """One negation: since when nothing has failed fast."""
 
@@ -145,9 +161,13 @@ class Recovery:
         self._recovery_ns = config.recovery_s * NS_PER_S
         self._failed_at_ns = self._seen_at_ns = int(journey.t_ns[k])
 
-    def is_over(self, k: int, seen: bool, failing: bool) -> bool:
-        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now."""
+    def is_over(self, k: int, evaluated: bool, failing: bool) -> bool:
+        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now.
+
+        Without an odometer there is no along bank to look on; the position itself has to do.
+        """
         t_ns = int(self._journey.t_ns[k])
+        seen = evaluated if self._journey.has_odometer else bool(self._journey.usable[k])
         if seen:
             if t_ns - self._seen_at_ns > self._journey.gap_ns:
                 self._failed_at_ns = t_ns

@@ -17,7 +17,8 @@ from schemas.enums import Fix
 class Fixes:
     """Epochs of one solution in order; NaN where not known.
 
-    `valid` has a position and a fix; `from_receiver` says that the (co)variances [m2] are the receiver's.
+    `valid` has a position and a fix; `from_receiver` says that the (co)variances [m2] are the receiver's; `estimated`
+    that the position was carried on without satellites.
     """
 
     t_ns: Ints
@@ -31,6 +32,7 @@ class Fixes:
     cov_nn_m2: Floats
     cov_uu_m2: Floats
     from_receiver: Bools
+    estimated: Bools
     vel_e_mps: Floats
     vel_n_mps: Floats
     hpl_m: Floats
@@ -78,6 +80,7 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
         cov_nn_m2=nn,
         cov_uu_m2=up,
         from_receiver=receiver,
+        estimated=fix == _KINDS.index(Fix.ESTIMATED.value),
         vel_e_mps=column["vel_e_mps"],
         vel_n_mps=column["vel_n_mps"],
         hpl_m=column["hpl_m"],

@@ -24,11 +24,10 @@ from schemas.config import MatchingConfig
 # table's, which knows nothing of this receiver's noise.
 _FLOOR_M = 0.02
 _TABLE_FLOOR_M = 0.1
-# An offset outside this many sigmas, and the scale of outliers, lasts for this long [s]: being off costs by the time.
-_OFF_SIGMAS = 5.0
+# A position that an element does not explain stays so for this long [s]: being off costs by the time.
 # Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_S = 8.0
-_OFF_WANDER = 0.1
+_OFF_WANDER = 0.03
 _HEADING_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
@@ -70,13 +69,14 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     elapsed, way = steps.elapsed_s[candidates.step], steps.chord_m[candidates.step]
     renewed = -np.expm1(-2.0 * np.nan_to_num(elapsed) / config.noise_tau_s)
     wander_m2 = survey_m2 * -np.expm1(-2.0 * np.nan_to_num(way) / config.survey_correlation_m)
+    wander_m2 += np.where(fixes.estimated[row], (config.estimated_drift * np.nan_to_num(way)) ** 2, 0.0)
     fast_m2 = ((1.0 - config.slow_share) * gnss_m2)[:, None] * hypotheses.scale**2
     variance = fast_m2 + hypotheses.within_m**2 + np.maximum(survey_m2 - common_m2, 0.0)[:, None]
     floor_m2 = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M) ** 2
     fresh = np.maximum(fast_m2 * renewed[:, None] + wander_m2[:, None], floor_m2[:, None])
     whole_m2 = gnss_m2 + survey_m2 + config.cross_bias_sigma_m**2
     unexplained = candidates.distance_m > config.on_track_sigmas * np.sqrt(whole_m2)
-    off = candidates.distance_m > np.maximum(_OFF_SIGMAS * np.sqrt(whole_m2), config.outlier_scale_m)
+    off = unexplained & (candidates.distance_m > config.outlier_scale_m)
     heading = _heading(steps, candidates, config)
     share_new = np.clip(gnss_m2 * renewed + wander_m2, np.minimum(floor_m2, whole_m2), whole_m2) / whole_m2
     return Likelihood(

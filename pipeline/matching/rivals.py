@@ -50,7 +50,7 @@ def posterior_of(trellis: Trellis, found: Found) -> Posterior:
     step = np.repeat(np.arange(len(trellis)), np.diff(trellis.first))
     count = trellis.network.count
     keys, inverse = np.unique(step * count + trellis.oriented // 2, return_inverse=True)
-    probability = np.bincount(inverse, weights=found.posterior, minlength=len(keys))
+    probability = np.asarray(np.bincount(inverse, found.posterior, len(keys)), dtype=np.float64)
     first = np.searchsorted(keys // count, np.arange(len(trellis) + 1))
     return Posterior(trellis.steps.epoch, first, (keys % count).astype(np.int64), probability)
 

@@ -1,6 +1,7 @@
 """Viterbi, forward and backward over the steps (Rabiner 1989, section III), in logarithms.
 
-Every state carries a weight for each hypothesis of what lasts. On a change of net element part of the bias is drawn anew.
+Every state carries a weight for each hypothesis of what lasts. On a change of net element part of the bias is drawn
+anew.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class Trellis:
         changes = self.oriented[one] != self.oriented[other]
         score = step_score(self.offset_m[one], self.offset_m[other], self.candidate[other], changes, self.like)
         score = np.maximum(move[:, None] + score, BREAK + self.initial[other])
-        return score.reshape(*shape, -1)
+        return np.asarray(score.reshape(*shape, -1))
 
     def changes(self, step: int) -> Bools:
         """Which states of step - 1 (rows) and of `step` (columns) are on different elements."""

@@ -134,7 +134,8 @@ def test_a_jump_along_the_track_makes_no_detour(jump_m: float, seed: int) -> Non
     assert found.path.elements() == ["A1", "A2"]
     assert len(found.path.legs) == 1
     assert np.allclose(found.epochs["path_m"], raw, atol=0.01)
-    assert found.epochs["path_probability"].min() > 0.99
+    # Half a metre aside on tracks 4 m apart never proves more; the jump takes nothing off.
+    assert found.epochs["path_probability"].min() == pytest.approx(found.epochs["path_probability"].max(), abs=0.02)
 
 
 def test_a_jump_onto_the_other_track_for_a_while_is_not_followed() -> None:
@@ -296,7 +297,8 @@ def test_biases_are_told_per_element_and_outlast_a_fault() -> None:
     table = dict(zip(found.biases["netelement_id"], found.biases["cross_bias_m"], strict=True))
     assert table["s"] == pytest.approx(0.8, abs=0.01)
     assert table["m"] == pytest.approx(-0.4, abs=0.01)
-    assert found.biases["epochs"].to_list() == [90, 90]
+    # Positions that no track explains tell no bias.
+    assert found.biases["epochs"].to_list() == [71, 90]
     assert found.biases["cross_scatter_m"].max() < 0.01
 
 

@@ -9,13 +9,15 @@ import pytest
 
 from pipeline.matching.fixes import fixes_of
 from pipeline.matching.steps import believable, travelled
-from schemas.config import FixSigma, MatchingConfig
+from pipeline.odometry import odometry_of
+from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from tests.matching.builders import line, matched, odometer, run, site
 
 
 def disbelieved(x_m: npt.NDArray[np.float64], rate_hz: float, distance: pl.DataFrame | None = None) -> list[int]:
     fixes = fixes_of(run(x_m, np.zeros(len(x_m)), rate_hz, sigma_m=0.1), FixSigma())
-    believed = believable(fixes, fixes.valid, travelled(fixes, distance), MatchingConfig())
+    way = None if distance is None else odometry_of(distance, Vehicle(), Configuration())
+    believed = believable(fixes, fixes.valid, travelled(fixes, way), MatchingConfig())
     return np.setdiff1d(np.arange(len(x_m)), believed).tolist()
 
 
