@@ -226,7 +226,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         counts=counts,
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
-        notes=(*notes, *reading_notes(ride.aligned, context.config)),
+        notes=notes,
     )
 
 
