@@ -7,7 +7,7 @@ of 1e-4 that the vehicle file knows no better. The track is the equator, so path
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import dataframely as dy
@@ -38,32 +38,33 @@ SOURCES = ((0.083, 360.0), (0.014, 1800.0), (0.150, 3600.0), (0.752, 100.0))
 
 @dataclass(frozen=True)
 class Journey:
-    """A run on the equator and what the generator knows: the train's path positions [m] at each epoch."""
+    """A run on the equator and what the generator knows: the train's path positions at each epoch, and the drift."""
 
     run: RunLog
     site: Site
     vehicle: Vehicle
     true_m: Floats
+    drift_mps: float = 0.0
 
 
 @dataclass(frozen=True)
 class Outcome:
     """One run: was the position negated, did it return, and how long was it in use beyond the limit afterwards [s]."""
 
+    drift_mps: float
     negated: bool
     returned: bool
     beyond_s: float
-    lds: LdsResult
 
 
 def ramp(seed: int, sigma_m: float) -> Journey:
     """A drift of 0.01 to 0.1 m/s, either way, to 40 m, between 600 and 1,200 s after the start."""
     dice = np.random.default_rng(seed)
-    rate_mps = float(np.exp(dice.uniform(np.log(0.01), np.log(0.1)))) * float(dice.choice([-1.0, 1.0]))
+    rate_mps = dice.uniform(0.01, 0.1) * float(dice.choice([-1.0, 1.0]))
     onset_s = dice.uniform(600.0, 1_200.0)
     t_s = np.arange(onset_s + SIZE_M / abs(rate_mps) + 600.0)
     drift_m = np.clip(rate_mps * np.maximum(t_s - onset_s, 0.0), -SIZE_M, SIZE_M)
-    return journey(dice, t_s, drift_m, sigma_m)
+    return replace(journey(dice, t_s, drift_m, sigma_m), drift_mps=rate_mps)
 
 
 def journey(dice: np.random.Generator, t_s: Floats, fault_m: Floats, sigma_m: float) -> Journey:
@@ -115,25 +116,41 @@ def outcome(made: Journey, config: Configuration) -> Outcome:
     ends = [negation.end_epoch for negation in lds.negations if negation.end_epoch is not None]
     after = np.arange(path_m.size) >= (ends[0] if ends else path_m.size)
     beyond_s = float((in_use & after & (error_m > LIMIT_M)).sum())
-    return Outcome(bool(lds.negations), bool(ends), beyond_s, lds)
+    return Outcome(made.drift_mps, bool(lds.negations), bool(ends), beyond_s)
 
 
 def measure(out: Path, cases: int = CASES) -> list[Figure]:
-    """Figures at 1 and 2 m sigma, with the re-link and without; the targets are those of DOMAIN section 4."""
-    figures: list[Figure] = []
-    for relink in (True, False):
-        config = Configuration(lds=LdsConfig(relink=relink))
-        outcomes = [outcome(ramp(seed, 1.0 + seed % 2), config) for seed in range(cases)]
-        beyond_s = [one.beyond_s for one in outcomes]
-        name = "re-link" if relink else "no re-link"
-        share = cases / CASES
-        figures += [
-            Figure(f"{name}: negated", sum(one.negated for one in outcomes), "cases"),
-            Figure(f"{name}: returned", sum(one.returned for one in outcomes), "cases"),
-            Figure(f"{name}: beyond 20 m after", sum(s > 0 for s in beyond_s), "cases", 4.0 * share if relink else 0.0),
-            Figure(f"{name}: longest beyond 20 m", max(beyond_s), "s", 93.0 if relink else 0.0),
-        ]
+    """Figures at 1 and 2 m sigma; beside the rule: the last TVB as anchor, a lag of 900 s, and no re-link at all.
+
+    Those of DOMAIN section 4 (4 of 50, at most 93 s) are the targets for drifts that are half the failure limit within
+    `anchor_lag_s`. A slower one has moved the anchor with it: the rule cannot see it, only a longer lag can.
+    """
+    rule = LdsConfig()
+    others = {"last TVB": LdsConfig(anchor_lag_s=0.0), "lag 900 s": LdsConfig(anchor_lag_s=900.0)}
+    found = [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=rule)) for seed in range(cases)]
+    figures = [*_figures("re-link, fast drifts", [one for one in found if is_fast(one, rule)], (4.0, 93.0))]
+    figures += _figures("re-link, all", found)
+    for name, config in {**others, "no re-link": LdsConfig(relink=False)}.items():
+        found = [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=config)) for seed in range(cases)]
+        figures += _figures(name, found)
     return figures
+
+
+def is_fast(one: Outcome, config: LdsConfig) -> bool:
+    """The drift comes to half the failure limit within the lag of the anchor."""
+    return abs(one.drift_mps) * config.anchor_lag_s >= LIMIT_M / 2.0
+
+
+def _figures(name: str, found: list[Outcome], most: tuple[float, float] | None = None) -> list[Figure]:
+    beyond_s = [one.beyond_s for one in found]
+    most_cases, most_s = most or (None, None)
+    return [
+        Figure(f"{name}: drifts", len(found), "cases"),
+        Figure(f"{name}: negated", sum(one.negated for one in found), "cases"),
+        Figure(f"{name}: returned", sum(one.returned for one in found), "cases"),
+        Figure(f"{name}: beyond 20 m after a return", sum(s > 0 for s in beyond_s), "cases", most_cases),
+        Figure(f"{name}: longest beyond 20 m", max(beyond_s), "s", most_s),
+    ]
 
 
 def _gauss_markov(dice: np.random.Generator, t_s: Floats, sigma_m: float) -> Floats:

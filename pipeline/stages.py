@@ -11,6 +11,7 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.bounds import threshold_factor
+from pipeline.figures.evidence_notes import reading_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
@@ -25,6 +26,7 @@ from pipeline.monitors.channels import on_path_of
 from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
 from pipeline.odometry import Odometry, odometry_of
+from pipeline.odometry.polarity import polarity
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network
 from pipeline.track.route import site_network
@@ -99,22 +101,11 @@ def _reference_places(
     sample = np.repeat(np.arange(len(rivals)), np.diff(rivals.first))
     element = np.array([index[name] for name in rivals.ids], dtype=np.int64)[rivals.element]
     sigma_m = floats(run.reference.with_columns(pl.col("sigma_m").fill_null(default_m)), "sigma_m")
-    facing = _faces(found, odometry, config.matching.orientation_distance_m)
+    # The leading end faces along growing path where the odometer grows over the first movement.
+    path_m, distance_m = floats(found.epochs, "path_m"), config.matching.orientation_distance_m
+    facing = 1 if odometry is None else polarity(odometry, times_ns(found.epochs), path_m, distance_m)
     ahead_m = facing * vehicle.gnss_antenna_ahead_m
     return ReferencePlaces.of(found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track)
-
-
-def _faces(found: Match, odometry: Odometry | None, distance_m: float) -> int:
-    """+1 where the leading end faces along growing path: the odometer grows over the first movement."""
-    if odometry is None:
-        return 1
-    path_m = floats(found.epochs, "path_m")
-    counted = odometry.distance_at(times_ns(found.epochs))
-    known = np.flatnonzero(np.isfinite(path_m) & np.isfinite(counted))
-    far = known[np.abs(counted[known] - counted[known[:1]]) >= distance_m]
-    if far.size == 0:
-        return 1
-    return 1 if (counted[far[0]] - counted[known[0]]) * (path_m[far[0]] - path_m[known[0]]) >= 0.0 else -1
 
 
 def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:
@@ -219,6 +210,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.odometry,
         context.config.align.straight_s,
     )
+    notes = (*notes, *reading_notes(ride.aligned, context.config))
     return SolutionResults(
         solution=name,
         epochs=epochs,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
 from schemas.enums import Fix
@@ -173,6 +173,8 @@ class MonitorConfig(Settings):
     doppler_sigma_mps: Positive = 0.1
     survey_wander_m: NonNegative = 0.3
     survey_wander_length_m: Positive = 100.0
+    # Between two epochs a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
+    sigma_step_factor: Positive = 1.5
     sigma_intercept_m: NonNegative = 0.0
     sigma_slope: Positive = 1.0
     channel_reference: str | None = None
@@ -206,7 +208,11 @@ class LdsConfig(Settings):
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
     crossing_gap_s: Positive = 1.0
     entry_from_unfitted_area: bool = False
+    # Instants at which the LDS begins anew, without LRVB and linking (DOMAIN section 4, initialisation).
+    starts_of_mission: tuple[AwareDatetime, ...] = ()
+    # Off: a negated position never returns (DOMAIN section 4).
     relink: bool = True
+    # A slow drift has moved the TVBs of the minutes before its alarm already: 9 m at 0.05 m/s in 180 s.
     anchor_lag_s: NonNegative = 300.0
 
 

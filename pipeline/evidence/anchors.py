@@ -18,8 +18,8 @@ from schemas.enums import BaliseKind, Evidence
 
 # A balise this far beyond its element's end is still on it: surveys and balise lists round [m].
 _ON_ELEMENT_M = 0.5
-# Net elements of the own way so far before or after a sample are the same track [m].
-_SAME_WAY_M = 100.0
+# So much way together says which way the odometer counts (DOMAIN section 2) [m].
+_TURNED_M = 20.0
 
 Pairs = tuple[Ints, Ints]
 
@@ -53,7 +53,7 @@ class ReferencePlaces:
         number = np.full(epochs.height, -1)
         number[kept] = np.arange(kept.size)
         sample, element = number[rivals[0]], rivals[1]
-        other = np.flatnonzero((sample >= 0) & ~_on_own_way(legs, leg, path_m, sample, element))
+        other = np.flatnonzero((sample >= 0) & ~_on_own_way(legs, leg, sample, element))
         order = other[np.argsort(sample[other], kind="stable")]
         t_ns = times_ns(epochs)[kept]
         return cls(t_ns, leg, path_m - ahead_m, sigma_m[kept], legs, sample[order], element[order])
@@ -63,26 +63,27 @@ class ReferencePlaces:
         return Place(int(element[0]), float(measure[0]))
 
 
-def _on_own_way(legs: tuple[Route, ...], leg: Ints, path_m: Floats, sample: Ints, element: Ints) -> Bools:
-    """The net element is one that the sample's own leg runs over just before or after it: no other track."""
+def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints) -> Bools:
+    """The net element is one that the sample's own leg runs over, sooner or later: no other track."""
     near = np.zeros(sample.size, dtype=np.bool_)
     for number, route in enumerate(legs):
         rows = np.flatnonzero((sample >= 0) & (leg[sample] == number))
-        for visit in range(route.element.size):
-            own = rows[element[rows] == route.element[visit]]
-            at_m = path_m[sample[own]]
-            near[own] |= (at_m >= route.entry_m[visit] - _SAME_WAY_M) & (at_m <= route.exit_m[visit] + _SAME_WAY_M)
+        near[rows] = np.isin(element[rows], route.element)
     return near
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Reference samples `first` to `last`, no two neighbours farther apart than a straight line reaches."""
+    """Reference samples `first` to `last`, no two neighbours farther apart than a straight line reaches.
+
+    `facing`: how the train ran over the net elements of both anchors as the odometer counted up, where it moved.
+    """
 
     first: int
     last: int
     begin: Anchor
     end: Anchor
+    facing: tuple[int, int] | None
 
 
 def coverages(
@@ -94,11 +95,41 @@ def coverages(
     breaks = np.flatnonzero(np.diff(reference.t_ns) > config.reference_gap_s * NS_PER_S)
     firsts = np.concatenate([[0], breaks + 1]).tolist()
     lasts = np.concatenate([breaks, [reference.t_ns.size - 1]]).tolist()
-    ends = np.array([*firsts, *lasts], dtype=np.int64)
+    counted = np.isfinite(Readings.of(odometry, reference.t_ns).distance_m)
+    inner = [_counted_ends(counted, first, last) for first, last in zip(firsts, lasts, strict=True)]
+    ends = np.array([*(begin for begin, _ in inner), *(end for _, end in inner)], dtype=np.int64)
     places = [reference.place(sample) for sample in ends.tolist()]
     anchors = _anchors(reference.t_ns[ends], places, reference.sigma_m[ends], Evidence.REFERENCE, odometry)
     pairs = zip(anchors[: len(firsts)], anchors[len(firsts) :], strict=True)
-    return [Coverage(first, last, begin, end) for first, last, (begin, end) in zip(firsts, lasts, pairs, strict=True)]
+    return [
+        Coverage(first, last, begin, end, _facing(reference, first, last, odometry))
+        for first, last, (begin, end) in zip(firsts, lasts, pairs, strict=True)
+    ]
+
+
+def _counted_ends(counted: Bools, first: int, last: int) -> tuple[int, int]:
+    """The outermost samples at which the odometer counted, for only from these can a place be carried on."""
+    own = first + np.flatnonzero(counted[first : last + 1])
+    return (int(own[0]), int(own[-1])) if own.size else (first, last)
+
+
+def _facing(
+    reference: ReferencePlaces, first: int, last: int, odometry: OdometerReadings | None
+) -> tuple[int, int] | None:
+    """Orientation of the first and last sample's net elements in which the odometer counts up."""
+    part = slice(first, last + 1)
+    readings, path_m = Readings.of(odometry, reference.t_ns[part]), reference.path_m[part]
+    step_m, counted_m = np.diff(path_m), np.diff(readings.distance_m)
+    whole = (np.diff(readings.segment) == 0) & (np.diff(reference.leg[part]) == 0) & np.isfinite(counted_m)
+    together_m = float((np.sign(step_m) * counted_m)[whole].sum())
+    if abs(together_m) < _TURNED_M:
+        return None
+    ends = []
+    for sample in _counted_ends(np.isfinite(readings.distance_m), 0, last - first):
+        sample += first
+        element, _, sense = reference.legs[int(reference.leg[sample])].locate(reference.path_m[[sample]])
+        ends.append(2 * int(element[0]) + int(sense[0] * together_m < 0.0))
+    return ends[0], ends[1]
 
 
 def read_anchors(

@@ -183,9 +183,15 @@ def evidence_of(
     ]
     borders = sorted([(one.begin, one.end) for one in covered] + [(one, one) for one in reads_apart], key=_begin_ns)
     span_ns = (odometry.begin_ns, odometry.end_ns) if odometry is not None and borders else (0, 0)
-    gaps = oriented_alike(_gaps(borders, span_ns, network, figures), network) if odometry is not None else []
+    facing = {
+        anchor: oriented
+        for one in covered
+        if one.facing is not None
+        for anchor, oriented in zip((one.begin, one.end), one.facing, strict=True)
+    }
+    gaps = oriented_alike(_gaps(borders, span_ns, network, figures), facing, network) if odometry is not None else []
     contradicted = sum(_contradicts(gap, figures) for gap in gaps)
-    reaching = with_open_ends(gaps, odometry, network, figures)
+    reaching = with_open_ends(gaps, facing, odometry, network, figures)
     return Evidence(reference, tuple(covered), tuple(reaching), odometry, network, figures, contradicted)
 
 

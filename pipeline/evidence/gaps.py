@@ -18,6 +18,10 @@ _SAME_M = 0.01
 _SLIPPED_M, _SLIPPED_SHARE = 200.0, 0.5
 
 
+Facing = dict[Anchor, int]
+"""Oriented net element of an anchor, in the sense in which the odometer counts up."""
+
+
 @dataclass(frozen=True)
 class Way:
     """A chain through a gap, with the coordinates of its anchors and how it runs over their net elements."""
@@ -101,12 +105,13 @@ def _distinct(ways: list[Way]) -> list[Way]:
     return list(kept.values())
 
 
-def oriented_alike(gaps: list[Gap], network: Network) -> list[Gap]:
+def oriented_alike(gaps: list[Gap], facing: Facing, network: Network) -> list[Gap]:
     """Ways that go through each anchor as those of the gap before and after it do: a train keeps its front.
 
-    Where no loop turns trains round, it keeps it over the whole run.
+    Where no loop turns trains round, it keeps it over the whole run. `facing`: what the reference tells of anchors.
     """
-    gaps = _on_one_sheet(gaps, network) if _keeps_its_front(gaps, network) else list(gaps)
+    gaps = [_as_faced(gap, facing) for gap in gaps]
+    gaps = _on_one_sheet(gaps, facing, network) if _keeps_its_front(gaps, network) else gaps
     for _ in range(2):
         for order in (range(1, len(gaps)), range(len(gaps) - 2, -1, -1)):
             for here in order:
@@ -130,9 +135,19 @@ def _keeps_its_front(gaps: list[Gap], network: Network) -> bool:
     return elements <= seen
 
 
-def _on_one_sheet(gaps: list[Gap], network: Network) -> list[Gap]:
-    """Ways of one orientation, where every gap that tells leaves but one."""
+def _as_faced(gap: Gap, facing: Facing) -> Gap:
+    """Ways that go through the anchors as the reference says that the train did."""
+    known = [anchor for anchor in gap.anchors if anchor in facing]
+    if gap.ways is None or not known:
+        return gap
+    kept = [way for way in gap.ways if all(_oriented_at(way, gap, anchor) == facing[anchor] for anchor in known)]
+    return replace(gap, ways=kept)
+
+
+def _on_one_sheet(gaps: list[Gap], facing: Facing, network: Network) -> list[Gap]:
+    """Ways of one orientation, where all that tells leaves but one."""
     told = [{network.usable[way.chain.oriented[0]] for way in gap.ways} for gap in gaps if gap.ways]
+    told += [{network.usable[oriented]} for oriented in facing.values()]
     common = set.intersection(*told) if told else set()
     if len(common) != 1:
         return list(gaps)
@@ -155,16 +170,19 @@ def _oriented_at(way: Way, gap: Gap, anchor: Anchor) -> int | None:
     return way.begin_oriented if anchor == gap.begin else way.end_oriented
 
 
-def with_open_ends(gaps: list[Gap], odometry: OdometerReadings | None, network: Network, figures: Figures) -> list[Gap]:
+def with_open_ends(
+    gaps: list[Gap], facing: Facing, odometry: OdometerReadings | None, network: Network, figures: Figures
+) -> list[Gap]:
     """Every gap with chains that reach as far as the odometer says that the train went, over every branch."""
-    orientations = _orientations(gaps, network)
+    orientations = _orientations(gaps, facing, network)
     return [_reaching(gap, orientations, odometry, network, figures) for gap in gaps]
 
 
-def _orientations(gaps: list[Gap], network: Network) -> dict[Anchor, set[int]]:
-    """How the train ran over the net element of each anchor, where chains between anchors tell."""
-    known: dict[Anchor, set[int]] = {}
+def _orientations(gaps: list[Gap], facing: Facing, network: Network) -> dict[Anchor, set[int]]:
+    """How the train ran over the net element of each anchor, where the reference or chains between anchors tell."""
+    known = {anchor: {oriented} for anchor, oriented in facing.items()}
     sheets = {network.usable[way.chain.oriented[0]] for gap in gaps for way in gap.ways or []}
+    sheets |= {network.usable[oriented] for oriented in facing.values()}
     if len(sheets) == 1 and _keeps_its_front(gaps, network):
         for anchor in (anchor for gap in gaps for anchor in gap.anchors):
             both = (2 * anchor.place.element, 2 * anchor.place.element + 1)
@@ -174,7 +192,7 @@ def _orientations(gaps: list[Gap], network: Network) -> dict[Anchor, set[int]]:
         for way in gap.ways or []:
             for anchor in gap.anchors:
                 oriented = _oriented_at(way, gap, anchor)
-                if oriented is not None:
+                if oriented is not None and anchor not in facing:
                     known.setdefault(anchor, set()).add(oriented)
     return known
 

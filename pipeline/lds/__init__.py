@@ -1,5 +1,8 @@
 """Location determination system: virtual balises, ETCS linking, travelling virtual balise.
 
+In: aligned epochs of one solution, a monitor bank, balises of the path, telegrams with the odometer at each.
+Out: LDS columns of the epochs, the table of crossings, passages. Touches no file and knows of no truth.
+
 Where the sources leave a choice, this package reads them so:
 
 - A step that passes a balise is judged by its last epoch: first the monitors (negated or failing: rejected
@@ -12,13 +15,10 @@ Where the sources leave a choice, this package reads them so:
 - A balise that is passed but not accepted is `missed` by linking whatever kept it from being accepted
   (outage, monitor, confidence, ambiguity): `status` says what happened, `linking_error` what the train
   made of it.
-- Virtual balises and physical ones are two chains that know nothing of each other, with one exception: a
-  physical balise read while the position is negated, or after such a return, says what GNSS minus odometer
-  should be.
-- The last TVB before the alarm's onset: an alarm that follows upon a return may be about the same fault, so its
-  re-link also has to hold against what that return was measured from (`footing`), while the odometer can tell.
-- The last TVB before the onset of an alarm of which only slow averages know may be any that the odometer still
-  reaches. A return wants room for the same drift once more within the failure limit (`drift`).
+- Virtual balises and physical ones are two chains that know nothing of each other, with one exception: a telegram
+  says what GNSS minus odometer should be, so it is the re-link anchor from then on (`relink`).
+- Before the first alarm the anchor is the later of telegram and TVB; an alarm fixes it, a return does not move it.
+  Where the odometer lost its distance since the anchor, only a telegram re-links.
 - Linking holds in both directions of travel. Balises in whose window the train turned round may be found
   or not; the 5 % of the odometer then count on the whole way run since the reference.
 - Not announced (`linked` false): rejected while linking is in force, taken like any other before that.
@@ -26,11 +26,13 @@ Where the sources leave a choice, this package reads them so:
   `init_s` of consistent epochs); without it the first one may begin the chain at once.
 - The linking distance monitor allows the odometer's 5 m + 5 % and the noise of the two positions at k_T:
   5 m alone would alarm on sound receivers.
-- After a break (no position, no odometer, or an ambiguous match for longer than a crossing is interpolated over; an
-  odometer that lost its distance) the position has to be what it was by the last TVB or accepted VB, within the bounds
-  of a re-link, else the linking distance monitor fails. Where these exceed the failure limit, or the distance of the
-  odometer was lost, nothing can tell: the monitor is `not_evaluated`, the TVB chain begins anew (`init_s`, or a VB
-  inside its window), and linking holds on. A locked-out train after every tunnel would be safe and useless.
+- Over an outage for which the bank begins anew (`align.gap_reset_s`) nobody looked on, and the expectation window is
+  too wide to see what came of it: of 300 virtual balises that 20 runs passed after an outage of 90 s with the position
+  30 m off, the plain rules accept 300 and this one none. So the first usable position after it has to re-link
+  (`relink`, the same function): where GNSS minus odometer has moved, the linking distance monitor fails; where it
+  cannot be told (no vehicle file, distance lost), it is `not_evaluated` and the position is negated without an alarm
+  until a telegram.
+- A start of mission (`lds.starts_of_mission`) forgets LRVB, linking and anchor.
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """
 

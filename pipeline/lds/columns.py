@@ -6,7 +6,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds.journey import Journey
-from pipeline.lds.machine import LocationSystem, LrvbChange
+from pipeline.lds.linking import LrvbChange
+from pipeline.lds.machine import LocationSystem
 from schemas.arrays import Floats
 from schemas.config import LdsConfig
 from schemas.enums import LdsMode

@@ -176,3 +176,16 @@ def turning_epochs(journey: Journey) -> frozenset[int]:
     known = np.flatnonzero(np.isfinite(journey.odometer_m))
     changed = (np.diff(journey.direction[known]) != 0) | (np.diff(journey.leg[known]) != 0)
     return frozenset(known[1:][changed].tolist())
+
+
+def segment_epochs(journey: Journey) -> list[int]:
+    """The first epochs of the odometer's continuity segments but the first: its distance was lost before them."""
+    found: list[int] = (np.flatnonzero(np.diff(journey.segment)) + 1).tolist()
+    return found
+
+
+def mission_epochs(journey: Journey, config: LdsConfig) -> frozenset[int]:
+    """The first epochs at or after the configured starts of mission that lie inside the run."""
+    starts_ns = np.array([round(start.timestamp() * NS_PER_S) for start in config.starts_of_mission], dtype=np.int64)
+    inside = starts_ns[(starts_ns > journey.t_ns[:1].sum()) & (starts_ns <= journey.t_ns[-1:].sum())]
+    return frozenset(np.searchsorted(journey.t_ns, inside).tolist())

@@ -28,6 +28,15 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class LrvbChange:
+    """From `epoch` on: the LRVB, and whether the TVB chain has begun."""
+
+    epoch: int
+    lrvb: Reference | None
+    chain_begun: bool
+
+
+@dataclass(frozen=True, slots=True)
 class _Turn:
     distance_m: float
     travelled_m: float

@@ -8,39 +8,17 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
-
-import numpy as np
 
 from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.crossings import Balise, Crossing
 from pipeline.lds.detection import BaliseDetection
-from pipeline.lds.journey import Journey
+from pipeline.lds.journey import Journey, mission_epochs, segment_epochs
 from pipeline.lds.link_monitors import LinkDistance
-from pipeline.lds.linking import Reference
-from pipeline.lds.relink import Anchor, Recovery, Relink, breaks
+from pipeline.lds.linking import LrvbChange
+from pipeline.lds.relink import Anchor, Negation, Recovery, Relink, Return, breaks
 from schemas.arrays import NS_PER_S
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
-
-
-@dataclass(slots=True)
-class Negation:
-    """The position was not used from `first_epoch` on until `end_epoch` (`None`: to the end)."""
-
-    first_epoch: int
-    end_epoch: int | None = None
-    ended_by: Literal["re-link", "initialisation"] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LrvbChange:
-    """From `epoch` on: the LRVB, and whether the TVB chain has begun."""
-
-    epoch: int
-    lrvb: Reference | None
-    chain_begun: bool
 
 
 class LocationSystem:
@@ -70,8 +48,8 @@ class LocationSystem:
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.direction
         self._breaks = breaks(journey, limits)
-        lost = np.flatnonzero(np.diff(journey.segment)) + 1
-        self._events = sorted({*self.balises.events, *self._breaks, *lost.tolist()})
+        self._missions = mission_epochs(journey, config)
+        self._events = sorted({*self.balises.events, *self._breaks, *self._missions, *segment_epochs(journey)})
         self._relink = Relink(journey, self.tvb, config, limits)
         self._recovery: Recovery | None = None  # while negated
         self._validated = False  # a VB or a TVB
@@ -81,16 +59,15 @@ class LocationSystem:
 
     def run(self) -> None:
         """Walk along all epochs."""
-        k, size = 0, len(self._t_ns)
-        while k < size:
+        k = 0
+        while k < len(self._t_ns):
             end = self._uneventful_until(k)
             if end > k:
                 self._pass_uneventful(k, end)
             else:
                 self._step(k)
-                end = k + 1
-            k = end
-        if size:
+            k = max(end, k + 1)
+        if k:
             self.balises.finish(self._t_ns[-1])
 
     def _uneventful_until(self, k: int) -> int:
@@ -116,6 +93,9 @@ class LocationSystem:
         self._validated = True
 
     def _step(self, k: int) -> None:
+        if k in self._missions:
+            self._relink.begin_mission(k)
+            self._initialise_anew(k)
         self.balises.turn(k)
         for read in self.balises.read(k):
             self._relink.note_read(read)
@@ -168,8 +148,7 @@ class LocationSystem:
     def _has_initialised(self, k: int) -> bool:
         """Consistent for `init_s` without a break: a TVB may arise between two VBs (SR)."""
         t_ns = self._t_ns[k]
-        broken = t_ns - self._consistent_at_ns > self._journey.gap_ns
-        if self._consistent_since_ns is None or broken:
+        if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns:
             self._consistent_since_ns = t_ns
         self._consistent_at_ns = t_ns
         if t_ns - self._consistent_since_ns < self._config.init_s * NS_PER_S:
@@ -187,9 +166,7 @@ class LocationSystem:
 
     def _seek_return(self, recovery: Recovery, k: int, disordered: bool) -> None:
         self.negated[k] = True
-        # Without an odometer there is no along bank to look on; the position itself has to do.
-        seen = self.evaluated[k] if self._journey.has_odometer else bool(self._journey.usable[k])
-        if not recovery.is_over(k, seen, disordered):
+        if not recovery.is_over(k, self.evaluated[k], disordered):
             return
         if not self._validated:
             self._initialise_anew(k)
@@ -198,16 +175,17 @@ class LocationSystem:
             self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
     def _initialise_anew(self, k: int) -> None:
-        """Nothing was validated before the fault, so there is nothing to re-link to."""
+        """No reference and no linking: a start of mission, or a fault before anything was validated."""
         self.balises.virtual.forget()
         self.distance.forget(k)
-        self._chain_from = None
-        self._return(k, "initialisation")
+        self._chain_from = self._consistent_since_ns = None
+        self._validated = False
+        if self._recovery is not None:
+            self._return(k, "initialisation")
         self._note_lrvb(k)
 
-    def _return(self, k: int, by: Literal["re-link", "initialisation"]) -> None:
-        negation = self.negations[-1]
-        negation.end_epoch, negation.ended_by = k, by
+    def _return(self, k: int, by: Return) -> None:
+        self.negations[-1].end(k, by)
         self._recovery = None
         self.negated[k] = False
         self._bank.restart(k)

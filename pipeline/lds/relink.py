@@ -10,13 +10,15 @@ on meanwhile.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import isfinite
+from typing import Literal
 
 import numpy as np
 
 from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
+from pipeline.odometry.drift import drift_m2, relink_bound_m
 from schemas.arrays import NS_PER_S
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
@@ -129,10 +131,26 @@ class Relink:
         """
         waited_s = (int(self._journey.t_ns[k]) - anchor.t_ns) / NS_PER_S
         way_m = float(self._journey.travelled_m[k]) - anchor.travelled_m
-        variance_m2 = anchor.sigma_m**2 + float(self._journey.sigma_m[k]) ** 2
-        variance_m2 += self._limits.odometer_sigma_mps**2 * waited_s
-        variance_m2 += ((self._limits.odometer_scale_sigma or 0.0) * way_m) ** 2
-        return min(self._limits.failure_limit_m / 2.0, self._limits.threshold_factor * sqrt(variance_m2))
+        positions_m2 = anchor.sigma_m**2 + float(self._journey.sigma_m[k]) ** 2
+        limits = self._limits
+        scale_sigma = limits.odometer_scale_sigma or 0.0
+        variance_m2 = drift_m2(positions_m2, waited_s, way_m, limits.odometer_sigma_mps, scale_sigma)
+        return float(relink_bound_m(variance_m2, limits.threshold_factor, limits.failure_limit_m))
+
+
+Return = Literal["re-link", "initialisation"]
+
+
+@dataclass(slots=True)
+class Negation:
+    """The position was not used from `first_epoch` on until `end_epoch` (`None`: to the end)."""
+
+    first_epoch: int
+    end_epoch: int | None = None
+    ended_by: Return | None = None
+
+    def end(self, k: int, by: Return) -> None:
+        self.end_epoch, self.ended_by = k, by
 
 
 class Recovery:
@@ -143,9 +161,13 @@ class Recovery:
         self._recovery_ns = config.recovery_s * NS_PER_S
         self._failed_at_ns = self._seen_at_ns = int(journey.t_ns[k])
 
-    def is_over(self, k: int, seen: bool, failing: bool) -> bool:
-        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now."""
+    def is_over(self, k: int, evaluated: bool, failing: bool) -> bool:
+        """`recovery_s` without a failure of the raw and fastest monitors, all of it seen, and a usable position now.
+
+        Without an odometer there is no along bank to look on; the position itself has to do.
+        """
         t_ns = int(self._journey.t_ns[k])
+        seen = evaluated if self._journey.has_odometer else bool(self._journey.usable[k])
         if seen:
             if t_ns - self._seen_at_ns > self._journey.gap_ns:
                 self._failed_at_ns = t_ns

@@ -10,9 +10,10 @@ from pipeline.lds.bank_protocol import Bank, LdsLimits
 from pipeline.lds.columns import epoch_columns
 from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time
 from pipeline.lds.journey import journey_of
-from pipeline.lds.machine import LocationSystem, Negation
+from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
 from pipeline.lds.reads import reads_of
+from pipeline.lds.relink import Negation
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
 

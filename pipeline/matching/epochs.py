@@ -95,6 +95,7 @@ def epoch_frame(
         "sigma_source": _words(_SOURCES, source, pl.Enum(SigmaSource)),
         "fix_valid": fixes.valid,
         "velocity_along_mps": velocity_along_mps(fixes, shape),
+        "hpl_m": fixes.hpl_m,
     }
     return _frame(fixes, solution, columns)
 

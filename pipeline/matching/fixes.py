@@ -35,6 +35,7 @@ class Fixes:
     estimated: Bools
     vel_e_mps: Floats
     vel_n_mps: Floats
+    hpl_m: Floats
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -82,6 +83,7 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
         estimated=fix == _KINDS.index(Fix.ESTIMATED.value),
         vel_e_mps=column["vel_e_mps"],
         vel_n_mps=column["vel_n_mps"],
+        hpl_m=column["hpl_m"],
     )
 
 
@@ -94,7 +96,7 @@ def contradictory_covariances(frame: pl.DataFrame) -> int:
 _KINDS = [kind.value for kind in Fix]
 _NUMBERS = (
     *("latitude_deg", "longitude_deg", "height_m"),
-    *("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "cov_uu_m2", "vel_e_mps", "vel_n_mps"),
+    *("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "cov_uu_m2", "vel_e_mps", "vel_n_mps", "hpl_m"),
 )
 
 

@@ -80,13 +80,8 @@ def match(
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    epochs = epochs.with_columns(_protection_level(fixes), *digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, odometer_sign=sign)
-
-
-def _protection_level(fixes: pl.DataFrame) -> pl.Series:
-    """The receiver's own, null where the log does not hold it."""
-    return fixes["hpl_m"] if "hpl_m" in fixes.columns else pl.Series("hpl_m", [None] * fixes.height, dtype=pl.Float64)
+    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
+    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, sign)
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:

@@ -53,6 +53,5 @@ def _as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:
         pl.lit(0.0).alias("cov_en_m2"),
         variance.alias("cov_nn_m2"),
         variance.alias("cov_uu_m2"),
-        pl.lit(None, dtype=pl.Float64).alias("hpl_m"),
         pl.lit(Fix.RTK_FIXED.value, dtype=pl.Enum(Fix)).alias("fix"),
     )

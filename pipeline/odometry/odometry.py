@@ -78,8 +78,8 @@ class Odometry:
 
     @property
     def end_ns(self) -> int:
-        """The last sample."""
-        return self.epoch_ns + int(float(self.t_s[-1]) * NS_PER_S) + 1
+        """The last row."""
+        return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
 
     def oriented(self, sign: int) -> Odometry:
         """The same odometer, growing with the path; `sign` is +1 or -1."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
 from math import sqrt
 from typing import Any
 
@@ -57,7 +58,8 @@ def test_the_first_alarm_fixes_the_anchor_and_later_alarms_do_not_move_it() -> N
         assert (anchor and anchor.epoch) == epoch
     # At 9 s the position is 9 m ahead of the odometer, at the anchor it was 2 m.
     found = relink.compare(9)
-    assert (found.moved_m, found.holds) == (pytest.approx(7.0), True)
+    assert found.moved_m == pytest.approx(7.0)
+    assert found.holds
 
 
 def test_an_alarm_without_an_anchor_fixes_none() -> None:
@@ -165,8 +167,20 @@ def test_no_return_through_a_lost_odometer_distance() -> None:
     true_m = steps(0.0, 20.0, 160)
     path_m = [x - (40.0 if k >= 40 else 0.0) for k, x in enumerate(true_m)]
     odometer_m = [x - (40.0 if k >= 50 else 0.0) for k, x in enumerate(true_m)]
-    epochs = epochs_of(path_m, odometer_m, odometer_stretch=[int(k >= 50) for k in range(160)])
+    epochs = epochs_of(path_m, odometer_m, odometer_segment=[int(k >= 50) for k in range(160)])
     assert negations(run(epochs, balises_at(V1), ScriptedBank([40])))[0] == (40, None)
+
+
+def test_at_a_configured_start_of_mission_the_lds_begins_anew() -> None:
+    """Negated since 20 s, 45 m off; the mission begins at 60 s, and ten consistent seconds later there is a TVB."""
+    odometer_m = steps(0.0, 20.0, 90)
+    path_m = [x + (45.0 if k >= 20 else 0.0) for k, x in enumerate(odometer_m)]
+    start = datetime.fromtimestamp(59.5, tz=UTC)
+    result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([20]), starts_of_mission=(start,))
+    assert negations(result) == [(20, 60)]
+    assert result.negations[0].ended_by == "initialisation"
+    assert result.epochs["lds_mode"][60:72].to_list() == ["initialising"] * 11 + ["linked"]
+    assert result.epochs["lrvb_id"][59:61].to_list() == ["V1", None]
 
 
 # After an outage
@@ -181,7 +195,7 @@ def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsResult:
     path_m = [x + (offset_m if k >= BEFORE else 0.0) for k, x in enumerate(odometer_m)]
     places = {"V1": 110.0, "V2": 20.0 * (gap_s + 40.0)}
     lost = settings.pop("lost", False)
-    columns = {"odometer_stretch": [int(lost and k >= BEFORE) for k in range(len(t_s))]}
+    columns = {"odometer_segment": [int(lost and k >= BEFORE) for k in range(len(t_s))]}
     balises = settings.pop("balises", balises_at(places))
     return run(epochs_of(path_m, odometer_m, t_s, **columns), balises, ScriptedBank(blind=[BEFORE]), **settings)
 

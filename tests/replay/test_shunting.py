@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-from pipeline.lds.telegrams import place_reads
 
 from pipeline.stages import replay
-from schemas.config import Configuration, Vehicle
+from schemas.config import Vehicle
 from schemas.inputs import Balises, Gnss, Odometer
 from schemas.run import RunLog, Site
 from tests.matching import builders
@@ -76,23 +75,3 @@ def test_each_passage_of_a_shared_element_is_seen():
     assert rows == [(name, names[sense], "accepted") for name, sense in expected]
     assert tables.alarms.height == 0
     assert tables.hazards.height == 0
-
-
-def test_a_read_is_placed_where_the_train_is():
-    """Balise on an element passed twice on one leg: the place near the position is meant, not the first."""
-    stamps = pl.Series("t", [0, 10**9, 2 * 10**9, 3 * 10**9]).cast(pl.Datetime("ns", "UTC"))
-    aligned = pl.DataFrame({"t": stamps, "leg": [0, 0, 0, 1], "path_m": [100.0, 500.0, 4100.0, 4100.0]})
-    aligned = aligned.with_columns(pl.col("leg").cast(pl.Int32))
-    balises = pl.DataFrame(
-        {
-            "leg": pl.Series([0, 0, 1, 0], dtype=pl.Int32),
-            "balise_id": ["P", "P", "P", "V"],
-            "kind": ["physical", "physical", "physical", "virtual"],
-            "path_m": [120.0, 4090.0, 130.0, 100.0],
-        }
-    )
-    reads = pl.DataFrame({"t": stamps, "balise_id": ["P", "X", "P", "P"]})
-    placed = place_reads(reads, aligned, balises, None, Configuration())
-    assert placed["path_m"].to_list() == [120.0, None, 4090.0, 130.0]
-    assert placed["leg"].to_list() == [0, None, 0, 1]
-    assert placed["odometer_m"].null_count() == 4

@@ -48,7 +48,8 @@ def test_allowed_times_to_detect_of_the_papers():
     safety = Configuration().safety
     assert safety.allowed_time_to_detect_s("npa") == pytest.approx(24.12, abs=0.005)
     assert safety.allowed_time_to_detect_s("lpv200") == pytest.approx(0.5025, abs=5e-5)
-    assert Configuration().budget_s == pytest.approx(1.675, abs=5e-4)
+    assert Configuration().budget_s == pytest.approx(0.5025, abs=5e-5)
+    assert safety.allowed_time_to_detect_s("egnos_observed") == pytest.approx(1.675, abs=5e-4)
     assert safety.allowed_time_to_detect_s("horizontal_sis") == pytest.approx(100.5, abs=0.05)
 
 
