@@ -43,11 +43,15 @@ IDLE: tuple[str, ...] = ()
 def tables(page: Path) -> list[Rows]:
     """Every table `key | default | meaning`, with a source or without, of a page: key to default."""
     found: list[Rows] = []
+    width = 0
     for line in page.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) in (3, 4) and "default" in cells[1] and cells[0].startswith("key"):
             found.append({})
-        elif found and line.startswith("| `") and len(cells) in (3, 4):
+            width = len(cells)
+        elif not line.startswith("|"):
+            width = 0
+        elif line.startswith("| `") and len(cells) == width:
             assert cells[0].strip("`") not in found[-1]
             found[-1][cells[0].strip("`")] = cells[1]
     return found
