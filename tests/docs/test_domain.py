@@ -9,7 +9,7 @@ import pytest
 
 from tests.docs.blocks import ROOT
 
-SECTIONS = re.findall(r"^#+ (\d(?:\.\d)?) ", (ROOT / "docs" / "domain.md").read_text(encoding="utf-8"), re.MULTILINE)
+SECTIONS = re.findall(r"^#+ (\d(?:\.\d)?)\.? ", (ROOT / "docs" / "domain.md").read_text(encoding="utf-8"), re.MULTILINE)
 SOURCES = sorted(
     path for layer in ("pipeline", "schemas", "datasets", "benchmarks") for path in (ROOT / layer).rglob("*.py")
 )
