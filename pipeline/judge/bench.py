@@ -82,9 +82,9 @@ class Bench:
     @cached_property
     def odometer_moves(self) -> Bools:
         """Per epoch whether the odometer says that the train moved to the next one."""
-        step_s, moving_s = np.diff(self.at_ns) / NS_PER_S, np.diff(self.readings.moving_s)
-        with np.errstate(invalid="ignore"):
-            moves = moving_s > 0.5 * step_s
+        if self.odometry is None:
+            return np.zeros(self.t_ns.size, dtype=np.bool_)
+        moves = self.odometry.moved(self.at_ns)
         return np.append(moves, moves[-1:])[: self.t_ns.size]
 
     @cached_property

@@ -101,9 +101,11 @@ def _virtual_offers(bench: Bench, series: Series) -> VirtualOffers:
 
 
 def _marked(series: Series, offers: VirtualOffers) -> Bools:
-    """Valid positions that complete an offer judged wrong."""
+    """Valid positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
     marked = np.zeros(series.size, dtype=np.bool_)
     marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
+    for jump in series.jumps:
+        marked[jump.first : jump.last + 1] = False
     return marked
 
 
@@ -215,7 +217,13 @@ def _epochs(
     cross, up = errors_across(bench.solution.fixes, heading, bench.at_ns, reference, config.hazards.reference_gap_s)
     by_reference = np.where(judged.kind == KINDS.index(Evidence.REFERENCE), bench.train_m, np.nan)
     moving, sure = moving_by_evidence(
-        bench.at_ns, by_reference, bench.odometer_moves, bench.odometer_told, bench.stood, config.matching.deadband_mps
+        bench.at_ns,
+        by_reference,
+        0.5 * (judged.high_m - judged.low_m),
+        bench.odometer_moves,
+        bench.odometer_told,
+        bench.stood,
+        config.matching.deadband_mps,
     )
     suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
     known = np.isfinite(bench.path_m)
