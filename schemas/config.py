@@ -95,6 +95,8 @@ class MatchingConfig(Settings):
     reach_m: Positive = 50.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
+    # The bias in that. Kept apart from `cross_bias_sigma_m`: an exact reference whose antenna is 0.3 m aside is on it.
+    on_track_bias_m: NonNegative = 1.5
     # DIAG, error models: track survey 1 m.
     survey_sigma_default_m: Positive = 1.0
     # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
