@@ -6,14 +6,14 @@ import pytest
 from polars.testing import assert_frame_equal
 from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
+from datasets.mcap_messages import odometry_topic
+from pipeline.export.position_messages import navsatfix_topic
 from pipeline.ingest import read_run
-from pipeline.ingest.payloads import navsatfix_payloads, odometry_payloads
 from pipeline.ingest.ros2_idl import IdlError, ros2msg_text
-from pipeline.ingest.ros2_text import DEFINITIONS
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from tests.ingest import samples
-from tests.ingest.samples import channel, message, schema, whole
+from tests.ingest.samples import DEFINITIONS, channel, message, schema, whole
 
 CONFIG = IngestConfig()
 
@@ -101,8 +101,8 @@ def test_another_parser_of_idl_finds_the_same_fields():
 
 def log(encoding: str, fix: str, odometry: str) -> bytes:
     run = samples.run()
-    positions = navsatfix_payloads(run.gnss, "gps")
-    speeds = odometry_payloads(run.odometer, "odom")  # type: ignore[arg-type]
+    positions = navsatfix_topic("/fix", run.gnss, "gps").messages
+    speeds = odometry_topic(run.odometer).messages  # type: ignore[arg-type]
     return whole(
         schema(1, "sensor_msgs/msg/NavSatFix", encoding, fix.encode()),
         schema(2, "nav_msgs/msg/Odometry", encoding, odometry.encode()),
