@@ -7,7 +7,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 Fields = tuple[tuple[str, str], ...]
-"""Names and kinds: `time`, `double`, `int64`, `fixed32`, `level`, `bool`, `string`."""
+"""Names and kinds: `time`, `double`, `int64`, `fixed32`, `level`, `bool`, `string`; `int8`, `uint8`, `uint16` (ROS 2
+only), `doubles` and `covariance type` (protobuf only).
+"""
 
 _SECOND_NS = 1_000_000_000
 _HEADER = b"\x00\x01\x00\x00"
@@ -18,6 +20,9 @@ _PLAIN = {
     "fixed32": ("uint32", "<I", 4),
     "level": ("uint8", "<B", 1),
     "bool": ("bool", "<?", 1),
+    "int8": ("int8", "<b", 1),
+    "uint8": ("uint8", "<B", 1),
+    "uint16": ("uint16", "<H", 2),
 }
 _UNKNOWN: Mapping[str, Any] = {"double": float("nan"), "string": "", "bool": False}
 _TIME = "\n" + "=" * 80 + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"

@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Literal
+from typing import IO, Literal
 
 import polars as pl
 
 from pipeline.export.events import alarm_entries, hazard_entries, passage_entries
 from pipeline.export.gis import balises_geojson, track_geojson
-from pipeline.export.messages import Encoding, geojson_topic, log_topic, rows_topic
+from pipeline.export.messages import Encoding, Topic, geojson_topic, log_topic, rows_topic
+from pipeline.export.position_messages import location_fix_topic, navsatfix_topic
 from pipeline.export.positions import as_gnss, positions_of
-from pipeline.ingest import payloads
-from pipeline.ingest.mcap_writer import Topic
-from pipeline.ingest.proto_schemas import LOCATION_FIX, descriptor_set
-from pipeline.ingest.ros2_text import DEFINITIONS
 from schemas.errors import OutputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import MONITORS
 
 PositionMessage = Literal["foxglove", "ros"]
+Compression = Literal["zstd", "lz4", "none"]
 
-_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _FRAME = "wgs84"
 _LDS = (
     "t", "netelement_id", "measure_m", "path_m", "odometer_m", "speed_mps", "cross_track_m", "vertical_m", "on_track",
@@ -51,16 +50,34 @@ def run_topics(
     for solution in solutions:
         topics += _position_topics(solution, tables, site, log, positions)
         topics += _result_topics(solution, tables, encoding)
-    return topics, missing
+    # Viewers play messages in the order in which they stand: no log time goes back.
+    return [replace(topic, times_ns=list(accumulate(topic.times_ns, max))) for topic in topics], missing
 
 
-def write_topics(topics: list[Topic], path: Path, profile: str) -> None:
-    """Write topics merged by time; the same topics give the same bytes."""
+def write_topics(
+    topics: list[Topic],
+    path: Path | IO[bytes],
+    profile: str,
+    compression: Compression = "zstd",
+    chunk_size: int | None = 1024 * 1024,
+    checksums: bool = True,
+) -> None:
+    """Write topics merged by time, disorder inside a topic as it is; the same topics give the same bytes.
+
+    `chunk_size` in bytes, none for a file without chunks. Raises `OutputError`.
+    """
     from mcap.writer import CompressionType, Writer
 
+    kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
     try:
-        with path.open("wb") as stream:
-            writer = Writer(stream, compression=CompressionType.ZSTD)
+        with path.open("wb") if isinstance(path, Path) else nullcontext(path) as stream:
+            writer = Writer(
+                stream,
+                compression=kinds[compression],
+                chunk_size=chunk_size or 1024 * 1024,
+                use_chunking=chunk_size is not None,
+                enable_crcs=checksums,
+            )
             writer.start(profile=profile, library="balise")
             channels = [
                 writer.register_channel(
@@ -70,8 +87,8 @@ def write_topics(topics: list[Topic], path: Path, profile: str) -> None:
                 )
                 for topic in topics
             ]
-            for t_ns, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
-                data = next(topics[number].messages)
+            for _, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
+                t_ns, data = topics[number].times_ns[row], next(topics[number].messages)
                 writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
             writer.finish()  # type: ignore[no-untyped-call]
     except OSError as error:
@@ -79,6 +96,7 @@ def write_topics(topics: list[Topic], path: Path, profile: str) -> None:
 
 
 def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
+    """The running maximum orders topics among each other and leaves each topic's own order alone."""
     for row, t_ns in enumerate(accumulate(topic.times_ns, max)):
         yield t_ns, number, row
 
@@ -123,9 +141,5 @@ def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
 
 def _position_topic(topic: str, frame: pl.DataFrame, positions: PositionMessage) -> Topic:
     known = frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
-    times = known["t"].to_physical().to_list()
-    if positions == "ros":
-        messages = payloads.navsatfix_payloads(known, _FRAME)
-        return Topic(topic, "cdr", _NAVSATFIX, "ros2msg", DEFINITIONS[_NAVSATFIX].encode(), times, messages)
-    messages = payloads.location_fix_payloads(known, _FRAME)
-    return Topic(topic, "protobuf", LOCATION_FIX, "protobuf", descriptor_set(LOCATION_FIX), times, messages)
+    make = navsatfix_topic if positions == "ros" else location_fix_topic
+    return make(topic, known, _FRAME)

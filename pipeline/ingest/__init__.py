@@ -1,7 +1,5 @@
-"""Files to frames: recorded runs and sites."""
+"""Recorded runs in: MCAP logs and Parquet folders become `RunLog`s that fit the contract."""
 
-from pipeline.ingest.describe import LogDescription, describe_log
-from pipeline.ingest.mcap_writer import write_mcap
 from pipeline.ingest.run import read_run
 
-__all__ = ["LogDescription", "describe_log", "read_run", "write_mcap"]
+__all__ = ["read_run"]

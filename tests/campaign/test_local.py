@@ -14,12 +14,12 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from datasets.mcap_log import write_mcap
 from pipeline import storage
 from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
 from pipeline.campaign.outcome import lost
 from pipeline.campaign.progress import LogWatch
 from pipeline.ingest import read_run
-from pipeline.ingest.mcap_writer import write_mcap
 from pipeline.results import store
 from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
