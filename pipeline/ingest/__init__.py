@@ -1,4 +1,8 @@
-"""Files to frames: recorded runs and sites."""
+"""Files to frames: recorded runs.
+
+In: MCAP logs and Parquet folders, mappings of the configuration. Out: `schemas.run.RunLog`.
+Touches files. It mends nothing: what does not fit is an error that lists every breach, what was left out is counted.
+"""
 
 from pipeline.ingest.describe import LogDescription, describe_log
 from pipeline.ingest.mcap_writer import write_mcap
