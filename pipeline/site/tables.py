@@ -26,15 +26,21 @@ class RawTable:
     epsg: int = EPSG_WGS84
 
 
-# What a site need not say of a balise (CONTRACT section 2).
-_DEFAULTS: Defaults = {"location_accuracy_m": 12.0, "linked": True, "link_reaction": Reaction.SERVICE_BRAKE.value}
+# What a site need not say of a balise (CONTRACT section 2), nor a route of its legs.
+_DEFAULTS: Defaults = {
+    "location_accuracy_m": 12.0,
+    "linked": True,
+    "link_reaction": Reaction.SERVICE_BRAKE.value,
+    "leg": 0,
+}
 # As recorded: an element without measures gets those of its geometry, and plane coordinates become degrees later.
 _RECORDED: dict[str, dict[str, dy.Column]] = {
     "track": {
         "measure_m": dy.Float64(nullable=True),
         "latitude_deg": dy.Float64(nullable=False),
         "longitude_deg": dy.Float64(nullable=False),
-    }
+    },
+    "route": {"leg": dy.Int64(nullable=False, min=0)},
 }
 _TRUTH = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
 
@@ -56,7 +62,7 @@ def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame 
     read = {name: _read(raw, name, column, found) for name, column in columns.items() if name in raw.frame.columns}
     known = {name: column for name, column in columns.items() if name not in read or read[name] is not None}
     recorded = raw.frame.with_columns(series for series in read.values() if series is not None)
-    frame = conform_to(known, recorded, raw.file, found, _DEFAULTS if table == "balises" else {})
+    frame = conform_to(known, recorded, raw.file, found, _DEFAULTS)
     breaches += [line_of(breach) for breach in found]
     return None if found else frame.with_columns(pl.col(pl.Enum).cast(pl.String))
 
