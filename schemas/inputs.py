@@ -96,7 +96,7 @@ class Track(dy.Schema):
     measure_m = real("m", "distance along the net element from its start", nullable=False)
     latitude_deg = real("deg", "WGS 84 latitude", nullable=False, min=-90, max=90)
     longitude_deg = real("deg", "WGS 84 longitude", nullable=False, min=-180, max=180)
-    height_m = real("m", "ellipsoidal height of the rail; null in a 2-D survey")
+    height_m = real("m", "ellipsoidal height of the rail; null in a 2-D survey", min=-1_000, max=10_000)
     sigma_m = real("m", "standard deviation of the survey", min=0)
 
 

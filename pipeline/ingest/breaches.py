@@ -26,7 +26,7 @@ def refuse(breaches: Sequence[Breach]) -> None:
     if len(breaches) == 1:
         raise _as_error(breaches[0])
     remedies = list(dict.fromkeys(breach.remedy for breach in breaches if breach.remedy))
-    listed = "\n  ".join(_line(breach) for breach in breaches)
+    listed = "\n  ".join(line_of(breach) for breach in breaches)
     raise InputError(
         f"{len(breaches)} breaches of the input contract\n  {listed}\n",
         place=_common_place(breaches),
@@ -44,7 +44,8 @@ def _as_error(breach: Breach) -> InputError:
     )
 
 
-def _line(breach: Breach) -> str:
+def line_of(breach: Breach) -> str:
+    """The breach as one line of an error."""
     text = f"{breach.place}: {breach.message}"
     if breach.found is not None:
         text += f"; found {breach.found}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import dataframely as dy
 import polars as pl
@@ -12,7 +12,8 @@ from pipeline.ingest.breaches import Breach
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
 
-DEFAULTS: dict[str, str] = {"solution": "primary"}
+Defaults = Mapping[str, str | float | bool]
+DEFAULTS: Defaults = {"solution": "primary"}
 NEVER_EMPTY: tuple[Stream, ...] = ("gnss", "odometer")
 _EXACT_INTEGER = 2**53  # above it not every integer is a float
 
@@ -22,18 +23,24 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Brea
 
     Breaches are appended; the frame returned is of use only if none were.
     """
-    columns = STREAM_SCHEMAS[stream].columns()
     if frame.height == 0 and stream in NEVER_EMPTY:
         breaches.append(Breach(place, "has no rows", expected="at least one", remedy="Record the stream."))
-    conformed = {
-        name: _column(frame, name, column, place, breaches)
-        for name, column in columns.items()
-        if name in frame.columns or _may_be_absent(name, column, frame, place, breaches)
-    }
-    result = pl.DataFrame({name: series for name, series in conformed.items() if series is not None})
+    result = conform_to(STREAM_SCHEMAS[stream].columns(), frame, place, breaches, DEFAULTS)
     if stream == "odometer":
         _check_odometer(result, place, breaches)
     return result
+
+
+def conform_to(
+    columns: Mapping[str, dy.Column], frame: pl.DataFrame, place: str, breaches: list[Breach], defaults: Defaults
+) -> pl.DataFrame:
+    """As `conform`, for any columns; `defaults` fill those that are absent, and nulls in those that are there."""
+    conformed = {
+        name: _column(frame, name, column, place, breaches, defaults)
+        for name, column in columns.items()
+        if name in frame.columns or name in defaults or _may_be_absent(name, column, frame, place, breaches)
+    }
+    return pl.DataFrame({name: series for name, series in conformed.items() if series is not None})
 
 
 def extra_columns(frame: pl.DataFrame, stream: Stream) -> list[str]:
@@ -43,7 +50,7 @@ def extra_columns(frame: pl.DataFrame, stream: Stream) -> list[str]:
 
 
 def _may_be_absent(name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[Breach]) -> bool:
-    if column.nullable or name in DEFAULTS:
+    if column.nullable:
         return True
     breaches.append(
         Breach(
@@ -57,13 +64,15 @@ def _may_be_absent(name: str, column: dy.Column, frame: pl.DataFrame, place: str
     return False
 
 
-def _column(frame: pl.DataFrame, name: str, column: dy.Column, place: str, breaches: list[Breach]) -> pl.Series | None:
+def _column(
+    frame: pl.DataFrame, name: str, column: dy.Column, place: str, breaches: list[Breach], defaults: Defaults
+) -> pl.Series | None:
     where = f"{place}: column {name}"
     if name not in frame.columns:
-        return pl.Series(name, [DEFAULTS.get(name)], dtype=column.dtype).new_from_index(0, frame.height)
+        return pl.Series(name, [defaults.get(name)], dtype=column.dtype).new_from_index(0, frame.height)
     series = _converted(frame[name], column)
-    if name in DEFAULTS and not isinstance(series, str) and series.null_count():
-        series = series.fill_null(DEFAULTS[name])
+    if name in defaults and not isinstance(series, str) and series.null_count():
+        series = series.fill_null(defaults[name])
     if isinstance(series, str):
         breaches.append(Breach(where, "has the wrong type", found=series, expected=type_name(column), remedy=_RETYPE))
         return None

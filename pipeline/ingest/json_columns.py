@@ -15,8 +15,9 @@ from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.template import Part
 
 _ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
-# Literals that are no JSON but that pyarrow takes, and `null` between two objects, which it does not survive.
-_NOT_FOR_ARROW = r"NaN|Inf|\}\s*null|(?:\[\s*){64}"
+# Literals that pyarrow takes and JSON does not know, and `null` after an object, which pyarrow does not survive.
+_LITERALS, _AS_VALUE = ["NaN", "Inf"], r"[:,\[]\s*-?(?:NaN|Inf)"
+_NULL_AFTER = r"\}\s*null"
 
 
 class JsonDecoder:
@@ -87,5 +88,7 @@ def _joined(messages: Messages) -> bytes | None:
         texts = binary.cast(pl.String).str.strip_chars(" \t\r\n")
     except pl.exceptions.PolarsError:
         return None
-    fits = texts.str.starts_with("{") & texts.str.ends_with("}") & ~texts.str.contains(_NOT_FOR_ARROW)
+    fits = texts.str.starts_with("{") & texts.str.ends_with("}") & ~texts.str.contains(_NULL_AFTER)
+    if texts.str.contains_any(_LITERALS).any():
+        fits &= ~texts.str.contains(_AS_VALUE)
     return texts.str.join("\n").item().encode() if fits.all() else None

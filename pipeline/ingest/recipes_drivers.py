@@ -27,7 +27,7 @@ def _word(kind: Fix) -> pl.Expr:
 
 
 # Septentrio SBF reference guide, block PVTGeodetic: Mode, bits 0-3.
-_SBF_MODES = {
+SBF_FIXES = {
     1: Fix.AUTONOMOUS, 2: Fix.DIFFERENTIAL, 3: Fix.AUTONOMOUS, 4: Fix.RTK_FIXED, 5: Fix.RTK_FLOAT, 6: Fix.SBAS,
     7: Fix.RTK_FIXED, 8: Fix.RTK_FLOAT, 10: Fix.DIFFERENTIAL,
 }  # fmt: skip
@@ -42,7 +42,7 @@ def _sbf(path: str) -> pl.Expr:
 
 def _pvt_geodetic() -> Recipe:
     mode = pl.col("mode") & 0x0F
-    fix = pl.when(pl.col("error") == 0).then(fix_from(mode, _SBF_MODES)).otherwise(_kind(_word(Fix.NONE)))
+    fix = pl.when(pl.col("error") == 0).then(fix_from(mode, SBF_FIXES)).otherwise(_kind(_word(Fix.NONE)))
     sbas = mode == 6
     return Recipe(
         stream="gnss",

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.ingest.recipes_drivers import SBF_FIXES
 from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
 from pipeline.receivers.earth_fixed import east_north_up, geodetic, local_velocity
 from pipeline.receivers.epochs import Epoch, Gathered
@@ -15,18 +16,6 @@ from schemas.enums import Fix
 _WEEK_MS = 604_800_000
 _NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
 _DO_NOT_USE = -2e10
-_FIXES = {
-    0: Fix.NONE,
-    1: Fix.AUTONOMOUS,
-    2: Fix.DIFFERENTIAL,
-    3: Fix.AUTONOMOUS,
-    4: Fix.RTK_FIXED,
-    5: Fix.RTK_FLOAT,
-    6: Fix.SBAS,
-    7: Fix.RTK_FIXED,
-    8: Fix.RTK_FLOAT,
-    10: Fix.DIFFERENTIAL,
-}
 _SBAS_PRNS = range(120, 159)
 _NOT_KNOWN_U16 = 65535
 
@@ -54,7 +43,7 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
 
 def _solution(epoch: Epoch, m: Any) -> bool:
     """What both PVT blocks share; true where they hold a position."""
-    fix = _FIXES.get(m.Type, Fix.NONE) if m.Error == 0 else Fix.NONE
+    fix = SBF_FIXES.get(m.Type, Fix.NONE) if m.Error == 0 else Fix.NONE
     epoch.gnss |= {"fix": fix.value, "satellites": m.NrSV if m.NrSV != 255 else None}
     # Base stations are numbered too: only an SBAS solution refers to a satellite.
     if fix is Fix.SBAS and m.ReferenceID in _SBAS_PRNS:

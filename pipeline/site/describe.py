@@ -6,6 +6,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.track.network import Network, network_of
 from pipeline.track.survey import Track, track_of
@@ -88,16 +90,7 @@ def _dimensions(track: Track) -> str:
 
 def _parts(network: Network) -> int:
     """Connected pieces of the network, whatever the navigability."""
-    group = list(range(network.count))
-    for oriented, edges in enumerate(network.successors):
-        for edge in edges:
-            one, other = _root(group, oriented // 2), _root(group, edge.to // 2)
-            group[max(one, other)] = min(one, other)
-    return len({_root(group, element) for element in group})
-
-
-def _root(group: list[int], element: int) -> int:
-    while group[element] != element:
-        group[element] = group[group[element]]
-        element = group[element]
-    return element
+    pairs = [(start // 2, edge.to // 2) for start, edges in enumerate(network.successors) for edge in edges]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(network.count, network.count))
+    return int(connected_components(joined, directed=False, return_labels=False))

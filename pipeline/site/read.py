@@ -11,16 +11,7 @@ import polars as pl
 from pipeline.site.checks import drop_repeated_points, remarks
 from pipeline.site.geojson import Network, read_network
 from pipeline.site.route import route_table
-from pipeline.site.tables import (
-    BALISES,
-    EPSG_WGS84,
-    LINKS,
-    TRACK,
-    Column,
-    RawTable,
-    load_table,
-    typed_table,
-)
+from pipeline.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.track.survey import geometric_measures_m, track_of
@@ -51,7 +42,7 @@ def read_site(path: Path | str) -> Site:
     breaches: list[str] = []
     track, network, notes = _read_track(files, breaches)
     links = _read_links(files, network, breaches)
-    balises = _read_table(files, "balises", BALISES, breaches)
+    balises = _read_table(files, "balises", breaches)
     route = _read_route(files, breaches)
     if breaches or track is None or links is None:
         raise _refusal(path, breaches)
@@ -112,11 +103,9 @@ def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable 
     return None if name is None else load_table(name, files[name], breaches)
 
 
-def _read_table(
-    files: dict[str, bytes], table: str, columns: dict[str, Column], breaches: list[str]
-) -> pl.DataFrame | None:
+def _read_table(files: dict[str, bytes], table: str, breaches: list[str]) -> pl.DataFrame | None:
     raw = _load(files, table, breaches)
-    return None if raw is None else typed_table(raw, columns, breaches)
+    return None if raw is None else typed_table(raw, table, breaches)
 
 
 def _read_track(
@@ -128,7 +117,7 @@ def _read_track(
         raw = network.track if network else None
     else:
         raw = _load(files, "track", breaches)
-    frame = typed_table(_in_degrees(raw), TRACK, breaches) if raw is not None else None
+    frame = typed_table(_in_degrees(raw), "track", breaches) if raw is not None else None
     if raw is None or frame is None:
         return None, network, []
     if frame.is_empty():
@@ -148,7 +137,7 @@ def _read_links(files: dict[str, bytes], network: Network | None, breaches: list
         raw = network.links
     if raw is None:
         return Links.create_empty()
-    return typed_table(raw, LINKS, breaches)
+    return typed_table(raw, "links", breaches)
 
 
 def _read_route(files: dict[str, bytes], breaches: list[str]) -> pl.DataFrame | None:

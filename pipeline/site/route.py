@@ -8,7 +8,7 @@ from dataclasses import replace
 import polars as pl
 
 from pipeline.site.checks import route_breaches
-from pipeline.site.tables import ROUTE, load_table, typed_table
+from pipeline.site.tables import load_table, typed_table
 from pipeline.storage.address import Address, name_of, shown
 from pipeline.storage.files import read_bytes
 from pipeline.track.survey import track_of
@@ -28,7 +28,7 @@ def route_table(file: str, data: bytes, breaches: list[str]) -> pl.DataFrame | N
     Other columns are left alone: `balise replay --write-route` writes some that say what is in doubt.
     """
     raw = load_table(file, data, breaches)
-    route = None if raw is None else typed_table(raw, ROUTE, breaches)
+    route = None if raw is None else typed_table(raw, "route", breaches)
     if route is None:
         return None
     words = route["direction"].str.strip_chars().str.to_lowercase()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from enum import StrEnum
 
+import dataframely as dy
 import polars as pl
 
+from pipeline.ingest.breaches import Breach, line_of
+from pipeline.ingest.conform import Defaults, conform_to, rows_text, type_name
 from pipeline.ingest.csv_text import comments_of, epsg_in, read_table
-from schemas.enums import BaliseKind, Navigability, Reaction
+from schemas.enums import Reaction
+from schemas.inputs import SITE_SCHEMAS
 
 EPSG_WGS84 = 4326
 
@@ -23,48 +26,23 @@ class RawTable:
     epsg: int = EPSG_WGS84
 
 
-@dataclass(frozen=True)
-class Column:
-    """What a column must be; `default` fills a column or cell that is absent (none: must be given)."""
-
-    dtype: type[pl.DataType]
-    required: bool = True
-    nullable: bool = False
-    default: str | float | bool | None = None
-    low: float | None = None
-    high: float | None = None
-    words: type[StrEnum] | None = None
-
-
-TRACK = {
-    "netelement_id": Column(pl.String),
-    "measure_m": Column(pl.Float64, required=False, nullable=True),
-    "latitude_deg": Column(pl.Float64),
-    "longitude_deg": Column(pl.Float64),
-    "height_m": Column(pl.Float64, required=False, nullable=True, low=-1_000.0, high=10_000.0),
-    "sigma_m": Column(pl.Float64, required=False, nullable=True, low=0.0),
+# What a site need not say of a balise (CONTRACT section 2), nor a route of its legs.
+_DEFAULTS: Defaults = {
+    "location_accuracy_m": 12.0,
+    "linked": True,
+    "link_reaction": Reaction.SERVICE_BRAKE.value,
+    "leg": 0,
 }
-LINKS = {
-    "netelement_a": Column(pl.String),
-    "position_a": Column(pl.Int64, low=0, high=1),
-    "netelement_b": Column(pl.String),
-    "position_b": Column(pl.Int64, low=0, high=1),
-    "navigability": Column(pl.String, words=Navigability),
+# As recorded: an element without measures gets those of its geometry, and plane coordinates become degrees later.
+_RECORDED: dict[str, dict[str, dy.Column]] = {
+    "track": {
+        "measure_m": dy.Float64(nullable=True),
+        "latitude_deg": dy.Float64(nullable=False),
+        "longitude_deg": dy.Float64(nullable=False),
+    },
+    "route": {"leg": dy.Int64(nullable=False, min=0)},
 }
-BALISES = {
-    "balise_id": Column(pl.String),
-    "netelement_id": Column(pl.String),
-    "measure_m": Column(pl.Float64),
-    "kind": Column(pl.String, words=BaliseKind),
-    "location_accuracy_m": Column(pl.Float64, required=False, default=12.0, low=0.0, high=63.0),
-    "linked": Column(pl.Boolean, required=False, default=True),
-    "link_reaction": Column(pl.String, required=False, default=Reaction.SERVICE_BRAKE.value, words=Reaction),
-}
-ROUTE = {
-    "netelement_id": Column(pl.String),
-    "direction": Column(pl.String),
-    "leg": Column(pl.Int64, required=False, default=0, low=0),
-}
+_TRUTH = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
 
 
 def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
@@ -77,23 +55,16 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
         return None
 
 
-def typed_table(raw: RawTable, columns: dict[str, Column], breaches: list[str]) -> pl.DataFrame | None:
-    """The contract's columns with the contract's types, or breaches and none."""
-    before = len(breaches)
-    missing = [name for name, column in columns.items() if column.required and name not in raw.frame.columns]
-    if missing:
-        have = ", ".join(raw.frame.columns)
-        breaches.append(f"{raw.file}: no column {', '.join(missing)}; found {have}")
-        return None
-    typed = [_typed(raw, name, column, breaches) for name, column in columns.items()]
-    return pl.DataFrame(typed) if len(breaches) == before else None
-
-
-def rows_text(mask: pl.Series) -> str:
-    """Which rows, for a message: the first few, counted from 0 as in the table."""
-    rows = mask.arg_true().to_list()
-    shown = ", ".join(str(row) for row in rows[:3])
-    return f"row {shown}" if len(rows) <= 3 else f"rows {shown} and {len(rows) - 3} more"
+def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame | None:
+    """The contract's columns with the contract's types (words as text), or breaches and none."""
+    columns = SITE_SCHEMAS[table].columns() | _RECORDED.get(table, {})
+    found: list[Breach] = []
+    read = {name: _read(raw, name, column, found) for name, column in columns.items() if name in raw.frame.columns}
+    known = {name: column for name, column in columns.items() if name not in read or read[name] is not None}
+    recorded = raw.frame.with_columns(series for series in read.values() if series is not None)
+    frame = conform_to(known, recorded, raw.file, found, _DEFAULTS)
+    breaches += [line_of(breach) for breach in found]
+    return None if found else frame.with_columns(pl.col(pl.Enum).cast(pl.String))
 
 
 def _parquet(file: str, data: bytes) -> RawTable:
@@ -123,60 +94,22 @@ def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:
     return RawTable(file, frame, int(digits))
 
 
-def _typed(raw: RawTable, name: str, column: Column, breaches: list[str]) -> pl.Series:
-    place = f"{raw.file}: column {name}"
-    if name not in raw.frame.columns:
-        return pl.Series(name, [column.default] * raw.frame.height, dtype=column.dtype)
+def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[Breach]) -> pl.Series | None:
+    """What stands as text in the type that it spells, identities that are numbers as text; none with a breach."""
     found = raw.frame[name]
-    series = _converted(found, column.dtype)
-    if series is None:
-        breaches.append(f"{place}: found {found.dtype}, expected {column.dtype.__name__}")
-        return pl.Series(name, [], dtype=column.dtype)
+    if isinstance(column, dy.String) and found.dtype.is_integer():
+        return found.cast(pl.String)
+    if found.dtype != pl.String or isinstance(column, dy.String | dy.Enum):
+        return found
+    texts = found.str.strip_chars()
+    if isinstance(column, dy.Bool):
+        series = texts.str.to_lowercase().replace_strict(_TRUTH, default=None, return_dtype=pl.Boolean)
+    else:
+        series = texts.cast(column.dtype, strict=False)
     unreadable = series.is_null() & found.is_not_null()
-    if unreadable.any():
-        breaches.append(f"{place}: not a {column.dtype.__name__} in {rows_text(unreadable)}")
-    if column.default is not None:
-        series = series.fill_null(column.default)
-    _check_values(place, series, column, unreadable, breaches)
-    return series.alias(name)
-
-
-def _converted(series: pl.Series, dtype: type[pl.DataType]) -> pl.Series | None:
-    """Values in the wanted type, null where one does not convert; none where the type cannot be meant."""
-    if series.dtype == dtype or series.dtype == pl.Null:
-        return series.cast(dtype)
-    if dtype == pl.String:
-        plain = series.dtype.is_integer() or isinstance(series.dtype, pl.Categorical | pl.Enum)
-        return series.cast(pl.String) if plain else None
-    if series.dtype == pl.String:
-        stripped = series.str.strip_chars()
-        if dtype != pl.Boolean:
-            return stripped.cast(dtype, strict=False)
-        truth = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
-        return stripped.str.to_lowercase().replace_strict(truth, default=None, return_dtype=pl.Boolean)
-    if dtype == pl.Boolean or not series.dtype.is_numeric():
-        return None
-    whole = series.cast(pl.Float64)
-    if dtype == pl.Int64:
-        whole = pl.select(pl.when(whole == whole.floor()).then(whole)).to_series()
-    return whole.cast(dtype, strict=False)
-
-
-def _check_values(place: str, series: pl.Series, column: Column, unreadable: pl.Series, breaches: list[str]) -> None:
-    empty = series.is_null() & ~unreadable
-    if not column.nullable and empty.any():
-        breaches.append(f"{place}: empty in {rows_text(empty)}")
-    if column.dtype == pl.Float64:
-        odd = (~series.is_finite()).fill_null(False)
-        if odd.any():
-            breaches.append(f"{place}: NaN or infinite in {rows_text(odd)}; leave a value that is not known empty")
-    for limit, outside, word in ((column.low, series.__lt__, "below"), (column.high, series.__gt__, "above")):
-        mask = outside(limit).fill_null(False) if limit is not None else None
-        if mask is not None and mask.any():
-            breaches.append(f"{place}: {series.filter(mask)[0]} is {word} {limit:g} in {rows_text(mask)}")
-    if column.words is not None:
-        allowed = [word.value for word in column.words]
-        strange = ~series.is_in(allowed) & series.is_not_null()
-        if strange.any():
-            value = series.filter(strange)[0]
-            breaches.append(f"{place}: {value!r} in {rows_text(strange)}; expected one of {', '.join(allowed)}")
+    if not unreadable.any():
+        return series
+    place, value = f"{raw.file}: column {name}", found.filter(unreadable)[0]
+    where = f"{value!r} in {rows_text(unreadable)}"
+    breaches.append(Breach(place, "cannot be read", found=where, expected=type_name(column)))
+    return None

@@ -74,7 +74,9 @@ def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
 
 
 def test_good_messages_are_taken_at_once():
-    contents = [json.dumps({"a": number / 7, "name": "x", "t": {"sec": number}}).encode() for number in range(50)]
+    contents = [
+        json.dumps({"a": number / 7, "name": "Info NaN null", "t": {"sec": number}}).encode() for number in range(50)
+    ]
     parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
     assert (len(parts), left) == (1, [])
     assert parts[0].values["a"].to_list() == [number / 7 for number in range(50)]

@@ -184,20 +184,22 @@ def test_all_breaches_come_at_once(tmp_path: Path) -> None:
     links = builders.links().with_columns(navigability=pl.lit("sideways"), position_a=pl.lit(3))
     balises = builders.balises(kind=["virtual", "imaginary"], balise_id=["v1", None])
     text = messages(builders.write(tmp_path, track=track, links=links, balises=balises))
-    assert "track.parquet: column latitude_deg: NaN or infinite in row 1" in text
-    assert "links.parquet: column position_a: 3 is above 1" in text
-    assert "links.parquet: column navigability: 'sideways'" in text
-    assert "expected one of AB, BA, both, none" in text
-    assert "balises.parquet: column kind: 'imaginary' in row 1" in text
-    assert "balises.parquet: column balise_id: empty in row 1" in text
+    assert "track.parquet: column latitude_deg: is not a number; found nan in row 1" in text
+    assert "links.parquet: column position_a: is out of range; found 3 in 4 rows, first 0; expected at most 1" in text
+    assert "links.parquet: column navigability: has the wrong type; found 'sideways'" in text
+    assert "expected one of AB BA both none" in text
+    assert "balises.parquet: column kind: has the wrong type; found 'imaginary'" in text
+    assert "balises.parquet: column balise_id: is not complete; found null in row 1" in text
 
 
 def test_missing_columns_wrong_types_and_falling_measures(tmp_path: Path) -> None:
-    assert "track.parquet: no column longitude_deg; found netelement_id" in messages(
+    assert "track.parquet: column longitude_deg: is missing; found netelement_id" in messages(
         builders.write(tmp_path / "1", track=builders.track().drop("longitude_deg"))
     )
     listed = builders.track().with_columns(latitude_deg=pl.concat_list("latitude_deg"))
-    assert "column latitude_deg: found List" in messages(builders.write(tmp_path / "2", track=listed))
+    assert "column latitude_deg: has the wrong type; found List" in messages(
+        builders.write(tmp_path / "2", track=listed)
+    )
     falling = builders.track().with_columns(measure_m=-pl.col("longitude_deg"))
     assert "element a does not grow at point 1" in messages(builders.write(tmp_path / "3", track=falling))
     partial = builders.track().with_columns(measure_m=pl.Series([0.0, None, *[None] * 7], dtype=pl.Float64))
