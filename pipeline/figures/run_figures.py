@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,8 +10,9 @@ import polars as pl
 from pipeline.epochs.clock import Clock, flags, trusted, usable
 from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
+from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
 from pipeline.figures.independent import missed_detection
-from pipeline.figures.levels import is_proven, level_counts, level_verdict
+from pipeline.figures.levels import LEVEL_LISTS, level_rows
 from schemas.config import Configuration
 from schemas.enums import (
     TRUTH,
@@ -28,9 +28,6 @@ from schemas.enums import (
 from schemas.tables import SCALES
 
 Row = dict[str, object]
-
-CONTINUITY_S = 15.0
-"""Most critical phase of an APV-I/LPV-200 operation (LOC section VI)."""
 
 _REJECTED = [status.value for status in PassageStatus if status.value.startswith("rejected_")]
 
@@ -51,7 +48,7 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
         "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
         "mtbf_h": mtbf_h,
-        "continuity_15s": math.exp(-CONTINUITY_S / 3600.0 / mtbf_h) if mtbf_h else None,
+        "continuity_15s": continuity(CONTINUITY_S, mtbf_h) if mtbf_h else None,
         "trusted_s": trust.up_s if epochs.height else None,
         "trusted_losses": trust.losses,
     }
@@ -160,17 +157,8 @@ def service_levels(
 ) -> Row:
     """Whether the failures were within the allowed T_D of each service level (TVB eq. 7); `unknown`: share of time."""
     hazardous_s, may_s = (failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s"))
-    safety = config.safety
-    allowed_s = [safety.allowed_time_to_detect_s(level) for level in safety.service_levels]
-    counts = [level_counts(hazardous_s, may_s, limit_s) for limit_s in allowed_s]
-    proven = is_proven(evidence, unknown, config.hazards.unknown_share_limit)
-    return {
-        "service_levels": list(safety.service_levels),
-        "level_allowed_s": allowed_s,
-        "level_within": [within for within, _ in counts],
-        "level_exceeded": [exceeded for _, exceeded in counts],
-        "level_verdict": [level_verdict(failures.height, *count, proven=proven) for count in counts],
-    }
+    rows = level_rows(hazardous_s, may_s, evidence, unknown, config)
+    return {name: [row[part] for row in rows] for part, name in LEVEL_LISTS.items()}
 
 
 def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None, clock: Clock) -> Row:
@@ -194,9 +182,7 @@ def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence 
         **{name: float(held.sum()) if epochs.height else None for name, held in times.items()},
         "alarms": alarms.height,
         "false_alarms": false if truth else None,
-        "false_alarm_rate_per_h": rate.value,
-        "false_alarm_rate_low_per_h": rate.low,
-        "false_alarm_rate_high_per_h": rate.high,
+        **columns_of("false_alarm_rate", rate, "_per_h"),
     }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.export.places import Ground, ground_of, plane_m
-from pipeline.report.packing import Json
+from pipeline.report.markup import Json
 from pipeline.track.survey import track_of
 from schemas.run import Site
 

@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.export.places import Ground, Stretches, beside, ground_at, ground_of, plane_m, sign_of, stretches_of
 from pipeline.report.decimate import detail_rows
-from pipeline.report.packing import Json, packed
+from pipeline.report.markup import Json, packed
 from pipeline.report.series import UNKNOWN, column_of
 from pipeline.track.survey import track_of
 from schemas.arrays import Floats, Ints

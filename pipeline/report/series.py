@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
 from pipeline.report.decimate import Band, band, detail_rows, kept_rows
-from pipeline.report.packing import Json, packed
+from pipeline.report.markup import Json, packed
 from schemas.arrays import Bools, Floats, Ints
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
 from schemas.tables import MONITORS
@@ -28,7 +28,7 @@ SERIES = (
 )
 NO_EPOCH, UNKNOWN = "no epoch", "not known"
 MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)
-_MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
+MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
 
 
 def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
@@ -56,7 +56,7 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
 
 def moments_of(*frames: pl.DataFrame) -> Ints:
     """Every instant that hazards and alarms name [ns]."""
-    names = (*_MOMENTS, "t_start")
+    names = (*MOMENTS, "t_start")
     columns = [frame[name].drop_nulls() for frame in frames for name in names if name in frame.columns]
     parts = [column.to_physical().to_numpy() for column in columns]
     return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
@@ -67,16 +67,14 @@ def column_of(frame: pl.DataFrame, name: str) -> Floats:
     return frame[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
-def reasons(epochs: pl.DataFrame) -> list[Json]:
-    """Why monitors were not evaluated, with the epochs that it was so."""
-    rows: list[Json] = []
-    for monitor in MONITORS:
-        named = epochs[f"{monitor}_reason"].drop_nulls()
-        if named.is_empty():
-            continue
-        counts = named.value_counts(sort=True, name="epochs").sort("epochs", named.name, descending=[True, False])
-        rows += [[monitor, reason, count] for reason, count in counts.head(4).iter_rows()]
-    return rows
+def reasons(epochs: pl.DataFrame) -> pl.DataFrame:
+    """Why monitors were not evaluated: `reason, epochs, monitors`; of each monitor the four most frequent."""
+    counts = [
+        epochs.select(reason=f"{name}_reason").drop_nulls().group_by("reason").len("epochs").with_columns(monitor=pl.lit(name))
+        .sort("epochs", "reason", descending=[True, False]).head(4)
+        for name in MONITORS
+    ]  # fmt: skip
+    return pl.concat(counts).group_by("reason", "epochs", maintain_order=True).agg(monitors="monitor")
 
 
 def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.report.packing import Json
+from pipeline.report.markup import Json
 
 _BINS = 56
 

@@ -14,7 +14,7 @@ import polars as pl
 
 from pipeline.campaign.plan import software_digest
 from pipeline.campaign.workers import each
-from pipeline.figures.map_errors import map_places
+from pipeline.figures.derived_tables import derived_tables
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, run_page
@@ -130,14 +130,16 @@ def _made(out: Path, site: Site | None) -> Made:
 def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dict[Key, Tally]]) -> Campaign:
     needed = ("solution", "netelement_id", "measure_m", "moving", "tvb", "alarm")
     epochs = read_table(out, "epochs").select(pl.col(name) for name in needed)
+    small = ("runs", "hazards", "passages", "alarms")
+    runs, hazards, passages, alarms = (read_table(out, name).collect() for name in small)
     return Campaign(
-        runs=read_table(out, "runs").collect(),
-        hazards=read_table(out, "hazards").collect(),
-        passages=read_table(out, "passages").collect(),
+        runs=runs,
+        hazards=hazards,
+        passages=passages,
+        derived=derived_tables(runs, hazards, passages, alarms, made.config),
         pieces=availability_pieces(epochs),
         hrefs=hrefs,
         architectures=over_all_runs(found),
-        map=map_places(read_table(out, "alarms").collect()),
     )
 
 

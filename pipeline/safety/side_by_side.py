@@ -16,11 +16,12 @@ from pipeline.epochs.clock import Clock, flags, trusted
 from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import held_s, uptime
 from pipeline.figures.bounds import threshold_factor
+from pipeline.figures.independent import independent_episodes, missed_detection
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
-from pipeline.safety.composite_alarms import Side, verdicts_of
-from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
+from pipeline.safety.composite_alarms import Solution, verdict_of_both
+from pipeline.safety.tally import Alarms, Faults, Tally, Working
 from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
@@ -53,20 +54,6 @@ class _Channel:
     wrong: Bools
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Tables of one solution; `faults` one row per fault."""
-
-    epochs: pl.DataFrame
-    faults: pl.DataFrame
-    alarms: pl.DataFrame
-    with_truth: bool
-
-    @property
-    def side(self) -> Side:
-        return Side(self.epochs, self.faults, self.alarms, self.with_truth)
-
-
 def side_by_side(
     epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
 ) -> dict[Key, Tally]:
@@ -92,19 +79,11 @@ def side_by_side(
 
 
 def side_by_side_table(found: dict[Key, Tally]) -> pl.DataFrame:
-    """One row per architecture and solution or pair; `mtbf_expected_h` from the MTBF of the channels alone.
-
-    Of two independent channels: both needed, half the MTBF where they are equal; one enough, their product over
-    one hour (LOC eq. 11), which holds for MTBFs well beyond that hour and is left out below it.
-    """
-    rows: list[Row] = []
-    for (solution, architecture, other), tally in sorted(found.items(), key=lambda item: _order(item[0])):
-        expected = None if other is None else _expected_h(architecture, found, solution, other)
-        rows.append(
-            {"architecture": architecture, "solution": solution, "other": other}
-            | tally.row()
-            | {"mtbf_expected_h": expected}
-        )
+    """One row per architecture and solution or pair."""
+    rows = [
+        {"architecture": architecture, "solution": solution, "other": other} | tally.row()
+        for (solution, architecture, other), tally in sorted(found.items(), key=lambda item: _order(item[0]))
+    ]
     return pl.DataFrame(rows, infer_schema_length=None)
 
 
@@ -112,46 +91,20 @@ def _order(key: Key) -> tuple[int, str, str]:
     return (REACTIVE, COMPOSITE, REDUNDANT).index(key[1]), key[0], key[2] or ""
 
 
-def _expected_h(architecture: str, found: dict[Key, Tally], solution: str, other: str) -> float | None:
-    alone = [found[name, REACTIVE, None].working for name in (solution, other)]
-    one, two = (part.up_s / part.losses / 3600.0 if part.losses else None for part in alone)
-    if one is None or two is None:
-        return None
-    if architecture == COMPOSITE:
-        return one * two / (one + two)
-    return one * two if min(one, two) > 1.0 else None
-
-
 def _solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
-) -> _Solution:
+) -> Solution:
     own = pl.col("solution") == name
     evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
-    return _Solution(
+    return Solution(
         epochs=epochs.filter(own).sort("t"),
-        faults=_one_per_fault(hazards.filter(own)),
+        faults=independent_episodes(hazards.filter(own)),
         alarms=alarms.filter(own),
         with_truth=len(evidence) == 1 and evidence[0] in TRUTH,
     )
 
 
-def _one_per_fault(hazards: pl.DataFrame) -> pl.DataFrame:
-    """`begin, failure, end` [ns], `budget_s` and `with_truth`; rows of one fault, and those its end made, are one."""
-    instants = [pl.col(name).to_physical() for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
-    return (
-        hazards.filter(pl.col("caused_by").is_null())
-        .select(*instants, "budget_s", with_truth=pl.col("evidence").is_in(TRUTH))
-        .group_by(begin=pl.coalesce("t_onset", "t_hazard"), maintain_order=True)
-        .agg(
-            failure=pl.col("t_failure").min(),
-            end=pl.when(pl.col("t_end").is_null().any()).then(None).otherwise(pl.col("t_end").max()),
-            budget_s=pl.col("budget_s").first(),
-            with_truth=pl.col("with_truth").all(),
-        )
-    )
-
-
-def _reactive(one: _Solution, config: Configuration) -> _Channel:
+def _reactive(one: Solution, config: Configuration) -> _Channel:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
     return _channel(one, one.epochs, _DIAGNOSIS, judged, trusted(config), config)
 
@@ -160,7 +113,7 @@ def _evaluated(monitor: str) -> pl.Expr:
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
-def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally:
+def _composite(one: Solution, other: Solution, config: Configuration) -> Tally:
     placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     factor = threshold_factor(config.monitors.false_alarm_probability)
@@ -171,12 +124,12 @@ def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally
     frame = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared).hstack(met)
     trust = pl.col("own_trusted") & pl.col("other_trusted")
     channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
-    verdicts = verdicts_of(channel.fails.alarms, (one.side, other.side), config.hazards)
+    verdicts = [verdict_of_both(alarm, (one, other), config.hazards) for alarm in channel.fails.alarms]
     return _tally(channel, _faults(one.faults, other.faults, channel), verdicts)
 
 
 def _channel(
-    one: _Solution,
+    one: Solution,
     epochs: pl.DataFrame,
     monitors: tuple[str, ...],
     judged: pl.Expr,
@@ -228,20 +181,28 @@ def _redundant(one: _Channel, other: _Channel) -> Working:
 
 def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Faults:
     """`others`: faults of the other solution, so that common ones can be told apart."""
-    hazards = failures = missed = common = common_missed = judged = missed_judged = 0
-    delays: list[float] = []
-    columns = ("begin", "failure", "end", "budget_s", "with_truth")
-    for begin, failure, end, budget_s, with_truth in faults.select(columns).iter_rows():
-        last = int(channel.clock.t_ns[-1]) if end is None else end
-        detected = _detected_ns(channel.fails, begin, last)
-        late = failure is not None and _is_late(detected, failure, budget_s)
-        shared = failure is not None and others is not None and _overlaps(others, begin, last)
-        hazards, failures, missed = hazards + 1, failures + (failure is not None), missed + late
-        common, common_missed = common + shared, common_missed + (shared and late)
-        judged, missed_judged = judged + (failure is not None and with_truth), missed_judged + (late and with_truth)
-        if detected is not None:
-            delays.append((detected - begin) / 1e9)
-    return Faults(hazards, failures, missed, common, common_missed, tuple(delays), judged, missed_judged)
+    last, kind = int(channel.clock.t_ns[-1]), faults.schema["begin"]
+    ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
+    found = [_detected_ns(channel.fails, *span) for span in ends]
+    failed, missed, common = pl.col("failed"), pl.col("missed"), pl.col("failed") & pl.col("common")
+    counts = (
+        faults.with_columns(
+            t_detected=pl.Series(found, dtype=pl.Int64).cast(kind),
+            common=pl.Series([others is not None and _overlaps(others, *span) for span in ends], dtype=pl.Boolean),
+        )
+        .with_columns(missed=missed_detection().fill_null(value=False))
+        .select(
+            hazards=pl.len(),
+            failures=failed.sum(),
+            missed=missed.sum(),
+            common=common.sum(),
+            common_missed=(common & missed).sum(),
+            judged=(failed & pl.col("with_truth")).sum(),
+            missed_judged=(missed & pl.col("with_truth")).sum(),
+        )
+    )
+    delays = ((moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None)
+    return Faults(time_to_detect_s=tuple(delays), **counts.row(0, named=True))
 
 
 def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
@@ -252,14 +213,10 @@ def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
     return None if first is None else first[0]
 
 
-def _is_late(detected: int | None, failure: int, budget_s: float | None) -> bool:
-    """A missed detection: no fail by the failure + budget (DOMAIN section 5.3)."""
-    return detected is None or detected > failure + round((budget_s or 0.0) * 1e9)
-
-
 def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
-    meets = (pl.col("begin") <= last) & (pl.col("end").is_null() | (pl.col("end") >= begin))
-    return faults.filter(pl.col("failure").is_not_null() & meets).height > 0
+    end = pl.col("t_end").to_physical()
+    meets = (pl.col("begin").to_physical() <= last) & (end.is_null() | (end >= begin))
+    return faults.filter(pl.col("failed") & meets).height > 0
 
 
 def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:

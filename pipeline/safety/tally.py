@@ -7,21 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.epochs.timeline import Uptime
-from pipeline.figures.bounds import UNKNOWN, Estimate, clopper_pearson, poisson_rate
-from pipeline.figures.run_figures import CONTINUITY_S
-from pipeline.safety.continuity import continuity
+from pipeline.figures.bounds import UNKNOWN, clopper_pearson, poisson_rate
+from pipeline.figures.estimates import columns_of, continuity_15s, mtbf
 
 Row = dict[str, object]
-
-
-def columns_of(name: str, estimate: Estimate, unit: str = "") -> Row:
-    """An estimate as three columns `name`, `name_low`, `name_high`, with their unit at the end."""
-    return {
-        f"{name}{unit}": estimate.value,
-        f"{name}_low{unit}": estimate.low,
-        f"{name}_high{unit}": estimate.high,
-    }
 
 
 @dataclass(frozen=True)
@@ -81,13 +70,15 @@ class Tally:
 
     def row(self) -> Row:
         """Figures with exact 95 % bounds."""
+        lost = self.working.losses, self.working.up_s / 3600.0
         return {
             **_fault_columns(self.faults),
             **_alarm_columns(self.alarms),
             "availability": self.working.working_s / self.working.held_s if self.working.held_s > 0 else None,
             "wrong_in_use_s": self.working.wrong_s if self.working.truth_s > 0 else None,
             "wrong_in_use_share": self.working.wrong_s / self.working.truth_s if self.working.truth_s > 0 else None,
-            **continuity_columns(Uptime(self.working.up_s, self.working.losses)),
+            **columns_of("mtbf", mtbf(*lost), "_h"),
+            **columns_of("continuity_15s", continuity_15s(*lost)),
         }
 
 
@@ -128,15 +119,3 @@ def _alarm_columns(alarms: Alarms | None) -> Row:
         **columns_of("false_alarm_rate", rate, "_per_h"),
         "judged_h": alarms.judged_s / 3600.0,
     }
-
-
-def continuity_columns(up: Uptime) -> Row:
-    """MTBF [h] and its continuity over 15 s (LOC eq. 8), with bounds from the losses counted.
-
-    Without a loss the value is not known, but it has a lower bound.
-    """
-    rate = poisson_rate(up.losses, up.up_s / 3600.0)
-    mtbf = Estimate(*(1.0 / per_h if per_h else None for per_h in (rate.value, rate.high, rate.low)))
-    parts = (mtbf.value, mtbf.low, mtbf.high)
-    kept = Estimate(*(None if part is None else continuity(CONTINUITY_S, part) for part in parts))
-    return {**columns_of("mtbf", mtbf, "_h"), **columns_of("continuity_15s", kept)}

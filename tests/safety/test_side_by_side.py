@@ -10,7 +10,6 @@ import pytest
 
 from pipeline.figures.bounds import clopper_pearson
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, REDUNDANT, side_by_side, side_by_side_table
-from pipeline.safety.tally import Alarms, Faults, Tally, Working
 from schemas.config import Configuration
 from schemas.tables import Runs
 from tests.summary.tables import NS, alarms, epochs, hazards, table
@@ -257,17 +256,6 @@ class TestRedundantChannels:
         assert (row["availability"], row["mtbf_h"]) == (1.0, None)
         alone = [found[name, REACTIVE]["mtbf_h"] for name in ("galileo", "gps")]
         assert alone == pytest.approx([188 / 3600] * 2)
-        assert row["mtbf_expected_h"] is None
-        assert found["galileo", COMPOSITE]["mtbf_expected_h"] == pytest.approx(94 / 3600)
-
-    def test_expected_as_published(self) -> None:
-        """LOC eq. 11 with 520.8 h: 2.71e5 h, as the trial's own channels would have it."""
-        working = Working(held_s=1e9, working_s=1e9, up_s=520.8 * 3600 * 4, losses=4)
-        alone = {(name, REACTIVE, None): Tally(Faults(), Alarms(), working) for name in ("galileo", "gps")}
-        pairs = {("galileo", kind, "gps"): Tally(None, None, working) for kind in (COMPOSITE, REDUNDANT)}
-        rows = {row["architecture"]: row for row in side_by_side_table(alone | pairs).iter_rows(named=True)}
-        assert rows[REDUNDANT]["mtbf_expected_h"] == pytest.approx(2.712e5, rel=1e-3)
-        assert rows[COMPOSITE]["mtbf_expected_h"] == pytest.approx(260.4)
 
     def test_lost_only_where_both_are(self) -> None:
         row = self.both(list(range(50, 60)), list(range(55, 65)))["galileo", REDUNDANT]
