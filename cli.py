@@ -371,7 +371,6 @@ def export(
     ],
     site: Annotated[str | None, typer.Option("--site", help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, typer.Option("--log", help="The recorded run, for its raw positions.")] = None,
-    ros: Annotated[bool, typer.Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
@@ -382,7 +381,7 @@ def export(
     settings = _configuration(config)
     ground = None if site is None else read_site(site)
     recorded = None if log is None else read_run(log, settings.ingest)
-    files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
+    files, missing = export_run(out, run, to, ground, recorded)
     print("Wrote " + " and ".join(str(path) for path in files))
     for text in missing:
         print(f"Without {text}")

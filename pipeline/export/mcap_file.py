@@ -6,25 +6,20 @@ import heapq
 from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
-from typing import Literal
 
 import polars as pl
 
 from pipeline.export.events import alarm_entries, hazard_entries, passage_entries
 from pipeline.export.gis import balises_geojson, track_geojson
-from pipeline.export.messages import Encoding, geojson_topic, log_topic, rows_topic
+from pipeline.export.messages import geojson_topic, log_topic, rows_topic
 from pipeline.export.positions import as_gnss, positions_of
 from pipeline.ingest import payloads
 from pipeline.ingest.mcap_writer import Topic
 from pipeline.ingest.proto_schemas import LOCATION_FIX, descriptor_set
-from pipeline.ingest.ros2_text import DEFINITIONS
 from schemas.errors import OutputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import MONITORS
 
-PositionMessage = Literal["foxglove", "ros"]
-
-_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _FRAME = "wgs84"
 _LDS = (
     "t", "netelement_id", "measure_m", "path_m", "odometer_m", "speed_mps", "cross_track_m", "vertical_m", "on_track",
@@ -34,34 +29,30 @@ _LDS = (
 )  # fmt: skip
 
 
-def run_topics(
-    tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
-) -> tuple[list[Topic], list[str]]:
+def run_topics(tables: RunTables, site: Site | None, log: RunLog | None) -> tuple[list[Topic], list[str]]:
     """All topics of a run, and what could not be written for want of the site or the log."""
     topics: list[Topic] = []
     missing = [] if site is not None else ["matched and true positions, track and balises (no site given)"]
     missing += [] if log is not None else ["raw positions (no log given)"]
-    # Readers of ROS 2 bags refuse a bag that holds anything else.
-    encoding: Encoding = "cdr" if positions == "ros" else "protobuf"
     solutions = tables.epochs["solution"].unique(maintain_order=True).to_list()
     if site is not None and tables.epochs.height:
         t0_ns = int(tables.epochs["t"].to_physical().min())  # type: ignore[arg-type]
-        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site), encoding))
-        topics.append(geojson_topic("/site/balises", t0_ns, balises_geojson(site), encoding))
+        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site)))
+        topics.append(geojson_topic("/site/balises", t0_ns, balises_geojson(site)))
     for solution in solutions:
-        topics += _position_topics(solution, tables, site, log, positions)
-        topics += _result_topics(solution, tables, encoding)
+        topics += _position_topics(solution, tables, site, log)
+        topics += _result_topics(solution, tables)
     return topics, missing
 
 
-def write_topics(topics: list[Topic], path: Path, profile: str) -> None:
+def write_topics(topics: list[Topic], path: Path) -> None:
     """Write topics merged by time; the same topics give the same bytes."""
     from mcap.writer import CompressionType, Writer
 
     try:
         with path.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD)
-            writer.start(profile=profile, library="balise")
+            writer.start(profile="", library="balise")
             channels = [
                 writer.register_channel(
                     topic.topic,
@@ -83,31 +74,29 @@ def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
         yield t_ns, number, row
 
 
-def _position_topics(
-    solution: str, tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
-) -> list[Topic]:
+def _position_topics(solution: str, tables: RunTables, site: Site | None, log: RunLog | None) -> list[Topic]:
     topics = []
     if log is not None:
         raw = log.gnss.filter(pl.col("solution") == solution)
-        topics.append(_position_topic(f"/{solution}/raw", raw, positions))
+        topics.append(_position_topic(f"/{solution}/raw", raw))
     if site is not None:
         places = positions_of(tables.epochs.filter(pl.col("solution") == solution), site)
         for name in ("gnss", "matched", "truth"):
-            topics.append(_position_topic(f"/{solution}/{name}", as_gnss(getattr(places, name)), positions))
+            topics.append(_position_topic(f"/{solution}/{name}", as_gnss(getattr(places, name))))
     return topics
 
 
-def _result_topics(solution: str, tables: RunTables, encoding: Encoding) -> list[Topic]:
+def _result_topics(solution: str, tables: RunTables) -> list[Topic]:
     epochs, hazards, alarms, passages = (
         frame.filter(pl.col("solution") == solution)
         for frame in (tables.epochs, tables.hazards, tables.alarms, tables.passages)
     )
     return [
-        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS), encoding),
-        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs), encoding),
-        log_topic(f"/{solution}/hazards", hazard_entries(hazards), encoding),
-        log_topic(f"/{solution}/alarms", alarm_entries(alarms), encoding),
-        log_topic(f"/{solution}/passages", passage_entries(passages), encoding),
+        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS)),
+        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs)),
+        log_topic(f"/{solution}/hazards", hazard_entries(hazards)),
+        log_topic(f"/{solution}/alarms", alarm_entries(alarms)),
+        log_topic(f"/{solution}/passages", passage_entries(passages)),
     ]
 
 
@@ -121,11 +110,8 @@ def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
     return epochs.select(columns)
 
 
-def _position_topic(topic: str, frame: pl.DataFrame, positions: PositionMessage) -> Topic:
+def _position_topic(topic: str, frame: pl.DataFrame) -> Topic:
     known = frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
     times = known["t"].to_physical().to_list()
-    if positions == "ros":
-        messages = payloads.navsatfix_payloads(known, _FRAME)
-        return Topic(topic, "cdr", _NAVSATFIX, "ros2msg", DEFINITIONS[_NAVSATFIX].encode(), times, messages)
     messages = payloads.location_fix_payloads(known, _FRAME)
     return Topic(topic, "protobuf", LOCATION_FIX, "protobuf", descriptor_set(LOCATION_FIX), times, messages)

@@ -1,14 +1,13 @@
-"""Flat messages, protobuf or ROS 2, built at run time: rows of a frame, and those of Foxglove's that are needed."""
+"""Flat protobuf messages, built at run time: rows of a frame, and those of Foxglove's that are needed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import polars as pl
 
-from pipeline.export.cdr import Fields, cdr_messages, definition
 from pipeline.ingest.mcap_writer import Topic
 
 _SECOND_NS = 1_000_000_000
@@ -16,7 +15,8 @@ _SECOND_NS = 1_000_000_000
 _DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM, _OPTIONAL = 1, 3, 7, 8, 9, 11, 14, 1
 _TYPES: Mapping[str, int] = {"double": _DOUBLE, "int64": _INT64, "fixed32": _FIXED32, "bool": _BOOL, "string": _STRING}
 
-Encoding = Literal["protobuf", "cdr"]
+Fields = tuple[tuple[str, str], ...]
+"""Names and kinds: `time`, `double`, `int64`, `fixed32`, `level`, `bool`, `string`."""
 
 LOG: Fields = (
     ("timestamp", "time"), ("level", "level"), ("message", "string"), ("name", "string"), ("file", "string"),
@@ -31,38 +31,30 @@ INFO, WARNING, ERROR = 2, 3, 4
 _LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
 
-def rows_topic(topic: str, name: str, frame: pl.DataFrame, encoding: Encoding) -> Topic:
+def rows_topic(topic: str, name: str, frame: pl.DataFrame) -> Topic:
     """One message per row, time in the first column; a null is not set."""
     fields = tuple((column, _kind(dtype)) for column, dtype in frame.schema.items())
     times = frame.to_series(0).to_physical().to_list()
     plain = frame.with_columns(pl.col(field).to_physical() for field, kind in fields if kind == "time")
-    return _topic(topic, name, fields, times, plain.iter_rows(named=True), encoding)
+    return _topic(topic, name, fields, times, plain.iter_rows(named=True))
 
 
-def log_topic(topic: str, entries: list[tuple[int, int, str, str]], encoding: Encoding) -> Topic:
+def log_topic(topic: str, entries: list[tuple[int, int, str, str]]) -> Topic:
     """foxglove.Log from time [ns], level, name and message, put in order of time."""
     ordered = sorted(entries)
     rows = (
         {"timestamp": t_ns, "level": level, "message": text, "name": name, "file": "", "line": 0}
         for t_ns, level, name, text in ordered
     )
-    return _topic(topic, "foxglove.Log", LOG, [entry[0] for entry in ordered], rows, encoding)
+    return _topic(topic, "foxglove.Log", LOG, [entry[0] for entry in ordered], rows)
 
 
-def geojson_topic(topic: str, t_ns: int, text: str, encoding: Encoding) -> Topic:
+def geojson_topic(topic: str, t_ns: int, text: str) -> Topic:
     """foxglove.GeoJSON, once."""
-    return _topic(topic, "foxglove.GeoJSON", GEOJSON, [t_ns], iter([{"geojson": text}]), encoding)
+    return _topic(topic, "foxglove.GeoJSON", GEOJSON, [t_ns], iter([{"geojson": text}]))
 
 
-def _topic(
-    topic: str, name: str, fields: Fields, times: list[int], rows: Iterator[Mapping[str, Any]], encoding: Encoding
-) -> Topic:
-    if encoding == "cdr":
-        package, _, message = name.rpartition(".")
-        schema = definition(fields).encode()
-        return Topic(
-            topic, "cdr", f"{package}_msgs/msg/{message}", "ros2msg", schema, times, cdr_messages(fields, rows)
-        )
+def _topic(topic: str, name: str, fields: Fields, times: list[int], rows: Iterator[Mapping[str, Any]]) -> Topic:
     messages = (_message(name, fields, row) for row in rows)
     return Topic(topic, "protobuf", name, "protobuf", descriptor(name, fields), times, messages)
 

@@ -17,8 +17,7 @@ from pipeline.report.architectures import architectures_section
 from pipeline.report.columns import Row, figures, frame_table
 from pipeline.report.markup import Cell, Json, badge, figure, link, page, pairs, script_json, section, verdict_head
 from pipeline.report.plan_view import plan_data
-from pipeline.report.series import MOMENTS, moments_of, reasons, time_data
-from pipeline.report.stanford import stanford_data
+from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
 from pipeline.safety.side_by_side import Key, side_by_side_table
 from pipeline.safety.tally import Tally
 from schemas.campaign import STANFORD, CampaignLevels

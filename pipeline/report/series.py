@@ -1,4 +1,4 @@
-"""What the time axes of a run's page show, one solution at a time."""
+"""What the time axes and the Stanford diagram of a run's page show, one solution at a time."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ SERIES = (
 )
 NO_EPOCH, UNKNOWN = "no epoch", "not known"
 MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)
+_BINS = 56
 MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
 
 
@@ -131,4 +132,27 @@ def _band(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints,
         "starts": packed(pieces.starts_ms, "u4"),
         "codes": packed(pieces.codes, "u1"),
         "end_ms": pieces.end_ms,
+    }
+
+
+def stanford_data(epochs: pl.DataFrame, limit_m: float) -> Json:
+    """Counts of epochs of known error on a square grid up to twice the limit; the last bin holds all beyond it."""
+    known = epochs.select(error=pl.col("error_along_m").abs(), bound=pl.col("confidence_m")).drop_nulls()
+    width = 2.0 * limit_m / _BINS
+    cells = (
+        known.select(
+            x=(pl.col("error") / width).floor().clip(0, _BINS - 1).cast(pl.Int64),
+            y=(pl.col("bound") / width).floor().clip(0, _BINS - 1).cast(pl.Int64),
+        )
+        .group_by("x", "y")
+        .len("count")
+        .sort("x", "y")
+    )
+    counts = np.array(cells["count"].to_list(), dtype=np.int64)
+    return {
+        "width_m": width,
+        "bins": _BINS,
+        "limit_m": limit_m,
+        "cells": [list(row) for row in cells.iter_rows()],
+        "epochs": int(counts.sum()),
     }
