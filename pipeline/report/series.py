@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
 from pipeline.report.decimate import Band, band, detail_rows, kept_rows
 from pipeline.report.markup import Json, packed
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
 from schemas.tables import MONITORS
 
@@ -44,7 +44,7 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
     gaps = np.flatnonzero(np.diff(t_ms) > hold_ms) + 1
     shown_ms = np.insert(t_ms, gaps, t_ms[gaps - 1] + hold_ms)
     whole = detail_rows(shown_ms * 1_000_000, moments_ns - t0_ms * 1_000_000)
-    columns = {name: column_of(epochs, name) for name in SERIES} | _ratios(epochs)
+    columns = {name: floats(epochs, name) for name in SERIES} | _ratios(epochs)
     columns["residual_m"] = _residual(epochs)
     known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     return {
@@ -63,11 +63,6 @@ def moments_of(*frames: pl.DataFrame) -> Ints:
     return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
 
 
-def column_of(frame: pl.DataFrame, name: str) -> Floats:
-    """A column with NaN for null."""
-    return frame[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-
-
 def reasons(epochs: pl.DataFrame) -> pl.DataFrame:
     """Why monitors were not evaluated: `reason, epochs, monitors`; of each monitor the four most frequent."""
     counts = [
@@ -82,7 +77,7 @@ def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
     """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
     ratios = {}
     for monitor in MONITORS:
-        value, threshold = column_of(epochs, f"{monitor}_value"), column_of(epochs, f"{monitor}_threshold")
+        value, threshold = floats(epochs, f"{monitor}_value"), floats(epochs, f"{monitor}_threshold")
         evaluated = (epochs[f"{monitor}_state"] != MonitorState.NOT_EVALUATED).to_numpy() & (threshold > 0)
         ratios[f"ratio_{monitor}"] = np.divide(value, threshold, out=np.full(len(value), np.nan), where=evaluated)
     return ratios
@@ -90,7 +85,7 @@ def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
 
 def _residual(epochs: pl.DataFrame) -> Floats:
     """GNSS minus odometer along the path, from where both are first known [m]."""
-    both = column_of(epochs, "path_m") - column_of(epochs, "odometer_m")
+    both = floats(epochs, "path_m") - floats(epochs, "odometer_m")
     known = np.flatnonzero(np.isfinite(both))
     return both - both[known[0]] if len(known) else both
 
