@@ -51,6 +51,14 @@ Out = Annotated[str, typer.Option("--out", help="Where the tables go: a folder o
 OutFolder = Annotated[Path, typer.Option("--out", callback=_here, help="Folder to write.")]
 VehicleFile = Annotated[Path | None, typer.Option("--vehicle", callback=_here, help="Vehicle file (TOML).")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", callback=_here, help="Configuration file (TOML).")]
+RouteFiles = Annotated[
+    Path | None,
+    typer.Option("--route", callback=_here, help="A route for all runs, or a folder with RUN.csv or RUN.parquet."),
+]
+FoundRoutes = Annotated[
+    Path | None,
+    typer.Option("--write-route", callback=_here, help="Folder for the routes found, doubtful elements marked."),
+]
 ResultFolder = Annotated[Path, typer.Argument(callback=_here, help="A result of `balise replay`.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="The result as JSON on standard output.")]
@@ -74,6 +82,8 @@ def replay(
     out: Out,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
+    route: RouteFiles = None,
+    write_route: FoundRoutes = None,
     jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
@@ -88,7 +98,7 @@ def replay(
     from pipeline.campaign.progress import watches
 
     settings, train = _configuration(config), _vehicle(vehicle)
-    plan = make_plan(runs, site, out, settings, train)
+    plan = make_plan(runs, site, out, settings, train, route, write_route)
     try:
         summary = run_campaign(
             plan,
@@ -206,7 +216,7 @@ def inspect(
     from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result)
+    tables = inspect_path(path, settings.ingest, result, settings.matching)
     if as_json:
         _print_json(tables)
     else:
@@ -371,6 +381,7 @@ def export(
     ],
     site: Annotated[str | None, typer.Option("--site", help="Site, for positions on the ground.")] = None,
     log: Annotated[str | None, typer.Option("--log", help="The recorded run, for its raw positions.")] = None,
+    ros: Annotated[bool, typer.Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
@@ -381,7 +392,7 @@ def export(
     settings = _configuration(config)
     ground = None if site is None else read_site(site)
     recorded = None if log is None else read_run(log, settings.ingest)
-    files, missing = export_run(out, run, to, ground, recorded)
+    files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
     print("Wrote " + " and ".join(str(path) for path in files))
     for text in missing:
         print(f"Without {text}")

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import polars as pl
 
+from datasets.mcap_log import Encoding, OdometerMessage, write_mcap
 from pipeline.ingest.conform import conform
-from pipeline.ingest.mcap_writer import Encoding, OdometerMessage, write_mcap
 from schemas.run import RunLog, Stream
 
 Case = Literal["cdr Odometry", "cdr TwistStamped", "protobuf", "json"]

@@ -6,10 +6,10 @@ import shutil
 from pathlib import Path
 
 from datasets.demo import demo_scenario
+from datasets.mcap_log import write_mcap
 from datasets.motion import MotionSpec, PhaseSpec
 from datasets.scenario import BaliseSpec, ElementSpec, RunSpec, Scenario, with_seed
 from datasets.trial import build_run, build_site, write_run_log, write_site
-from pipeline.ingest.mcap_writer import write_mcap
 
 _ELEMENT_M = 6000.0
 _SPEED_MPS = 33.0

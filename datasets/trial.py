@@ -16,11 +16,11 @@ import polars as pl
 
 from datasets.faults import FaultSpec, PlacedFault, faults_table
 from datasets.line import Line, balises_table, build_line, links_table, track_table
+from datasets.mcap_log import write_mcap
 from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
 from datasets.receiver import Journey, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
-from pipeline.ingest.mcap_writer import write_mcap
 from schemas.config import Vehicle, settings_from, to_toml
 from schemas.errors import OutputError
 from schemas.run import STREAMS, RunLog, Site

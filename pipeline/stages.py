@@ -81,7 +81,7 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     odometry = odometry_of(cleaned.odometer, vehicle, config)
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
-    evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, vehicle, config)
+    evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
     factor = threshold_factor(config.monitors.false_alarm_probability)
     return _Context(cleaned, site, vehicle, config, counts, odometry, evidence, factor)
 
@@ -149,7 +149,7 @@ def _failed(context: _Context, solution: str, error: InputError) -> _Part:
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Part:
     """One solution: what the train made of it, then what the judge says of that."""
     ride = _ride(context, solution, matches)
-    bench = Bench(ride.solution, context.evidence, context.odometry, context.vehicle, context.config)
+    bench = Bench(ride.solution, context.evidence, ride.odometry, context.vehicle, context.config)
     judged = judge(bench, context.run.reference, context.run.faults)
     epochs = pl.concat([ride.solution.epochs, judged.epochs_columns], how="horizontal")
     row = summarise(_results(context, ride, judged, epochs), context.config, _made(context))
@@ -166,12 +166,13 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
 
 @dataclass(frozen=True)
 class _Ride:
-    """One solution as the train saw it, before anything is known of the truth."""
+    """One solution as the train saw it, before anything is known of the truth; `odometry` grows with its path."""
 
     solution: Solution
     found: Match
     aligned: pl.DataFrame
     lds: LdsResult
+    odometry: Odometry | None
 
 
 def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
@@ -184,8 +185,8 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
     lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path, found.odometer_sign)
-    return _Ride(seen, found, aligned, lds)
+    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
+    return _Ride(seen, found, aligned, lds, odometry)
 
 
 def _reads_on_odometer(

@@ -58,6 +58,7 @@ class IngestConfig(Settings):
     satellites: tuple[StreamMapping, ...] = ()
     reference: tuple[StreamMapping, ...] = ()
     balise_reads: tuple[StreamMapping, ...] = ()
+    # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
 
     @model_validator(mode="before")
@@ -71,12 +72,14 @@ class IngestConfig(Settings):
 class FixSigma(Settings):
     """Horizontal sigma by kind of fix where the receiver gives no covariance (DOMAIN section 3)."""
 
+    # Ours: receivers of these kinds, 68 %; TVB section 5 asks for 1.1 m at 95 %.
     autonomous_m: Positive = 2.0
     differential_m: Positive = 1.0
     sbas_m: Positive = 1.0
     rtk_float_m: Positive = 0.5
     rtk_fixed_m: Positive = 0.1
     estimated_m: Positive = 5.0
+    # Satellites stand above the horizon only.
     vertical_factor: Positive = 1.5
 
     def horizontal_m(self, fix: Fix) -> float | None:
@@ -88,9 +91,13 @@ class FixSigma(Settings):
 class MatchingConfig(Settings):
     """Map matching (DOMAIN section 2; Newson & Krumm 2009)."""
 
+    # Farther than any sigma that can still tell tracks apart; DOMAIN section 2.
     reach_m: Positive = 50.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
+    # The bias in that. Kept apart from `cross_bias_sigma_m`: an exact reference whose antenna is 0.3 m aside is on it.
+    on_track_bias_m: NonNegative = 1.5
+    # DIAG, error models: track survey 1 m.
     survey_sigma_default_m: Positive = 1.0
     # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
@@ -99,27 +106,37 @@ class MatchingConfig(Settings):
     # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
     sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
+    # DOMAIN section 2: a claim of 0.99 has to be right in 99 of 100 runs.
     ambiguity_probability: Probability = 0.99
+    # Noise of 0.35 m/s across the track at the slowest speed that counts.
     heading_sigma_deg: Positive = 10.0
+    # Slower, the noise of the velocity decides its heading.
     heading_min_speed_mps: Positive = 2.0
+    # Newson & Krumm 2009, eq. 2, for ways by odometer.
     transition_scale_m: Positive = 5.0
+    # DOMAIN section 2: the noise of a standing train is no turn; the first 20 m of net movement orient the path.
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
     # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
+    # A survey error is constant in place, not white (DOMAIN section 3); the length is ours.
     survey_correlation_m: Positive = 200.0
     # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
     estimated_drift: NonNegative = 0.1
+    # Reflections follow no error model: one of them must not decide on the track.
     outlier_probability: Probability = 1e-4
     outlier_scale_m: Positive = 10.0
+    # Positions closer together tell the same of the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
+    # A jump that no train makes decides on no track; after half a minute the odometer may be the wrong one.
     jump_hold_s: Positive = 30.0
 
 
 class AlignConfig(Settings):
     """Odometer against GNSS (DOMAIN section 3), and the causal filter of scale and latency."""
 
+    # DOMAIN section 3: slow errors have changed meanwhile.
     gap_reset_s: Positive = 60.0
     # A pause of the recording inside which the way is not known: longer than this, and than so many periods. Loggers
     # drop single rows at any rate.
@@ -141,8 +158,10 @@ class AlignConfig(Settings):
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
     # 400 pieces is within 10 % of its mean.
     quantisation_factor: Positive = 2.0
+    # 0.8 % of scale and 83 ms of latency were seen in recorded runs (DOMAIN section 3).
     scale_prior_sigma: Positive = 0.01
     latency_prior_sigma_s: Positive = 0.2
+    # Errors of a position hardly change in less (DIAG Table 1).
     filter_period_s: Positive = 1.0
     # Stamps that scatter make no gap by themselves: the first position after one that they made is always late.
     scattered_gap_sigmas: NonNegative = 3.0
@@ -159,8 +178,11 @@ class AlignConfig(Settings):
 class MonitorConfig(Settings):
     """Monitor bank (DIAG eq. 1-17; DOMAIN section 3)."""
 
+    # DIAG eq. 8; the paper's own set is lost from the text (eq. 9, 16).
     ewma_alphas: tuple[Probability, Probability, Probability] = (0.1, 0.01, 0.001)
+    # Per sample and monitor, two-sided Gaussian: k_T 5.3267 (DIAG; DOMAIN section 3).
     false_alarm_probability: Probability = 1e-7
+    # Shares of the variance at 45 degrees, and correlation times: DIAG Table 1.
     ionosphere_share: NonNegative = 0.083
     ionosphere_tau_s: Positive = 360.0
     troposphere_share: NonNegative = 0.014
@@ -169,12 +191,19 @@ class MonitorConfig(Settings):
     orbit_clock_tau_s: Positive = 3600.0
     user_share: NonNegative = 0.752
     user_tau_s: Positive = 100.0
+    # DIAG, error models: 0.05 m/s at 1 Hz.
     odometer_sigma_mps: Positive = 0.05
+    # Of plain receivers; `balise calibrate` measures it.
     doppler_sigma_mps: Positive = 0.1
+    # A drawn line is no survey: 2-D surveys that state no sigma wander across the track.
     survey_wander_m: NonNegative = 0.3
     survey_wander_length_m: Positive = 100.0
+    # Between two epochs a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
+    sigma_step_factor: Positive = 1.5
+    # DIAG regresses thresholds on sigma; `balise calibrate` fits both.
     sigma_intercept_m: NonNegative = 0.0
     sigma_slope: Positive = 1.0
+    # The second receiver of composite fail-safety (LOC Fig. 3).
     channel_reference: str | None = None
     disabled: tuple[str, ...] = ()
 
@@ -196,15 +225,21 @@ class MonitorConfig(Settings):
 class LdsConfig(Settings):
     """Virtual and travelling virtual balises (DOMAIN section 4)."""
 
+    # 3InSat's requirement for the most demanding operation (LOC section I).
     ci_limit_m: Positive = 14.0
+    # HPL of NPA: K_H 6.18 (RTCA DO-229); few receivers give a protection level themselves.
     ci_factor: Positive = 6.18
     ci_source: Literal["sigma", "hpl"] = "sigma"
+    # Times of return and initialisation, and re-arming at a stand: DOMAIN section 4, ours.
     recovery_s: Positive = 30.0
     init_s: Positive = 10.0
     rearm_m: Positive = 10.0
+    # SUBSET-041 5.3.1.1: 5 m + 5 % of the distance.
     odometer_fixed_m: NonNegative = 5.0
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
+    # A crossing inside a longer gap is not seen but guessed (DOMAIN section 4).
     crossing_gap_s: Positive = 1.0
+    # Insertion is the more dangerous failure there (TVB section 5).
     entry_from_unfitted_area: bool = False
     # Instants at which the LDS begins anew, without LRVB and linking (DOMAIN section 4, initialisation).
     starts_of_mission: tuple[AwareDatetime, ...] = ()
@@ -217,23 +252,36 @@ class LdsConfig(Settings):
 class HazardConfig(Settings):
     """Hazard classes and budgets (DOMAIN section 5)."""
 
+    # DIAG: 20 m for position failure and shift; a jump the same.
     failure_limit_m: Positive = 20.0
     shift_limit_m: Positive = 20.0
     jump_limit_m: Positive = 20.0
+    # So that the class does not depend on the rate of the log (DOMAIN section 5.3).
     jump_window_s: Positive = 1.0
+    # Noise at the limit is neither a failure nor its end (DOMAIN section 5.3).
     failure_hold_s: NonNegative = 1.0
     episode_end_s: NonNegative = 10.0
+    # Monitors see a drift before its error can be told from noise (DOMAIN section 5.3).
     alarm_lead_s: NonNegative = 30.0
+    # From detection to negation; not set: one epoch, for the failing one has been used already.
     reaction_s: NonNegative | None = None
+    # Errors of a healthy position; a slow average may alarm minutes after its cause (DOMAIN section 5.3).
     false_alarm_margin_m: NonNegative = 5.0
     false_alarm_lookback_s: NonNegative = 300.0
+    # Half-width of evidence in its sigmas, and the sigma of a reference that states none (DOMAIN section 5.1).
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
+    # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
+    # A net element less probable than one in a thousand is no place of the reference (DOMAIN section 5.1).
     rival_probability: Probability = 0.001
+    # Of the read itself; Q of the site is the announcement's (DOMAIN section 5.1).
     balise_read_sigma_m: Positive = 1.0
+    # An error known less closely is not given as a number (DOMAIN section 5.2).
     known_error_m: Positive = 5.0
+    # More of the moving time in use unknown is `unproven` (DOMAIN section 5.4).
     unknown_share_limit: Probability = 0.01
+    # LPV-200 is the guaranteed service (LOC uses no other).
     service_level: str = "lpv200"
 
 
@@ -251,14 +299,18 @@ class ServiceLevel(Settings):
 class SafetyConfig(Settings):
     """Safety budget (DOMAIN section 6)."""
 
+    # TVB section 3.
     thr_vb_per_h: Positive = 0.67e-9
+    # TVB section 5; LOC section V (horizontal signal in space).
     service_levels: dict[str, ServiceLevel] = {
         "npa": ServiceLevel(integrity_risk=1e-7, exposure_s=3600.0),
         "lpv200": ServiceLevel(integrity_risk=2e-7, exposure_s=150.0),
         "egnos_observed": ServiceLevel(integrity_risk=6e-8, exposure_s=150.0),
         "horizontal_sis": ServiceLevel(integrity_risk=1e-9, exposure_s=150.0),
     }
+    # The published form has one; 64 to 400 at 160 km/h (DOMAIN section 6).
     demands_per_hour: Positive = 1.0
+    # None is published; SIL 4 (DOMAIN section 6).
     diagnosis_hazard_rate_per_h: Positive = 1e-9
 
     def allowed_time_to_detect_s(self, level: str) -> float:

@@ -1,5 +1,5 @@
-"""The odometer at each GNSS epoch's time of validity, with scale and latency known or learned.
+"""The odometer beside each position, at its time of validity, with scale and latency known or learned.
 
-`align` adds it to the epochs, over the increments of `increments`; `learning` runs the filter of `odometer_filter`
-along the run and holds it under alarm; `odometer` is the recorded stream as distance over time.
+In: positions of one solution, the odometer, vehicle file, configuration. Out: `schemas.stages.Aligned`.
+Touches no file. Causal: at an epoch only earlier epochs count. For thresholds only: nothing that judges asks here.
 """

@@ -1,4 +1,8 @@
-"""Many runs over one site: on one machine or a cluster, resumed where they stopped, nothing lost."""
+"""Many runs over one site: on one machine or a cluster, resumed where they stopped, nothing lost.
+
+In: addresses of runs, a site, configuration. Out: the tables of each run and over all runs, on disk; a log of progress.
+Touches files, stores, processes and clusters; what one run says is made by `pipeline.stages` in a worker.
+"""
 
 from pipeline.campaign.interruption import Interrupted
 from pipeline.campaign.outcome import RunOutcome

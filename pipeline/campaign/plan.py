@@ -29,7 +29,8 @@ class RunJob:
     """One run as a worker gets it; everything in it survives the way to another machine.
 
     `previous` is the metadata of the complete run that an earlier campaign left, if any; `campaign` the name
-    under which its campaign holds the output (`lock.check_held`).
+    under which its campaign holds the output (`lock.check_held`). `route`: the file with this run's own route, and its
+    digest; `write_route`: the file to write the route that was found to. Empty where there is none.
     """
 
     run_id: str
@@ -42,6 +43,9 @@ class RunJob:
     software_digest: str
     previous: Mapping[str, str] | None = None
     campaign: str = ""
+    route: str = ""
+    route_digest: str = ""
+    write_route: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,13 @@ def make_plan(
     out: Address,
     config: Configuration | None = None,
     vehicle: Vehicle | None = None,
+    routes: Address | None = None,
+    write_routes: Address | None = None,
 ) -> Plan:
-    """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done."""
+    """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done.
+
+    `routes`: a route file for all runs, or a folder with one per run id. `write_routes`: a folder for those found.
+    """
     config, vehicle = config or Configuration(), vehicle or Vehicle()
     addresses = find_runs(runs)
     site_digest = read_site(site).digest
@@ -76,7 +85,26 @@ def make_plan(
         software_digest=software_digest(),
     )
     jobs = [replace(base, run_id=run_id, address=address) for run_id, address in addresses.items()]
+    jobs = [_with_routes(job, routes, write_routes) for job in jobs]
+    if routes is not None and not any(job.route for job in jobs):
+        expected = "a route file, or a folder with RUN.csv or RUN.parquet of these runs"
+        raise UsageError("holds no route of any of the runs", place=redacted(str(routes)), expected=expected)
     return Plan(tuple(jobs), base.out, config, vehicle)
+
+
+def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | None) -> RunJob:
+    """The job with its own route, where there is one, and where to write the one that is found."""
+    if write_routes is not None:
+        job = replace(job, write_route=storage.absolute(join(write_routes, f"{job.run_id}.csv")))
+    if routes is None:
+        return job
+    names = [f"{job.run_id}{suffix}" for suffix in (".csv", ".parquet")]
+    own = [join(routes, name) for name in names] if files.is_dir(routes) else [routes]
+    found = next((address for address in own if files.exists(address)), None)
+    if found is None:
+        return job
+    digest = hashlib.sha256(files.read_bytes(found)).hexdigest()
+    return replace(job, route=storage.absolute(found), route_digest=digest)
 
 
 def with_previous(plan: Plan) -> Plan:
@@ -95,7 +123,7 @@ def digests(job: RunJob, files_digest: str) -> dict[str, str]:
     return {
         "config_digest": digest_of(job.config, job.vehicle),
         "files_digest": files_digest,
-        "site_digest": job.site_digest,
+        "site_digest": f"{job.site_digest} {job.route_digest}".strip(),
         "software": SOFTWARE,
         "software_digest": job.software_digest,
     }

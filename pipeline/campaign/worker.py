@@ -16,6 +16,8 @@ from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
 from pipeline.results import store
 from pipeline.site.read import read_site
+from pipeline.site.route import with_route
+from pipeline.storage import files
 from pipeline.storage.address import is_url, redacted
 from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
@@ -49,7 +51,10 @@ def replay_one(job: RunJob) -> RunOutcome:
                 files_digest = files_digest or _files_digest(job, path, version)
                 raise
             files_digest = files_digest or _files_digest(job, path, version, run.input_digest)
+            site = with_route(site, job.route) if job.route else site
             tables = _replayed(job, run, site)
+            if job.write_route:
+                _write_found_route(job, run, site)
             if storage.signature(path) != before:
                 raise changed(path)
     except (OutputError, SiteError, UsageError):
@@ -162,6 +167,8 @@ def _told_of(job: RunJob, path: Path) -> Iterator[None]:
 def _is_done(job: RunJob, files_digest: str) -> bool:
     if job.previous is None or job.previous.get("redo") == "yes":
         return False
+    if job.write_route and not files.exists(job.write_route):
+        return False
     return all(job.previous.get(key) == value for key, value in digests(job, files_digest).items())
 
 
@@ -176,6 +183,14 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
     from pipeline.stages import replay
 
     return replay(run, site, job.vehicle, job.config)
+
+
+def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
+    # Imported here for the same reason.
+    from pipeline.campaign.found_routes import found_route_of
+
+    route = found_route_of(run, site, job.vehicle, job.config)
+    storage.write_bytes(job.write_route, route.write_csv().encode())
 
 
 def _metadata(job: RunJob, files_digest: str, status: RunStatus) -> dict[str, str]:

@@ -1,4 +1,8 @@
-"""What changed between two tables, and between two results."""
+"""What changed between two tables, and between two results.
+
+In: two results. Out: differences by run, hazard and value, with the tolerance of each column.
+Touches files to read them. It judges nothing: it says what is not the same.
+"""
 
 from pipeline.diff.hazards import HazardChange, compare_hazards
 from pipeline.diff.results import ResultDiff, RunDiff, diff_results

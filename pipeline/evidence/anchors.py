@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 import polars as pl
 
-from pipeline.evidence.carrying import Anchor, OdometerReadings, Readings
+from pipeline.evidence.carrying import Anchor, Odometer
 from pipeline.evidence.routes import Place, Route, routes_of_path
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import Track
@@ -58,9 +58,10 @@ class ReferencePlaces:
         t_ns = times_ns(epochs)[kept]
         return cls(t_ns, leg, path_m - ahead_m, sigma_m[kept], legs, sample[order], element[order])
 
-    def place(self, sample: int) -> Place:
+    def anchor(self, sample: int) -> Anchor:
         element, measure, _ = self.legs[int(self.leg[sample])].locate(self.path_m[[sample]])
-        return Place(int(element[0]), float(measure[0]))
+        place = Place(int(element[0]), float(measure[0]))
+        return Anchor(int(self.t_ns[sample]), place, float(self.sigma_m[sample]), Evidence.REFERENCE)
 
 
 def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints) -> Bools:
@@ -76,67 +77,49 @@ def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints)
 class Coverage:
     """Reference samples `first` to `last`, no two neighbours farther apart than a straight line reaches.
 
-    `facing`: how the train ran over the net elements of both anchors as the odometer counted up, where it moved.
+    `begin`, `end`: the outermost samples at which the odometer counted, for only from these can a place be carried.
     """
 
     first: int
     last: int
     begin: Anchor
     end: Anchor
-    facing: tuple[int, int] | None
 
 
-def coverages(
-    reference: ReferencePlaces | None, odometry: OdometerReadings | None, config: HazardConfig
-) -> list[Coverage]:
-    """Stretches of time that the reference covers."""
+def coverages(reference: ReferencePlaces | None, odometer: Odometer | None, config: HazardConfig) -> list[Coverage]:
+    """The times that the reference covers."""
     if reference is None or reference.t_ns.size == 0:
         return []
     breaks = np.flatnonzero(np.diff(reference.t_ns) > config.reference_gap_s * NS_PER_S)
-    firsts = np.concatenate([[0], breaks + 1]).tolist()
-    lasts = np.concatenate([breaks, [reference.t_ns.size - 1]]).tolist()
-    counted = np.isfinite(Readings.of(odometry, reference.t_ns).distance_m)
-    inner = [_counted_ends(counted, first, last) for first, last in zip(firsts, lasts, strict=True)]
-    ends = np.array([*(begin for begin, _ in inner), *(end for _, end in inner)], dtype=np.int64)
-    places = [reference.place(sample) for sample in ends.tolist()]
-    anchors = _anchors(reference.t_ns[ends], places, reference.sigma_m[ends], Evidence.REFERENCE, odometry)
-    pairs = zip(anchors[: len(firsts)], anchors[len(firsts) :], strict=True)
-    return [
-        Coverage(first, last, begin, end, _facing(reference, first, last, odometry))
-        for first, last, (begin, end) in zip(firsts, lasts, pairs, strict=True)
-    ]
+    counted = np.zeros(reference.t_ns.size, dtype=np.bool_) if odometer is None else odometer.known_at(reference.t_ns)
+    found = []
+    for first, last in zip([0, *(breaks + 1).tolist()], [*breaks.tolist(), counted.size - 1], strict=True):
+        own = first + np.flatnonzero(counted[first : last + 1])
+        ends = (int(own[0]), int(own[-1])) if own.size else (first, last)
+        found.append(Coverage(first, last, *(reference.anchor(sample) for sample in ends)))
+    return found
 
 
-def _counted_ends(counted: Bools, first: int, last: int) -> tuple[int, int]:
-    """The outermost samples at which the odometer counted, for only from these can a place be carried on."""
-    own = first + np.flatnonzero(counted[first : last + 1])
-    return (int(own[0]), int(own[-1])) if own.size else (first, last)
-
-
-def _facing(
-    reference: ReferencePlaces, first: int, last: int, odometry: OdometerReadings | None
-) -> tuple[int, int] | None:
-    """Orientation of the first and last sample's net elements in which the odometer counts up."""
-    part = slice(first, last + 1)
-    readings, path_m = Readings.of(odometry, reference.t_ns[part]), reference.path_m[part]
-    step_m, counted_m = np.diff(path_m), np.diff(readings.distance_m)
-    whole = (np.diff(readings.segment) == 0) & (np.diff(reference.leg[part]) == 0) & np.isfinite(counted_m)
-    together_m = float((np.sign(step_m) * counted_m)[whole].sum())
-    if abs(together_m) < _TURNED_M:
-        return None
-    ends = []
-    for sample in _counted_ends(np.isfinite(readings.distance_m), 0, last - first):
-        sample += first
-        element, _, sense = reference.legs[int(reference.leg[sample])].locate(reference.path_m[[sample]])
-        ends.append(2 * int(element[0]) + int(sense[0] * together_m < 0.0))
-    return ends[0], ends[1]
+def facing_of(reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometer | None) -> set[int]:
+    """Oriented net elements over which the train ran as the odometer counted up, by the reference."""
+    if reference is None or odometer is None:
+        return set()
+    found: set[int] = set()
+    for one in covered:
+        part = slice(one.first, one.last + 1)
+        t_ns, path_m, leg = reference.t_ns[part], reference.path_m[part], reference.leg[part]
+        counted_m = odometer.between(t_ns[:-1], t_ns[1:]).distance_m
+        together = np.where(np.diff(leg) == 0, np.sign(np.diff(path_m)) * counted_m, 0.0)
+        if abs(float(np.nansum(together))) >= _TURNED_M:
+            element, _, sense = reference.legs[int(leg[0])].locate(path_m[:1])
+            found.add(2 * int(element[0]) + int(sense[0] * np.nansum(together) < 0.0))
+    return found
 
 
 def read_anchors(
     reads: pl.DataFrame | None,
     balises: pl.DataFrame | None,
     track: Track,
-    odometry: OdometerReadings | None,
     config: HazardConfig,
 ) -> list[Anchor]:
     """Reads of physical balises that the site knows, in order of time."""
@@ -144,9 +127,11 @@ def read_anchors(
         return []
     places = _physical_places(balises, track)
     known = reads.filter(pl.col("balise_id").is_in(list(places))).sort("t", "balise_id")
-    at = [places[name] for name in known["balise_id"].to_list()]
-    sigma_m = np.full(known.height, config.balise_read_sigma_m)
-    return _anchors(times_ns(known), at, sigma_m, Evidence.BALISE, odometry)
+    times, names = times_ns(known).tolist(), known["balise_id"].to_list()
+    return [
+        Anchor(t_ns, places[name], config.balise_read_sigma_m, Evidence.BALISE)
+        for t_ns, name in zip(times, names, strict=True)
+    ]
 
 
 def _physical_places(balises: pl.DataFrame, track: Track) -> dict[str, Place]:
@@ -162,22 +147,3 @@ def _physical_places(balises: pl.DataFrame, track: Track) -> dict[str, Place]:
         if own[0] - _ON_ELEMENT_M <= measure_m <= own[-1] + _ON_ELEMENT_M:
             places[name] = Place(number, measure_m)
     return places
-
-
-def _anchors(
-    t_ns: Ints, places: list[Place], sigma_m: Floats, kind: Evidence, odometry: OdometerReadings | None
-) -> list[Anchor]:
-    at = Readings.of(odometry, t_ns)
-    return [
-        Anchor(
-            t_ns=int(t_ns[row]),
-            place=place,
-            sigma_m=float(sigma_m[row]),
-            kind=kind,
-            distance_m=float(at.distance_m[row]),
-            travelled_m=float(at.travelled_m[row]),
-            moving_s=float(at.moving_s[row]),
-            segment=int(at.segment[row]),
-        )
-        for row, place in enumerate(places)
-    ]

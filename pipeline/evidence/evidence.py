@@ -4,26 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import polars as pl
 
-from pipeline.evidence.anchors import Coverage, ReferencePlaces, coverages, read_anchors
-from pipeline.evidence.carrying import (
-    Anchor,
-    Figures,
-    OdometerReadings,
-    Readings,
-    beside_anchor,
-    between_anchors,
-    closes,
-)
-from pipeline.evidence.gaps import Gap, Way, gap_between, oriented_alike, routes_of, with_open_ends
+from pipeline.evidence.anchors import Coverage, ReferencePlaces, coverages, facing_of, read_anchors
+from pipeline.evidence.carrying import Anchor, Interval, Odometer, Trust, beside_anchor, between_anchors, closes
+from pipeline.evidence.gaps import Gap, Way, gaps_of
 from pipeline.evidence.routes import Route
 from pipeline.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration
 from schemas.enums import Evidence as Kind
 
 KINDS = tuple(Kind)
@@ -62,13 +53,13 @@ class Evidence:
     reference: ReferencePlaces | None
     covered: tuple[Coverage, ...]
     gaps: tuple[Gap, ...]
-    odometry: OdometerReadings | None
+    odometer: Odometer | None
     network: Network
-    figures: Figures
+    trust: Trust
     contradicted: int
 
     def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
-        """Evidence at these instants, in order of time.
+        """Evidence at these instants.
 
         `stood`: when the odometer stood although the train may have moved; there nothing is carried from one side.
         """
@@ -77,9 +68,8 @@ class Evidence:
         rivals: list[tuple[Ints, Ints]] = []
         for coverage in self.covered:
             alternatives += self._covered(coverage, t_ns, kind, rivals)
-        readings = Readings.of(self.odometry, t_ns)
         for gap in self.gaps:
-            alternatives += self._carried(gap, readings, kind, stood)
+            alternatives += self._carried(gap, t_ns, kind, stood)
         rows, elements = (np.concatenate([part[i] for part in rivals] or [np.zeros(0, np.int64)]) for i in (0, 1))
         return EvidenceSet(kind, tuple(alternatives), rows, elements)
 
@@ -97,7 +87,7 @@ class Evidence:
         rows, before, after = rows[whole], before[whole], after[whole]
         at_m = np.interp((t_ns[rows] - times[0]).astype(np.float64), times - times[0], self.reference.path_m[part])
         sigma = self.reference.sigma_m[part]
-        half = self.figures.factor * np.maximum(sigma[before], sigma[after])
+        half = self.trust.factor * np.maximum(sigma[before], sigma[after])
         kind[rows] = KINDS.index(Kind.REFERENCE)
         rivals.append(self._rivals(coverage.first + before, coverage.first + after, rows))
         legs = leg[before]
@@ -119,34 +109,29 @@ class Evidence:
         pairs = np.unique(np.concatenate(found, axis=1), axis=1)
         return pairs[0], pairs[1]
 
-    def _carried(self, gap: Gap, readings: Readings, kind: Ints, stood: Sequence[Span]) -> list[Alternative]:
+    def _carried(self, gap: Gap, t_ns: Ints, kind: Ints, stood: Sequence[Span]) -> list[Alternative]:
         """By the odometer, from the anchors of a gap."""
-        inside = (readings.t_ns >= gap.begin_ns) & (readings.t_ns <= gap.end_ns) & (readings.segment != NOTHING)
-        inside &= kind == NOTHING
-        for anchor in gap.anchors:
-            inside &= readings.segment == anchor.segment
-        if gap.begin is None or gap.end is None:
-            inside &= ~_after_standing(readings.t_ns, gap, stood)
-        rows = np.flatnonzero(inside)
-        if rows.size == 0 or not gap.ways:
-            return []
-        kinds = {anchor.kind for anchor in gap.anchors}
-        kind[rows] = KINDS.index(Kind.BALISE if Kind.BALISE in kinds else Kind.REFERENCE)
-        own = readings.take(rows)
-        return [
-            Alternative(rows, route, *_interval(gap, way, own, self.figures))
-            for way, route in routes_of(gap, self.network)
-        ]
+        inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & (kind == NOTHING)
+        if len(gap.anchors) == 1:
+            inside &= ~_after_standing(t_ns, gap, stood)
+        rows, found = np.flatnonzero(inside), []
+        for way in gap.ways or [] if rows.size else []:
+            low, high = self._interval(gap, way, t_ns[rows])
+            reached = np.isfinite(low)
+            found.append(Alternative(rows[reached], way.chain.route(self.network), low[reached], high[reached]))
+        if found:
+            kinds = {anchor.kind for anchor in gap.anchors}
+            kind[found[0].rows] = KINDS.index(Kind.BALISE if Kind.BALISE in kinds else Kind.REFERENCE)
+        return found
 
-
-def _interval(gap: Gap, way: Way, readings: Readings, figures: Figures) -> tuple[Floats, Floats]:
-    if gap.begin is not None and gap.end is not None and way.begin_m is not None and way.end_m is not None:
-        return between_anchors(gap.begin, gap.end, (way.begin_m, way.end_m), readings, figures)
-    if gap.begin is not None and way.begin_m is not None:
-        return beside_anchor(gap.begin, way.begin_m, readings, figures)
-    assert gap.end is not None
-    assert way.end_m is not None
-    return beside_anchor(gap.end, way.end_m, readings, figures)
+    def _interval(self, gap: Gap, way: Way, t_ns: Ints) -> Interval:
+        assert self.odometer is not None
+        if gap.begin is not None and gap.end is not None and way.begin_m is not None and way.end_m is not None:
+            ends = (way.begin_m, way.end_m)
+            return between_anchors(self.odometer, (gap.begin, gap.end), ends, t_ns, self.trust)
+        (anchor,) = gap.anchors
+        at_m = way.begin_m if way.end_m is None else way.end_m
+        return beside_anchor(self.odometer, anchor, at_m or 0.0, t_ns, self.trust)
 
 
 def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
@@ -164,60 +149,37 @@ def evidence_of(
     reference: ReferencePlaces | None,
     reads: pl.DataFrame | None,
     balises: pl.DataFrame | None,
-    odometry: OdometerReadings | None,
+    odometer: Odometer | None,
     network: Network,
-    vehicle: Vehicle,
     config: Configuration,
 ) -> Evidence:
     """Everything that is known of where the train was, but from GNSS.
 
-    `reference`: placed on the network by itself; `reads`, `balises`: as in the run and the site; `odometry`: as
+    `reference`: placed on the network by itself; `reads`, `balises`: as in the run and the site; `odometer`: as
     recorded. Anchors are the reads outside the reference's time, and the reference's samples beside its pauses.
     """
-    figures = Figures.of(vehicle, config)
-    covered = coverages(reference, odometry, config.hazards)
-    reads_apart = [
-        anchor
-        for anchor in read_anchors(reads, balises, network.track, odometry, config.hazards)
-        if not any(one.begin.t_ns <= anchor.t_ns <= one.end.t_ns for one in covered)
-    ]
-    borders = sorted([(one.begin, one.end) for one in covered] + [(one, one) for one in reads_apart], key=_begin_ns)
-    span_ns = (odometry.begin_ns, odometry.end_ns) if odometry is not None and borders else (0, 0)
-    facing = {
-        anchor: oriented
-        for one in covered
-        if one.facing is not None
-        for anchor, oriented in zip((one.begin, one.end), one.facing, strict=True)
-    }
-    gaps = oriented_alike(_gaps(borders, span_ns, network, figures), facing, network) if odometry is not None else []
-    contradicted = sum(_contradicts(gap, figures) for gap in gaps)
-    reaching = with_open_ends(gaps, facing, odometry, network, figures)
-    return Evidence(reference, tuple(covered), tuple(reaching), odometry, network, figures, contradicted)
+    trust, covered = Trust.of(config), coverages(reference, odometer, config.hazards)
+    read = read_anchors(reads, balises, network.track, config.hazards)
+    apart = [one for one in read if not any(c.begin.t_ns <= one.t_ns <= c.end.t_ns for c in covered)]
+    borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
+    gaps: list[Gap] = []
+    if odometer is not None and borders:
+        gaps = gaps_of(borders, facing_of(reference, covered, odometer), odometer, network, trust)
+    contradicted = sum(_contradicts(gap, odometer, trust) for gap in gaps)
+    return Evidence(reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted)
 
 
 def _begin_ns(border: tuple[Anchor, Anchor]) -> int:
     return border[0].t_ns
 
 
-def _gaps(borders: list[tuple[Anchor, Anchor]], span_ns: Span, network: Network, figures: Figures) -> list[Gap]:
-    """From the odometer's first instant to its last."""
-    if not borders:
-        return []
-    first, last = borders[0][0], borders[-1][1]
-    inner = [
-        gap for (_, a), (b, _) in pairwise(borders) if b.t_ns > a.t_ns for gap in gap_between(a, b, network, figures)
-    ]
-    begin_ns, end_ns = span_ns
-    before = Gap(min(begin_ns, first.t_ns), first.t_ns, None, first, [])
-    return [before, *inner, Gap(last.t_ns, max(end_ns, last.t_ns), last, None, [])]
-
-
-def _contradicts(gap: Gap, figures: Figures) -> bool:
-    """An odometer with the figures of a vehicle file that closes on none of the chains between two anchors."""
-    if gap.begin is None or gap.end is None or gap.ways is None or not figures.by_file:
+def _contradicts(gap: Gap, odometer: Odometer | None, trust: Trust) -> bool:
+    """An odometer with the scale of a vehicle file that closes on none of the chains between two anchors."""
+    if gap.begin is None or gap.end is None or gap.ways is None or odometer is None or odometer.scale is None:
         return False
+    anchors = (gap.begin, gap.end)
     return not any(
-        closes(gap.begin, gap.end, way.end_m - way.begin_m, figures)
+        closes(odometer, anchors, way.end_m - way.begin_m, trust)
         for way in gap.ways
         if way.begin_m is not None and way.end_m is not None
     )

@@ -1,4 +1,8 @@
-"""Results for other programs: MCAP viewers and geographic information systems."""
+"""Results for other programs: MCAP viewers and geographic information systems.
+
+In: a run, its result and its site. Out: MCAP, GeoJSON, GPX.
+Touches files. It computes nothing that a table does not hold.
+"""
 
 from pipeline.export.write import export_run
 

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
+from typing import IO, Literal
 
 import polars as pl
 
 from pipeline.export.events import alarm_entries, hazard_entries, passage_entries
 from pipeline.export.gis import balises_geojson, track_geojson
-from pipeline.export.messages import geojson_topic, log_topic, rows_topic
+from pipeline.export.messages import Encoding, Topic, geojson_topic, log_topic, rows_topic
+from pipeline.export.position_messages import location_fix_topic, navsatfix_topic
 from pipeline.export.positions import as_gnss, positions_of
-from pipeline.ingest import payloads
-from pipeline.ingest.mcap_writer import Topic
-from pipeline.ingest.proto_schemas import LOCATION_FIX, descriptor_set
 from schemas.errors import OutputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import MONITORS
+
+PositionMessage = Literal["foxglove", "ros"]
+Compression = Literal["zstd", "lz4", "none"]
 
 _FRAME = "wgs84"
 _LDS = (
@@ -29,30 +33,52 @@ _LDS = (
 )  # fmt: skip
 
 
-def run_topics(tables: RunTables, site: Site | None, log: RunLog | None) -> tuple[list[Topic], list[str]]:
+def run_topics(
+    tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
+) -> tuple[list[Topic], list[str]]:
     """All topics of a run, and what could not be written for want of the site or the log."""
     topics: list[Topic] = []
     missing = [] if site is not None else ["matched and true positions, track and balises (no site given)"]
     missing += [] if log is not None else ["raw positions (no log given)"]
+    # Readers of ROS 2 bags refuse a bag that holds anything else.
+    encoding: Encoding = "cdr" if positions == "ros" else "protobuf"
     solutions = tables.epochs["solution"].unique(maintain_order=True).to_list()
     if site is not None and tables.epochs.height:
         t0_ns = int(tables.epochs["t"].to_physical().min())  # type: ignore[arg-type]
-        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site)))
-        topics.append(geojson_topic("/site/balises", t0_ns, balises_geojson(site)))
+        topics.append(geojson_topic("/site/track", t0_ns, track_geojson(site), encoding))
+        topics.append(geojson_topic("/site/balises", t0_ns, balises_geojson(site), encoding))
     for solution in solutions:
-        topics += _position_topics(solution, tables, site, log)
-        topics += _result_topics(solution, tables)
-    return topics, missing
+        topics += _position_topics(solution, tables, site, log, positions)
+        topics += _result_topics(solution, tables, encoding)
+    # Viewers play messages in the order in which they stand: no log time goes back.
+    return [replace(topic, times_ns=list(accumulate(topic.times_ns, max))) for topic in topics], missing
 
 
-def write_topics(topics: list[Topic], path: Path) -> None:
-    """Write topics merged by time; the same topics give the same bytes."""
+def write_topics(
+    topics: list[Topic],
+    path: Path | IO[bytes],
+    profile: str,
+    compression: Compression = "zstd",
+    chunk_size: int | None = 1024 * 1024,
+    checksums: bool = True,
+) -> None:
+    """Write topics merged by time, disorder inside a topic as it is; the same topics give the same bytes.
+
+    `chunk_size` in bytes, none for a file without chunks. Raises `OutputError`.
+    """
     from mcap.writer import CompressionType, Writer
 
+    kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
     try:
-        with path.open("wb") as stream:
-            writer = Writer(stream, compression=CompressionType.ZSTD)
-            writer.start(profile="", library="balise")
+        with path.open("wb") if isinstance(path, Path) else nullcontext(path) as stream:
+            writer = Writer(
+                stream,
+                compression=kinds[compression],
+                chunk_size=chunk_size or 1024 * 1024,
+                use_chunking=chunk_size is not None,
+                enable_crcs=checksums,
+            )
+            writer.start(profile=profile, library="balise")
             channels = [
                 writer.register_channel(
                     topic.topic,
@@ -61,8 +87,8 @@ def write_topics(topics: list[Topic], path: Path) -> None:
                 )
                 for topic in topics
             ]
-            for t_ns, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
-                data = next(topics[number].messages)
+            for _, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
+                t_ns, data = topics[number].times_ns[row], next(topics[number].messages)
                 writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
             writer.finish()  # type: ignore[no-untyped-call]
     except OSError as error:
@@ -70,33 +96,36 @@ def write_topics(topics: list[Topic], path: Path) -> None:
 
 
 def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
+    """The running maximum orders topics among each other and leaves each topic's own order alone."""
     for row, t_ns in enumerate(accumulate(topic.times_ns, max)):
         yield t_ns, number, row
 
 
-def _position_topics(solution: str, tables: RunTables, site: Site | None, log: RunLog | None) -> list[Topic]:
+def _position_topics(
+    solution: str, tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
+) -> list[Topic]:
     topics = []
     if log is not None:
         raw = log.gnss.filter(pl.col("solution") == solution)
-        topics.append(_position_topic(f"/{solution}/raw", raw))
+        topics.append(_position_topic(f"/{solution}/raw", raw, positions))
     if site is not None:
         places = positions_of(tables.epochs.filter(pl.col("solution") == solution), site)
         for name in ("gnss", "matched", "truth"):
-            topics.append(_position_topic(f"/{solution}/{name}", as_gnss(getattr(places, name))))
+            topics.append(_position_topic(f"/{solution}/{name}", as_gnss(getattr(places, name)), positions))
     return topics
 
 
-def _result_topics(solution: str, tables: RunTables) -> list[Topic]:
+def _result_topics(solution: str, tables: RunTables, encoding: Encoding) -> list[Topic]:
     epochs, hazards, alarms, passages = (
         frame.filter(pl.col("solution") == solution)
         for frame in (tables.epochs, tables.hazards, tables.alarms, tables.passages)
     )
     return [
-        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS)),
-        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs)),
-        log_topic(f"/{solution}/hazards", hazard_entries(hazards)),
-        log_topic(f"/{solution}/alarms", alarm_entries(alarms)),
-        log_topic(f"/{solution}/passages", passage_entries(passages)),
+        rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS), encoding),
+        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs), encoding),
+        log_topic(f"/{solution}/hazards", hazard_entries(hazards), encoding),
+        log_topic(f"/{solution}/alarms", alarm_entries(alarms), encoding),
+        log_topic(f"/{solution}/passages", passage_entries(passages), encoding),
     ]
 
 
@@ -110,8 +139,7 @@ def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
     return epochs.select(columns)
 
 
-def _position_topic(topic: str, frame: pl.DataFrame) -> Topic:
+def _position_topic(topic: str, frame: pl.DataFrame, positions: PositionMessage) -> Topic:
     known = frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
-    times = known["t"].to_physical().to_list()
-    messages = payloads.location_fix_payloads(known, _FRAME)
-    return Topic(topic, "protobuf", LOCATION_FIX, "protobuf", descriptor_set(LOCATION_FIX), times, messages)
+    make = navsatfix_topic if positions == "ros" else location_fix_topic
+    return make(topic, known, _FRAME)

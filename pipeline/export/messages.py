@@ -1,22 +1,23 @@
-"""Flat protobuf messages, built at run time: rows of a frame, and those of Foxglove's that are needed."""
+"""Flat messages, protobuf or ROS 2, built at run time: rows of a frame, and those of Foxglove's that are needed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import polars as pl
 
-from pipeline.ingest.mcap_writer import Topic
+from pipeline.export.cdr import Fields, cdr_messages, definition
 
 _SECOND_NS = 1_000_000_000
 # descriptor.proto: FieldDescriptorProto.Type and Label
-_DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM, _OPTIONAL = 1, 3, 7, 8, 9, 11, 14, 1
+_DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM = 1, 3, 7, 8, 9, 11, 14
+_OPTIONAL, _REPEATED = 1, 3
 _TYPES: Mapping[str, int] = {"double": _DOUBLE, "int64": _INT64, "fixed32": _FIXED32, "bool": _BOOL, "string": _STRING}
 
-Fields = tuple[tuple[str, str], ...]
-"""Names and kinds: `time`, `double`, `int64`, `fixed32`, `level`, `bool`, `string`."""
+Encoding = Literal["protobuf", "cdr"]
 
 LOG: Fields = (
     ("timestamp", "time"), ("level", "level"), ("message", "string"), ("name", "string"), ("file", "string"),
@@ -28,33 +29,64 @@ GEOJSON: Fields = (("geojson", "string"),)
 """foxglove.GeoJSON."""
 
 INFO, WARNING, ERROR = 2, 3, 4
-_LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+# Kinds that are enumerations: name and words in the order of their numbers.
+_ENUMS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "level": ("Level", ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")),
+    "covariance type": ("PositionCovarianceType", ("UNKNOWN", "APPROXIMATED", "DIAGONAL_KNOWN", "KNOWN")),
+}
 
 
-def rows_topic(topic: str, name: str, frame: pl.DataFrame) -> Topic:
+@dataclass(frozen=True)
+class Topic:
+    """One channel to write: its schema, and one payload per time [ns since 1970]."""
+
+    topic: str
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    times_ns: list[int]
+    messages: Iterator[bytes]
+
+
+def rows_topic(topic: str, name: str, frame: pl.DataFrame, encoding: Encoding) -> Topic:
     """One message per row, time in the first column; a null is not set."""
-    fields = tuple((column, _kind(dtype)) for column, dtype in frame.schema.items())
+    fields = fields_of(frame)
     times = frame.to_series(0).to_physical().to_list()
     plain = frame.with_columns(pl.col(field).to_physical() for field, kind in fields if kind == "time")
-    return _topic(topic, name, fields, times, plain.iter_rows(named=True))
+    return message_topic(topic, name, fields, times, plain.iter_rows(named=True), encoding)
 
 
-def log_topic(topic: str, entries: list[tuple[int, int, str, str]]) -> Topic:
+def fields_of(frame: pl.DataFrame) -> Fields:
+    """Columns and the kinds of field that hold them."""
+    return tuple((column, _kind(dtype)) for column, dtype in frame.schema.items())
+
+
+def log_topic(topic: str, entries: list[tuple[int, int, str, str]], encoding: Encoding) -> Topic:
     """foxglove.Log from time [ns], level, name and message, put in order of time."""
     ordered = sorted(entries)
     rows = (
         {"timestamp": t_ns, "level": level, "message": text, "name": name, "file": "", "line": 0}
         for t_ns, level, name, text in ordered
     )
-    return _topic(topic, "foxglove.Log", LOG, [entry[0] for entry in ordered], rows)
+    return message_topic(topic, "foxglove.Log", LOG, [entry[0] for entry in ordered], rows, encoding)
 
 
-def geojson_topic(topic: str, t_ns: int, text: str) -> Topic:
+def geojson_topic(topic: str, t_ns: int, text: str, encoding: Encoding) -> Topic:
     """foxglove.GeoJSON, once."""
-    return _topic(topic, "foxglove.GeoJSON", GEOJSON, [t_ns], iter([{"geojson": text}]))
+    return message_topic(topic, "foxglove.GeoJSON", GEOJSON, [t_ns], iter([{"geojson": text}]), encoding)
 
 
-def _topic(topic: str, name: str, fields: Fields, times: list[int], rows: Iterator[Mapping[str, Any]]) -> Topic:
+def message_topic(
+    topic: str, name: str, fields: Fields, times: list[int], rows: Iterator[Mapping[str, Any]], encoding: Encoding
+) -> Topic:
+    """One message per row."""
+    if encoding == "cdr":
+        package, _, message = name.rpartition(".")
+        schema = definition(fields).encode()
+        return Topic(
+            topic, "cdr", f"{package}_msgs/msg/{message}", "ros2msg", schema, times, cdr_messages(fields, rows)
+        )
     messages = (_message(name, fields, row) for row in rows)
     return Topic(topic, "protobuf", name, "protobuf", descriptor(name, fields), times, messages)
 
@@ -96,11 +128,14 @@ def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> N
     if kind == "time":
         stamp = ".google.protobuf.Timestamp"
         message.field.add(name=field, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=stamp)
-    elif kind == "level":
-        levels = message.enum_type.add(name="Level")
-        for value, level in enumerate(_LEVELS):
-            levels.value.add(name=level, number=value)
-        message.field.add(name=field, number=number, type=_ENUM, label=_OPTIONAL, type_name=f".{name}.Level")
+    elif kind in _ENUMS:
+        enum, words = _ENUMS[kind]
+        values = message.enum_type.add(name=enum)
+        for value, word in enumerate(words):
+            values.value.add(name=word, number=value)
+        message.field.add(name=field, number=number, type=_ENUM, label=_OPTIONAL, type_name=f".{name}.{enum}")
+    elif kind == "doubles":
+        message.field.add(name=field, number=number, type=_DOUBLE, label=_REPEATED)
     elif name.startswith("foxglove."):
         message.field.add(name=field, number=number, type=_TYPES[kind], label=_OPTIONAL)
     else:
@@ -132,6 +167,8 @@ def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
             stamp = getattr(message, field)
             stamp.SetInParent()
             stamp.seconds, stamp.nanos = divmod(value, _SECOND_NS)
+        elif kind == "doubles":
+            getattr(message, field).extend(value)
         else:
             setattr(message, field, value)
     return bytes(message.SerializeToString(deterministic=True))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline.export.gis import run_geojson, run_gpx
 from pipeline.export.layout import layout_json
-from pipeline.export.mcap_file import run_topics, write_topics
+from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
 from pipeline.results.provenance import input_digest
 from pipeline.results.store import check_site, metadata_of, read_run, table_address
 from schemas.errors import OutputError, UsageError
@@ -21,12 +21,13 @@ def export_run(
     to: Path,
     site: Site | None = None,
     log: RunLog | None = None,
+    positions: PositionMessage = "foxglove",
 ) -> tuple[list[Path], list[str]]:
     """Write a run of the result `out`; returns the files, and what they lack for want of site or log.
 
     `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards,
     alarms and passages; beside it goes `NAME.layout.json` for Foxglove. `.geojson` and `.gpx` hold matched
-    positions and hazards and need the site.
+    positions and hazards and need the site. `positions` chooses foxglove.LocationFix or ROS 2 NavSatFix.
     """
     if to.suffix.lower() not in SUFFIXES:
         raise UsageError("cannot be told by its suffix", place=str(to), expected=" or ".join(SUFFIXES))
@@ -34,7 +35,7 @@ def export_run(
     _check(out, tables, site, log)
     to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() == ".mcap":
-        return _write_mcap(tables, to, site, log)
+        return _write_mcap(tables, to, site, log, positions)
     if site is None:
         raise UsageError(
             "positions on the ground need the site", place=str(to), remedy="Name it with --site, as in the replay."
@@ -56,9 +57,11 @@ def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) 
         raise UsageError("has no epoch to export", place=tables.run_id, found=str(tables.runs["error"].first()))
 
 
-def _write_mcap(tables: RunTables, to: Path, site: Site | None, log: RunLog | None) -> tuple[list[Path], list[str]]:
-    topics, missing = run_topics(tables, site, log)
-    write_topics(topics, to)
+def _write_mcap(
+    tables: RunTables, to: Path, site: Site | None, log: RunLog | None, positions: PositionMessage
+) -> tuple[list[Path], list[str]]:
+    topics, missing = run_topics(tables, site, log, positions)
+    write_topics(topics, to, "ros2" if positions == "ros" else "")
     layout = to.with_suffix(".layout.json")
     first = str(tables.epochs["solution"][0])
     return [to, _write_text(layout, layout_json(first, site is not None))], missing

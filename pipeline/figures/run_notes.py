@@ -122,13 +122,13 @@ def _ambiguous(found: Match) -> Iterator[str]:
     """Stretches on which another path is as likely."""
     clock = "%H:%M:%S"
     stretches = [
-        f"{one} or {other} from {start:{clock}} to {end:{clock}}"
-        for one, other, start, end in found.ambiguous.select(
-            "netelement_id", "other_netelement_id", "t_start", "t_end"
+        f"{one} ({probability:.2f}) or {other} from {start:{clock}} to {end:{clock}}, told apart by {told_by}"
+        for one, other, start, end, probability, told_by in found.ambiguous.select(
+            "netelement_id", "other_netelement_id", "t_start", "t_end", "probability", "told_by"
         ).iter_rows()
     ]
     if stretches:
-        yield "ambiguous: " + ", ".join(stretches)
+        yield "ambiguous: " + "; ".join(stretches)
 
 
 def _linking(lds: LdsResult) -> Iterator[str]:

@@ -11,7 +11,6 @@ import polars as pl
 
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel, Schema, as_mcap_schema
-from pipeline.ingest.ros2_idl import as_ros2msg
 from schemas.errors import InputError
 
 Value = Any
@@ -98,7 +97,7 @@ def _stock_protobuf(schema: Schema | None) -> Decode | None:
 def _stock_ros2(schema: Schema | None) -> Decode | None:
     from mcap_ros2.decoder import DecoderFactory
 
-    return DecoderFactory().decoder_for("cdr", as_mcap_schema(as_ros2msg(schema) if schema else None))
+    return DecoderFactory().decoder_for("cdr", as_mcap_schema(schema))
 
 
 def _made(make: Callable[[Schema | None], Decode | None], channel: Channel) -> Decode:
@@ -114,7 +113,7 @@ def _made(make: Callable[[Schema | None], Decode | None], channel: Channel) -> D
             "has no schema that fits its encoding",
             place=channel.place,
             found=f"encoding {channel.encoding}, schema encoding {channel.schema_encoding or 'none'}",
-            expected="protobuf with protobuf, cdr with ros2msg or ros2idl",
+            expected="protobuf with protobuf, cdr with ros2msg",
         )
     return decode
 

@@ -1,83 +1,79 @@
-"""Columnar decoding of JSON messages by their patterns."""
+"""Columnar decoding of JSON messages by pyarrow, whose parser holds every value against the type asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
+import pyarrow.json
 
-from pipeline.ingest.conform import all_finite
-from pipeline.ingest.json_layout import JsonLayout, NoPatternError, layout_of
-from pipeline.ingest.layout import Repeated
+from pipeline.ingest.generic import parse_path
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.template import Part
 
-_MOST_LAYOUTS = 32
-_MOST_ASIDE = 8  # messages without pattern that may come before one that has a pattern
+_ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
+# Literals that are no JSON but that pyarrow takes, and `null` between two objects, which it does not survive.
+_NOT_FOR_ARROW = r"NaN|Inf|\}\s*null|(?:\[\s*){64}"
 
 
 class JsonDecoder:
-    """Decodes the messages of a channel that match the pattern of one seen before."""
+    """Decodes the messages of a channel; whatever pyarrow refuses is left to the ordinary parser."""
 
     def __init__(self, types: Mapping[str, pl.DataType]) -> None:
         self._types = types
-        self._layouts: list[JsonLayout] = []
-        self._tried = 0
+        tree: dict[str, Any] = {}
+        for path, dtype in types.items():
+            *above, last = parse_path(path)
+            node = tree
+            for step in above:
+                node = node.setdefault("[]" if isinstance(step, int) else step, {})
+            node["[]" if isinstance(last, int) else last] = _ARROW[type(dtype)]
+        self._schema = pa.schema(list(_struct(tree)))
 
     def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]:
-        """Messages by pattern, learning new ones while there are few, and those that have none."""
-        parts: list[Part] = []
-        left: list[Messages] = []
-        number = 0
-        while len(messages) and number < _MOST_LAYOUTS:
-            if number < len(self._layouts) or self._learn(messages.payload(0)):
-                messages = _matched(messages, self._layouts[number], self._types, parts)
-                number += 1
-            elif len(left) < _MOST_ASIDE:
-                left.append(messages.chosen(np.arange(1)))
-                messages = messages.chosen(np.arange(1, len(messages)))
-            else:
-                break
-        return parts, [*left, messages] if len(messages) else left
-
-    def _learn(self, payload: bytes) -> bool:
-        self._tried += 1
-        if self._tried > 2 * _MOST_LAYOUTS:
-            return False
+        """All messages as columns, or all of them left over."""
+        content = _joined(messages)
+        if content is None:
+            return [], [messages]
         try:
-            self._layouts.append(layout_of(payload, self._types))
-        except NoPatternError:
-            return False
-        return True
+            table = pa.json.read_json(
+                pa.BufferReader(content),
+                read_options=pa.json.ReadOptions(use_threads=False, block_size=len(content) + 1),
+                parse_options=pa.json.ParseOptions(explicit_schema=self._schema, unexpected_field_behavior="ignore"),
+            )
+        except pa.ArrowInvalid:
+            return [], [messages]
+        # Every payload starts and ends as an object does: so many objects as messages are one each.
+        if table.num_rows != len(messages):
+            return [], [messages]
+        frame = pl.DataFrame(pl.from_arrow(table))
+        values = frame.select(_value(path).alias(path) for path in self._types).to_dict()
+        return [Part(messages, values=values)], []
 
 
-def _matched(messages: Messages, layout: JsonLayout, types: Mapping[str, pl.DataType], parts: list[Part]) -> Messages:
-    """Keep what matches the layout, and return the rest."""
-    if not layout.paths:
-        return messages
-    texts = _texts(messages)
-    if texts is None:
-        return messages
-    groups = texts.to_frame("").select(pl.col("").str.extract_groups(layout.pattern)).unnest("")
-    # A match without any group that is not null is none: its message goes the other way.
-    whole = any(column.null_count() == 0 for column in groups)
-    found = None if whole else groups.select(pl.any_horizontal(pl.all().is_not_null())).to_series()
-    if found is not None:
-        groups = groups.filter(found)
-    values = _cast(groups, layout.paths, types) if groups.height else None
-    if values is None:
-        return messages
-    absent = {path: Repeated(None, groups.height, types[path]) for path in layout.absent}
-    mask = np.ones(len(messages), np.bool_) if found is None else found.to_numpy()
-    taken = messages if found is None else messages.chosen(mask)
-    parts.append(Part(taken, values={**values, **absent}))
-    return messages.chosen(~mask)
+def _struct(tree: Mapping[str, Any]) -> list[pa.Field]:
+    return [pa.field(name, _type(node)) for name, node in tree.items()]
 
 
-def _texts(messages: Messages) -> pl.Series | None:
-    """The payloads as texts, none if any is not UTF-8."""
+def _type(node: Any) -> pa.DataType:
+    if not isinstance(node, dict):
+        return node
+    return pa.list_(_type(node["[]"])) if "[]" in node else pa.struct(_struct(node))
+
+
+def _value(path: str) -> pl.Expr:
+    first, *steps = parse_path(path)
+    value = pl.col(str(first))
+    for step in steps:
+        value = value.list.get(step, null_on_oob=True) if isinstance(step, int) else value.struct.field(step)
+    return value
+
+
+def _joined(messages: Messages) -> bytes | None:
+    """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
     bounds = np.empty(2 * len(messages) + 1, dtype=np.int64)
     bounds[0:-1:2] = messages.start
     bounds[1::2] = messages.start + messages.length
@@ -87,20 +83,9 @@ def _texts(messages: Messages) -> pl.Series | None:
         pa.large_binary(), 2 * len(messages), [None, pa.py_buffer(bounds), pa.py_buffer(messages.data)]
     )
     try:
-        return pl.Series(pl.from_arrow(pieces.take(pa.array(np.arange(0, 2 * len(messages), 2))))).cast(pl.String)
+        binary = pl.Series(pl.from_arrow(pieces.take(pa.array(np.arange(0, 2 * len(messages), 2)))))
+        texts = binary.cast(pl.String).str.strip_chars(" \t\r\n")
     except pl.exceptions.PolarsError:
         return None
-
-
-def _cast(groups: pl.DataFrame, paths: Sequence[str], types: Mapping[str, pl.DataType]) -> dict[str, pl.Series] | None:
-    """Values of the groups, none where a number is beyond its type."""
-    columns = [
-        (pl.col(group) == "true" if types[path] == pl.Boolean else pl.col(group).cast(types[path])).alias(path)
-        for group, path in zip(groups.columns, paths, strict=True)
-    ]
-    try:
-        values = groups.select(columns)
-    except pl.exceptions.PolarsError:
-        return None
-    finite = all(all_finite(column) for column in values if column.dtype == pl.Float64)
-    return values.to_dict() if finite else None
+    fits = texts.str.starts_with("{") & texts.str.ends_with("}") & ~texts.str.contains(_NOT_FOR_ARROW)
+    return texts.str.join("\n").item().encode() if fits.all() else None

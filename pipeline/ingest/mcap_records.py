@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
+from io import BytesIO
 from struct import Struct
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
-from pipeline.ingest.mcap_model import Schema
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.records import McapRecord
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = Struct("<BQ")  # opcode, length of what follows
@@ -42,76 +46,21 @@ class DamageError(Exception):
         super().__init__(f"damaged at byte {offset}: {kind}")
 
 
-_U16, _U32, _U64 = Struct("<H"), Struct("<I"), Struct("<Q")
-_CHUNK_HEAD = Struct("<QQQI")
-_INDEX_ENTRY = Struct("<QQ")
-_CHUNK_INDEX_HEAD, _CHUNK_INDEX_SIZES = Struct("<QQQQ"), Struct("<QQ")
-_COUNT_OF_CHANNEL = Struct("<HQ")
+Record = TypeVar("Record", bound=McapRecord)
+
+_CHUNK_HEAD = Struct("<QQQII")  # first and last time, size, checksum, length of the name of the compression
+_LENGTH = Struct("<Q")
+_INDEX_HEAD, _INDEX_ENTRY_SIZE = Struct("<HI"), 16
 
 
-class Cursor:
-    """Reads the fields of one record; none may run past its end."""
+class _Stream(ReadDataStream):
+    """As of the `mcap` package, but a field that its record cuts short is an error."""
 
-    def __init__(self, body: memoryview, offset: int, record: str) -> None:
-        self._body = body
-        self._at = 0
-        self._offset = offset
-        self._record = record
-
-    def _take(self, size: int) -> memoryview:
-        end = self._at + size
-        if end > len(self._body):
-            raise DamageError(self._offset, f"a field runs past the end of its {self._record} record")
-        part = self._body[self._at : end]
-        self._at = end
-        return part
-
-    def u16(self) -> int:
-        return int(_U16.unpack(self._take(2))[0])
-
-    def u32(self) -> int:
-        return int(_U32.unpack(self._take(4))[0])
-
-    def u64(self) -> int:
-        return int(_U64.unpack(self._take(8))[0])
-
-    def fixed(self, fields: Struct) -> tuple[int, ...]:
-        """Several numbers at once."""
-        return fields.unpack(self._take(fields.size))
-
-    def data(self, size: int) -> memoryview:
-        return self._take(size)
-
-    def text(self) -> str:
-        content = bytes(self._take(self.u32()))
-        try:
-            return content.decode("utf-8")
-        except UnicodeDecodeError:
-            raise DamageError(self._offset, f"a text of a {self._record} record is not UTF-8") from None
-
-    def rest(self) -> memoryview:
-        return self._take(len(self._body) - self._at)
-
-    def finish(self) -> None:
-        """Fields that later versions append to a record are none of ours; unread bytes of known ones are."""
-        if self._at != len(self._body):
-            raise DamageError(self._offset, f"a {self._record} record is longer than its fields")
-
-    def array(self, entry: Struct) -> memoryview:
-        """An array that is prefixed by its length in bytes."""
-        content = self._take(self.u32())
-        if len(content) % entry.size:
-            raise DamageError(self._offset, f"an array of a {self._record} record ends inside an entry")
+    def read(self, length: int) -> bytes:
+        content = super().read(length)
+        if len(content) < length:
+            raise EndOfFile
         return content
-
-
-@dataclass(frozen=True)
-class ChannelRecord:
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
-    metadata: tuple[tuple[str, str], ...]
 
 
 class ChunkRecord(NamedTuple):
@@ -138,91 +87,61 @@ class ChunkSummary(NamedTuple):
     size: int
 
 
-@dataclass(frozen=True)
-class Statistics:
-    messages: int
-    attachments: int
-    metadata: int
-    chunks: int
-    start_ns: int
-    end_ns: int
-    by_channel: Mapping[int, int]
-
-
-def parse_schema(body: memoryview, offset: int) -> Schema:
-    cursor = Cursor(body, offset, "Schema")
-    schema_id = cursor.u16()
-    if schema_id == 0:
-        raise DamageError(offset, "a Schema record has the id 0")
-    name, encoding = cursor.text(), cursor.text()
-    data = bytes(cursor.data(cursor.u32()))
-    cursor.finish()
-    return Schema(schema_id, name, encoding, data)
-
-
-def parse_channel(body: memoryview, offset: int) -> ChannelRecord:
-    cursor = Cursor(body, offset, "Channel")
-    channel_id, schema_id = cursor.u16(), cursor.u16()
-    topic, encoding = cursor.text(), cursor.text()
-    metadata = Cursor(cursor.data(cursor.u32()), offset, "Channel")
-    cursor.finish()
-    return ChannelRecord(channel_id, schema_id, topic, encoding, tuple(_pairs(metadata)))
-
-
-def _pairs(cursor: Cursor) -> list[tuple[str, str]]:
-    pairs = []
-    while cursor._at < len(cursor._body):
-        pairs.append((cursor.text(), cursor.text()))
-    return pairs
+def parse(kind: type[Record], body: memoryview, offset: int) -> Record:
+    """A record by the reader of the `mcap` package; it must be used up exactly."""
+    stream = _Stream(BytesIO(body))
+    with _reading(kind.__name__, offset):
+        record: Record = kind.read(stream)  # type: ignore[attr-defined]
+    _check_used_up(kind.__name__, stream.count, len(body), offset)
+    return record
 
 
 def parse_chunk(body: memoryview, offset: int) -> ChunkRecord:
-    cursor = Cursor(body, offset, "Chunk")
-    start_ns, end_ns, size, crc = cursor.fixed(_CHUNK_HEAD)
-    compression = cursor.text()
-    records = cursor.data(cursor.u64())
-    cursor.finish()
-    return ChunkRecord(offset, start_ns, end_ns, size, crc, compression, records)
+    """A chunk; its records are not copied."""
+    with _reading("Chunk", offset):
+        start_ns, end_ns, size, crc, length = _CHUNK_HEAD.unpack_from(body)
+        name_end = _CHUNK_HEAD.size + length
+        compression = str(body[_CHUNK_HEAD.size : name_end], "utf-8")
+        (records_size,) = _LENGTH.unpack_from(body, name_end)
+    first = name_end + _LENGTH.size
+    _check_used_up("Chunk", first + records_size, len(body), offset)
+    return ChunkRecord(offset, start_ns, end_ns, size, crc, compression, body[first:])
 
 
 def parse_message_index(body: memoryview, offset: int) -> tuple[int, memoryview]:
     """Channel and the array of (log time, offset in the chunk), 16 bytes each."""
-    cursor = Cursor(body, offset, "MessageIndex")
-    channel_id = cursor.u16()
-    entries = cursor.array(_INDEX_ENTRY)
-    cursor.finish()
-    return channel_id, entries
+    with _reading("MessageIndex", offset):
+        channel_id, size = _INDEX_HEAD.unpack_from(body)
+    _check_used_up("MessageIndex", _INDEX_HEAD.size + size, len(body), offset)
+    if size % _INDEX_ENTRY_SIZE:
+        raise DamageError(offset, "an array of a MessageIndex record ends inside an entry")
+    return channel_id, body[_INDEX_HEAD.size :]
 
 
-def parse_chunk_index(body: memoryview, offset: int) -> ChunkSummary:
-    cursor = Cursor(body, offset, "ChunkIndex")
-    start_ns, end_ns, chunk_offset, length = cursor.fixed(_CHUNK_INDEX_HEAD)
-    cursor.array(_COUNT_OF_CHANNEL)
-    cursor.u64()
-    compression = cursor.text()
-    compressed_size, size = cursor.fixed(_CHUNK_INDEX_SIZES)
-    cursor.finish()
-    return ChunkSummary(start_ns, end_ns, chunk_offset, length, compression, compressed_size, size)
-
-
-def parse_statistics(body: memoryview, offset: int) -> Statistics:
-    cursor = Cursor(body, offset, "Statistics")
-    messages = cursor.u64()
-    cursor.u16()  # schemas and channels are counted as registered, which some writers do before use
-    cursor.u32()
-    attachments, metadata, chunks = cursor.u32(), cursor.u32(), cursor.u32()
-    start_ns, end_ns = cursor.u64(), cursor.u64()
-    counts = dict(_COUNT_OF_CHANNEL.iter_unpack(cursor.array(_COUNT_OF_CHANNEL)))
-    cursor.finish()
-    return Statistics(messages, attachments, metadata, chunks, start_ns, end_ns, counts)
-
-
-def parse_attachment_lengths(head: memoryview, length: int, offset: int) -> None:
+def check_attachment(head: memoryview, length: int, offset: int) -> None:
     """Whether the declared lengths of an attachment fit its record; the content itself is not needed."""
-    cursor = Cursor(head, offset, "Attachment")
-    cursor.data(16)
-    cursor.text()
-    cursor.text()
-    size = cursor.u64()
-    if cursor._at + size + 4 != length:
+    stream = _Stream(BytesIO(head))
+    with _reading("Attachment", offset):
+        stream.read(16)
+        stream.read_prefixed_string()
+        stream.read_prefixed_string()
+        size = stream.read8()
+    if stream.count + size + 4 != length:
         raise DamageError(offset, "the content of an Attachment record does not fill it")
+
+
+@contextmanager
+def _reading(record: str, offset: int) -> Iterator[None]:
+    try:
+        yield
+    except UnicodeDecodeError:
+        raise DamageError(offset, f"a text of a {record} record is not UTF-8") from None
+    except (EndOfFile, struct.error):
+        raise DamageError(offset, f"a field runs past the end of its {record} record") from None
+
+
+def _check_used_up(record: str, used: int, size: int, offset: int) -> None:
+    if used > size:
+        raise DamageError(offset, f"a field runs past the end of its {record} record")
+    if used < size:
+        raise DamageError(offset, f"a {record} record is longer than its fields")

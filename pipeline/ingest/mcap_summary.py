@@ -6,10 +6,10 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from isal.isal_zlib import crc32
+from mcap.records import ChunkIndex, Footer, Statistics
 
-from pipeline.ingest import mcap_records as records
 from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.mcap_records import HEAD_SIZE, MAGIC, ChunkSummary, DamageError, Op
+from pipeline.ingest.mcap_records import HEAD_SIZE, MAGIC, ChunkSummary, DamageError, Op, parse
 
 
 @dataclass
@@ -40,33 +40,32 @@ class Summary:
         """A record before the footer."""
         self._crc = crc32(whole, self._crc)
         if opcode == Op.CHUNK_INDEX:
-            self._indexed.append(records.parse_chunk_index(whole[HEAD_SIZE:], position))
+            self._indexed.append(_summary_of(parse(ChunkIndex, whole[HEAD_SIZE:], position)))
         elif opcode == Op.STATISTICS:
-            self._check_statistics(records.parse_statistics(whole[HEAD_SIZE:], position), position)
+            self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
 
-    def _check_statistics(self, told: records.Statistics, position: int) -> None:
+    def _check_statistics(self, told: Statistics, position: int) -> None:
         met = self._met
-        per_channel = {channel: count for channel, count in told.by_channel.items() if count}
+        per_channel = {channel: count for channel, count in told.channel_message_counts.items() if count}
         pairs = [
-            ("messages", told.messages, met.message_counts.total()),
-            ("chunks", told.chunks, len(met.chunks)),
-            ("attachments", told.attachments, met.attachments),
-            ("metadata records", told.metadata, met.metadata),
+            ("messages", told.message_count, met.message_counts.total()),
+            ("chunks", told.chunk_count, len(met.chunks)),
+            ("attachments", told.attachment_count, met.attachments),
+            ("metadata records", told.metadata_count, met.metadata),
             ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
         ]
         if met.span_ns:
             # Some writers take a first time of 0 for none yet, and tell of the earliest after it.
-            start_ns = told.start_ns if met.span_ns[0] else 0
-            pairs.append(("times", (start_ns, told.end_ns), met.span_ns))
+            start_ns = told.message_start_time if met.span_ns[0] else 0
+            pairs.append(("times", (start_ns, told.message_end_time), met.span_ns))
         for name, expected, found in pairs:
             if expected != found:
                 raise DamageError(position, f"the statistics speak of {expected} {name}, the file holds {found}")
 
     def finish(self, footer: memoryview, position: int, window: ByteWindow) -> int | None:
         """The footer and the end of the file; the offset of a cut through the closing magic, if there is one."""
-        cursor = records.Cursor(footer[HEAD_SIZE:], position, "Footer")
-        start, _, crc = cursor.u64(), cursor.u64(), cursor.u32()
-        cursor.finish()
+        told = parse(Footer, footer[HEAD_SIZE:], position)
+        start, crc = told.summary_start, told.summary_crc
         met = self._start if position != self._start else 0
         if start != met:
             raise DamageError(position, f"the footer places the summary at {start}, it is at {met}")
@@ -86,6 +85,18 @@ class Summary:
             raise DamageError(position, told)
         if sorted(self._indexed, key=lambda chunk: chunk.offset) != chunks:
             raise DamageError(position, "the chunk index disagrees with the chunks")
+
+
+def _summary_of(index: ChunkIndex) -> ChunkSummary:
+    return ChunkSummary(
+        index.message_start_time,
+        index.message_end_time,
+        index.chunk_start_offset,
+        index.chunk_length,
+        index.compression,
+        index.compressed_size,
+        index.uncompressed_size,
+    )
 
 
 def _check_end(end: int, window: ByteWindow) -> int | None:

@@ -10,15 +10,27 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+import mcap.records
 import numpy as np
 
-from pipeline.ingest import mcap_records as records
 from pipeline.ingest.byte_window import ByteWindow
 from pipeline.ingest.decompress import Decompressor
 from pipeline.ingest.mcap_block import Block, block_of
 from pipeline.ingest.mcap_chunk import Index, Placed, messages_in
 from pipeline.ingest.mcap_model import Channel, Schema
-from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, MAGIC, ChunkRecord, ChunkSummary, DamageError, Op
+from pipeline.ingest.mcap_records import (
+    HEAD,
+    HEAD_SIZE,
+    MAGIC,
+    ChunkRecord,
+    ChunkSummary,
+    DamageError,
+    Op,
+    check_attachment,
+    parse,
+    parse_chunk,
+    parse_message_index,
+)
 from pipeline.ingest.mcap_summary import Met, Summary
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
@@ -59,7 +71,7 @@ class McapWalk:
         self._file = file
         self._limit = chunk_limit
         self._schemas: dict[int, Schema] = {}
-        self._definitions: dict[int, records.ChannelRecord] = {}
+        self._definitions: dict[int, mcap.records.Channel] = {}
         self._pending: list[Pending] = []
         self._pending_size = 0
         self._unpacker = Decompressor()
@@ -186,27 +198,28 @@ class McapWalk:
     def _header(self, body: memoryview, position: int) -> None:
         if position != len(MAGIC):
             raise DamageError(position, "a second Header: is this two files in one?")
-        cursor = records.Cursor(body, position, "Header")
-        cursor.text()
-        cursor.text()
+        parse(mcap.records.Header, body, position)
 
     def _schema(self, body: memoryview, position: int) -> None:
-        schema = records.parse_schema(body, position)
+        record = parse(mcap.records.Schema, body, position)
+        if record.id == 0:
+            raise DamageError(position, "a Schema record has the id 0")
+        schema = Schema(record.id, record.name, record.encoding, record.data)
         if self._schemas.setdefault(schema.id, schema) != schema:
             raise DamageError(position, f"schema {schema.id} is defined a second time, differently")
 
     def _channel(self, body: memoryview, position: int) -> None:
-        record = records.parse_channel(body, position)
+        record = parse(mcap.records.Channel, body, position)
         if self._definitions.setdefault(record.id, record) != record:
             raise DamageError(position, f"channel {record.id} ({record.topic}) is defined a second time, differently")
         if record.schema_id and record.schema_id not in self._schemas:
             raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
         schema = self._schemas.get(record.schema_id)
         if record.id not in self.channels:
-            self.channels[record.id] = Channel(record.id, record.topic, record.encoding, schema, self._file)
+            self.channels[record.id] = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
 
     def _chunk(self, body: memoryview, position: int) -> None:
-        chunk = records.parse_chunk(body, position)
+        chunk = parse_chunk(body, position)
         if chunk.size > self._limit:
             told = f"a chunk declares {chunk.size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
             raise DamageError(position, told)
@@ -219,19 +232,18 @@ class McapWalk:
     def _message_index(self, body: memoryview, position: int) -> None:
         if not self._pending:
             raise DamageError(position, "a message index follows no chunk")
-        self._pending[-1].indexes.append(records.parse_message_index(body, position))
+        self._pending[-1].indexes.append(parse_message_index(body, position))
 
     def _attachment(self, length: int, position: int) -> None:
         head = self._window.at(position + HEAD_SIZE, min(length, _ATTACHMENT_HEAD))
-        records.parse_attachment_lengths(head, length, position)
+        check_attachment(head, length, position)
         self.met.attachments += 1
 
     def _metadata_record(self, body: memoryview, position: int) -> None:
         self.met.metadata += 1
 
     def _data_end(self, body: memoryview, position: int) -> None:
-        cursor = records.Cursor(body, position, "DataEnd")
-        self.data_crc = (cursor.u32(), position)
+        self.data_crc = (parse(mcap.records.DataEnd, body, position).data_section_crc, position)
         self._summary = Summary(position + HEAD_SIZE + len(body), self.met)
 
     def _finished_chunks(self) -> Block:

@@ -35,12 +35,10 @@ def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder | 
             from pipeline.ingest.json_columns import JsonDecoder
 
             return JsonDecoder(types)
-        if channel.encoding == "cdr" and channel.schema and channel.schema.encoding in ("ros2msg", "ros2idl"):
+        if channel.encoding == "cdr" and channel.schema and channel.schema.encoding == "ros2msg":
             from pipeline.ingest.cdr import CdrWalk
-            from pipeline.ingest.ros2_idl import as_ros2msg
 
-            schema = as_ros2msg(channel.schema)
-            return TemplateDecoder(CdrWalk(schema.name, schema.data.decode(), types))
+            return TemplateDecoder(CdrWalk(channel.schema.name, channel.schema.data.decode(), types))
         if channel.encoding == "protobuf":
             from pipeline.ingest.generic import protobuf_descriptor
             from pipeline.ingest.protobuf import ProtobufWalk

@@ -9,8 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.evidence import Evidence
-from pipeline.evidence.accused import OwnAnchors, carried_forward
-from pipeline.evidence.carrying import Readings
+from pipeline.evidence.accused import carried_forward
 from pipeline.evidence.routes import Route, routes_of_path
 from pipeline.judge.in_use import unambiguous
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, with_own_anchors
@@ -27,7 +26,7 @@ class Solution:
     """One solution as it was recorded and replayed.
 
     `fixes`: its positions as recorded; `epochs`: matched, aligned and monitored, with the LDS columns; `crossings` and
-    `passages`: of the LDS; `balises`: those on the path; `odometer_sign`: +1 where the recorded odometer grows with it.
+    `passages`: of the LDS; `balises`: those on the path.
     """
 
     name: str
@@ -37,12 +36,11 @@ class Solution:
     passages: pl.DataFrame
     balises: pl.DataFrame
     path: TravelledPath
-    odometer_sign: int
 
 
 @dataclass(frozen=True)
 class Bench:
-    """One solution before the judge."""
+    """One solution before the judge; `odometry` grows with its path."""
 
     solution: Solution
     evidence: Evidence
@@ -71,10 +69,6 @@ class Bench:
         return routes_of_path(self.solution.path, self.evidence.network.track.index)
 
     @cached_property
-    def readings(self) -> Readings:
-        return Readings.of(self.odometry, self.at_ns)
-
-    @cached_property
     def path_m(self) -> Floats:
         """Path positions of valid fixes, NaN elsewhere."""
         return np.where(flags(self.epochs, "fix_valid"), floats(self.epochs, "path_m"), np.nan)
@@ -82,16 +76,17 @@ class Bench:
     @cached_property
     def odometer_moves(self) -> Bools:
         """Per epoch whether the odometer says that the train moved to the next one."""
-        step_s, moving_s = np.diff(self.at_ns) / NS_PER_S, np.diff(self.readings.moving_s)
-        with np.errstate(invalid="ignore"):
-            moves = moving_s > 0.5 * step_s
+        if self.odometry is None:
+            return np.zeros(self.t_ns.size, dtype=np.bool_)
+        moves = self.odometry.moved(self.at_ns)
         return np.append(moves, moves[-1:])[: self.t_ns.size]
 
     @cached_property
     def odometer_told(self) -> Bools:
         """Per epoch whether the odometer counted from it to the next one."""
-        segment = self.readings.segment
-        told = (segment[:-1] == segment[1:]) & (segment[1:] >= 0)
+        if self.odometry is None:
+            return np.zeros(self.t_ns.size, dtype=np.bool_)
+        told = np.isfinite(self.odometry.between(self.at_ns[:-1], self.at_ns[1:]).distance_m)
         return np.append(told, told[-1:])[: self.t_ns.size]
 
     @cached_property
@@ -144,21 +139,15 @@ class Bench:
     def _judge(self, positions: Positions, at_ns: Ints) -> Judgements:
         hazards = self.config.hazards
         found = judge_positions(positions, self.evidence.at(at_ns, self.stood), self.legs, hazards)
-        readings = Readings.of(self.odometry, at_ns)
-        figures, limit_m = self.evidence.figures, hazards.failure_limit_m
-        carried = carried_forward(
-            self._own_anchors, readings, self.solution.odometer_sign, self.stood, figures, limit_m
-        )
+        if self.odometry is None:
+            return found
+        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+        accepted = (kind == BaliseKind.VIRTUAL.value) & (status == PassageStatus.ACCEPTED.value)
+        virtual = self.offers.filter(accepted).sort("t")
+        since_ns, path_m = self.instants(times_ns(virtual)), floats(virtual, "path_m")
+        trust, limit_m = self.evidence.trust, hazards.failure_limit_m
+        carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, trust, limit_m)
         return with_own_anchors(found, positions, carried, hazards)
-
-    @cached_property
-    def _own_anchors(self) -> OwnAnchors:
-        """Virtual balises that the LDS accepted."""
-        virtual = self.offers.filter(
-            (pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
-            & (pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value)
-        ).sort("t")
-        return OwnAnchors(floats(virtual, "path_m"), Readings.of(self.odometry, self.instants(times_ns(virtual))))
 
     @cached_property
     def train_m(self) -> Floats:

@@ -75,10 +75,13 @@ def _series(bench: Bench, used_s: Floats) -> Series:
     row = np.flatnonzero(bench.positions.known)
     by_reference = bench.judged.kind == KINDS.index(Evidence.REFERENCE)
     train_m = np.where(by_reference, bench.train_m, np.nan)[row]
-    odometer_m = bench.solution.odometer_sign * bench.evidence.figures.scale * bench.readings.distance_m[row]
+    at_ns, odometry = bench.at_ns[row], bench.odometry
+    counted_m = np.full(max(row.size - 1, 0), np.nan)
+    if odometry is not None:
+        counted_m = odometry.between(at_ns[:-1], at_ns[1:]).distance_m
     gap_s = linking_gap_s(nominal_period_s(bench.t_ns), bench.config.lds.crossing_gap_s)
     t_ns, path_m = bench.t_ns[row], bench.path_m[row]
-    steps = steps_of(t_ns, path_m, train_m, odometer_m, bench.readings.segment[row], gap_s)
+    steps = steps_of(t_ns, path_m, train_m, counted_m, gap_s)
     jumps = find_jumps(steps, bench.positions.direction[row], bench.config.hazards)
     sigma_m = floats(bench.epochs, "sigma_along_m")[row]
     return Series(row, t_ns, bench.judged.take(row), used_s[row], sigma_m, jumps)
@@ -101,9 +104,11 @@ def _virtual_offers(bench: Bench, series: Series) -> VirtualOffers:
 
 
 def _marked(series: Series, offers: VirtualOffers) -> Bools:
-    """Valid positions that complete an offer judged wrong."""
+    """Valid positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
     marked = np.zeros(series.size, dtype=np.bool_)
     marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
+    for jump in series.jumps:
+        marked[jump.first : jump.last + 1] = False
     return marked
 
 
@@ -215,7 +220,13 @@ def _epochs(
     cross, up = errors_across(bench.solution.fixes, heading, bench.at_ns, reference, config.hazards.reference_gap_s)
     by_reference = np.where(judged.kind == KINDS.index(Evidence.REFERENCE), bench.train_m, np.nan)
     moving, sure = moving_by_evidence(
-        bench.at_ns, by_reference, bench.odometer_moves, bench.odometer_told, bench.stood, config.matching.deadband_mps
+        bench.at_ns,
+        by_reference,
+        0.5 * (judged.high_m - judged.low_m),
+        bench.odometer_moves,
+        bench.odometer_told,
+        bench.stood,
+        config.matching.deadband_mps,
     )
     suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
     known = np.isfinite(bench.path_m)
@@ -238,7 +249,7 @@ def _epochs(
 def _distance_m(bench: Bench) -> float | None:
     """Way driven: by the odometer, else by the reference, else by the positions; None where none of them tells."""
     if bench.odometry is not None:
-        driven = bench.readings.travelled_m
+        driven = bench.odometry.travelled_at(bench.at_ns[[0, -1]])
         scale = bench.epochs["odometer_scale"].drop_nulls()
         return float(driven[-1] - driven[0]) * (scale[-1] if scale.len() else 1.0)
     train = bench.train_m[np.isfinite(bench.train_m)]

@@ -35,10 +35,9 @@ class Jump:
     step_m: float
 
 
-def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, odometer_m: Floats, segment: Ints, gap_s: float) -> Steps:
-    """`train_m`: path position by the reference, NaN elsewhere; there `odometer_m` (along growing path) serves."""
-    by_reference = np.diff(path_m - train_m)
-    by_odometer = np.where(np.diff(segment) == 0, np.diff(path_m - odometer_m), np.nan)
+def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_s: float) -> Steps:
+    """`train_m`: path position by the reference, NaN elsewhere; there `counted_m`, the odometer's steps, serves."""
+    by_reference, by_odometer = np.diff(path_m - train_m), np.diff(path_m) - counted_m
     change = np.where(np.isfinite(by_reference), by_reference, by_odometer)
     linked = np.isfinite(change) & (np.diff(t_ns) <= gap_s * NS_PER_S)
     excess = np.concatenate([[0.0], np.cumsum(np.where(linked, change, 0.0))])

@@ -6,6 +6,8 @@ import numpy as np
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 
+_WINDOW_S = 1.0
+
 
 def stood_spans(
     t_ns: Ints, path_m: Floats, odometer_moves: Bools, known: Bools, limit_m: float
@@ -27,24 +29,26 @@ def stood_spans(
 def moving_by_evidence(
     t_ns: Ints,
     train_m: Floats,
+    noise_m: Floats,
     odometer_moves: Bools,
     known: Bools,
     stood: list[tuple[int, int]],
     deadband_mps: float,
 ) -> tuple[Bools, Bools]:
-    """Per epoch whether the train moved to the next one, and whether that is known.
+    """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
 
-    `train_m`: its place by the reference, NaN elsewhere: it comes before the odometer.
+    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over a second it moved where it came
+    farther than the dead band and that noise allow. It also tells where the odometer stands or is silent.
     """
-    step_s = np.diff(t_ns) / NS_PER_S
-    with np.errstate(invalid="ignore", divide="ignore"):
-        by_reference = np.abs(np.diff(train_m)) / step_s
-    told = np.isfinite(by_reference)
-    moves = np.where(told, by_reference > deadband_mps, odometer_moves[:-1])
-    sure = told | known[:-1]
+    ahead = np.searchsorted(t_ns, t_ns + round(_WINDOW_S * NS_PER_S)).clip(0, t_ns.size - 1)
+    with np.errstate(invalid="ignore"):
+        came_m = np.abs(train_m[ahead] - train_m)
+        by_reference = came_m > deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S + noise_m + noise_m[ahead]
+    told = np.isfinite(came_m)
+    moves, sure = by_reference | (odometer_moves & known), told | known
     for begin_ns, end_ns in stood:
-        sure &= told | (t_ns[:-1] < begin_ns) | (t_ns[:-1] >= end_ns)
-    return _held(moves, t_ns.size), _held(sure, t_ns.size)
+        sure &= told | (t_ns < begin_ns) | (t_ns >= end_ns)
+    return _held(moves[:-1], t_ns.size), _held(sure[:-1], t_ns.size)
 
 
 def _held(steps: Bools, size: int) -> Bools:

@@ -47,7 +47,7 @@ def passages_table(
         *offered,
         pl.Series("_positioned", positioned),
         pl.Series("_suspect", _inside(passages, spans)),
-        _speeds(passages, t_true, epochs),
+        _speeds(passages, t_true, epochs, gap_ns),
     )
     return _with_failures(frame).select(Passages.column_names())
 
@@ -121,8 +121,8 @@ def within_spans(t_ns: Ints, spans: Sequence[tuple[int, int]]) -> Bools:
     return inside
 
 
-def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame) -> pl.Series:
-    """Speed of the train at the offer, else where it passed [m/s]."""
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap_ns: int) -> pl.Series:
+    """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
     stamps, speed = times_ns(epochs), np.abs(floats(epochs, "speed_mps"))
     known = np.isfinite(speed)
@@ -130,7 +130,8 @@ def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame) -> 
         return pl.Series("speed_mps", [None] * passages.height, dtype=pl.Float64)
     offset = int(stamps[0])
     values = np.interp((ints(at) - offset) / 1e9, (stamps[known] - offset) / 1e9, speed[known])
-    return pl.select(pl.when(at.is_not_null()).then(pl.Series(values)).alias("speed_mps")).to_series()
+    told = at.is_not_null() & pl.Series(_within_gap(stamps[known], ints(at), gap_ns))
+    return pl.select(pl.when(told).then(pl.Series(values)).alias("speed_mps")).to_series()
 
 
 def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:

@@ -1,7 +1,8 @@
 """Location determination system: virtual balises, ETCS linking, travelling virtual balise.
 
 In: aligned epochs of one solution, a monitor bank, balises of the path, telegrams with the odometer at each.
-Out: LDS columns of the epochs, the table of crossings, passages. Touches no file and knows of no truth.
+Out: LDS columns of the epochs, the table of crossings, passages.
+Touches no file, knows of no truth, and asks the monitors only through `bank_protocol`.
 
 Where the sources leave a choice, this package reads them so:
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +12,19 @@ from pipeline.matching.decode import Decoded
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
+from pipeline.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
+# What ended a stretch of doubt: a balise read, a switch taken, positions (tracks that part, offsets), or nothing.
+TOLD_BY = ("read", "switch", "positions", "nothing")
 AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "t_start": pl.Datetime("ns", "UTC"),
     "t_end": pl.Datetime("ns", "UTC"),
     "netelement_id": pl.String,
     "other_netelement_id": pl.String,
     "probability": pl.Float64,
+    "told_by": pl.Enum(TOLD_BY),
 }
 # Elements of the path this many before or after the one in question are the same way, not another.
 _NEIGHBOURS = 2
@@ -48,8 +53,13 @@ def doubt_of(trellis: Trellis, found: Found, decoded: Decoded) -> Doubt:
     )
 
 
-def stretches(fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, config: MatchingConfig) -> pl.DataFrame:
-    """Stretches where either probability of the path is below the configured one, each with its least."""
+def stretches(
+    fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, pinned: Ints, config: MatchingConfig
+) -> pl.DataFrame:
+    """Stretches where either probability of the path is below the configured one, each with its least.
+
+    `pinned`: per epoch the element that a balise read proves, -1 without one.
+    """
     probability = np.minimum(doubt.posterior, doubt.gate)
     unsure = np.concatenate([[False], probability < config.ambiguity_probability, [False]])
     edges = np.flatnonzero(np.diff(unsure.astype(np.int8)))
@@ -61,8 +71,28 @@ def stretches(fixes: Fixes, trellis: Trellis, found: Found, doubt: Doubt, config
         until = int(epoch[end]) - 1 if end < len(trellis) else len(fixes) - 1
         here = ids[int(trellis.oriented[found.best[worst]]) // 2]
         there = ids[other] if other >= 0 else None
-        rows.append((int(fixes.t_ns[epoch[begin]]), int(fixes.t_ns[until]), here, there, float(probability[worst])))
+        span = int(fixes.t_ns[epoch[begin]]), int(fixes.t_ns[until])
+        rows.append((*span, here, there, float(probability[worst]), _told_by(trellis, found, pinned, begin, end)))
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
+
+
+def _told_by(trellis: Trellis, found: Found, pinned: Ints, begin: int, end: int) -> str:
+    """What ended the doubt of steps `begin : end`; a switch is taken where the path had more than one way on."""
+    if end >= len(trellis):
+        return "nothing"
+    epoch = trellis.steps.epoch
+    if (pinned[int(epoch[end - 1]) + 1 : int(epoch[end]) + 1] >= 0).any():
+        return "read"
+    way = trellis.oriented[found.best[max(begin - 1, 0) : end + 1]]
+    passed = [(one, other) for one, other in itertools.pairwise(way.tolist()) if one != other]
+    return "switch" if any(_over_switch(trellis.network, one, other) for one, other in passed) else "positions"
+
+
+def _over_switch(network: Network, one: int, other: int) -> bool:
+    """Whether more than one way leads on from one oriented element towards another, or from there back."""
+    forward = any(edge.to == other for edge in network.successors[one])
+    ends = (one, other ^ 1) if forward else (one ^ 1, other)
+    return any(len(network.successors[end]) > 1 for end in ends)
 
 
 def no_doubt() -> pl.DataFrame:

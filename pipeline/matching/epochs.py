@@ -134,7 +134,7 @@ def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
 def on_track_limit_m(sigma_cross_m: Floats, survey_sigma_m: Floats, config: MatchingConfig) -> Floats:
     """How far beside a track its own sigma, the survey's and the bias allow a position to lie [m]."""
     survey_m = np.where(np.isfinite(survey_sigma_m), survey_sigma_m, config.survey_sigma_default_m)
-    spread_m = np.sqrt(sigma_cross_m**2 + survey_m**2 + config.cross_bias_sigma_m**2)
+    spread_m = np.sqrt(sigma_cross_m**2 + survey_m**2 + config.on_track_bias_m**2)
     return np.asarray(np.minimum(config.on_track_sigmas * spread_m, config.reach_m))
 
 

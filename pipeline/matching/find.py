@@ -62,7 +62,7 @@ def find_path(
     doubt = doubt_of(trellis, found, decoded)
     path = TravelledPath(network.track, tuple(legs))
     assignment = _assign(fixes, trellis.steps, decoded, positions_m(decoded, legs), doubt)
-    return path, assignment, stretches(fixes, trellis, found, doubt, config), posterior_of(trellis, found)
+    return path, assignment, stretches(fixes, trellis, found, doubt, pinned, config), posterior_of(trellis, found)
 
 
 def _trellis(

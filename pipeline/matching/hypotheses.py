@@ -17,7 +17,7 @@ from schemas.config import MatchingConfig
 
 # Grid of the bias in its standard deviations. Half of a spacing is how far the bias scatters about each value, which
 # leaves no gaps between them.
-_GRID_SIGMAS = np.linspace(-3.6, 3.6, 13)
+_GRID_SIGMAS = np.linspace(-3.6, 3.6, 9)
 _WITHIN_SIGMAS = 0.5 * float(_GRID_SIGMAS[1] - _GRID_SIGMAS[0])
 
 

@@ -74,7 +74,7 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     variance = fast_m2 + hypotheses.within_m**2 + np.maximum(survey_m2 - common_m2, 0.0)[:, None]
     floor_m2 = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M) ** 2
     fresh = np.maximum(fast_m2 * renewed[:, None] + wander_m2[:, None], floor_m2[:, None])
-    whole_m2 = gnss_m2 + survey_m2 + config.cross_bias_sigma_m**2
+    whole_m2 = gnss_m2 + survey_m2 + config.on_track_bias_m**2
     unexplained = candidates.distance_m > config.on_track_sigmas * np.sqrt(whole_m2)
     off = unexplained & (candidates.distance_m > config.outlier_scale_m)
     heading = _heading(steps, candidates, config)

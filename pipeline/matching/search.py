@@ -1,4 +1,4 @@
-"""Viterbi, forward and backward over the steps (Rabiner 1989, section III), in logarithms.
+"""Viterbi, forward and backward over the steps (Rabiner 1989, section III).
 
 Every state carries a weight for each hypothesis of what lasts. On a change of net element part of the bias is drawn
 anew.
@@ -6,15 +6,19 @@ anew.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.matching.trellis import Trellis
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Floats, Ints
 
 # Least probability that is told from none.
 _TINY = 1e-300
+# Pairs of states that are weighed at once: enough to be quick, few enough to hold.
+_AT_ONCE = 50_000
 
 
 @dataclass(frozen=True)
@@ -28,23 +32,16 @@ class Found:
 
 @dataclass(frozen=True)
 class _Block:
-    """Steps `begin : end`, over whose later steps every state stays.
+    """Steps `begin : end`, over whose later steps every state stays, and how it is entered.
 
-    It is entered by `transitions` `[before, after, hypothesis]`, of which `changes` lead to another element.
+    `same`, `other`: weights `[before, after, hypothesis]` of staying on an element and of changing to another; empty
+    for the first block.
     """
 
     begin: int
     end: int
-    transitions: Floats | None
-    changes: Bools | None
-
-
-@dataclass(frozen=True)
-class _Survivors:
-    """The best way to each state of a step with its weight under each hypothesis, and where each came from."""
-
-    weight: Floats
-    origin: Ints
+    same: Floats
+    other: Floats
 
 
 def search(trellis: Trellis) -> Found:
@@ -52,7 +49,7 @@ def search(trellis: Trellis) -> Found:
 
     `forward` is causal: it uses nothing that a train would not know at that step.
     """
-    blocks = _blocks(trellis)
+    blocks = list(_blocks(trellis))
     forward, best = _forward(trellis, blocks)
     backward = _backward(trellis, blocks)
     return Found(
@@ -62,93 +59,84 @@ def search(trellis: Trellis) -> Found:
     )
 
 
-def _blocks(trellis: Trellis) -> list[_Block]:
+def _blocks(trellis: Trellis) -> Iterator[_Block]:
     """Runs of steps between which something can be decided."""
-    starts = np.flatnonzero(~trellis.stays)
-    ends = np.append(starts[1:], len(trellis))
-    blocks = []
-    for begin, end in zip(starts.tolist(), ends.tolist(), strict=True):
-        entered = (trellis.transitions(begin), trellis.changes(begin)) if begin else (None, None)
-        blocks.append(_Block(begin, end, *entered))
-    return blocks
+    begins = np.flatnonzero(~trellis.stays)
+    ends = np.append(begins[1:], len(trellis))
+    nothing = np.zeros((0, 0, len(trellis.like.hypotheses)))
+    yield _Block(0, int(ends[0]), nothing, nothing)
+    for rows in _batches(trellis, begins[1:]):
+        pairs = trellis.pairs(begins[1:][rows])
+        for number, (begin, end) in enumerate(zip(begins[1:][rows].tolist(), ends[1:][rows].tolist(), strict=True)):
+            yield _Block(begin, end, *pairs.at(number))
+
+
+def _batches(trellis: Trellis, steps: Ints) -> Iterator[slice]:
+    """Parts of the steps with so many pairs each."""
+    count = np.diff(trellis.first)
+    batch = np.cumsum(count[steps - 1] * count[steps]) // _AT_ONCE
+    cuts = [0, *(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(steps)]
+    for begin, end in itertools.pairwise(cuts):
+        if end > begin:
+            yield slice(begin, end)
 
 
 def _forward(trellis: Trellis, blocks: list[_Block]) -> tuple[Floats, Ints]:
-    """Weights of all states by what came before, and the state of the best path at each step."""
+    """Weights of all states by what came before, in logarithms, and the state of the best path at each step.
+
+    The best path is the one that is most probable under all hypotheses together: each state keeps one way to it.
+    """
     renewal = trellis.like.hypotheses.renewal
     forward = np.empty_like(trellis.initial)
     back: list[Ints] = []
-    alpha, best = np.zeros((0, 0)), np.zeros((0, 0))
+    start = trellis.initial[: int(trellis.first[1])] + trellis.like.hypotheses.log_prior
+    both = np.stack([start, start])
     for block in blocks:
-        rows = slice(int(trellis.first[block.begin]), int(trellis.first[block.end]))
         count = int(trellis.first[block.begin + 1] - trellis.first[block.begin])
-        if block.transitions is None:
-            alpha = best = trellis.initial[rows][:count] + trellis.like.hypotheses.log_prior
-            back.append(np.zeros(count, dtype=np.int64))
+        if len(block.same):
+            weight = _weights(both)
+            entered = weight[:, :, None] * block.same + (weight @ renewal)[:, :, None] * block.other
+            origin = entered[1].sum(axis=2).argmax(axis=0)
+            best = entered[1, origin, np.arange(count)]
+            both = np.log(np.stack([entered[0].sum(axis=0), best]) + _TINY)
+            back.append(origin)
         else:
-            alpha = _log_sum(_entered(alpha, block, renewal), 0)
-            survivors = _survivors(_entered(best, block, renewal))
-            best = survivors.weight
-            back.append(survivors.origin)
+            back.append(np.zeros(count, dtype=np.int64))
         gained = _gained(trellis, block, count)
-        filtered = alpha + gained
-        filtered -= _log_sum(filtered.reshape(len(filtered), -1), 1)[:, None, None]
-        forward[rows] = filtered.reshape(-1, forward.shape[1])
-        alpha, best = filtered[-1], best + gained[-1]
-        best = best - best.max()
-    return forward, _trace(trellis, blocks, back, int(np.argmax(_log_sum(best, 1))))
+        rows = slice(int(trellis.first[block.begin]), int(trellis.first[block.end]))
+        forward[rows] = (both[0] + gained).reshape(-1, forward.shape[1])
+        both = both + gained[-1]
+    return forward, _trace(trellis, blocks, back, int(_weights(both)[1].sum(axis=1).argmax()))
 
 
-def _entered(weight: Floats, block: _Block, renewal: Floats) -> Floats:
-    """Weights after a block's transitions: `[before, after, hypothesis]`."""
-    assert block.transitions is not None
-    assert block.changes is not None
-    carried = np.where(block.changes[:, :, None], _renewed(weight, renewal)[:, None, :], weight[:, None, :])
-    return np.asarray(carried + block.transitions)
-
-
-def _renewed(weight: Floats, renewal: Floats) -> Floats:
-    """Weights over the hypotheses after a change of element."""
-    most = weight.max(axis=1, keepdims=True)
-    return np.asarray(np.log(np.exp(weight - most) @ renewal + _TINY) + most)
-
-
-def _survivors(entered: Floats) -> _Survivors:
-    """To each state the way that is most probable under all hypotheses together."""
-    origin = np.argmax(_log_sum(entered, 2), axis=0)
-    return _Survivors(entered[origin, np.arange(entered.shape[1])], origin)
+def _weights(logs: Floats) -> Floats:
+    """Weights from logarithms, the largest of each of the two being one."""
+    return np.asarray(np.exp(logs - logs.max(axis=(1, 2), keepdims=True)))
 
 
 def _gained(trellis: Trellis, block: _Block, count: int) -> Floats:
     """Log-probability that each state has gained within a block, step by step (first row zero)."""
     rows = slice(int(trellis.first[block.begin + 1]), int(trellis.first[block.end]))
     gained = np.zeros((block.end - block.begin, count, trellis.stay.shape[1]))
-    np.cumsum(trellis.stay[rows].reshape(-1, count, gained.shape[2]), axis=0, out=gained[1:])
+    if len(gained) > 1:
+        np.cumsum(trellis.stay[rows].reshape(-1, count, gained.shape[2]), axis=0, out=gained[1:])
     return gained
 
 
 def _backward(trellis: Trellis, blocks: list[_Block]) -> Floats:
-    """Weights of all states by what came after."""
+    """Weights of all states by what came after, in logarithms."""
     renewal = trellis.like.hypotheses.renewal.T
     backward = np.empty_like(trellis.initial)
-    beta = np.zeros((0, 0))
-    after: _Block | None = None
+    beta = np.zeros((int(trellis.first[-1] - trellis.first[-2]), backward.shape[1]))
     for block in reversed(blocks):
-        count = int(trellis.first[block.begin + 1] - trellis.first[block.begin])
-        if after is None or after.transitions is None or after.changes is None:
-            beta = np.zeros((count, backward.shape[1]))
-        else:
-            onward = after.transitions + beta[None, :, :]
-            elsewhere = after.changes[:, :, None]
-            same = _log_sum(np.where(elsewhere, -np.inf, onward), 1)
-            other = _renewed(_log_sum(np.where(elsewhere, onward, -np.inf), 1), renewal)
-            beta = np.logaddexp(same, other)
-        beta = beta - beta.max()
-        gained = _gained(trellis, block, count)
+        gained = _gained(trellis, block, len(beta))
         later = beta + gained[-1] - gained
         rows = slice(int(trellis.first[block.begin]), int(trellis.first[block.end]))
         backward[rows] = later.reshape(-1, backward.shape[1])
-        beta, after = later[0], block
+        if not len(block.same):
+            break
+        weight = np.exp(later[0] - later[0].max())
+        beta = np.log((block.same * weight).sum(axis=1) + (block.other * weight).sum(axis=1) @ renewal + _TINY)
     return backward
 
 
@@ -162,19 +150,9 @@ def _trace(trellis: Trellis, blocks: list[_Block], back: list[Ints], last: int) 
     return best
 
 
-def _log_sum(values: Floats, axis: int) -> Floats:
-    """Logarithm of the sum of exponentials along an axis; at least the logarithm of next to nothing."""
-    most = np.maximum(values.max(axis=axis, keepdims=True), _LOWEST)
-    return np.asarray(np.log(np.exp(values - most).sum(axis=axis) + _TINY) + np.squeeze(most, axis=axis))
-
-
 def _of_states(log_values: Floats, first: Ints) -> Floats:
     """Probabilities of states, under all hypotheses together, that sum to one within each step."""
     count = np.diff(first)
     most = np.repeat(np.maximum.reduceat(log_values.max(axis=1), first[:-1]), count)
     values = np.exp(log_values - most[:, None]).sum(axis=1)
     return np.asarray(values / np.repeat(np.add.reduceat(values, first[:-1]), count))
-
-
-# Of next to nothing, so that differences of such values stay numbers.
-_LOWEST = -1e9

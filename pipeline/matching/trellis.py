@@ -51,22 +51,43 @@ class Trellis:
     def states(self, step: int) -> range:
         return range(int(self.first[step]), int(self.first[step + 1]))
 
-    def transitions(self, step: int) -> Floats:
-        """Log-probabilities from states of step - 1 to those of `step`: `[before, after, hypothesis]`."""
-        before, after = self.states(step - 1), self.states(step)
-        shape = len(before), len(after)
-        one, other = np.repeat(before, len(after)), np.tile(after, len(before))
-        begin = int(self.pair_first[step])
-        move = self.pair_move[begin : begin + len(one)]
+    def pairs(self, steps: Ints) -> Pairs:
+        """All pairs of states of the given steps and of the steps before them, with how probable each move is."""
+        before, after = (np.diff(self.first)[at] for at in (steps - 1, steps))
+        sizes = before * after
+        begin = np.concatenate([[0], np.cumsum(sizes)])
+        step = np.repeat(steps, sizes)
+        number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
+        width = np.repeat(after, sizes)
+        one, other = self.first[step - 1] + number // width, self.first[step] + number % width
         changes = self.oriented[one] != self.oriented[other]
         score = step_score(self.offset_m[one], self.offset_m[other], self.candidate[other], changes, self.like)
+        move = self.pair_move[self.pair_first[step] + number]
         score = np.maximum(move[:, None] + score, BREAK + self.initial[other])
-        return np.asarray(score.reshape(*shape, -1))
+        most = np.maximum.reduceat(score.max(axis=1), begin[:-1])
+        weight = np.exp(score - np.repeat(most, sizes)[:, None])
+        return Pairs(before, after, begin, weight * ~changes[:, None], weight * changes[:, None])
 
-    def changes(self, step: int) -> Bools:
-        """Which states of step - 1 (rows) and of `step` (columns) are on different elements."""
-        before, after = self.states(step - 1), self.states(step)
-        return np.asarray(self.oriented[before][:, None] != self.oriented[after][None, :])
+
+@dataclass(frozen=True)
+class Pairs:
+    """Of several steps: `begin[k] : begin[k + 1]` are the pairs of step k, `before` times `after` states, row by row.
+
+    `same`, `other`: probability of each under each hypothesis, the largest of a step being one, in `same` of those that
+    stay on an element and in `other` of those that change to another; zero elsewhere.
+    """
+
+    before: Ints
+    after: Ints
+    begin: Ints
+    same: Floats
+    other: Floats
+
+    def at(self, number: int) -> tuple[Floats, Floats]:
+        """`same` and `other` of one step: `[before, after, hypothesis]`."""
+        part = slice(int(self.begin[number]), int(self.begin[number + 1]))
+        shape = int(self.before[number]), int(self.after[number]), self.same.shape[1]
+        return self.same[part].reshape(shape), self.other[part].reshape(shape)
 
 
 def trellis_of(

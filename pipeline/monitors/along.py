@@ -10,10 +10,7 @@ from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AxisSeries, decorrelation_of, error_model, with_memory
 from pipeline.odometry.odometry import Increments
 from schemas.arrays import Floats, Ints
-from schemas.config import Configuration
-
-# Half of the fastest average's memory: so the variance of all averages is that of rows up to 5 s apart, or above it.
-_LASTS_S = 5.0
+from schemas.config import Configuration, MonitorConfig
 
 
 @dataclass(frozen=True)
@@ -52,14 +49,14 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
     decorrelations = [decorrelation_of(dt, taus_s), np.ones(dt.size)]
     if epochs.rows_m.any():
         sigmas.append(epochs.rows_m)
-        decorrelations.append(_rows_decorrelation(dt, epochs.period_s))
+        decorrelations.append(_rows_decorrelation(dt, epochs.period_s, config.monitors))
     return AxisSeries(
         epoch=epochs.epoch,
         fresh=fresh,
         border=np.zeros(dt.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[0]) - odometer.distance_m) / dt,
-        **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T),
+        **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T, config.monitors),
         white_m2=epochs.white_m2_per_s * dt,
         border_m2=zero,
         steady_mps=epochs.scale_sigma * odometer.distance_m / dt,
@@ -67,14 +64,16 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
     )
 
 
-def _rows_decorrelation(dt_s: Floats, period_s: float) -> Floats:
+def _rows_decorrelation(dt_s: Floats, period_s: float, config: MonitorConfig) -> Floats:
     """1 - phi of the rows' noise over these steps: none is left from row to row; between them little changes.
 
     The square is what a step changes on a straight line between two rows. Errors that change so little and at random
-    would last for `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than `_LASTS_S`.
+    would last for `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than half of
+    the fastest average's memory. So the variance of all averages is that of rows up to so far apart, or above it.
     """
     changed = np.minimum(dt_s / max(period_s, 1e-9), 1.0) ** 2
-    lost: Floats = np.maximum(changed, np.minimum(dt_s / _LASTS_S, 1.0))
+    lasts_s = 0.5 / config.ewma_alphas[0]
+    lost: Floats = np.maximum(changed, np.minimum(dt_s / lasts_s, 1.0))
     return lost
 
 

@@ -57,12 +57,12 @@ class AxisResult:
     sigma: Floats
 
 
-def with_memory(sigma_m: Floats, decorrelation: Floats) -> dict[str, Floats]:
+def with_memory(sigma_m: Floats, decorrelation: Floats, config: MonitorConfig) -> dict[str, Floats]:
     """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j, best in Fortran order.
 
     The recursions go along the rows, one source after the other.
     """
-    before = before_steps(sigma_m, decorrelation)
+    before = before_steps(sigma_m, decorrelation, config.sigma_step_factor)
     return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
 
 

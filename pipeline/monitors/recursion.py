@@ -13,9 +13,6 @@ from scipy.linalg.lapack import dtbtrs
 
 from schemas.arrays import Floats
 
-# Between two rows a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
-STEP_OF_SIGMA = 1.5
-
 
 def linear_recurrence(decay: Floats, drive: Floats, initial: Floats) -> Floats:
     """Solve `y[k] = decay[k] * y[k-1] + drive[k]` with `y[-1] = initial`, shapes (n, c), (n, c), (c,).
@@ -111,17 +108,17 @@ def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> t
     return carried, own, np.where(ratio == 1.0, -decorrelation, carried - 1.0)
 
 
-def before_steps(sigma_m: Floats, decorrelation: Floats) -> Floats:
+def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Floats:
     """The sigma before each row that the recursion counts with, per source; shapes (n, sources).
 
-    Until a source's sigma first changes by the step, R_j of the row stands for both ends of the increment, as
-    printed; from then on the row before has its own. Sources without memory (phi = 0) know no step.
+    Until a source's sigma first changes by more than `factor` (a step), R_j of the row stands for both ends of the
+    increment, as printed; from then on the row before has its own. Sources without memory (phi = 0) know no step.
     """
     before = sigma_m
     for source, (now, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
         earlier = np.concatenate([now[:1], now[:-1]])
         low, high = np.minimum(now, earlier), np.maximum(now, earlier)
-        steps = (high > STEP_OF_SIGMA * low) & (lost < 1.0)
+        steps = (high > factor * low) & (lost < 1.0)
         if steps.any():
             before = before.copy(order="F") if before is sigma_m else before
             before[:, source] = np.where(np.logical_or.accumulate(steps), earlier, now)

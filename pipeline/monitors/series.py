@@ -126,7 +126,7 @@ class _Builder:
             border=border,
             dt_s=dt,
             rate_mps=_steps(self._column(position, rows)) / dt,
-            **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T),
+            **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T, self._config.monitors),
             white_m2=zero,
             border_m2=2.0 * survey**2,
             steady_mps=self._turned_mps(rows) if position == "cross_track_m" else zero,

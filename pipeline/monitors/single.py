@@ -123,7 +123,7 @@ def channel_monitor(
 
 
 def _window(
-    t_s: Floats, usable: npt.NDArray[np.bool_], stretch: npt.NDArray[np.int64]
+    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], Floats]:
     """Epoch at least a second before, and the time since; NaN unless all in between are usable and connected."""
     first = np.maximum(np.searchsorted(t_s, t_s - _WINDOW_S * (1.0 - 1e-6), side="right") - 1, 0)
@@ -131,7 +131,7 @@ def _window(
     clean = bad[np.arange(t_s.size) + 1] == bad[first]
     span = t_s - t_s[first]
     connected = clean & (span >= _WINDOW_S * (1.0 - 1e-6)) & (span <= 2.5 * _WINDOW_S)
-    connected &= stretch == stretch[first]
+    connected &= segment == segment[first]
     return first, np.where(connected, span, np.nan)
 
 

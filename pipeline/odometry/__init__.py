@@ -1,6 +1,7 @@
 """The odometer of a run, made once: distance over time in continuity segments, with its noise.
 
-In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry`, handed to every stage. No files.
+In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry`, handed to every stage.
+Touches no file, and knows no position: only the sign against the path is set from one (`polarity`).
 """
 
 from pipeline.odometry.odometry import Odometry, odometry_of

@@ -1,4 +1,8 @@
-"""Logs of GNSS receivers as runs."""
+"""Logs of GNSS receivers as runs (`balise convert`).
+
+In: UBX, SBF, NMEA, CSV with a mapping. Out: the streams of a run.
+Touches files. Damaged messages are counted and left out, never guessed.
+"""
 
 from pipeline.receivers.convert import Converted, convert
 

@@ -1,4 +1,8 @@
-"""Results as pages that open offline."""
+"""Results as pages that open offline.
+
+In: a result and its site. Out: HTML with its scripts and styles.
+Touches files. It shows what the tables hold, the verdict first; it judges nothing itself.
+"""
 
 from pipeline.report.write import page_name, write_report
 

@@ -13,12 +13,13 @@ from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.results import store
 from pipeline.site.describe import describe_site
+from pipeline.site.parallels import parallel_findings
 from pipeline.site.read import is_geojson, read_site
 from pipeline.site.survey_findings import survey_findings
 from pipeline.site.windows import window_findings
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, MatchingConfig
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding
 
@@ -32,14 +33,17 @@ _RUN_COLUMNS = (
 
 
 def inspect_path(
-    path: Address, config: IngestConfig | None = None, result: Address | None = None
+    path: Address,
+    config: IngestConfig | None = None,
+    result: Address | None = None,
+    matching: MatchingConfig | None = None,
 ) -> dict[str, pl.DataFrame]:
     """Tables by title, for whatever stands at the path; `result`: runs over a site, for what they say of its survey."""
     if not files.exists(path):
         raise UsageError("does not exist", place=redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()
     if names & _SITE_FILES or (is_geojson(path) and not names):
-        return inspect_site(path, result)
+        return inspect_site(path, result, matching or MatchingConfig())
     if result is not None:
         raise UsageError("is no site", place=redacted(str(path)), expected="a site, to hold a result against")
     if "runs" in names and store.run_ids(path):
@@ -92,15 +96,19 @@ def _instant(t_ns: int | None) -> datetime | None:
     return None if t_ns is None else datetime.fromtimestamp(t_ns / 1e9, UTC)
 
 
-def inspect_site(path: Address, result: Address | None = None) -> dict[str, pl.DataFrame]:
-    """Figures and findings of a site; among these balises that linking cannot tell apart.
+def inspect_site(
+    path: Address, result: Address | None = None, matching: MatchingConfig | None = None
+) -> dict[str, pl.DataFrame]:
+    """Figures and findings of a site; among these balises that linking cannot tell apart, and tracks that positions
+    cannot.
 
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     site = read_site(path)
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
-    tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *window_findings(site)))}
+    alike = (*window_findings(site), *parallel_findings(site, matching or MatchingConfig()))
+    tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *alike))}
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))

@@ -1,4 +1,8 @@
-"""Safety figures: the published budget, recalculated, and what a campaign measured against it."""
+"""Safety figures: the published budget, recalculated, and what a campaign measured against it.
+
+In: the configuration's `[safety]`, and the tables of a result. Out: tables, figures with bounds, sentences.
+Touches a result to read it. It counts what the judge has said and judges no position.
+"""
 
 from __future__ import annotations
 

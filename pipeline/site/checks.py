@@ -58,7 +58,7 @@ def remarks(
     if balises is not None:
         _check_balises(track, balises, found)
     if route is not None:
-        _check_route(track, route, found)
+        found.breaches += route_breaches(track, route)
     return found
 
 
@@ -233,19 +233,20 @@ def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, s
     return text, "Mend measure_m."
 
 
-def _check_route(track: Track, route: pl.DataFrame, found: Remarks) -> None:
-    """A route must be one continuous run over elements that exist."""
-    rows = route.rows()
-    unknown = [name for name, _ in rows if name not in track.index]
+def route_breaches(track: Track, route: pl.DataFrame) -> list[str]:
+    """A route must be one continuous run over elements that exist, within each `leg` where it has that column."""
+    columns = ["netelement_id", "direction"]
+    rows = route.select(*columns, leg="leg" if "leg" in route.columns else pl.lit(0)).rows()
+    unknown = [name for name, _, _ in rows if name not in track.index]
     if unknown or not rows:
-        what = f"names {', '.join(unknown[:3])}, not in the track" if unknown else "is empty"
-        found.breaches.append(f"route: {what}")
-        return
+        return [f"route: names {', '.join(unknown[:3])}, not in the track" if unknown else "route: is empty"]
     places = end_places(track)
-    for (a, direction_a), (b, direction_b) in itertools.pairwise(rows):
+    breaches = []
+    for (a, direction_a, leg), (b, direction_b, other_leg) in itertools.pairwise(rows):
         end = places[track.index[a], 1 if direction_a == "AB" else 0]
         start = places[track.index[b], 0 if direction_b == "AB" else 1]
         gap = float(np.linalg.norm(end - start))
-        if gap > GAP_LIMIT_M:
+        if gap > GAP_LIMIT_M and leg == other_leg:
             text = f"{a} ({direction_a}) ends {gap:.0f} m from where {b} ({direction_b}) begins"
-            found.breaches.append(f"route: {text}; expected at most {GAP_LIMIT_M:g} m")
+            breaches.append(f"route: {text}; expected at most {GAP_LIMIT_M:g} m")
+    return breaches

@@ -10,11 +10,11 @@ import polars as pl
 
 from pipeline.site.checks import drop_repeated_points, remarks
 from pipeline.site.geojson import Network, read_network
+from pipeline.site.route import route_table
 from pipeline.site.tables import (
     BALISES,
     EPSG_WGS84,
     LINKS,
-    ROUTE,
     TRACK,
     Column,
     RawTable,
@@ -33,10 +33,6 @@ _SUFFIXES = {"track": (".parquet", ".csv", ".geojson"), "links": (".parquet", ".
 _TABLES = (".parquet", ".csv")
 # GeoJSON and PROJ know these as longitude and latitude on (nearly) the ellipsoid of WGS 84.
 _SAME_AS_WGS84 = (EPSG_WGS84, 4979)
-_DIRECTIONS = {
-    "ab": "AB", "growing": "AB", "forward": "AB", "+": "AB",
-    "ba": "BA", "falling": "BA", "reverse": "BA", "backward": "BA", "-": "BA",
-}  # fmt: skip
 
 
 def read_site(path: Path | str) -> Site:
@@ -156,16 +152,10 @@ def _read_links(files: dict[str, bytes], network: Network | None, breaches: list
 
 
 def _read_route(files: dict[str, bytes], breaches: list[str]) -> pl.DataFrame | None:
-    """Directions become AB (from the element's start to its end) or BA."""
-    route = _read_table(files, "route", ROUTE, breaches)
-    if route is None:
-        return None
-    words = route["direction"].str.strip_chars().str.to_lowercase()
-    direction = words.replace_strict(_DIRECTIONS, default=None, return_dtype=pl.String)
-    if direction.null_count():
-        strange = words.filter(direction.is_null())[0]
-        breaches.append(f"route: column direction: {strange!r}; expected AB or BA (growing or falling)")
-    return route.with_columns(direction.alias("direction"))
+    """The route of every run over this site."""
+    name = next((name for name in files if name.startswith("route.")), None)
+    route = None if name is None else route_table(name, files[name], breaches)
+    return None if route is None else route.drop("leg")
 
 
 def _in_degrees(raw: RawTable) -> RawTable:

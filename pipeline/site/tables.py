@@ -60,7 +60,11 @@ BALISES = {
     "linked": Column(pl.Boolean, required=False, default=True),
     "link_reaction": Column(pl.String, required=False, default=Reaction.SERVICE_BRAKE.value, words=Reaction),
 }
-ROUTE = {"netelement_id": Column(pl.String), "direction": Column(pl.String)}
+ROUTE = {
+    "netelement_id": Column(pl.String),
+    "direction": Column(pl.String),
+    "leg": Column(pl.Int64, required=False, default=0, low=0),
+}
 
 
 def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:

@@ -1,5 +1,8 @@
 """Local folders and object stores behind the same few operations.
 
+In: paths and addresses. Out: their content, listed, read, written whole or not at all.
+Touches files and stores, and knows nothing of what they hold.
+
 `address` is how places are named; `files` reads one file; `fetching` lists, and reads many; `writing` puts files there
 whole or not at all; `identity` tells whether content is still the same; `object_store` opens the stores, and is the
 patience with those that fail.

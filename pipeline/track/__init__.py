@@ -1,0 +1,5 @@
+"""The surveyed track as geometry: net elements, network, legs, path, in metres on the ellipsoid.
+
+In: tables of a site. Out: `Track`, `Network`, `TravelledPath`.
+Touches no file and knows no position: matching, evidence and judge all stand on it.
+"""

@@ -104,10 +104,10 @@ def test_clean_ranges_raise_no_alarm(local: Scenario) -> None:
 
 def test_a_range_that_drifts_is_seen_before_the_position_fails(local: Scenario) -> None:
     tables = replayed(local, "satellite_ramp")
-    assert tables.alarms["verdict"].to_list() == ["true", "true"]
+    assert set(tables.alarms["verdict"]) == {"true"}
     assert all("pseudorange" in monitors for monitors in tables.alarms["monitors"].to_list())
     failed = tables.epochs.filter(pl.col("error_along_m").abs() > 20.0)
-    first_alarm = dict(tables.alarms.select("solution", "t_start").iter_rows())
+    first_alarm = dict(tables.alarms.group_by("solution").agg(pl.col("t_start").min()).iter_rows())
     assert failed.height > 0
     assert all(t > first_alarm[name] for t, name in failed.select("t", "solution").iter_rows())
 

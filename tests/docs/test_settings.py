@@ -41,13 +41,17 @@ IDLE: tuple[str, ...] = ()
 
 
 def tables(page: Path) -> list[Rows]:
-    """Every table `key | default | meaning` of a page: key to default."""
+    """Every table `key | default | meaning`, with a source or without, of a page: key to default."""
     found: list[Rows] = []
+    width = 0
     for line in page.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if len(cells) == 3 and "default" in cells[1] and cells[0].startswith("key"):
+        if len(cells) in (3, 4) and "default" in cells[1] and cells[0].startswith("key"):
             found.append({})
-        elif found and line.startswith("| `") and len(cells) == 3:
+            width = len(cells)
+        elif not line.startswith("|"):
+            width = 0
+        elif line.startswith("| `") and len(cells) == width:
             assert cells[0].strip("`") not in found[-1]
             found[-1][cells[0].strip("`")] = cells[1]
     return found
@@ -108,6 +112,14 @@ def test_configuration_keys_and_defaults() -> None:
     written |= {("vehicle", key): default for key, default in vehicle.items()}
     assert written == {key: "none" if value == "()" else value for key, value in rows.items()}
     assert mapping == {**defaults(StreamMapping), "time": "auto"}
+
+
+def test_configuration_tells_reason_or_source() -> None:
+    """Every key of the configuration has a cell that says why it has this value."""
+    lines = CONFIGURATION.read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if re.match(r"\| `\w+\.", line)]
+    assert len(rows) == sum(file == "configuration" for file in settings_frame()["file"])
+    assert [row[0] for row in rows if len(row) != 4 or not row[3]] == []
 
 
 # Read by the name of the stream, of the fix and of the service level.

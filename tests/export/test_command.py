@@ -29,7 +29,7 @@ def test_export_with_site_and_log(result: Result, tmp_path: Path) -> None:
     bare = to.stat().st_size
     wrong = CliRunner().invoke(app, [*arguments, "--log", str(recorded)])
     assert wrong.exit_code == 0, wrong.output
-    answer = CliRunner().invoke(app, [*arguments, "--site", str(tmp_path / "site")])
+    answer = CliRunner().invoke(app, [*arguments, "--site", str(tmp_path / "site"), "--ros"])
     assert answer.exit_code == 0, answer.output
     assert to.stat().st_size > bare
     assert to.with_name("run.layout.json").exists()

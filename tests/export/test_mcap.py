@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 from mcap.reader import make_reader
@@ -100,6 +101,41 @@ def test_messages_are_in_order_and_bytes_repeat(result: Result, exported: Path, 
     assert times == sorted(times)
     export_run(result.out, "jump_two", tmp_path / "again.mcap", result.site, result.log)
     assert (tmp_path / "again.mcap").read_bytes() == exported.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def bag(result: Result, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
+    from rosbags.highlevel import AnyReader
+
+    to = tmp_path_factory.mktemp("ros") / "ros.mcap"
+    export_run(result.out, "jump_two", to, result.site, result.log, positions="ros")
+    found: dict[str, list[Any]] = {}
+    with AnyReader([to]) as reader:
+        for connection, _, data in reader.messages():
+            found.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+    return found
+
+
+def test_positions_are_read_by_rosbags(bag: dict[str, list[Any]], result: Result) -> None:
+    fixes = bag["/primary/raw"]
+    assert {fix.__msgtype__ for fix in fixes} == {"sensor_msgs/msg/NavSatFix"}
+    assert [fix.latitude for fix in fixes] == result.log.gnss["latitude_deg"].to_list()
+    assert [fix.altitude for fix in fixes] == result.log.gnss["height_m"].to_list()
+
+
+def test_results_are_read_by_rosbags(
+    bag: dict[str, list[Any]], content: dict[str, list[tuple[int, Any]]], result: Result
+) -> None:
+    assert set(bag) == set(content)
+    values = [message.along_raw_value for message in bag["/primary/monitors"]]
+    expected = result.tables.epochs["along_raw_value"].fill_null(float("nan")).to_numpy()
+    np.testing.assert_array_equal(values, expected)
+    states = result.tables.epochs["pseudorange_state"].to_list()
+    assert [message.pseudorange_state for message in bag["/primary/monitors"]] == states
+    assert [message.tvb for message in bag["/primary/lds"]] == result.tables.epochs["tvb"].to_list()
+    texts = [message.message for message in bag["/primary/hazards"]]
+    assert texts == [message.message for _, message in content["/primary/hazards"]]
+    assert bag["/site/track"][0].geojson == content["/site/track"][0][1].geojson
 
 
 def test_layout_names_topics_that_exist(exported: Path, content: dict[str, list[tuple[int, Any]]]) -> None:

@@ -10,9 +10,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from datasets import mcap_messages
+from datasets.mcap_log import write_mcap
+from pipeline.export.position_messages import NAVSATFIX, NAVSATFIX_DEFINITION
 from pipeline.ingest.conform import conform
-from pipeline.ingest.mcap_writer import write_mcap
 from schemas.run import RunLog, Stream
+
+DEFINITIONS = mcap_messages.DEFINITIONS | {NAVSATFIX: NAVSATFIX_DEFINITION}
 
 START_NS = 1_700_000_000_000_000_000
 MAGIC = b"\x89MCAP0\r\n"

@@ -1,4 +1,4 @@
-"""JSON by pattern against JSON message by message."""
+"""JSON of many messages at once against JSON message by message."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from pipeline.ingest.generic import UndecodableError, decode_columns, parse_json
 from pipeline.ingest.json_columns import JsonDecoder
-from pipeline.ingest.layout import Repeated
 from pipeline.ingest.mcap_block import MESSAGE_HEAD, Messages
 from pipeline.ingest.mcap_model import Channel
 from schemas.errors import InputError
@@ -63,19 +62,18 @@ def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(payloads)
-def test_what_a_pattern_takes_is_what_the_parser_says(drawn):
+def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
     contents = [written(*one) for one in drawn]
-    parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
-    taken = [part.messages for part in parts]
-    assert sum(map(len, taken)) + sum(map(len, left)) == len(contents)
-    for part in parts:
-        expected, _ = decode_columns(CHANNEL, part.messages, TYPES)
-        for path, values in part.values.items():
-            series = values.series() if isinstance(values, Repeated) else values
-            assert series.to_list() == expected[path].to_list()
+    for some in ([content] for content in contents):
+        parts, left = JsonDecoder(TYPES).decode(messages_of(some))
+        assert sum(len(part.messages) for part in parts) + sum(map(len, left)) == len(some)
+        for part in parts:
+            expected, _ = decode_columns(CHANNEL, part.messages, TYPES)
+            for path, values in part.values.items():
+                assert values.to_list() == expected[path].to_list()
 
 
-def test_equal_messages_share_a_pattern():
+def test_good_messages_are_taken_at_once():
     contents = [json.dumps({"a": number / 7, "name": "x", "t": {"sec": number}}).encode() for number in range(50)]
     parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
     assert (len(parts), left) == (1, [])
@@ -95,7 +93,12 @@ def test_what_is_no_json_is_refused(content):
         parse_json(content)
     with pytest.raises(InputError):
         decode_columns(CHANNEL, messages_of([content]), TYPES)
-    parts, left = JsonDecoder(TYPES).decode(messages_of([b'{"a": 1.5}', content, b'{"a": 2.5}']))
-    is_text = content != b"\xff"
-    assert sum(len(part.messages) for part in parts) == (2 if is_text else 0)
-    assert sum(map(len, left)) == (1 if is_text else 3)
+    several = [b'{"a": 1.5}', content, b'{"a": 2.5}']
+    parts, left = JsonDecoder(TYPES).decode(messages_of(several))
+    assert (parts, [len(rest) for rest in left]) == ([], [len(several)])
+
+
+def test_two_halves_of_a_document_are_not_one():
+    halves = [b'{"a": 1.5}{"a": 2.5}', b'{"a": 3.5, "c": {}', b"}", b"{}"]
+    for several in (halves[1:3], halves[:3], [*halves, b'{"a": 1}null{}']):
+        assert JsonDecoder(TYPES).decode(messages_of(several))[0] == []

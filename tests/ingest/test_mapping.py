@@ -12,8 +12,9 @@ import pytest
 from mcap.writer import Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
-from pipeline.ingest import describe_log, read_run
+from pipeline.ingest import read_run
 from pipeline.ingest.clean import clean
+from pipeline.ingest.describe import describe_log
 from pipeline.ingest.timescale import utc_from_gps
 from schemas.config import IngestConfig, settings_from
 from schemas.errors import ConfigError, InputError
@@ -346,7 +347,7 @@ def test_novatel_and_gpsfix(tmp_path):
 
 
 def test_nan_is_null_only_where_there_is_no_fix(tmp_path):
-    from pipeline.ingest.ros2_text import DEFINITIONS
+    from tests.ingest.samples import DEFINITIONS
 
     name = "sensor_msgs/msg/NavSatFix"
     message = {"header": {"stamp": STAMP, "frame_id": ""}, "status": {"status": -1}, "latitude": math.nan,

@@ -13,11 +13,12 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 from polars.testing import assert_frame_equal
 
+from pipeline.export.messages import descriptor, message_class
+from pipeline.export.position_messages import LOCATION_FIELDS, LOCATION_FIX
 from pipeline.ingest import read_run
-from pipeline.ingest.proto_schemas import LOCATION_FIX, descriptor_set, message_class
-from pipeline.ingest.ros2_text import DEFINITIONS
 from schemas.config import IngestConfig
 from tests.ingest import oracle, samples
+from tests.ingest.samples import DEFINITIONS
 
 SETTINGS = settings(
     max_examples=25, deadline=None, derandomize=True,
@@ -161,7 +162,7 @@ def _at(message, path: str):
 @SETTINGS
 @given(fixes=fixes, container=containers)
 def test_protobuf(tmp_path, fixes, container):
-    kind = message_class(LOCATION_FIX)
+    kind = message_class(LOCATION_FIX, LOCATION_FIELDS)
     messages = []
     for fix in fixes:
         message = kind(
@@ -171,7 +172,7 @@ def test_protobuf(tmp_path, fixes, container):
         message.timestamp.SetInParent()
         message.timestamp.seconds, message.timestamp.nanos = fix["stamp"]
         messages.append((fix["channel"], fix["log_time"], message.SerializeToString()))
-    channels = [("/loc", "protobuf", LOCATION_FIX, descriptor_set(LOCATION_FIX))] * 2
+    channels = [("/loc", "protobuf", LOCATION_FIX, descriptor(LOCATION_FIX, LOCATION_FIELDS))] * 2
     content = written(container, channels, messages)
     check(tmp_path, content, oracle.location_fix_rows(oracle.decoded(content)["/loc"]), None)
 

@@ -8,14 +8,16 @@ import zlib
 
 import pytest
 
+from pipeline.export.position_messages import navsatfix_topic
 from pipeline.ingest import read_run
 from pipeline.ingest.describe import describe_log
-from pipeline.ingest.payloads import navsatfix_payloads
-from pipeline.ingest.ros2_text import DEFINITIONS
 from schemas.config import Configuration, IngestConfig, settings_from
 from schemas.errors import ConfigError, InputError
+from schemas.inputs import STREAM_SCHEMAS
+from schemas.run import Stream
 from tests.ingest import samples
 from tests.ingest.samples import (
+    DEFINITIONS,
     MAGIC,
     START_NS,
     channel,
@@ -118,7 +120,7 @@ def test_velocity_and_unknown_height_of_a_location_fix(tmp_path):
 
 def test_a_variance_that_a_driver_does_not_know_is_null(tmp_path):
     payloads = []
-    for payload in navsatfix_payloads(samples.gnss(3), "gps"):
+    for payload in navsatfix_topic("/fix", samples.gnss(3), "gps").messages:
         # The last variance of nine stands before the type.
         payloads.append(payload[:-9] + struct.pack("<d", float("nan")) + payload[-1:])
     name = "sensor_msgs/msg/NavSatFix"
@@ -132,7 +134,10 @@ def test_lines_of_a_definition_may_end_as_on_windows(tmp_path):
     name = "sensor_msgs/msg/NavSatFix"
     text = DEFINITIONS[name].replace("\n", "\r\n").encode()
     log = [schema(1, name, "ros2msg", text), channel(1, 1, "/fix", "cdr")]
-    run = read(tmp_path, whole(*log, *(message(payload) for payload in navsatfix_payloads(samples.gnss(3), "gps"))))
+    run = read(
+        tmp_path,
+        whole(*log, *(message(payload) for payload in navsatfix_topic("/fix", samples.gnss(3), "gps").messages)),
+    )
     assert (run.gnss.height, run.notes.slow_path_messages) == (3, 0)
 
 
@@ -165,16 +170,16 @@ def test_a_constant_that_its_column_cannot_hold_is_an_error_of_the_configuration
         read(tmp_path, quality("sbas"), mapped(constants={"solution": True}))
 
 
-def implicit_protobuf(stream: str, rows: list[dict[str, object]], without: str = "") -> bytes:
+def implicit_protobuf(stream: Stream, rows: list[dict[str, object]], without: str = "") -> bytes:
     """This project's message by a writer whose fields are not `optional`: what it does not set has its default."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message_factory import GetMessageClass
 
-    from pipeline.ingest.proto_schemas import descriptor_set
+    from pipeline.export.messages import descriptor, fields_of
 
     name = f"balise.{stream.capitalize()}"
-    files = FileDescriptorSet.FromString(descriptor_set(name))
+    files = FileDescriptorSet.FromString(descriptor(name, fields_of(STREAM_SCHEMAS[stream].create_empty())))
     message_type = files.file[-1].message_type[0]
     del message_type.oneof_decl[:]
     for field in [field for field in message_type.field if field.name == without]:

@@ -36,6 +36,13 @@ def test_an_exact_reference_leaves_one_track() -> None:
     assert rivals.at(len(X_M) - 5) == ["b"]
 
 
+def test_an_exact_reference_whose_antenna_is_aside_is_on_its_track() -> None:
+    found = placed(np.full(len(X_M), 0.4), 0.02)
+    assert found is not None
+    assert found.epochs["on_track"].all()
+    assert "a" in found.rivals(0.001).at(5)
+
+
 @pytest.mark.parametrize("sigma_m", [2.0, None])
 def test_a_coarse_reference_leaves_both(sigma_m: float | None) -> None:
     found = placed(np.full(len(X_M), 1.8), sigma_m)

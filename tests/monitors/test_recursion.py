@@ -41,7 +41,7 @@ def exact(dt_s, sigma2_m2, odometer_sigma_mps=0.05):
     weight = ewma_weight(ALPHAS, dt_s)
     sigma_m = np.sqrt(np.outer(sigma2_m2, SHARES))
     decorrelation = -np.expm1(-dt_s[:, None] / TAUS_S)
-    errors = sigma_m, before_steps(sigma_m, decorrelation), decorrelation
+    errors = sigma_m, before_steps(sigma_m, decorrelation, 1.5), decorrelation
     white_m2 = odometer_sigma_mps**2 * dt_s
     variance, _ = variance_of_ewma(
         1.0 - weight,

@@ -1,4 +1,4 @@
-"""Stream rows as message payloads: this project's JSON and protobuf, and the common ROS 2 and Foxglove ones."""
+"""Messages of synthetic logs: this project's JSON, and the speeds of an odometer in ROS 2's messages."""
 
 from __future__ import annotations
 
@@ -9,28 +9,55 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.proto_schemas import LOCATION_FIX, message_class
-from schemas.enums import Fix
+from pipeline.export.messages import Topic
+from pipeline.ingest.recipes import OWN_SCHEMAS
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
 
 SECOND_NS = 1_000_000_000
+_FRAME_ID = "odometer"
 
-Row = dict[str, object]
+_VECTOR3 = "float64 x\nfloat64 y\nfloat64 z\n"
+_PARTS = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "geometry_msgs/Vector3": _VECTOR3,
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
+    "geometry_msgs/Point": _VECTOR3,
+    "geometry_msgs/Quaternion": _VECTOR3 + "float64 w\n",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
+}
+_TWIST_PARTS, _TWIST_COVARIANCE_PARTS = list(_PARTS)[:4], list(_PARTS)[:5]
 
-_COVARIANCE = ("ee", "en", "eu", "en", "nn", "nu", "eu", "nu", "uu")
-_NAVSAT_STATUS = {
-    Fix.NONE: -1, Fix.AUTONOMOUS: 0, Fix.SBAS: 1, Fix.DIFFERENTIAL: 2, Fix.RTK_FLOAT: 2, Fix.RTK_FIXED: 2,
-    Fix.ESTIMATED: 0,
-}  # fmt: skip
-GNSS_IN_STANDARD = {
-    "t", "solution", "latitude_deg", "longitude_deg", "height_m", "fix",
-    *(f"cov_{axes}_m2" for axes in set(_COVARIANCE)),
-}  # fmt: skip
-_UNKNOWN, _KNOWN = 0, 3  # covariance types of both NavSatFix and LocationFix
+
+def _definition(members: str, parts: list[str]) -> str:
+    """The concatenated form: the message, then all that it is made of."""
+    return f"{'=' * 80}\n".join([members, *(f"MSG: {name}\n{_PARTS[name]}" for name in parts)])
 
 
-def json_schema(stream: Stream) -> bytes:
+DEFINITIONS: dict[str, str] = {
+    "geometry_msgs/msg/TwistStamped": _definition("std_msgs/Header header\ngeometry_msgs/Twist twist\n", _TWIST_PARTS),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _definition(
+        "std_msgs/Header header\ngeometry_msgs/TwistWithCovariance twist\n", _TWIST_COVARIANCE_PARTS
+    ),
+    "nav_msgs/msg/Odometry": _definition(
+        "std_msgs/Header header\nstring child_frame_id\n"
+        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n",
+        list(_PARTS),
+    ),
+}
+
+
+def json_topic(stream: Stream, frame: pl.DataFrame) -> Topic:
+    """This project's own JSON: one object per row."""
+    times = _times_ns(frame)
+    name, messages = OWN_SCHEMAS[stream], _json_payloads(frame)
+    return Topic(f"/{stream}", "json", name, "jsonschema", _json_schema(stream), times, messages)
+
+
+def _json_schema(stream: Stream) -> bytes:
     """The jsonschema of this project's own message: one property per column."""
     properties = {name: _json_property(column) for name, column in STREAM_SCHEMAS[stream].columns().items()}
     document = {"title": stream, "type": "object", "properties": properties}
@@ -48,7 +75,7 @@ def _json_property(column: dy.Column) -> dict[str, object]:
     return named | {"type": kinds[type(column)]}
 
 
-def json_payloads(frame: pl.DataFrame) -> Iterator[bytes]:
+def _json_payloads(frame: pl.DataFrame) -> Iterator[bytes]:
     """One object per row; a null is left out."""
     times = [name for name, dtype in frame.schema.items() if isinstance(dtype, pl.Datetime)]
     for row in frame.with_columns(pl.col(times).to_physical()).iter_rows(named=True):
@@ -60,78 +87,15 @@ def json_payloads(frame: pl.DataFrame) -> Iterator[bytes]:
         yield json.dumps(known, separators=(",", ":"), ensure_ascii=False).encode()
 
 
-def own_protobuf_payloads(frame: pl.DataFrame, name: str) -> Iterator[bytes]:
-    """This project's own protobuf message per row; a null is not set."""
-    kind = message_class(name)
-    times = [column for column, dtype in frame.schema.items() if isinstance(dtype, pl.Datetime)]
-    for row in frame.with_columns(pl.col(times).to_physical()).iter_rows(named=True):
-        message = kind()
-        for column, value in row.items():
-            if value is None:
-                continue
-            if column in times:
-                stamp = getattr(message, column)
-                stamp.SetInParent()
-                stamp.seconds, stamp.nanos = divmod(value, SECOND_NS)
-            else:
-                setattr(message, column, value)
-        yield message.SerializeToString(deterministic=True)
-
-
-def location_fix_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
-    """foxglove.LocationFix per row; rows need a position."""
-    kind = message_class(LOCATION_FIX)
-    for row in frame.with_columns(pl.col("t").to_physical()).iter_rows(named=True):
-        covariance = _covariance(row)
-        message = kind(
-            latitude=row["latitude_deg"],
-            longitude=row["longitude_deg"],
-            altitude=row["height_m"] or 0.0,
-            position_covariance=covariance or [0.0] * 9,
-            position_covariance_type=_KNOWN if covariance else _UNKNOWN,
-            frame_id=frame_id,
-        )
-        message.timestamp.SetInParent()
-        message.timestamp.seconds, message.timestamp.nanos = divmod(row["t"], SECOND_NS)
-        yield message.SerializeToString(deterministic=True)
-
-
-def _covariance(row: Row) -> list[float] | None:
-    values = [row[f"cov_{axes}_m2"] for axes in _COVARIANCE]
-    return None if any(value is None for value in values) else [float(value) for value in values]  # type: ignore[arg-type]
-
-
-def navsatfix_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
-    """sensor_msgs/NavSatFix in little-endian CDR; unknown position or height is NaN."""
-    covariance = frame.select(f"cov_{axes}_m2" for axes in dict.fromkeys(_COVARIANCE))
-    known = ~covariance.select(pl.any_horizontal(pl.all().is_null())).to_series().to_numpy()
-    status = (
-        frame["fix"]
-        .cast(pl.String)
-        .replace_strict({kind.value: code for kind, code in _NAVSAT_STATUS.items()}, return_dtype=pl.Int8)
-    )
-    fields: dict[str, tuple[str, np.ndarray]] = {
-        "status": ("i1", status.to_numpy()),
-        "service": ("<u2", np.ones(frame.height)),
-        **{name: ("<f8", _floats(frame[name])) for name in ("latitude_deg", "longitude_deg", "height_m")},
-        **{
-            f"covariance {place}": ("<f8", np.where(known, _floats(frame[f"cov_{axes}_m2"]), 0.0))
-            for place, axes in enumerate(_COVARIANCE)
-        },
-        "type": ("u1", np.where(known, _KNOWN, _UNKNOWN)),
-    }
-    return _cdr(frame["t"], frame_id, (), fields)
-
-
-def twist_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
+def twist_topic(frame: pl.DataFrame) -> Topic:
     """geometry_msgs/TwistStamped in little-endian CDR: speed as linear x."""
     zeros = np.zeros(frame.height)
     fields = {"x": ("<f8", _floats(frame["speed_mps"]))}
     fields |= dict.fromkeys(("y", "z", "roll", "pitch", "yaw"), ("<f8", zeros))
-    return _cdr(frame["t"], frame_id, (), fields)
+    return _odometer_topic("geometry_msgs/msg/TwistStamped", frame, _cdr(frame["t"], _FRAME_ID, (), fields))
 
 
-def odometry_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
+def odometry_topic(frame: pl.DataFrame) -> Topic:
     """nav_msgs/Odometry in little-endian CDR: speed as linear x, variance where the stream has it."""
     count = frame.height
     variance = frame["sigma_speed_mps"].fill_null(0.0).to_numpy() ** 2
@@ -141,7 +105,16 @@ def odometry_payloads(frame: pl.DataFrame, frame_id: str) -> Iterator[bytes]:
     twist["twist 0"] = ("<f8", _floats(frame["speed_mps"]))
     twist |= {f"twist covariance {index}": ("<f8", np.zeros(count)) for index in range(36)}
     twist["twist covariance 0"] = ("<f8", variance)
-    return _cdr(frame["t"], frame_id, ("base_link",), pose | twist)
+    messages = _cdr(frame["t"], _FRAME_ID, ("base_link",), pose | twist)
+    return _odometer_topic("nav_msgs/msg/Odometry", frame, messages)
+
+
+def _odometer_topic(name: str, frame: pl.DataFrame, messages: Iterator[bytes]) -> Topic:
+    return Topic("/odometer", "cdr", name, "ros2msg", DEFINITIONS[name].encode(), _times_ns(frame), messages)
+
+
+def _times_ns(frame: pl.DataFrame) -> list[int]:
+    return frame.to_series(0).to_physical().to_list()
 
 
 def _floats(series: pl.Series) -> np.ndarray:

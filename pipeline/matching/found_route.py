@@ -1,0 +1,83 @@
+"""The path found, as a route that somebody who knows the track can correct and hand in again (CONTRACT section 2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from pipeline.matching.match import Match
+from pipeline.matching.rivals import Posterior
+from pipeline.track.leg import Leg
+from schemas.arrays import Bools, Floats, Ints, floats
+
+ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
+    "netelement_id": pl.String,
+    "direction": pl.String,
+    "leg": pl.Int64,
+    "doubtful": pl.Boolean,
+    "probability": pl.Float64,
+    "rivals": pl.String,
+    "t_start": pl.Datetime("ns", "UTC"),
+    "t_end": pl.Datetime("ns", "UTC"),
+}
+
+
+def found_route(found: Match, sure: float) -> pl.DataFrame:
+    """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
+
+    `doubtful`: its least probability is below `sure`, or no position tells of it. `rivals`: other elements possible
+    meanwhile, the most probable first, each with its highest probability, in words.
+    """
+    leg = found.epochs["leg"].fill_null(-1).to_numpy()
+    rows = [
+        _row(found, number, one, visit, leg == number, sure)
+        for number, one in enumerate(found.path.legs)
+        for visit in range(len(one.visits))
+    ]
+    return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
+
+
+def _row(found: Match, number: int, leg: Leg, visit: int, on_leg: Bools, sure: float) -> tuple[object, ...]:
+    path_m, probability = floats(found.epochs, "path_m"), floats(found.epochs, "path_probability")
+    inside = np.flatnonzero(on_leg & (leg.visit[_segment(leg, path_m)] == visit) & np.isfinite(probability))
+    least = float(probability[inside].min()) if len(inside) else None
+    name = found.path.track.ids[leg.visits[visit].element]
+    times = found.epochs["t"]
+    return (
+        name,
+        "AB" if leg.visits[visit].forward else "BA",
+        number,
+        least is None or least < sure,
+        least,
+        _rivals(found, inside, 1.0 - sure),
+        times[int(inside[0])] if len(inside) else None,
+        times[int(inside[-1])] if len(inside) else None,
+    )
+
+
+def _segment(leg: Leg, path_m: Floats) -> Ints:
+    """Segment of a leg for path positions, the first or last beyond its ends."""
+    found = np.searchsorted(leg.path_start_m, np.nan_to_num(path_m, nan=-np.inf), side="right") - 1
+    return np.clip(found, 0, len(leg.path_start_m) - 1)
+
+
+def _rivals(found: Match, rows: Ints, least: float) -> str:
+    """Elements off the path that are possible at some of these epochs."""
+    if found.posterior is None or len(rows) == 0:
+        return ""
+    highest = _highest(found.posterior, int(rows[0]), int(rows[-1]))
+    ids, own = found.path.track.ids, set(found.path.elements())
+    order = sorted((-probability, ids[element]) for element, probability in highest.items())
+    return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in own)
+
+
+def _highest(posterior: Posterior, first: int, last: int) -> dict[int, float]:
+    """The highest probability of each element at the steps from one epoch to another."""
+    begin, end = np.searchsorted(posterior.epoch, [first, last + 1])
+    part = slice(int(posterior.first[max(int(begin) - 1, 0)]), int(posterior.first[int(end)]))
+    highest: dict[int, float] = {}
+    for element, probability in zip(
+        posterior.element[part].tolist(), posterior.probability[part].tolist(), strict=True
+    ):
+        highest[element] = max(highest.get(element, 0.0), probability)
+    return highest
