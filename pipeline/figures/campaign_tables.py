@@ -11,11 +11,11 @@ from pipeline.figures.bounds import clopper_pearson, poisson_rate
 from pipeline.figures.estimates import Estimator, with_estimates
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.levels import level_rows
-from pipeline.figures.run_figures import is_passage, judged
+from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import TRUTH, BaliseKind, FailureMode, Judgement, LinkingError, PassageStatus
+from schemas.enums import TRUTH, BaliseKind, FailureMode, LinkingError
 
 SPEED_BAND_KMH = 40.0
 
@@ -112,47 +112,25 @@ def with_truth(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
     return joined.with_columns(pl.col("truth").fill_null(value=False))
 
 
-def accepted() -> pl.Expr:
-    return pl.col("status") == PassageStatus.ACCEPTED
-
-
-def acceptances() -> dict[str, pl.Expr]:
-    """Conditions on passages (`with_truth`): acceptances by what the judge says of them; none re-judges."""
-    known = judged().fill_null(value=False)
-    wrong = accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False)
-    return {
-        "accepted_judged": accepted() & known & pl.col("truth"),
-        "unsafe_judged": wrong & pl.col("truth"),
-        "unsafe_accepted": wrong,
-        "unproven_accepted": accepted() & ~known,
-    }
-
-
 def _spread() -> dict[str, pl.Expr]:
-    """Mean, sigma, 95 % and largest of the location errors [m] of acceptances, and how many are known."""
+    """Spread of the location errors [m] of acceptances."""
     error = pl.col("location_error_m").filter(accepted())
-    return {
-        "location_error_count": error.count().cast(pl.Int64),
-        "location_error_mean_m": error.mean(),
-        "location_error_sigma_m": error.std(),
-        "location_error_p95_m": error.abs().quantile(0.95, interpolation="linear"),
-        "location_error_max_m": error.abs().max(),
-    }
+    return {**spread(error, "location_error", "count"), "location_error_sigma_m": error.std()}
 
 
 def _counts() -> dict[str, pl.Expr]:
-    status, mode, passage = pl.col("status"), pl.col("failure_mode"), is_passage()
+    """Conditions on passages (`with_truth`): in how many rows each holds."""
+    mode, passage, judged = pl.col("failure_mode"), is_passage(), acceptances()
     counts = {
+        **outcomes(),
+        **judged,
         "passages": passage,
-        "accepted": accepted(),
         "accepted_passages": accepted() & passage,
-        "rejected": status.cast(pl.String).str.starts_with("rejected_"),
-        "missed": status == PassageStatus.MISSED,
-        "not_available": status == PassageStatus.NOT_AVAILABLE,
         "deletions": (mode == FailureMode.DELETION) & passage,
         "insertions": mode == FailureMode.INSERTION,
         "linking_errors": pl.col("linking_error") != LinkingError.NONE,
-        **acceptances(),
+        "accepted_judged": judged["accepted_judged"] & pl.col("truth"),
+        "unsafe_judged": judged["unsafe_accepted"] & pl.col("truth"),
         "suspect_after_the_fact": pl.col("suspect_after_the_fact"),
     }
     return {name: condition.sum().cast(pl.Int64) for name, condition in counts.items()}

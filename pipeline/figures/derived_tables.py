@@ -28,5 +28,5 @@ def derived_tables(
         "figures": measured_figures(runs, hazards, config.safety),
         "detection": detection_by_level(runs, hazards, config.safety),
         "levels": campaign_levels(runs, config),
-        "map": map_places(alarms),
+        "map": map_places(alarms, config.hazards.map_reach_m),
     }

@@ -29,8 +29,6 @@ from schemas.tables import SCALES
 
 Row = dict[str, object]
 
-_REJECTED = [status.value for status in PassageStatus if status.value.startswith("rejected_")]
-
 
 def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
     """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
@@ -69,40 +67,55 @@ def share_unknown(epochs: pl.DataFrame, clock: Clock) -> float | None:
     return share_of_time(clock.held_s[used], ~flags(epochs, judged())[used])
 
 
-def _spread(errors: pl.Series, name: str, counted: str) -> Row:
-    """Mean, 95 % and largest of the known errors, the latter two of their magnitude, and how many these are."""
-    size = errors.abs()
+def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
+    """Mean, 95 % and largest of the known errors [m], the latter two of their magnitude, and how many these are."""
+    size = error.abs()
     return {
-        f"{name}_mean_m": errors.mean(),
+        f"{name}_mean_m": error.mean(),
         f"{name}_p95_m": size.quantile(0.95, interpolation="linear"),
         f"{name}_max_m": size.max(),
-        f"{name}_{counted}": size.count(),
+        f"{name}_{counted}": size.count().cast(pl.Int64),
     }
 
 
 def accuracy(epochs: pl.DataFrame) -> Row:
-    row: Row = {}
+    errors: dict[str, pl.Expr] = {}
     for axis in ("along", "cross", "up"):
-        row |= _spread(epochs[f"error_{axis}_m"], f"{axis}_error", "epochs")
-    return row
+        errors |= spread(pl.col(f"error_{axis}_m"), f"{axis}_error", "epochs")
+    return epochs.select(**errors).row(0, named=True)
+
+
+def accepted() -> pl.Expr:
+    return pl.col("status") == PassageStatus.ACCEPTED
+
+
+def outcomes() -> dict[str, pl.Expr]:
+    """Conditions on passages: what became of the offer."""
+    status = pl.col("status")
+    return {
+        "accepted": accepted(),
+        "rejected": status.cast(pl.String).str.starts_with("rejected_"),
+        "missed": status == PassageStatus.MISSED,
+        "not_available": status == PassageStatus.NOT_AVAILABLE,
+    }
+
+
+def acceptances() -> dict[str, pl.Expr]:
+    """Conditions on passages: acceptances by what the judge says of them; none re-judges."""
+    known = judged().fill_null(value=False)
+    return {
+        "accepted_judged": accepted() & known,
+        "unsafe_accepted": accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False),
+        "unproven_accepted": accepted() & ~known,
+    }
 
 
 def balise_counts(passages: pl.DataFrame) -> Row:
     """What became of the virtual balises, and of those accepted what the judge says of their positions."""
-    virtual, status, judgement = pl.col("kind") == BaliseKind.VIRTUAL, pl.col("status"), pl.col("judgement")
-    accepted = virtual & (status == PassageStatus.ACCEPTED)
-    counts = {
-        "balises_on_path": virtual & is_passage(),
-        "balises_accepted": accepted,
-        "balises_rejected": virtual & status.is_in(_REJECTED),
-        "balises_missed": virtual & (status == PassageStatus.MISSED),
-        "balises_not_available": virtual & (status == PassageStatus.NOT_AVAILABLE),
-        "accepted_judged": accepted & judged(),
-        "unsafe_accepted": accepted & (judgement == Judgement.WRONG),
-        "unproven_accepted": accepted & ~judged().fill_null(value=False),
-    }
-    known = passages.filter(accepted)["location_error_m"]
-    return {**_counted(passages, counts), **_spread(known, "location_error", "count")}
+    virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
+    counts = {"balises_on_path": is_passage(), **{f"balises_{name}": met for name, met in outcomes().items()}}
+    errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
+    return _counted(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True)
 
 
 def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:

@@ -54,7 +54,7 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         "accuracy": derived["accuracy"],
         "side_by_side": over_all_runs(of_runs),
         "side_by_side_of_runs": by_run(of_runs),
-        "alarms": alarm_causes(alarms),
+        "alarms": alarm_causes(alarms, settings.hazards.map_reach_m),
         "map": derived["map"],
     }
     said = [
@@ -127,9 +127,9 @@ def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def alarm_causes(alarms: pl.DataFrame) -> pl.DataFrame:
+def alarm_causes(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     """Alarms by verdict and suspect, the map held to be at fault where several runs agree on a place."""
-    named = map_suspects(alarms).with_columns(pl.col("verdict", "suspect").cast(pl.String))
+    named = map_suspects(alarms, reach_m).with_columns(pl.col("verdict", "suspect").cast(pl.String))
     keys = ("solution", "verdict", "suspect")
     counts = {"alarms": pl.len().cast(pl.Int64), "runs": pl.col("run_id").n_unique().cast(pl.Int64)}
     return named.group_by(keys).agg(**counts).sort(keys)
