@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import polars as pl
 
-from pipeline.figures.bounds import Estimate, poisson_rate
+from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 
 CONTINUITY_S = 15.0
 """Most critical phase of an APV-I/LPV-200 operation (LOC section VI)."""
@@ -26,12 +26,12 @@ def columns_of(name: str, estimate: Estimate, unit: str = "") -> dict[str, objec
 
 
 def with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
-    """The columns of estimates, row by row."""
+    """The columns of estimates, row by row; not known where their events are not."""
     series = []
     for name, unit, estimate, events, against in estimates:
         pairs = zip(frame[events].to_list(), frame[against].to_list(), strict=True)
-        rows = [columns_of(name, estimate(*pair), unit) for pair in pairs]
-        schema = dict.fromkeys(columns_of(name, Estimate(None, None, None), unit), pl.Float64)
+        rows = [columns_of(name, UNKNOWN if None in pair else estimate(*pair), unit) for pair in pairs]
+        schema = dict.fromkeys(columns_of(name, UNKNOWN, unit), pl.Float64)
         series += pl.DataFrame(rows, schema=schema).get_columns()
     return frame.with_columns(series)
 

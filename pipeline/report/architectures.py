@@ -6,6 +6,7 @@ import polars as pl
 
 from pipeline.report.columns import frame_table
 from pipeline.report.markup import section
+from pipeline.safety.tally import architecture_figures
 
 _NOTE = (
     "<p>Reactive: a solution diagnosed by itself (LOC Fig. 4). Composite: two solutions compared, both needed (LOC "
@@ -19,9 +20,10 @@ _COLUMNS = (
 )
 
 
-def architectures_section(identity: str, found: pl.DataFrame) -> str:
-    """`found` as from `side_by_side_table`; nothing where there is but one solution."""
-    if found.is_empty() or found["other"].null_count() == found.height:
+def architectures_section(identity: str, counts: pl.DataFrame) -> str:
+    """`counts` as of `pipeline.safety.tally`; nothing where there is but one solution."""
+    if counts["other"].null_count() == counts.height:
         return ""
+    found = architecture_figures(counts)
     shown = frame_table(f"table-{identity}", "Composite and reactive fail-safety side by side", found, _COLUMNS)
     return section(identity, "Architectures", _NOTE, shown)

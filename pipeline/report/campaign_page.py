@@ -38,7 +38,7 @@ from schemas.tables import Hazards
 @dataclass(frozen=True)
 class Campaign:
     """Tables of all runs, `run_id` in front, and `derived` from them by the name of their file; `pieces` as from
-    `availability_pieces`; `hrefs` of the runs' pages; `architectures` as from `over_all_runs`.
+    `availability_pieces`; `hrefs` of the runs' pages; `architectures` as from `added`.
     """
 
     runs: pl.DataFrame

@@ -18,8 +18,6 @@ from pipeline.report.columns import Row, figures, frame_table
 from pipeline.report.markup import Cell, Json, badge, figure, link, page, pairs, script_json, section, verdict_head
 from pipeline.report.plan_view import plan_data
 from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
-from pipeline.safety.side_by_side import Key, side_by_side_table
-from pipeline.safety.tally import Tally
 from schemas.campaign import STANFORD, CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
@@ -83,7 +81,7 @@ class Made:
 
 
 def run_page(
-    tables: RunTables, metadata: Mapping[str, str], made: Made, architectures: Mapping[Key, Tally] | None = None
+    tables: RunTables, metadata: Mapping[str, str], made: Made, architectures: pl.DataFrame | None = None
 ) -> str:
     """HTML of one run with all its solutions; one is shown at a time, all of them are in the page.
 
@@ -92,7 +90,7 @@ def run_page(
     rows = list(tables.runs.iter_rows(named=True))
     names = [row["solution"] for row in rows if row["solution"]]
     parts = [_solution(f"s{number}", row, tables, len(rows) > 1) for number, row in enumerate(rows)]
-    side_by_side = architectures_section("architectures", side_by_side_table(dict(architectures or {})))
+    side_by_side = "" if architectures is None else architectures_section("architectures", architectures)
     body = "\n".join([_navigation(names), *parts, side_by_side, _provenance(rows, metadata, made)])
     data = {
         "run": tables.run_id,

@@ -27,9 +27,8 @@ from pipeline.results.store import (
     read_table,
     table_address,
 )
-from pipeline.safety.assessment import over_all_runs
-from pipeline.safety.side_by_side import Key, side_by_side
-from pipeline.safety.tally import Tally
+from pipeline.safety.side_by_side import side_by_side
+from pipeline.safety.tally import added
 from schemas.config import Configuration, read_toml, settings_from
 from schemas.errors import OutputError
 from schemas.run import Site
@@ -64,12 +63,12 @@ def write_report(
     names = {run: page_name(run) for run in runs}
     pages = [_Page(out, run, out / "report" / "runs" / name, made) for run, name in names.items()]
     written = [*_write_assets(out / "report" / "assets")]
-    found: dict[str, dict[Key, Tally]] = {}
+    found: dict[str, pl.DataFrame] = {}
     for done, (page, tallies) in enumerate(
         zip(pages, each(_written, pages, jobs or _worth(len(pages))), strict=True), start=1
     ):
         written.append(page.path)
-        if tallies:
+        if tallies is not None:
             found[page.run] = tallies
         if progress is not None:
             progress(done, len(pages))
@@ -90,7 +89,7 @@ def _worth(pages: int) -> int:
     return min(os.cpu_count() or 1, 1 + pages // _PAGES_PER_PROCESS)
 
 
-def _written(page: _Page) -> dict[Key, Tally] | None:
+def _written(page: _Page) -> pl.DataFrame | None:
     """Write the page, unless it is there already; returns the run's solutions side by side where it has several."""
     metadata = metadata_of(Path(str(table_address(page.out, "runs", page.run))))
     check_site(page.made.site, metadata.get("site_digest"), page.run)
@@ -127,7 +126,7 @@ def _made(out: Path, site: Site | None) -> Made:
     return Made(config, path.read_text(encoding="utf-8"), site)
 
 
-def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dict[Key, Tally]]) -> Campaign:
+def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, pl.DataFrame]) -> Campaign:
     needed = ("solution", "netelement_id", "measure_m", "moving", "tvb", "alarm")
     epochs = read_table(out, "epochs").select(pl.col(name) for name in needed)
     small = ("runs", "hazards", "passages", "alarms")
@@ -139,7 +138,7 @@ def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dic
         derived=derived_tables(runs, hazards, passages, alarms, made.config),
         pieces=availability_pieces(epochs),
         hrefs=hrefs,
-        architectures=over_all_runs(found),
+        architectures=added(found.values()),
     )
 
 

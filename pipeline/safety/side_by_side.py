@@ -21,14 +21,15 @@ from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Solution, verdict_of_both
-from pipeline.safety.tally import Alarms, Faults, Tally, Working
+from pipeline.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
 
+Row = dict[str, object]
+
 COMPARISON = "channel"
-REACTIVE, COMPOSITE, REDUNDANT = "reactive 1oo1", "composite 2oo2", "reactive 1oo2"
 _DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
 _ALONG = tuple(f"along_{scale}" for scale in SCALES)
 EPOCH_COLUMNS = (
@@ -37,9 +38,6 @@ EPOCH_COLUMNS = (
     *(f"{name}_{part}" for name in _DIAGNOSIS for part in ("state", "value", "threshold")),
 )
 """Columns of the epochs that the comparison takes."""
-
-Key = tuple[str, str, str | None]
-"""Solution, architecture, and the other solution where it takes two."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class _Channel:
 
 def side_by_side(
     epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
-) -> dict[Key, Tally]:
-    """What each architecture made of one run, from its tables with all solutions.
+) -> pl.DataFrame:
+    """What each architecture made of one run (`COUNTS`), from its tables with all solutions.
 
     `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
     are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
@@ -66,29 +64,18 @@ def side_by_side(
     names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
     channels = {name: _reactive(one, config) for name, one in solutions.items()}
-    found: dict[Key, Tally] = {}
+    rows: list[Row] = []
     for name, channel in channels.items():
         one = solutions[name]
         verdicts = _verdicts_in_table(channel.fails, one.alarms)
-        found[name, REACTIVE, None] = _tally(channel, _faults(one.faults, None, channel), verdicts)
+        found = _faults(one.faults, None, channel) | _alarms(channel, verdicts) | _working(channel)
+        rows.append({"architecture": REACTIVE, "solution": name, **found})
     for name, other in permutations(names, 2):
-        found[name, COMPOSITE, other] = _composite(solutions[name], solutions[other], config)
+        pair = {"solution": name, "other": other}
+        rows.append({"architecture": COMPOSITE, **pair, **_composite(solutions[name], solutions[other], config)})
         if name < other:
-            found[name, REDUNDANT, other] = Tally(None, None, _redundant(channels[name], channels[other]))
-    return found
-
-
-def side_by_side_table(found: dict[Key, Tally]) -> pl.DataFrame:
-    """One row per architecture and solution or pair."""
-    rows = [
-        {"architecture": architecture, "solution": solution, "other": other} | tally.row()
-        for (solution, architecture, other), tally in sorted(found.items(), key=lambda item: _order(item[0]))
-    ]
-    return pl.DataFrame(rows, infer_schema_length=None)
-
-
-def _order(key: Key) -> tuple[int, str, str]:
-    return (REACTIVE, COMPOSITE, REDUNDANT).index(key[1]), key[0], key[2] or ""
+            rows.append({"architecture": REDUNDANT, **pair, **_redundant(channels[name], channels[other])})
+    return pl.DataFrame(rows, schema=COUNTS)
 
 
 def _solution(
@@ -113,7 +100,7 @@ def _evaluated(monitor: str) -> pl.Expr:
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
-def _composite(one: Solution, other: Solution, config: Configuration) -> Tally:
+def _composite(one: Solution, other: Solution, config: Configuration) -> Row:
     placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     factor = threshold_factor(config.monitors.false_alarm_probability)
@@ -125,7 +112,7 @@ def _composite(one: Solution, other: Solution, config: Configuration) -> Tally:
     trust = pl.col("own_trusted") & pl.col("other_trusted")
     channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
     verdicts = [verdict_of_both(alarm, (one, other), config.hazards) for alarm in channel.fails.alarms]
-    return _tally(channel, _faults(one.faults, other.faults, channel), verdicts)
+    return _faults(one.faults, other.faults, channel) | _alarms(channel, verdicts) | _working(channel)
 
 
 def _channel(
@@ -150,36 +137,39 @@ def _channel(
     return _Channel(clock, fails, seen, working, known, wrong)
 
 
-def _tally(channel: _Channel, faults: Faults, verdicts: list[Verdict]) -> Tally:
-    judged_s = float(channel.clock.held_s[channel.judged].sum())
-    alarms = Alarms(len(verdicts), verdicts.count(Verdict.FALSE), verdicts.count(Verdict.UNKNOWN), judged_s)
-    return Tally(faults, alarms, _working(channel))
+def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
+    return {
+        "alarms": len(verdicts),
+        "false_alarms": verdicts.count(Verdict.FALSE),
+        "open_alarms": verdicts.count(Verdict.UNKNOWN),
+        "judged_s": float(channel.clock.held_s[channel.judged].sum()),
+    }
 
 
-def _working(channel: _Channel) -> Working:
+def _working(channel: _Channel) -> Row:
     clock, held = channel.clock, channel.clock.held_s
     up = uptime(clock.t_ns, channel.working, clock.limit_s)
-    return Working(
-        held_s=float(held.sum()),
-        working_s=float(held[channel.working].sum()),
-        up_s=up.up_s,
-        losses=up.losses,
-        truth_s=float(held[channel.known].sum()),
-        wrong_s=float(held[channel.wrong & channel.working].sum()),
-    )
+    return {
+        "held_s": float(held.sum()),
+        "working_s": float(held[channel.working].sum()),
+        "up_s": up.up_s,
+        "losses": up.losses,
+        "truth_s": float(held[channel.known].sum()),
+        "wrong_s": float(held[channel.wrong & channel.working].sum()),
+    }
 
 
-def _redundant(one: _Channel, other: _Channel) -> Working:
+def _redundant(one: _Channel, other: _Channel) -> Row:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
     parts = [pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working}) for channel in (one, other)]
     merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working").any()).sort("t_ns")
     t_ns, working = merged["t_ns"].to_numpy(), merged["working"].to_numpy()
     limit_s = max(one.clock.limit_s, other.clock.limit_s)
     whole_s, up = float(held_s(t_ns, limit_s).sum()), uptime(t_ns, working, limit_s)
-    return Working(whole_s, min(up.up_s, whole_s), up.up_s, up.losses)
+    return {"held_s": whole_s, "working_s": min(up.up_s, whole_s), "up_s": up.up_s, "losses": up.losses}
 
 
-def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Faults:
+def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Row:
     """`others`: faults of the other solution, so that common ones can be told apart."""
     last, kind = int(channel.clock.t_ns[-1]), faults.schema["begin"]
     ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
@@ -195,14 +185,14 @@ def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel
             hazards=pl.len(),
             failures=failed.sum(),
             missed=missed.sum(),
-            common=common.sum(),
+            common_failures=common.sum(),
             common_missed=(common & missed).sum(),
-            judged=(failed & pl.col("with_truth")).sum(),
+            failures_judged=(failed & pl.col("with_truth")).sum(),
             missed_judged=(missed & pl.col("with_truth")).sum(),
         )
     )
-    delays = ((moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None)
-    return Faults(time_to_detect_s=tuple(delays), **counts.row(0, named=True))
+    delays = [(moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None]
+    return counts.row(0, named=True) | {"delays_s": delays}
 
 
 def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
