@@ -271,6 +271,8 @@ class HazardConfig(Settings):
     # Half-width of evidence in its sigmas, and the sigma of a reference that states none (DOMAIN section 5.1).
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
+    # How far a reference may lie beside its track besides its sigma and the survey's: no antenna is in the middle.
+    reference_aside_m: NonNegative = 0.5
     # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
     # A net element less probable than one in a thousand is no place of the reference (DOMAIN section 5.1).
