@@ -283,6 +283,8 @@ class HazardConfig(Settings):
     known_error_m: Positive = 5.0
     # More of the moving time in use unknown is `unproven` (DOMAIN section 5.4).
     unknown_share_limit: Probability = 0.01
+    # Ours: alarms across the track of several runs that begin so near each other are of one place of the map.
+    map_reach_m: Positive = 100.0
     # LPV-200 is the guaranteed service (LOC uses no other).
     service_level: str = "lpv200"
 
