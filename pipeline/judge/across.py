@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.track.geodesy import points_of
-from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 
 
 def errors_across(
@@ -36,3 +36,15 @@ def errors_across(
     across = nothing.copy()
     across[known] = north * np.sin(heading) - east * np.cos(heading)
     return across, floats(fixes, "height_m") - height
+
+
+def healthy_across(
+    errors_m: tuple[Floats, Floats], sigmas_m: tuple[Floats, Floats], reference_m: Floats, factor: float
+) -> dict[str, Bools]:
+    """Per axis of the monitors, epochs whose error by the reference is within the noise of both."""
+    with np.errstate(invalid="ignore"):
+        within = [
+            np.abs(error) <= factor * np.hypot(np.nan_to_num(sigma), np.nan_to_num(reference_m))
+            for error, sigma in zip(errors_m, sigmas_m, strict=True)
+        ]
+    return dict(zip(("cross_", "up_"), within, strict=True))

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import AlarmEpisode, FailureLog
-from pipeline.evidence.evidence import KINDS
-from pipeline.judge.judgement import Judgements
+from pipeline.judge.hazards import Draft
 from pipeline.judge.suspect import Witnesses, suspect_of
 from schemas.arrays import NS_PER_S, Bools, Floats
 from schemas.config import HazardConfig
 from schemas.conform import dtypes
-from schemas.enums import Evidence, Verdict
+from schemas.enums import Verdict
 from schemas.tables import Alarms
-
-
-@dataclass(frozen=True)
-class Fault:
-    """When a fault lasted [ns], and the hazard row that it made, if any."""
-
-    onset_ns: int
-    end_ns: int
-    detected_ns: int | None
-    hazard_id: int | None
 
 
 def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
@@ -40,11 +28,15 @@ def alarms_table(
     log: FailureLog,
     witnesses: Witnesses,
     positioned: Bools,
+    healthy: dict[str, Bools],
     places: pl.DataFrame,
-    faults: Sequence[Fault],
+    drafts: Sequence[Draft],
     config: HazardConfig,
 ) -> pl.DataFrame:
-    """One row per alarm episode in order of time; `places`: `netelement_id, measure_m` of the epochs."""
+    """One row per alarm episode in order of time; `places`: `netelement_id, measure_m` of the epochs.
+
+    `healthy`: per axis across the track, epochs whose error by the reference is within its noise.
+    """
     rows = [
         {
             "solution": solution,
@@ -53,9 +45,9 @@ def alarms_table(
             "t_end": span.end_ns,
             "monitors": list(span.monitors),
             "peak_ratio": span.peak_ratio,
-            "verdict": verdict_of(span, witnesses, positioned, config).value,
+            "verdict": verdict_of(span, witnesses, positioned, healthy, config).value,
             "suspect": suspect_of(witnesses, span.start_ns, span.end_ns).value,
-            "hazard_id": _hazard_of(span, faults),
+            "hazard_id": _hazard_of(span, drafts),
             "netelement_id": places["netelement_id"][span.first],
             "measure_m": places["measure_m"][span.first],
         }
@@ -64,10 +56,13 @@ def alarms_table(
     return pl.DataFrame(rows, schema=dtypes(Alarms))
 
 
-def verdict_of(span: AlarmEpisode, w: Witnesses, positioned: Bools, config: HazardConfig) -> Verdict:
+def verdict_of(
+    span: AlarmEpisode, w: Witnesses, positioned: Bools, healthy: dict[str, Bools], config: HazardConfig
+) -> Verdict:
     """True where the whole interval was beyond the margin at some epoch, false where all of it stayed within.
 
-    Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end.
+    Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end; of
+    an alarm across the track only a reference, for four metres aside are another track.
     """
     since_ns = span.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     rows = np.arange(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
@@ -75,21 +70,20 @@ def verdict_of(span: AlarmEpisode, w: Witnesses, positioned: Bools, config: Haza
     judged, margin = w.judged, w.margin_m[rows]
     with np.errstate(invalid="ignore"):
         beyond = (judged.least_m[rows] > margin) | judged.wrong_track[rows]
-        within = _by_truth(judged)[rows] & (judged.largest_m[rows] <= margin)
+        within = judged.by_truth[rows] & (judged.largest_m[rows] <= margin)
+    for axis, well in healthy.items():
+        if any(monitor.startswith(axis) for monitor in span.monitors):
+            within &= well[rows]
     if beyond.any():
         return Verdict.TRUE
     return Verdict.FALSE if rows.size and within.all() else Verdict.UNKNOWN
 
 
-def _by_truth(judged: Judgements) -> Bools:
-    return np.isin(judged.kind, [KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE)])
-
-
-def _hazard_of(span: AlarmEpisode, faults: Sequence[Fault]) -> int | None:
+def _hazard_of(span: AlarmEpisode, drafts: Sequence[Draft]) -> int | None:
     """The first hazard that lasted during the alarm, or that it detected."""
-    for fault in faults:
-        lasted = span.start_ns <= fault.end_ns and span.end_ns >= fault.onset_ns
-        detected = fault.detected_ns is not None and span.start_ns <= fault.detected_ns <= span.end_ns
-        if fault.hazard_id is not None and (lasted or detected):
-            return fault.hazard_id
+    for number, episode in enumerate(draft.episode for draft in drafts):
+        lasted = span.start_ns <= episode.end_ns and span.end_ns >= episode.onset_ns
+        detected = episode.detected_ns is not None and span.start_ns <= episode.detected_ns <= span.end_ns
+        if lasted or detected:
+            return number
     return None

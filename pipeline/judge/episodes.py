@@ -20,11 +20,15 @@ _ODOMETER = "odometer"
 class Series:
     """Valid positions of one solution in order of time, judged; `row`: their epochs.
 
+    `path_m`, `train_m`: path positions of position and train (NaN where not known), `direction` of travel along it;
     `used_s`: for how long each was in use; `sigma_m`: of the position; `jumps` in order of time.
     """
 
     row: Ints
     t_ns: Ints
+    path_m: Floats
+    train_m: Floats
+    direction: Ints
     judged: Judgements
     used_s: Floats
     sigma_m: Floats

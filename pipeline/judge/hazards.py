@@ -8,38 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.judge.episodes import Episode, Series
-from pipeline.judge.judgement import WRONG, Judgements
+from pipeline.judge.judgement import WRONG
 from pipeline.judge.jumps import Jump
-from schemas.arrays import Bools, Floats, Ints
+from pipeline.judge.offers import Offers
 from schemas.config import HazardConfig
 from schemas.enums import Hazard
-
-
-@dataclass(frozen=True)
-class VirtualOffers:
-    """Crossings of virtual balises, judged; arrays in order of time.
-
-    `number`: the valid position (`Series`) that completes the crossing; `beyond_window`: offered after its window
-    closed; `accepted`: by the LDS; not `offered`: crossed again before it was re-armed, which only a jump does.
-    """
-
-    balise_id: list[str]
-    t_ns: Ints
-    number: Ints
-    path_m: Floats
-    judged: Judgements
-    beyond_window: Bools
-    accepted: Bools
-    offered: Bools
-
-
-@dataclass(frozen=True)
-class Travel:
-    """Path positions of the valid positions, and of the train where known (NaN elsewhere); +1/-1 of travel."""
-
-    path_m: Floats
-    train_m: Floats
-    direction: Ints
 
 
 @dataclass
@@ -57,24 +30,20 @@ class Draft:
     caused_by: Draft | None = None
 
 
-def drafts_of(
-    episodes: Iterable[Episode], series: Series, offers: VirtualOffers, travel: Travel, config: HazardConfig
-) -> list[Draft]:
+def drafts_of(episodes: Iterable[Episode], series: Series, offers: Offers, config: HazardConfig) -> list[Draft]:
     """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
     drafts: list[Draft] = []
     for episode in episodes:
-        drafts += _of_episode(episode, series, offers, travel, config)
+        drafts += _of_episode(episode, series, offers, config)
     return drafts
 
 
-def _of_episode(
-    episode: Episode, series: Series, offers: VirtualOffers, travel: Travel, config: HazardConfig
-) -> list[Draft]:
+def _of_episode(episode: Episode, series: Series, offers: Offers, config: HazardConfig) -> list[Draft]:
     inside = [jump for jump in series.jumps if episode.onset <= jump.last and jump.first < episode.end]
     taken: set[int] = set()
     rows: list[Draft] = []
     for jump in inside:
-        crossed = crossed_by(jump, offers, travel)
+        crossed = crossed_by(jump, offers, series)
         taken.update(crossed)
         if crossed:
             _add(rows, Draft(_class_of(crossed, offers), episode, jump), crossed)
@@ -89,7 +58,7 @@ def _of_episode(
     if astray:
         rows.append(Draft(Hazard.VB_WRONG_TRACK, episode, None, astray))
     rows.sort(key=lambda row: offers.t_ns[row.hits[0]] if row.jump is None else series.t_ns[row.jump.first])
-    back = _jump_back(episode, rows, offers, travel)
+    back = _jump_back(episode, rows, offers, series)
     return [*rows, back] if back is not None else rows
 
 
@@ -103,42 +72,42 @@ def _add(rows: list[Draft], draft: Draft, crossed: list[int]) -> None:
     own.crossed += crossed
 
 
-def _hits(episode: Episode, offers: VirtualOffers, taken: set[int], config: HazardConfig) -> list[int]:
+def _hits(episode: Episode, offers: Offers, taken: set[int], config: HazardConfig) -> list[int]:
     """Offers judged wrong during the episode, beyond the shift limit or on another track, that no jump crossed."""
     beyond = (offers.judged.least_m > config.shift_limit_m) | offers.judged.wrong_track
-    inside = (offers.number >= episode.onset) & (offers.number < episode.end)
-    hit = np.flatnonzero(inside & beyond & offers.offered & (offers.judged.code == WRONG))
+    wrong = beyond & offers.offered & (offers.judged.code == WRONG)
+    hit = np.flatnonzero(wrong & episode.holds(offers.number))
     return [number for number in hit.tolist() if number not in taken]
 
 
-def _jump_back(episode: Episode, rows: list[Draft], offers: VirtualOffers, travel: Travel) -> Draft | None:
+def _jump_back(episode: Episode, rows: list[Draft], offers: Offers, series: Series) -> Draft | None:
     if episode.jump_back is None:
         return None
-    crossed = crossed_by(episode.jump_back, offers, travel)
+    crossed = crossed_by(episode.jump_back, offers, series)
     if not crossed:
         return None
     cause = rows[0] if rows else None
     return Draft(_class_of(crossed, offers), episode, episode.jump_back, crossed, crossed, cause)
 
 
-def crossed_by(jump: Jump, offers: VirtualOffers, travel: Travel) -> list[int]:
-    """Offers on the way of a jump that the train's own step does not cross."""
-    on_the_way = np.flatnonzero((offers.number >= jump.first) & (offers.number <= jump.last))
-    before, after = travel.path_m[jump.first - 1], travel.path_m[jump.last]
-    step_m = jump.step_m * travel.direction[jump.last]
-    start = travel.train_m[jump.first - 1]
+def crossed_by(jump: Jump, offers: Offers, series: Series) -> list[int]:
+    """Virtual balises on the way of a jump that the train's own step does not cross."""
+    on_the_way = np.flatnonzero(offers.virtual & (offers.number >= jump.first) & (offers.number <= jump.last))
+    before, after = series.path_m[jump.first - 1], series.path_m[jump.last]
+    step_m = jump.step_m * series.direction[jump.last]
+    start = series.train_m[jump.first - 1]
     start = before if np.isnan(start) else start
     low, high = sorted((start, start + (after - before) - step_m))
     own = (offers.path_m[on_the_way] >= low) & (offers.path_m[on_the_way] <= high)
     return on_the_way[~own].tolist()  # type: ignore[no-any-return]
 
 
-def _class_of(crossed: list[int], offers: VirtualOffers) -> Hazard:
+def _class_of(crossed: list[int], offers: Offers) -> Hazard:
     distinct = {offers.balise_id[number] for number in crossed}
     return Hazard.VB_JUMP_1A if len(distinct) > 1 else Hazard.VB_JUMP_1B
 
 
-def size_m(draft: Draft, series: Series, offers: VirtualOffers, known_to_m: float) -> float | None:
+def size_m(draft: Draft, series: Series, offers: Offers, known_to_m: float) -> float | None:
     """The largest known |e| of the episode with its sign; of a jump back its step, as of a jump without known errors.
 
     Where no error is known closely, the largest that is sure.

@@ -12,21 +12,22 @@ from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.evidence.evidence import KINDS, NOTHING
 from pipeline.evidence.routes import Place
-from pipeline.judge.across import errors_across
-from pipeline.judge.alarms import Fault, alarms_table, margins_m
+from pipeline.judge.across import errors_across, healthy_across
+from pipeline.judge.alarms import alarms_table, margins_m
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series, find_episodes
-from pipeline.judge.hazards import Draft, Travel, VirtualOffers, drafts_of
+from pipeline.judge.hazards import Draft, drafts_of
 from pipeline.judge.in_use import in_use_s
 from pipeline.judge.judgement import WRONG, judgement_words
 from pipeline.judge.jumps import find_jumps, steps_of
 from pipeline.judge.moving import moving_by_evidence
-from pipeline.judge.passages import Offers, passages_table, position_stamps, with_unoffered, within_spans
+from pipeline.judge.offers import Offers
+from pipeline.judge.passages import Found, passages_table, position_stamps, with_unoffered, within_spans
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.rows import failures_table, hazards_table
 from pipeline.judge.states import lds_states, odometer_beyond_confidence
 from pipeline.judge.suspect import Witnesses
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 _LOOK_S = 1.0
@@ -53,18 +54,18 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
     used_s = in_use_s(bench.epochs, bench.config)
     log = failure_log(bench.epochs, bench.config.lds.recovery_s)
     series = _series(bench, used_s)
-    offers = _virtual_offers(bench, series)
+    offers = Offers.of(bench, series.row)
     episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)
-    drafts = drafts_of(episodes, series, offers, _travel(bench, series), bench.config.hazards)
-    witnesses = _witnesses(bench)
+    drafts = drafts_of(episodes, series, offers, bench.config.hazards)
+    witnesses, across = _witnesses(bench), _across(bench, reference)
     spans = [_undetected_ns(one, series) for one in episodes]
     passages = _passages(bench, drafts, offers, spans)
     return Judged(
         hazards=hazards_table(drafts, series, offers, witnesses, bench),
-        alarms=_alarms(bench, log, witnesses, drafts),
+        alarms=_alarms(bench, log, witnesses, across, drafts),
         passages=passages,
         failures=failures_table(episodes, drafts, series, offers, bench),
-        epochs_columns=_epochs(bench, used_s, _odometer_wrong(bench), spans, reference),
+        epochs_columns=_epochs(bench, used_s, _odometer_wrong(bench), spans, across),
         distance_m=_distance_m(bench),
         evidence=_evidence(bench),
     )
@@ -92,26 +93,11 @@ def _series(bench: Bench, used_s: Floats) -> Series:
     steps = steps_of(t_ns, path_m, train_m, counted_m, gap_s)
     jumps = find_jumps(steps, bench.positions.direction[row], bench.config.hazards)
     sigma_m = floats(bench.epochs, "sigma_along_m")[row]
-    return Series(row, t_ns, bench.judged.take(row), used_s[row], sigma_m, jumps)
+    direction = bench.positions.direction[row]
+    return Series(row, t_ns, path_m, bench.train_m[row], direction, bench.judged.take(row), used_s[row], sigma_m, jumps)
 
 
-def _virtual_offers(bench: Bench, series: Series) -> VirtualOffers:
-    rows = np.flatnonzero((bench.offers["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy())
-    offers = bench.offers[rows]
-    late = bench.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
-    return VirtualOffers(
-        offered=offers["offered"].to_numpy(),
-        balise_id=offers["balise_id"].to_list(),
-        t_ns=times_ns(offers),
-        number=np.searchsorted(series.row, ints(offers["epoch"])).clip(0, max(series.size - 1, 0)),
-        path_m=floats(offers, "path_m"),
-        judged=bench.offers_judged.take(rows),
-        beyond_window=offers["crossing_id"].is_in(late.drop_nulls().implode()).to_numpy(),
-        accepted=(offers["status"].cast(pl.String) == PassageStatus.ACCEPTED.value).fill_null(value=False).to_numpy(),
-    )
-
-
-def _marked(series: Series, offers: VirtualOffers) -> Bools:
+def _marked(series: Series, offers: Offers) -> Bools:
     """Valid positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
     marked = np.zeros(series.size, dtype=np.bool_)
     marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
@@ -120,9 +106,10 @@ def _marked(series: Series, offers: VirtualOffers) -> Bools:
     return marked
 
 
-def _travel(bench: Bench, series: Series) -> Travel:
-    row = series.row
-    return Travel(bench.path_m[row], bench.train_m[row], bench.positions.direction[row])
+def _across(bench: Bench, reference: pl.DataFrame | None) -> tuple[Floats, Floats]:
+    """Errors across the track and of height [m]."""
+    heading, gap_s = floats(bench.epochs, "heading_deg"), bench.config.hazards.reference_gap_s
+    return errors_across(bench.solution.fixes, heading, bench.at_ns, reference, gap_s)
 
 
 def _witnesses(bench: Bench) -> Witnesses:
@@ -143,7 +130,7 @@ def _witnesses(bench: Bench) -> Witnesses:
 def _odometer_wrong(bench: Bench) -> Bools:
     """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
     known = np.isfinite(bench.train_m)
-    half = np.where(known, 0.5 * (bench.judged.high_m - bench.judged.low_m), np.nan)
+    half = np.where(known, bench.judged.half_m, np.nan)
     status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
     accepted = bench.offers.filter((status == PassageStatus.ACCEPTED.value) & (kind == BaliseKind.VIRTUAL.value))
     odometer_m = floats(bench.epochs, "odometer_m")
@@ -151,30 +138,26 @@ def _odometer_wrong(bench: Bench) -> Bools:
     return odometer_beyond_confidence(bench.t_ns, odometer_m, bench.train_m, half, at_ns, bench.config.lds)
 
 
-def _passages(
-    bench: Bench, drafts: Sequence[Draft], offers: VirtualOffers, spans: Sequence[tuple[int, int]]
-) -> pl.DataFrame:
+def _passages(bench: Bench, drafts: Sequence[Draft], offers: Offers, spans: Sequence[tuple[int, int]]) -> pl.DataFrame:
     period_s = nominal_period_s(bench.t_ns)
     gap_ns = round(linking_gap_s(period_s, bench.config.lds.crossing_gap_s) * NS_PER_S)
     passings, forward = _train_passings(bench)
     stamps = position_stamps(bench.epochs)
     solution = bench.solution
     passages = with_unoffered(solution.passages, passings, solution.balises, forward, stamps, gap_ns, solution.name)
-    return passages_table(passages, _offers(bench, drafts, offers), passings, bench.epochs, spans, gap_ns)
+    return passages_table(passages, offers, _found(bench, drafts, offers), passings, bench.epochs, spans, gap_ns)
 
 
-def _offers(bench: Bench, drafts: Sequence[Draft], offers: VirtualOffers) -> Offers:
-    """All offers with the hazard that each belongs to; inserted: by a jump, on another track, or early and wrong."""
-    virtual = np.flatnonzero((bench.offers["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy())
-    hazard = np.full(bench.offers.height, NOTHING)
-    jumped = np.zeros(bench.offers.height, dtype=np.bool_)
+def _found(bench: Bench, drafts: Sequence[Draft], offers: Offers) -> Found:
+    """What the hazards say of each offer; inserted: by a jump, on another track, or early and wrong."""
+    hazard = np.full(offers.t_ns.size, NOTHING)
+    jumped = np.zeros(offers.t_ns.size, dtype=np.bool_)
     for number, draft in reversed(list(enumerate(drafts))):
-        hazard[virtual[draft.hits]] = number
-        jumped[virtual[draft.crossed]] = True
-    judged = bench.offers_judged
+        hazard[draft.hits] = number
+        jumped[draft.crossed] = True
+    judged = offers.judged
     early = (judged.code == WRONG) & ((judged.low_m > 0.0) | judged.wrong_track)
-    known_m = judged.known_m(bench.config.hazards.known_error_m)
-    return Offers(ints(bench.offers["crossing_id"]), judged, known_m, hazard, jumped | early)
+    return Found(judged.known_m(bench.config.hazards.known_error_m), hazard, jumped | early)
 
 
 def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
@@ -204,16 +187,14 @@ def _look_at(bench: Bench) -> Ints:
     return np.unique(np.concatenate([at_ns, *between]))
 
 
-def _alarms(bench: Bench, log: FailureLog, witnesses: Witnesses, drafts: Sequence[Draft]) -> pl.DataFrame:
-    faults = [_fault(draft.episode, number) for number, draft in enumerate(drafts)]
-    places = bench.epochs.select("netelement_id", "measure_m")
-    return alarms_table(
-        bench.solution.name, log, witnesses, bench.positions.known, places, faults, bench.config.hazards
-    )
-
-
-def _fault(episode: Episode, hazard_id: int) -> Fault:
-    return Fault(episode.onset_ns, episode.end_ns, episode.detected_ns, hazard_id)
+def _alarms(
+    bench: Bench, log: FailureLog, witnesses: Witnesses, across: tuple[Floats, Floats], drafts: Sequence[Draft]
+) -> pl.DataFrame:
+    hazards, epochs = bench.config.hazards, bench.epochs
+    sigmas = floats(epochs, "sigma_cross_m"), floats(epochs, "sigma_up_m")
+    healthy = healthy_across(across, sigmas, bench.judged.half_m / hazards.evidence_factor, hazards.evidence_factor)
+    places = epochs.select("netelement_id", "measure_m")
+    return alarms_table(bench.solution.name, log, witnesses, bench.positions.known, healthy, places, drafts, hazards)
 
 
 def _epochs(
@@ -221,16 +202,14 @@ def _epochs(
     used_s: Floats,
     odometer_wrong: Bools,
     spans: Sequence[tuple[int, int]],
-    reference: pl.DataFrame | None,
+    across: tuple[Floats, Floats],
 ) -> pl.DataFrame:
     config, judged = bench.config, bench.judged
-    heading = floats(bench.epochs, "heading_deg")
-    cross, up = errors_across(bench.solution.fixes, heading, bench.at_ns, reference, config.hazards.reference_gap_s)
     by_reference = np.where(judged.kind == KINDS.index(Evidence.REFERENCE), bench.train_m, np.nan)
     moving, sure = moving_by_evidence(
         bench.at_ns,
         by_reference,
-        0.5 * (judged.high_m - judged.low_m),
+        judged.half_m,
         bench.odometer_moves,
         bench.odometer_told,
         bench.stood,
@@ -243,8 +222,8 @@ def _epochs(
             pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
             pl.Series("error_low_m", np.where(known, judged.low_m, np.nan), nan_to_null=True),
             pl.Series("error_high_m", np.where(known, judged.high_m, np.nan), nan_to_null=True),
-            pl.Series("error_cross_m", cross, nan_to_null=True),
-            pl.Series("error_up_m", up, nan_to_null=True),
+            pl.Series("error_cross_m", across[0], nan_to_null=True),
+            pl.Series("error_up_m", across[1], nan_to_null=True),
             judgement_words(judged.code),
             pl.Series("in_use", used_s > 0.0),
             lds_states(bench.epochs, judged, odometer_wrong),

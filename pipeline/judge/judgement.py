@@ -72,11 +72,19 @@ class Judgements:
         largest: Floats = np.maximum(-self.low_m, self.high_m)
         return largest
 
+    @property
+    def half_m(self) -> Floats:
+        half: Floats = 0.5 * (self.high_m - self.low_m)
+        return half
+
+    @property
+    def by_truth(self) -> Bools:
+        """Judged by reference or balise reads, which alone can call a position right."""
+        return np.isin(self.kind, [KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE)])
+
     def known_m(self, known_to_m: float) -> Floats:
         """The error where reference or balise reads tell it so closely [m], else NaN."""
-        true = np.isin(self.kind, [KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE)])
-        close = 0.5 * (self.high_m - self.low_m) <= known_to_m
-        return np.where(true & close, self.middle_m, np.nan)
+        return np.where(self.by_truth & (self.half_m <= known_to_m), self.middle_m, np.nan)
 
 
 def judgement_words(code: Ints) -> pl.Series:

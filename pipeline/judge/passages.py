@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.judge.judgement import Judgements, judgement_words
+from pipeline.judge.judgement import judgement_words
+from pipeline.judge.offers import Offers
 from pipeline.judge.passings import Passing
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
 
-@dataclass(frozen=True)
-class Offers:
-    """The crossings that were offered, judged; arrays in their order. `mode`: failure mode by the hazards.
+class Found(NamedTuple):
+    """Per offer: its error where known closely [m], the hazard it belongs to (-1 none), and whether it is an insertion."""
 
-    `hazard`: row of `hazards` that the crossing belongs to, -1 none.
-    """
-
-    crossing_id: Ints
-    judged: Judgements
     known_m: Floats
     hazard: Ints
     inserted: Bools
@@ -32,13 +27,14 @@ class Offers:
 def passages_table(
     passages: pl.DataFrame,
     offers: Offers,
+    found: Found,
     passings: dict[str, list[Passing]],
     epochs: pl.DataFrame,
     spans: Sequence[tuple[int, int]],
     gap_ns: int,
 ) -> pl.DataFrame:
     """Passages of the LDS with the columns of the evidence; `spans`: from each fault's onset to its detection."""
-    offered = _of_crossings(passages, offers)
+    offered = _of_crossings(passages, offers, found)
     t_true = _assigned(passages, passings)
     stamps = position_stamps(epochs)
     positioned = _within_gap(stamps, ints(t_true), gap_ns) & t_true.is_not_null().to_numpy()
@@ -57,7 +53,7 @@ def position_stamps(epochs: pl.DataFrame) -> Ints:
     return times_ns(epochs)[flags(epochs, "fix_valid") & np.isfinite(floats(epochs, "path_m"))]
 
 
-def _of_crossings(passages: pl.DataFrame, offers: Offers) -> list[pl.Series]:
+def _of_crossings(passages: pl.DataFrame, offers: Offers, found: Found) -> list[pl.Series]:
     """Judgement, error, hazard and insertion of the crossing that each passage rests on."""
     order = np.argsort(offers.crossing_id)
     own = passages["crossing_id"].fill_null(-1).to_numpy()
@@ -72,9 +68,9 @@ def _of_crossings(passages: pl.DataFrame, offers: Offers) -> list[pl.Series]:
 
     return [
         taken(judgement_words(offers.judged.code), joined & virtual),
-        taken(pl.Series("location_error_m", offers.known_m, nan_to_null=True), joined),
-        taken(pl.Series("hazard_id", offers.hazard), joined & (offers.hazard[row] >= 0) if order.size else joined),
-        taken(pl.Series("_inserted", offers.inserted), joined).fill_null(value=False),
+        taken(pl.Series("location_error_m", found.known_m, nan_to_null=True), joined),
+        taken(pl.Series("hazard_id", found.hazard), joined & (found.hazard[row] >= 0) if order.size else joined),
+        taken(pl.Series("_inserted", found.inserted), joined).fill_null(value=False),
     ]
 
 

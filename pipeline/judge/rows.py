@@ -11,9 +11,10 @@ import polars as pl
 from pipeline.evidence.evidence import KINDS
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series
-from pipeline.judge.hazards import Draft, VirtualOffers, rate_mps, size_m
+from pipeline.judge.hazards import Draft, rate_mps, size_m
 from pipeline.judge.in_use import reaction_s
 from pipeline.judge.judgement import UNKNOWN, WRONG
+from pipeline.judge.offers import Offers
 from pipeline.judge.suspect import Witnesses, suspect_of
 from schemas.arrays import NS_PER_S, floats
 from schemas.conform import dtypes
@@ -22,7 +23,7 @@ from schemas.stages import Failures
 from schemas.tables import Hazards
 
 
-def within_budget(episode: Episode, offers: VirtualOffers, budget_s: float) -> bool | None:
+def within_budget(episode: Episode, offers: Offers, budget_s: float) -> bool | None:
     """Whether an episode kept the allowed T_D: not where a VB was accepted wrong in it; null where nobody knows."""
     accepted = offers.judged.code[offers.accepted & episode.holds(offers.number)]
     if (accepted == WRONG).any() or episode.hazardous_s > budget_s:
@@ -32,7 +33,7 @@ def within_budget(episode: Episode, offers: VirtualOffers, budget_s: float) -> b
 
 
 def failures_table(
-    episodes: Sequence[Episode], drafts: Sequence[Draft], series: Series, offers: VirtualOffers, bench: Bench
+    episodes: Sequence[Episode], drafts: Sequence[Draft], series: Series, offers: Offers, bench: Bench
 ) -> pl.DataFrame:
     """One row per episode with time judged wrong in use."""
     first_row = {id(draft.episode): number for number, draft in reversed(list(enumerate(drafts)))}
@@ -57,7 +58,7 @@ def failures_table(
 def hazards_table(
     drafts: Sequence[Draft],
     series: Series,
-    offers: VirtualOffers,
+    offers: Offers,
     witnesses: Witnesses,
     bench: Bench,
 ) -> pl.DataFrame:
@@ -81,7 +82,7 @@ def hazards_table(
     return pl.DataFrame(rows, schema=dtypes(Hazards))
 
 
-def _kind(draft: Draft, offers: VirtualOffers) -> dict[str, Any]:
+def _kind(draft: Draft, offers: Offers) -> dict[str, Any]:
     ids = list(dict.fromkeys(offers.balise_id[hit] for hit in draft.hits))
     accepted = {offers.balise_id[hit] for hit in draft.hits if offers.accepted[hit]}
     return {
@@ -93,7 +94,7 @@ def _kind(draft: Draft, offers: VirtualOffers) -> dict[str, Any]:
     }
 
 
-def _timing(draft: Draft, offers: VirtualOffers) -> Timing:
+def _timing(draft: Draft, offers: Offers) -> Timing:
     """Offered before (+) or after the train is there."""
     error = float(offers.judged.middle_m[draft.hits[0]])
     if np.isnan(error) or error == 0.0:
@@ -101,20 +102,20 @@ def _timing(draft: Draft, offers: VirtualOffers) -> Timing:
     return Timing.EARLY if error > 0.0 else Timing.LATE
 
 
-def _failure_mode(draft: Draft, offers: VirtualOffers) -> FailureMode:
+def _failure_mode(draft: Draft, offers: Offers) -> FailureMode:
     if draft.hazard is not Hazard.VB_SHIFT or _timing(draft, offers) is Timing.EARLY:
         return FailureMode.INSERTION
     return FailureMode.DELETION if offers.beyond_window[draft.hits].any() else FailureMode.NONE
 
 
-def _evidence(draft: Draft, series: Series, offers: VirtualOffers) -> Evidence:
+def _evidence(draft: Draft, series: Series, offers: Offers) -> Evidence:
     """What the judgement of the first VB hit rests on, else that of the mark; the odometer where nothing else is."""
     kinds = [offers.judged.kind[draft.hits[0]], series.judged.kind[draft.episode.mark]]
     known = [KINDS[kind] for kind in kinds if kind >= 0]
     return known[0] if known else Evidence.ODOMETER
 
 
-def _instants(draft: Draft, series: Series, offers: VirtualOffers, bench: Bench) -> dict[str, Any]:
+def _instants(draft: Draft, series: Series, offers: Offers, bench: Bench) -> dict[str, Any]:
     episode, jump = draft.episode, draft.jump
     hazard_ns = int(offers.t_ns[draft.hits[0]] if jump is None else series.t_ns[jump.first])
     number = int(offers.number[draft.hits[0]] if jump is None else jump.first)
@@ -157,7 +158,7 @@ def _known(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _budget(draft: Draft, offers: VirtualOffers, bench: Bench) -> dict[str, Any]:
+def _budget(draft: Draft, offers: Offers, bench: Bench) -> dict[str, Any]:
     episode, budget_s = draft.episode, bench.config.budget_s
     return {
         "hazardous_s": episode.hazardous_s,

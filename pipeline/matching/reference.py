@@ -31,10 +31,10 @@ def match_reference(
     """Place the reference's samples (ordered, unique `t`) on the site's track, none where no sample comes near any.
 
     `reference` has `t, latitude_deg, longitude_deg, height_m, sigma_m`; where `sigma_m` is null,
-    `reference_sigma_m` per axis holds. That sigma, and `reference_aside_m` at least, is also the bias of the run,
-    and no sample lies farther beside its track than that allows. Balise reads are evidence like the reference itself: they prove net
-    elements. A route holds only as far as the reference lies on it. Path positions and heights are those of the place
-    that the reference gives, which is the GNSS antenna: the caller takes off its lever arm.
+    `reference_sigma_m` per axis holds. That sigma, and `reference_aside_m` at least, is also the bias of the run, and
+    no sample lies farther beside its track than that allows. Balise reads are evidence like the reference itself: they
+    prove net elements. A route holds only as far as the reference lies on it. Path positions and heights are those of
+    the place that the reference gives, which is the GNSS antenna: the caller takes off its lever arm.
     """
     fixes = _as_fixes(reference, hazards.reference_sigma_m)
     aside_m = max(float(np.median(np.sqrt(floats(fixes, "cov_ee_m2")))), hazards.reference_aside_m)
