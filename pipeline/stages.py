@@ -11,7 +11,7 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.bounds import threshold_factor
-from pipeline.figures.evidence_notes import reading_notes
+from pipeline.figures.evidence_notes import reading_notes, reference_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
@@ -93,7 +93,7 @@ def _reference_places(
     if run.reference is None or run.reference.is_empty():
         return None
     default_m = config.hazards.reference_sigma_m
-    found = match_reference(run.reference, site, config.matching, default_m, run.balise_reads)
+    found = match_reference(run.reference, site, config.matching, config.hazards, run.balise_reads)
     if found is None:
         return None
     rivals = found.rivals(config.hazards.rival_probability)
@@ -211,7 +211,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.odometry,
         context.config.align.straight_s,
     )
-    notes = (*notes, *reading_notes(ride.aligned, context.config))
+    notes = (*notes, *reading_notes(ride.aligned, context.config), *reference_notes(context.evidence.disputed))
     return SolutionResults(
         solution=name,
         epochs=epochs,

@@ -271,6 +271,8 @@ class HazardConfig(Settings):
     # Half-width of evidence in its sigmas, and the sigma of a reference that states none (DOMAIN section 5.1).
     evidence_factor: Positive = 3.0
     reference_sigma_m: Positive = 1.0
+    # How far a reference may lie beside its track besides its sigma and the survey's: no antenna is in the middle.
+    reference_aside_m: NonNegative = 0.5
     # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
     # A net element less probable than one in a thousand is no place of the reference (DOMAIN section 5.1).
@@ -281,6 +283,8 @@ class HazardConfig(Settings):
     known_error_m: Positive = 5.0
     # More of the moving time in use unknown is `unproven` (DOMAIN section 5.4).
     unknown_share_limit: Probability = 0.01
+    # Ours: alarms across the track of several runs that begin so near each other are of one place of the map.
+    map_reach_m: Positive = 100.0
     # LPV-200 is the guaranteed service (LOC uses no other).
     service_level: str = "lpv200"
 

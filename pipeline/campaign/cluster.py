@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+from pipeline.campaign.engines import Engine
 from pipeline.campaign.outcome import Result, RunOutcome
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import replay_one
@@ -34,10 +35,8 @@ class LostWorkerError(Exception):
     """The worker that had begun the run is gone."""
 
 
-class DaskEngine:
+class DaskEngine(Engine):
     """An existing Dask cluster."""
-
-    in_process = False
 
     def __init__(self, scheduler: str, limit_s: float) -> None:
         self._client = _connect(scheduler)

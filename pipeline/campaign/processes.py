@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 
+from pipeline.campaign.engines import Engine
 from pipeline.campaign.outcome import Result
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import replay_one
@@ -19,10 +20,8 @@ from pipeline.campaign.workers import single_threaded_children
 _RUNS_PER_PROCESS = 200
 
 
-class LocalEngine:
+class LocalEngine(Engine):
     """Processes of this machine, each in an executor of its own, so that the loss of one touches no other."""
-
-    in_process = False
 
     def __init__(self, jobs: int) -> None:
         self._slots = [_Slot() for _ in range(jobs)]

@@ -6,12 +6,15 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.campaign.engines import engine_for
+from pipeline.campaign.cluster import DaskEngine
+from pipeline.campaign.engines import Engine
 from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.interruption import Interrupted, listening
 from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
 from pipeline.campaign.plan import Plan, held_by, with_previous
+from pipeline.campaign.processes import LocalEngine
+from pipeline.campaign.serial import SerialEngine
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
 from pipeline.storage.address import is_url
@@ -40,7 +43,7 @@ def run_campaign(
         store.sweep(plan.out)
         plan = held_by(plan if force else with_previous(plan), campaign)
         store.write_config(plan.out, plan.config)
-        engine = engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
+        engine = _engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
         loop = CampaignLoop(plan.jobs, engine, time_limit_s, watches)
         try:
             summary = _watched(plan, loop, watches, at_once=engine.in_process)
@@ -49,6 +52,12 @@ def run_campaign(
             _tidy(plan, loop, scheduler)
         _finish(plan, loop, summary)
         return summary
+
+
+def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> Engine:
+    if scheduler is not None:
+        return DaskEngine(scheduler, limit_s)
+    return SerialEngine(limit_s) if runs == 1 else LocalEngine(min(jobs, runs))
 
 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:

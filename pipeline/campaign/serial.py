@@ -9,21 +9,19 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from types import FrameType
 
+from pipeline.campaign.engines import Engine
 from pipeline.campaign.outcome import Result, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import fail_run, replay_one
 
 
-class SerialEngine:
+class SerialEngine(Engine):
     """This very process: for a single run, without the seconds that a worker takes to start."""
 
     in_process = True
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
-
-    def capacity(self) -> int:
-        return 1
 
     def submit(self, job: RunJob) -> Result:
         result: Result = Future()
@@ -35,21 +33,6 @@ class SerialEngine:
         except Exception as error:
             result.set_exception(error)
         return result
-
-    def has_begun(self, result: Result) -> bool:
-        return True
-
-    def kill(self, result: Result) -> None:
-        return None
-
-    def is_lost_worker(self, error: BaseException) -> bool:
-        return False
-
-    def collected(self, result: Result) -> None:
-        return None
-
-    def close(self) -> None:
-        return None
 
 
 class _Overdue(BaseException):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 import polars as pl
@@ -26,9 +26,6 @@ class HazardChange:
     def __str__(self) -> str:
         text = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
         return text + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
-
-    def as_dict(self) -> dict[str, object]:
-        return asdict(self) | {"differences": [item.as_dict() for item in self.differences]}
 
 
 def compare_hazards(

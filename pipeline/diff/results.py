@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import polars as pl
 
@@ -45,13 +45,6 @@ class RunDiff:
         verdicts = [item for item in self.differences if item.column == "verdict"]
         return [*verdicts, *self.hazards, *(item for item in self.differences if item not in verdicts)]
 
-    def as_dict(self) -> dict[str, object]:
-        return {
-            "run_id": self.run_id,
-            "hazards": [item.as_dict() for item in self.hazards],
-            "differences": [item.as_dict() for item in self.differences],
-        }
-
 
 @dataclass(frozen=True)
 class ResultDiff:
@@ -80,14 +73,7 @@ class ResultDiff:
 
     def as_dict(self) -> dict[str, object]:
         """For programs: plain values, as JSON holds them."""
-        return {
-            "same": self.same,
-            "compared": self.compared,
-            "only_in_a": list(self.only_in_a),
-            "only_in_b": list(self.only_in_b),
-            "runs": [run.as_dict() for run in self.runs],
-            "notes": list(self.notes),
-        }
+        return {"same": self.same, **asdict(self)}
 
 
 def diff_results(out_a: Address, out_b: Address, hazard_window_s: float = HAZARD_WINDOW_S) -> ResultDiff:

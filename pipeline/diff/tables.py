@@ -6,7 +6,7 @@ one, which would call positions tens of metres apart the same.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 import dataframely as dy
@@ -28,9 +28,6 @@ class Difference:
     def __str__(self) -> str:
         place = f"{self.table}.{self.column}" if self.column else self.table
         return f"{place}: {self.message}"
-
-    def as_dict(self) -> dict[str, object]:
-        return asdict(self)
 
 
 def compare_tables(

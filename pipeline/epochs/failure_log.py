@@ -53,11 +53,6 @@ class FailureLog:
             return earlier[-1].monitors[0]
         return None
 
-    def failed_in(self, first: int, last: int) -> tuple[str, ...]:
-        """Monitors of all alarms that overlap the epochs `first..last`."""
-        overlapping = [alarm for alarm in self.alarms if alarm.first <= last and alarm.last >= first]
-        return tuple(dict.fromkeys(name for alarm in overlapping for name in alarm.monitors))
-
     def start_within(self, begin_ns: int, end_ns: int) -> int | None:
         """Start of the first alarm that came in `begin <= t < end`."""
         return next((alarm.start_ns for alarm in self.alarms if begin_ns <= alarm.start_ns < end_ns), None)

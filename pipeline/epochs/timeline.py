@@ -88,18 +88,3 @@ def availability(t_ns: Ints, valid: Bools, moving: Bools, limit_s: float) -> flo
     total = steps[moving[:-1]].sum()
     held = held_s(t_ns, limit_s)[:-1]
     return min(1.0, float(held[moving[:-1] & valid[:-1]].sum() / total)) if total > 0 else None
-
-
-def moved(t_ns: Ints, distance_m: Floats, speed_mps: Floats, deadband_mps: float) -> Bools:
-    """Whether the train moved from each epoch to the next (False for the last).
-
-    By the distance covered where both ends are known (not NaN), by the speed at the epoch elsewhere.
-    """
-    if len(t_ns) == 0:
-        return np.empty(0, dtype=np.bool_)
-    steps = np.diff(t_ns, append=t_ns[-1:]) / NS_PER_S
-    covered = np.diff(distance_m, append=distance_m[-1:])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean_speed = np.abs(covered / steps)
-    speed = np.where(np.isfinite(mean_speed), mean_speed, np.abs(speed_mps))
-    return np.asarray((speed > deadband_mps) & (steps > 0))

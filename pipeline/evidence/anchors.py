@@ -20,6 +20,8 @@ from schemas.enums import BaliseKind, Evidence
 _ON_ELEMENT_M = 0.5
 # So much way together says which way the odometer counts (DOMAIN section 2) [m].
 _TURNED_M = 20.0
+# No train is faster, and no noise of a sample larger: what comes farther is no place of this train.
+_FASTEST_MPS, _SIGMAS = 150.0, 6.0
 
 Pairs = tuple[Ints, Ints]
 
@@ -29,7 +31,7 @@ class ReferencePlaces:
     """The reference on the network, placed by itself: samples in order of time, and the legs that they lie on.
 
     `path_m`: coordinate on the sample's leg, of the balise antenna; `rival_sample`, `rival_element`: further net
-    elements that a sample may as well lie on.
+    elements that a sample may as well lie on. `lost_ns`: samples that lie on no track, or where no train can have come.
     """
 
     t_ns: Ints
@@ -39,6 +41,7 @@ class ReferencePlaces:
     legs: tuple[Route, ...]
     rival_sample: Ints
     rival_element: Ints
+    lost_ns: Ints
 
     @classmethod
     def of(
@@ -47,7 +50,9 @@ class ReferencePlaces:
         """Matched samples (`t, leg, path_m, on_track`) and their path; `ahead_m`: the reference's place ahead of the
         balise antenna, along growing path. `rivals`: samples and net elements (numbers of the survey).
         """
-        kept = np.flatnonzero(flags(epochs, "on_track") & np.isfinite(floats(epochs, "path_m")))
+        all_ns, all_m = times_ns(epochs), floats(epochs, "path_m")
+        placed = np.flatnonzero(flags(epochs, "on_track") & np.isfinite(all_m))
+        kept = placed[_reachable(all_ns[placed], all_m[placed], sigma_m[placed])]
         leg, path_m = ints(epochs["leg"])[kept], floats(epochs, "path_m")[kept]
         legs = tuple(routes_of_path(path, track.index))
         number = np.full(epochs.height, -1)
@@ -55,13 +60,37 @@ class ReferencePlaces:
         sample, element = number[rivals[0]], rivals[1]
         other = np.flatnonzero((sample >= 0) & ~_on_own_way(legs, leg, sample, element))
         order = other[np.argsort(sample[other], kind="stable")]
-        t_ns = times_ns(epochs)[kept]
-        return cls(t_ns, leg, path_m - ahead_m, sigma_m[kept], legs, sample[order], element[order])
+        lost_ns = np.delete(all_ns, kept)
+        return cls(all_ns[kept], leg, path_m - ahead_m, sigma_m[kept], legs, sample[order], element[order], lost_ns)
 
     def anchor(self, sample: int) -> Anchor:
         element, measure, _ = self.legs[int(self.leg[sample])].locate(self.path_m[[sample]])
         place = Place(int(element[0]), float(measure[0]))
         return Anchor(int(self.t_ns[sample]), place, float(self.sigma_m[sample]), Evidence.REFERENCE)
+
+
+def _reachable(t_ns: Ints, path_m: Floats, sigma_m: Floats) -> Ints:
+    """Samples that a train can have come to from one another: outward from the longest piece without a leap."""
+    leaps = np.flatnonzero(_leaps(t_ns[:-1], t_ns[1:], path_m[:-1], path_m[1:], sigma_m[:-1] + sigma_m[1:])) + 1
+    pieces = np.split(np.arange(t_ns.size), leaps)
+    longest = int(np.argmax([piece.size for piece in pieces]))
+    kept = [pieces[longest]]
+    for ahead in pieces[longest + 1 :]:
+        a, b = kept[-1][-1:], ahead[:1]
+        if not _leaps(t_ns[a], t_ns[b], path_m[a], path_m[b], sigma_m[a] + sigma_m[b]).any():
+            kept.append(ahead)
+    for before in pieces[:longest][::-1]:
+        a, b = before[-1:], kept[0][:1]
+        if not _leaps(t_ns[a], t_ns[b], path_m[a], path_m[b], sigma_m[a] + sigma_m[b]).any():
+            kept.insert(0, before)
+    return np.concatenate(kept)
+
+
+def _leaps(begin_ns: Ints, end_ns: Ints, begin_m: Floats, end_m: Floats, sigma_m: Floats) -> Bools:
+    """Steps that no train can drive."""
+    most_m = _FASTEST_MPS * (end_ns - begin_ns) / NS_PER_S + _SIGMAS * sigma_m
+    leaps: Bools = np.abs(end_m - begin_m) > most_m
+    return leaps
 
 
 def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints) -> Bools:
@@ -90,7 +119,9 @@ def coverages(reference: ReferencePlaces | None, odometer: Odometer | None, conf
     """The times that the reference covers."""
     if reference is None or reference.t_ns.size == 0:
         return []
-    breaks = np.flatnonzero(np.diff(reference.t_ns) > config.reference_gap_s * NS_PER_S)
+    silent = np.diff(reference.t_ns) > config.reference_gap_s * NS_PER_S
+    lost_before = np.searchsorted(np.sort(reference.lost_ns), reference.t_ns)
+    breaks = np.flatnonzero(silent | (np.diff(lost_before) > 0))
     counted = np.zeros(reference.t_ns.size, dtype=np.bool_) if odometer is None else odometer.known_at(reference.t_ns)
     found = []
     for first, last in zip([0, *(breaks + 1).tolist()], [*breaks.tolist(), counted.size - 1], strict=True):
@@ -98,6 +129,38 @@ def coverages(reference: ReferencePlaces | None, odometer: Odometer | None, conf
         ends = (int(own[0]), int(own[-1])) if own.size else (first, last)
         found.append(Coverage(first, last, *(reference.anchor(sample) for sample in ends)))
     return found
+
+
+def lost_spans(reference: ReferencePlaces | None, config: HazardConfig) -> list[tuple[int, int]]:
+    """Times at which the reference was heard and lay nowhere [ns]: nobody knows where the train was then."""
+    if reference is None:
+        return []
+    gap_ns = round(config.reference_gap_s * NS_PER_S)
+    spans = []
+    for t_ns in reference.lost_ns.tolist():
+        after = int(np.searchsorted(reference.t_ns, t_ns))
+        before_ns = int(reference.t_ns[after - 1]) if after else t_ns
+        after_ns = int(reference.t_ns[after]) if after < reference.t_ns.size else t_ns
+        spans.append((max(before_ns, t_ns - gap_ns), min(after_ns, t_ns + gap_ns)))
+    return spans
+
+
+def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], config: HazardConfig) -> int:
+    """How many reads say that the train was not where the reference has it, by more than half the failure limit."""
+    inside = [read for read in reads if reference.t_ns[one.first] <= read.t_ns <= reference.t_ns[one.last]]
+    part = slice(one.first, one.last + 1)
+    count = 0
+    for read in inside:
+        sample = one.first + int(np.abs(reference.t_ns[part] - read.t_ns).argmin())
+        since = (reference.t_ns[part] - reference.t_ns[one.first]).astype(np.float64)
+        at_m = np.interp([read.t_ns - reference.t_ns[one.first]], since, reference.path_m[part])
+        place = read.place
+        route = reference.legs[int(reference.leg[sample])]
+        balise_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
+        noise_m = config.evidence_factor * float(np.hypot(reference.sigma_m[sample], read.sigma_m))
+        apart_m = float(np.abs(balise_m - at_m)[0])
+        count += not apart_m <= noise_m + 0.5 * config.failure_limit_m
+    return count
 
 
 def facing_of(reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometer | None) -> set[int]:

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.evidence.anchors import Coverage, ReferencePlaces, coverages, facing_of, read_anchors
+from pipeline.evidence.anchors import (
+    Coverage,
+    ReferencePlaces,
+    coverages,
+    disputed_by,
+    facing_of,
+    lost_spans,
+    read_anchors,
+)
 from pipeline.evidence.carrying import Anchor, Interval, Odometer, Trust, beside_anchor, between_anchors, closes
 from pipeline.evidence.gaps import Gap, Way, gaps_of
 from pipeline.evidence.routes import Route
@@ -48,7 +56,10 @@ class EvidenceSet:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All evidence of a run; `contradicted`: gaps that the odometer of a vehicle file does not close."""
+    """All evidence of a run; `contradicted`: gaps that the odometer of a vehicle file does not close.
+
+    `unknown`: times at which nobody knows, because the reference lay nowhere, or reads contradict it (`disputed`).
+    """
 
     reference: ReferencePlaces | None
     covered: tuple[Coverage, ...]
@@ -57,30 +68,32 @@ class Evidence:
     network: Network
     trust: Trust
     contradicted: int
+    unknown: tuple[Span, ...]
+    disputed: int
 
     def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
         """Evidence at these instants.
 
         `stood`: when the odometer stood although the train may have moved; there nothing is carried from one side.
         """
-        kind = np.full(t_ns.size, NOTHING)
+        kind, void = np.full(t_ns.size, NOTHING), _within(t_ns, self.unknown)
         alternatives: list[Alternative] = []
         rivals: list[tuple[Ints, Ints]] = []
         for coverage in self.covered:
-            alternatives += self._covered(coverage, t_ns, kind, rivals)
+            alternatives += self._covered(coverage, t_ns, void, kind, rivals)
         for gap in self.gaps:
-            alternatives += self._carried(gap, t_ns, kind, stood)
+            alternatives += self._carried(gap, t_ns, void, kind, stood)
         rows, elements = (np.concatenate([part[i] for part in rivals] or [np.zeros(0, np.int64)]) for i in (0, 1))
         return EvidenceSet(kind, tuple(alternatives), rows, elements)
 
     def _covered(
-        self, coverage: Coverage, t_ns: Ints, kind: Ints, rivals: list[tuple[Ints, Ints]]
+        self, coverage: Coverage, t_ns: Ints, void: Bools, kind: Ints, rivals: list[tuple[Ints, Ints]]
     ) -> list[Alternative]:
         """By the reference: straight lines between samples, each with its own sigma."""
         assert self.reference is not None
         part = slice(coverage.first, coverage.last + 1)
         times, leg = self.reference.t_ns[part], self.reference.leg[part]
-        rows = np.flatnonzero((t_ns >= times[0]) & (t_ns <= times[-1]))
+        rows = np.flatnonzero((t_ns >= times[0]) & (t_ns <= times[-1]) & ~void)
         after = np.searchsorted(times, t_ns[rows], side="left")
         before = np.where(times[after] == t_ns[rows], after, np.maximum(after - 1, 0))
         whole = leg[before] == leg[after]
@@ -109,9 +122,9 @@ class Evidence:
         pairs = np.unique(np.concatenate(found, axis=1), axis=1)
         return pairs[0], pairs[1]
 
-    def _carried(self, gap: Gap, t_ns: Ints, kind: Ints, stood: Sequence[Span]) -> list[Alternative]:
+    def _carried(self, gap: Gap, t_ns: Ints, void: Bools, kind: Ints, stood: Sequence[Span]) -> list[Alternative]:
         """By the odometer, from the anchors of a gap."""
-        inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & (kind == NOTHING)
+        inside = (t_ns >= gap.begin_ns) & (t_ns <= gap.end_ns) & (kind == NOTHING) & ~void
         if len(gap.anchors) == 1:
             inside &= ~_after_standing(t_ns, gap, stood)
         rows, found = np.flatnonzero(inside), []
@@ -132,6 +145,14 @@ class Evidence:
         (anchor,) = gap.anchors
         at_m = way.begin_m if way.end_m is None else way.end_m
         return beside_anchor(self.odometer, anchor, at_m or 0.0, t_ns, self.trust)
+
+
+def _within(t_ns: Ints, spans: Sequence[Span]) -> Bools:
+    """Instants of the spans, both ends left out."""
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
+    for begin_ns, end_ns in spans:
+        inside |= (t_ns > begin_ns) & (t_ns < end_ns)
+    return inside
 
 
 def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
@@ -158,15 +179,24 @@ def evidence_of(
     `reference`: placed on the network by itself; `reads`, `balises`: as in the run and the site; `odometer`: as
     recorded. Anchors are the reads outside the reference's time, and the reference's samples beside its pauses.
     """
-    trust, covered = Trust.of(config), coverages(reference, odometer, config.hazards)
-    read = read_anchors(reads, balises, network.track, config.hazards)
+    trust, hazards = Trust.of(config), config.hazards
+    read = read_anchors(reads, balises, network.track, hazards)
+    covered, disputed, unknown = coverages(reference, odometer, hazards), 0, lost_spans(reference, hazards)
+    if reference is not None:
+        counts = {one: disputed_by(one, reference, read, hazards) for one in covered}
+        disputed = sum(counts.values())
+        for one in [one for one in covered if counts[one]]:
+            covered.remove(one)
+            unknown.append((int(reference.t_ns[one.first]) - 1, int(reference.t_ns[one.last]) + 1))
     apart = [one for one in read if not any(c.begin.t_ns <= one.t_ns <= c.end.t_ns for c in covered)]
     borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
     gaps: list[Gap] = []
     if odometer is not None and borders:
         gaps = gaps_of(borders, facing_of(reference, covered, odometer), odometer, network, trust)
     contradicted = sum(_contradicts(gap, odometer, trust) for gap in gaps)
-    return Evidence(reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted)
+    return Evidence(
+        reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted, tuple(unknown), disputed
+    )
 
 
 def _begin_ns(border: tuple[Anchor, Anchor]) -> int:

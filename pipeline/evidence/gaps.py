@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.evidence.carrying import Anchor, Odometer, Trust, driven_m
 from pipeline.evidence.routes import Chain, Place, along_m, chains_between, extended
 from pipeline.track.network import Network
-from schemas.arrays import NS_PER_S
+from schemas.arrays import NS_PER_S, Ints
 
 # How finely the odometer is looked at for how far the train went beyond an anchor before it turned.
 _LOOK_S = 1.0
@@ -135,16 +135,39 @@ def _reaching(gap: Gap, sheets: set[bool], odometer: Odometer, network: Network,
     """The gap with the chains of the kept orientation, over every branch as far as the odometer says."""
     if gap.ways is None:
         return gap
+    turned = _turned(gap, odometer, trust)
     ways = gap.ways if len(gap.anchors) == 2 else _from_one_anchor(gap, network)
     reached: list[Way] = []
     for way in ways:
         if network.usable[way.chain.oriented[0]] not in sheets:
             continue
         chains = extended(network, way.chain, *_reach_m(gap, way, odometer, trust))
-        if chains is None:
+        if chains is None or (turned and any(_branches(chain, network) for chain in chains)):
             return replace(gap, ways=None)
         reached += [replace(way, chain=chain) for chain in chains]
     return replace(gap, ways=reached)
+
+
+def _turned(gap: Gap, odometer: Odometer, trust: Trust) -> bool:
+    """The train went to and fro in the gap by more than the odometer's own error."""
+    t_ns = _looks(gap)
+    for anchor in gap.anchors[:1]:
+        way = odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns).distance_m
+        known = way[np.isfinite(way)]
+        if known.size:
+            back = min(float((np.maximum.accumulate(sign * known) - sign * known).max()) for sign in (1.0, -1.0))
+            return back > trust.fixed_m
+    return False
+
+
+def _branches(chain: Chain, network: Network) -> bool:
+    """A switch on the chain: a train that turned beyond it may have come back on another track."""
+    return any(len(network.successors[side]) > 1 for one in chain.oriented for side in (one, one ^ 1))
+
+
+def _looks(gap: Gap) -> Ints:
+    count = int((gap.end_ns - gap.begin_ns) / (_LOOK_S * NS_PER_S)) + 2
+    return np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
 
 
 def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
@@ -157,12 +180,11 @@ def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
 
 def _reach_m(gap: Gap, way: Way, odometer: Odometer, trust: Trust) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
-    count = int((gap.end_ns - gap.begin_ns) / (_LOOK_S * NS_PER_S)) + 2
-    t_ns = np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
+    t_ns = _looks(gap)
     places = [at_m for at_m in (way.begin_m, way.end_m) if at_m is not None]
     least, most = min(places), max(places)
     for anchor, at_m in zip(gap.anchors, places, strict=True):
-        at = at_m + odometer.between(np.full(count, anchor.t_ns), t_ns).distance_m
+        at = at_m + odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns).distance_m
         slack = trust.beside_m(driven_m(odometer, anchor.t_ns, t_ns), anchor.sigma_m)
         if np.isfinite(at).any():
             least, most = min(least, float(np.nanmin(at - slack))), max(most, float(np.nanmax(at + slack)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import polars as pl
 from pipeline.track.geodesy import moved_deg, points_of
 from pipeline.track.survey import Track, track_of
 from schemas.arrays import Floats, Ints
+from schemas.run import Site
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,26 @@ def plane_m(ground: Ground, origin: tuple[float, float]) -> tuple[Floats, Floats
     plane = points_of(np.array([origin[0]]), np.array([origin[1]]))
     offset = points_of(ground.latitude_deg, ground.longitude_deg).surface - plane.surface[0]
     return offset @ plane.east[0], offset @ plane.north[0]
+
+
+def origin_of(site: Site) -> tuple[float, float]:
+    """Latitude and longitude of the track's first point, the origin of drawings."""
+    first = site.track.row(0, named=True)
+    return float(first["latitude_deg"]), float(first["longitude_deg"])
+
+
+def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
+    """Each net element as a line east and north of the origin [m]."""
+    survey = track_of(site.track)
+    nothing = np.full(len(survey.latitude_deg), np.nan)
+    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
+    for _, name, rows in survey.elements():
+        yield name, east[rows], north[rows]
+
+
+def thinned(values: Floats, most: int) -> Floats:
+    """No more than about so many of the values, the last one among them."""
+    return np.append(values[: -1 : max(1, -(-len(values) // most))], values[-1:])
 
 
 def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:

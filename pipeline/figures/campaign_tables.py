@@ -5,134 +5,101 @@ All functions take tables of many runs with their `run_id`, and give the same re
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import polars as pl
 
-from pipeline.figures.bounds import Estimate, clopper_pearson, poisson_rate
+from pipeline.figures.bounds import clopper_pearson, poisson_rate
+from pipeline.figures.estimates import Estimator, with_estimates
 from pipeline.figures.independent import independent_episodes
-from pipeline.figures.levels import is_proven, level_counts, level_verdict
-from pipeline.figures.run_figures import is_passage, judged
+from pipeline.figures.levels import level_rows
+from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
-from schemas.conform import conform
-from schemas.enums import TRUTH, BaliseKind, FailureMode, Judgement, LinkingError, PassageStatus
+from schemas.conform import conform, dtypes
+from schemas.enums import TRUTH, BaliseKind, FailureMode, LinkingError
 
 SPEED_BAND_KMH = 40.0
 
-_RUN = ["run_id", "solution"]
+RUN = ["run_id", "solution"]
 
 
-def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> pl.DataFrame:
-    """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3).
+RATES: tuple[Estimator, ...] = (
+    ("hazard_rate", "_per_h", poisson_rate, "truth_faults", "truth_h"),
+    ("missed_share", "", clopper_pearson, "truth_missed", "truth_failed"),
+    ("beyond_budget_share", "", clopper_pearson, "truth_beyond", "truth_budget"),
+    ("unsafe_share", "", clopper_pearson, "truth_unsafe", "truth_accepted"),
+    ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
+)
+"""Rates and shares of runs and of solutions: of what is known by a reference or balise reads, but for outages."""
 
-    Shares are of what is known by a reference or balise reads; what is not known stands beside them.
+
+def counted_runs(runs: pl.DataFrame, hazards: pl.DataFrame) -> pl.DataFrame:
+    """`runs` rows with `faults`, `missed`, `hours` and, as `truth_*`, what a reference or balise reads tell of them.
+
+    The odometer alone can show that a position was wrong, never that it was right.
     """
     faults = _faults_per_run(hazards)
     by_truth = pl.col("evidence").is_in(TRUTH).fill_null(value=False)
-    joined = (
-        runs.join(faults, on=_RUN, how="left", maintain_order="left")
-        .with_columns(pl.col(faults.drop(_RUN).columns).fill_null(0))
-        .with_columns(
-            unsafe_judged=_where(by_truth, pl.col("unsafe_accepted")),
-            truth_judged=_where(by_truth, pl.col("accepted_judged")),
-            beyond_budget=_where(by_truth, pl.col("failures_beyond_budget")),
-            budget_known=_where(by_truth, pl.col("failures_within_budget") + pl.col("failures_beyond_budget")),
-            hours=pl.col("duration_s").fill_null(0.0) / 3600.0,
-            hours_seen=_where(by_truth, pl.col("evidence_s").fill_null(0.0)) / 3600.0,
-        )
+    counts = {
+        "truth_unsafe": pl.col("unsafe_accepted"),
+        "truth_accepted": pl.col("accepted_judged"),
+        "truth_within": pl.col("failures_within_budget"),
+        "truth_beyond": pl.col("failures_beyond_budget"),
+        "truth_h": pl.col("evidence_s").fill_null(0.0) / 3600.0,
+        "truth_held_s": pl.col("held_s").fill_null(0.0),
+    }
+    return (
+        runs.join(faults, on=RUN, how="left", maintain_order="left")
+        .with_columns(pl.col(faults.drop(RUN).columns).fill_null(0), hours=pl.col("duration_s").fill_null(0.0) / 3600.0)
+        .with_columns(pl.when(by_truth).then(value).otherwise(0).alias(name) for name, value in counts.items())
+        .with_columns(truth_budget=pl.col("truth_within") + pl.col("truth_beyond"))
     )
-    table = _with_estimates(
-        joined,
-        ("hazard_rate", "_per_h", poisson_rate, "faults_judged", "hours_seen"),
-        ("missed_share", "", clopper_pearson, "missed_judged", "failed_judged"),
-        ("beyond_budget_share", "", clopper_pearson, "beyond_budget", "budget_known"),
-        ("unsafe_share", "", clopper_pearson, "unsafe_judged", "truth_judged"),
-        ("outage_rate", "_per_h", poisson_rate, "outages", "hours"),
-    )
-    levels = config.safety.service_levels
-    columns = [column for level in levels for column in _level_columns(runs, level, config)]
-    return conform(table.with_columns(columns).sort(_RUN), campaign_runs_schema(levels))
 
 
-def campaign_levels(wide: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def campaign_runs(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """Every `runs` row with rates, exact bounds and the verdict per service level (CONTRACT section 3)."""
+    table, levels = with_estimates(counted_runs(runs, hazards), *RATES), campaign_levels(runs, config)
+    for level in config.safety.service_levels:
+        named = {f"allowed_{level}_s": "allowed_s"}
+        named |= {f"{part}_{level}": part for part in ("within", "exceeded", "verdict")}
+        table = table.join(levels.filter(service_level=level).select(*RUN, **named), on=RUN, how="left")
+    return conform(table.sort(RUN), campaign_runs_schema(config.safety.service_levels))
+
+
+def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """One row per run, solution and service level: would the run have kept this level's allowed T_D (TVB eq. 7)?
 
-    The columns of `wide`, as `campaign_runs` made it, for each level, one below the other. With the reaction time of
-    the configuration (none: one epoch) the period of the epochs is the least that any fault takes.
+    With the reaction time of the configuration (none: one epoch) the period of the epochs is the least that any fault
+    takes.
     """
-    safety, reaction_s = config.safety, config.hazards.reaction_s
-    period_s = 1.0 / pl.col("gnss_rate_hz")
-    needed_s = period_s + (period_s if reaction_s is None else reaction_s)
-    parts = [
-        wide.select(
-            *_RUN,
-            "evidence",
-            "failures",
-            "hazardous_max_s",
-            hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
-            service_level=pl.lit(level),
-            allowed_s=f"allowed_{level}_s",
-            within=f"within_{level}",
-            exceeded=f"exceeded_{level}",
-            verdict=f"verdict_{level}",
-            receiver_needs_s=needed_s,
-            receiver_quick_enough=needed_s <= safety.allowed_time_to_detect_s(level),
-        )
-        for level in safety.service_levels
+    reaction_s, period_s = config.hazards.reaction_s, 1.0 / pl.col("gnss_rate_hz")
+    needed = runs.select(
+        *(*RUN, "evidence", "failures", "hazardous_max_s", "share_unknown"),
+        spent_s=pl.col("failure_hazardous_s").fill_null([]),
+        may_s=pl.col("failure_hazardous_may_s").fill_null([]),
+        hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
+        receiver_needs_s=period_s + (period_s if reaction_s is None else reaction_s),
+    )
+    rows = [
+        run | level
+        for run in needed.iter_rows(named=True)
+        for level in level_rows(run["spent_s"], run["may_s"], run["evidence"], run["share_unknown"], config)
     ]
-    table = pl.concat(parts) if parts else CampaignLevels.create_empty()
-    return conform(table.sort(_RUN, maintain_order=True), CampaignLevels)
-
-
-def _where(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
-    return pl.when(condition).then(value).otherwise(0)
+    quick = pl.col("receiver_needs_s") <= pl.col("allowed_s")
+    kinds = {name: kind for name, kind in dtypes(CampaignLevels).items() if name != "receiver_quick_enough"}
+    table = pl.DataFrame(rows, schema=kinds).with_columns(receiver_quick_enough=quick)
+    return conform(table.sort(RUN, maintain_order=True), CampaignLevels)
 
 
 def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
-    """Faults and missed detections of each run; `failed_judged`, `missed_judged`: by a reference or balise reads."""
     missed, truth = pl.col("missed"), pl.col("with_truth")
     counts = {
         "faults": pl.len(),
-        "faults_judged": truth.sum(),
         "missed": missed.sum(),
-        "failed_judged": (pl.col("failed") & truth).sum(),
-        "missed_judged": (truth & missed).sum(),
+        "truth_faults": truth.sum(),
+        "truth_failed": (pl.col("failed") & truth).sum(),
+        "truth_missed": (truth & missed).sum(),
     }
-    return independent_episodes(hazards).group_by(_RUN).agg(**{k: v.cast(pl.Int64) for k, v in counts.items()})
-
-
-def _level_columns(runs: pl.DataFrame, level: str, config: Configuration) -> list[pl.Series]:
-    """Failures of each run against one service level, and its verdict."""
-    allowed_s, limit = config.safety.allowed_time_to_detect_s(level), config.hazards.unknown_share_limit
-    counts, verdicts = [], []
-    names = ("failures", "failure_hazardous_s", "failure_hazardous_may_s", "evidence", "share_unknown")
-    for failures, hazardous_s, may_s, evidence, unknown in runs.select(names).iter_rows():
-        counts.append(level_counts(hazardous_s or [], may_s or [], allowed_s))
-        verdicts.append(level_verdict(failures, *counts[-1], proven=is_proven(evidence, unknown, limit)).value)
-    return [
-        pl.Series(f"allowed_{level}_s", [allowed_s] * runs.height, dtype=pl.Float64),
-        pl.Series(f"within_{level}", [within for within, _ in counts], dtype=pl.Int64),
-        pl.Series(f"exceeded_{level}", [exceeded for _, exceeded in counts], dtype=pl.Int64),
-        pl.Series(f"verdict_{level}", verdicts, dtype=pl.String),
-    ]
-
-
-Estimator = tuple[str, str, Callable[[int, float], Estimate] | Callable[[int, int], Estimate], str, str]
-
-
-def _with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
-    """Columns `name, name_low, name_high` from events and what they are held against, row by row."""
-    series = []
-    for name, ending, estimate, events, against in estimates:
-        found = list(map(estimate, frame[events].to_list(), frame[against].to_list()))
-        for part, values in (
-            ("", [item.value for item in found]),
-            ("_low", [item.low for item in found]),
-            ("_high", [item.high for item in found]),
-        ):
-            series.append(pl.Series(f"{name}{part}{ending}", values, dtype=pl.Float64))
-    return frame.with_columns(series)
+    return independent_episodes(hazards).group_by(RUN).agg(**{k: v.cast(pl.Int64) for k, v in counts.items()})
 
 
 def with_truth(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
@@ -140,52 +107,30 @@ def with_truth(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
 
     The odometer alone can show that a position was wrong, never that it was right: shares leave it out.
     """
-    true = runs.filter(pl.col("evidence").is_in(TRUTH)).select(*_RUN, truth=pl.lit(value=True))
-    joined = passages.join(true, on=_RUN, how="left", maintain_order="left")
+    true = runs.filter(pl.col("evidence").is_in(TRUTH)).select(*RUN, truth=pl.lit(value=True))
+    joined = passages.join(true, on=RUN, how="left", maintain_order="left")
     return joined.with_columns(pl.col("truth").fill_null(value=False))
 
 
-def accepted() -> pl.Expr:
-    return pl.col("status") == PassageStatus.ACCEPTED
-
-
-def acceptances() -> dict[str, pl.Expr]:
-    """Conditions on passages (`with_truth`): acceptances by what the judge says of them; none re-judges."""
-    known = judged().fill_null(value=False)
-    wrong = accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False)
-    return {
-        "accepted_judged": accepted() & known & pl.col("truth"),
-        "unsafe_judged": wrong & pl.col("truth"),
-        "unsafe_accepted": wrong,
-        "unproven_accepted": accepted() & ~known,
-    }
-
-
 def _spread() -> dict[str, pl.Expr]:
-    """Mean, sigma, 95 % and largest of the location errors [m] of acceptances, and how many are known."""
+    """Spread of the location errors [m] of acceptances."""
     error = pl.col("location_error_m").filter(accepted())
-    return {
-        "location_error_count": error.count().cast(pl.Int64),
-        "location_error_mean_m": error.mean(),
-        "location_error_sigma_m": error.std(),
-        "location_error_p95_m": error.abs().quantile(0.95, interpolation="linear"),
-        "location_error_max_m": error.abs().max(),
-    }
+    return {**spread(error, "location_error", "count"), "location_error_sigma_m": error.std()}
 
 
 def _counts() -> dict[str, pl.Expr]:
-    status, mode, passage = pl.col("status"), pl.col("failure_mode"), is_passage()
+    """Conditions on passages (`with_truth`): in how many rows each holds."""
+    mode, passage, judged = pl.col("failure_mode"), is_passage(), acceptances()
     counts = {
+        **outcomes(),
+        **judged,
         "passages": passage,
-        "accepted": accepted(),
         "accepted_passages": accepted() & passage,
-        "rejected": status.cast(pl.String).str.starts_with("rejected_"),
-        "missed": status == PassageStatus.MISSED,
-        "not_available": status == PassageStatus.NOT_AVAILABLE,
         "deletions": (mode == FailureMode.DELETION) & passage,
         "insertions": mode == FailureMode.INSERTION,
         "linking_errors": pl.col("linking_error") != LinkingError.NONE,
-        **acceptances(),
+        "accepted_judged": judged["accepted_judged"] & pl.col("truth"),
+        "unsafe_judged": judged["unsafe_accepted"] & pl.col("truth"),
         "suspect_after_the_fact": pl.col("suspect_after_the_fact"),
     }
     return {name: condition.sum().cast(pl.Int64) for name, condition in counts.items()}
@@ -207,7 +152,7 @@ def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
             **_spread(),
         )
         .pipe(
-            _with_estimates,
+            with_estimates,
             ("accepted_share", "", clopper_pearson, "accepted_passages", "passages"),
             ("deletion_rate", "", clopper_pearson, "deletions", "passages"),
             ("unsafe_rate", "", clopper_pearson, "unsafe_judged", "accepted_judged"),
@@ -262,7 +207,7 @@ def _accuracy(found: pl.DataFrame, config: Configuration) -> pl.DataFrame:
         )
         .with_columns(ci_limit_m=pl.lit(limit_m))
     )
-    return _with_estimates(
+    return with_estimates(
         counted.sort(keys),
         ("within_location_accuracy_share", "", clopper_pearson, "within_location_accuracy", "location_error_count"),
         ("within_ci_limit_share", "", clopper_pearson, "within_ci_limit", "location_error_count"),

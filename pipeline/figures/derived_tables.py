@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
+from pipeline.figures.campaign_figures import detection_by_level, measured_figures
 from pipeline.figures.campaign_tables import (
     campaign_accuracy,
     campaign_balises,
@@ -12,7 +13,6 @@ from pipeline.figures.campaign_tables import (
     with_truth,
 )
 from pipeline.figures.map_errors import map_places
-from pipeline.safety.measured import detection_by_level, measured_figures
 from schemas.config import Configuration
 
 
@@ -20,14 +20,13 @@ def derived_tables(
     runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
 ) -> dict[str, pl.DataFrame]:
     """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order."""
-    wide = campaign_runs(runs, hazards, config)
     told = with_truth(passages, runs)
     return {
-        "runs": wide,
+        "runs": campaign_runs(runs, hazards, config),
         "balises": campaign_balises(told),
         "accuracy": campaign_accuracy(told, config),
         "figures": measured_figures(runs, hazards, config.safety),
         "detection": detection_by_level(runs, hazards, config.safety),
-        "levels": campaign_levels(wide, config),
-        "map": map_places(alarms),
+        "levels": campaign_levels(runs, config),
+        "map": map_places(alarms, config.hazards.map_reach_m),
     }

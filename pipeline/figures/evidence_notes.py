@@ -27,6 +27,10 @@ _PROOF = (
 _CONTRADICTED = (
     "the odometer does not close {count} gaps between known places: the vehicle file or the odometer is wrong there"
 )
+_DISPUTED = (
+    "balise reads contradict the reference, {count} times: where they do, nobody knows where the train was; check the "
+    "clocks of both"
+)
 _LEARNED = (
     "no vehicle file: thresholds are widened by scale and latency as learned in the run, which absorb early drifts"
 )
@@ -50,6 +54,11 @@ _DIGITS = (
 _UNTOLD = "for {s:.0f} s nothing tells whether the train moved: availability counts that time as moving without a TVB"
 # Less than the positions themselves scatter is not worth a word.
 _WORTH_M = 0.1
+
+
+def reference_notes(disputed: int) -> tuple[str, ...]:
+    """Reads that contradict the reference (DOMAIN section 5.1)."""
+    return (_DISPUTED.format(count=disputed),) if disputed else ()
 
 
 def reading_notes(epochs: pl.DataFrame, config: Configuration) -> tuple[str, ...]:

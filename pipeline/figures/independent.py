@@ -15,23 +15,28 @@ def missed_detection() -> pl.Expr:
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
-    """One row per fault: `run_id, solution, failed, missed, with_truth, detected, time_to_detect_s`.
+    """One row per fault: `solution, begin, t_failure, t_end, budget_s, failed, missed, with_truth, detected,
+    time_to_detect_s`, and `run_id` where the hazards have one.
 
     A fault may stand in several rows of `hazards` (one per class, and the jump back as a row `caused_by` the first);
-    counted one by one they would make the bounds too narrow. Takes the hazards of many runs with their `run_id`.
-    Shares are of faults `with_truth` (reference or balise reads): the odometer alone mostly sees what was detected.
+    counted one by one they would make the bounds too narrow. Shares are of faults `with_truth` (reference or balise
+    reads): the odometer alone mostly sees what was detected.
     """
-    failed = pl.col("t_failure").is_not_null()
+    failed, t_end = pl.col("t_failure").is_not_null(), pl.col("t_end")
+    keys = [*(name for name in ("run_id", "solution") if name in hazards.columns), "begin"]
     return (
         hazards.filter(pl.col("caused_by").is_null())
         .with_columns(begin=pl.coalesce("t_onset", "t_hazard"), missed=missed_detection())
-        .group_by("run_id", "solution", "begin")
+        .group_by(keys)
         .agg(
+            t_failure=pl.col("t_failure").min(),
+            t_end=pl.when(t_end.null_count() == 0).then(t_end.max()),
+            budget_s=pl.col("budget_s").first(),
             failed=failed.any(),
             missed=pl.col("missed").any(),
             with_truth=pl.col("evidence").is_in(TRUTH).all(),
             detected=pl.col("detected").any(),
             time_to_detect_s=pl.col("time_to_detect_s").max(),
         )
-        .sort("run_id", "solution", "begin")
+        .sort(keys)
     )

@@ -8,11 +8,10 @@ from schemas.campaign import CampaignMap
 from schemas.conform import conform
 from schemas.enums import Suspect, Verdict
 
-REACH_M = 100.0
 _ACROSS = r"^(cross|up)_"
 
 
-def map_suspects(alarms: pl.DataFrame, reach_m: float = REACH_M) -> pl.DataFrame:
+def map_suspects(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     """Alarms of a campaign (with `run_id`) with `suspect` set to the map where it is due.
 
     Due are alarms of cross and up monitors only, not held against the position, that began within `reach_m` of
@@ -26,7 +25,7 @@ def map_suspects(alarms: pl.DataFrame, reach_m: float = REACH_M) -> pl.DataFrame
     ).drop("_row")
 
 
-def map_places(alarms: pl.DataFrame, reach_m: float = REACH_M) -> pl.DataFrame:
+def map_places(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     """Places at which several runs raised such alarms (`campaign_map`), by net element and measure."""
     apart = (pl.col("measure_m").diff() > reach_m).fill_null(value=True)
     places = (

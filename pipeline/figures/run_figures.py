@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,8 +10,9 @@ import polars as pl
 from pipeline.epochs.clock import Clock, flags, trusted, usable
 from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
+from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
 from pipeline.figures.independent import missed_detection
-from pipeline.figures.levels import is_proven, level_counts, level_verdict
+from pipeline.figures.levels import LEVEL_LISTS, level_rows
 from schemas.config import Configuration
 from schemas.enums import (
     TRUTH,
@@ -28,11 +28,6 @@ from schemas.enums import (
 from schemas.tables import SCALES
 
 Row = dict[str, object]
-
-CONTINUITY_S = 15.0
-"""Most critical phase of an APV-I/LPV-200 operation (LOC section VI)."""
-
-_REJECTED = [status.value for status in PassageStatus if status.value.startswith("rejected_")]
 
 
 def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
@@ -51,7 +46,7 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
         "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
         "mtbf_h": mtbf_h,
-        "continuity_15s": math.exp(-CONTINUITY_S / 3600.0 / mtbf_h) if mtbf_h else None,
+        "continuity_15s": continuity(CONTINUITY_S, mtbf_h) if mtbf_h else None,
         "trusted_s": trust.up_s if epochs.height else None,
         "trusted_losses": trust.losses,
     }
@@ -72,40 +67,55 @@ def share_unknown(epochs: pl.DataFrame, clock: Clock) -> float | None:
     return share_of_time(clock.held_s[used], ~flags(epochs, judged())[used])
 
 
-def _spread(errors: pl.Series, name: str, counted: str) -> Row:
-    """Mean, 95 % and largest of the known errors, the latter two of their magnitude, and how many these are."""
-    size = errors.abs()
+def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
+    """Mean, 95 % and largest of the known errors [m], the latter two of their magnitude, and how many these are."""
+    size = error.abs()
     return {
-        f"{name}_mean_m": errors.mean(),
+        f"{name}_mean_m": error.mean(),
         f"{name}_p95_m": size.quantile(0.95, interpolation="linear"),
         f"{name}_max_m": size.max(),
-        f"{name}_{counted}": size.count(),
+        f"{name}_{counted}": size.count().cast(pl.Int64),
     }
 
 
 def accuracy(epochs: pl.DataFrame) -> Row:
-    row: Row = {}
+    errors: dict[str, pl.Expr] = {}
     for axis in ("along", "cross", "up"):
-        row |= _spread(epochs[f"error_{axis}_m"], f"{axis}_error", "epochs")
-    return row
+        errors |= spread(pl.col(f"error_{axis}_m"), f"{axis}_error", "epochs")
+    return epochs.select(**errors).row(0, named=True)
+
+
+def accepted() -> pl.Expr:
+    return pl.col("status") == PassageStatus.ACCEPTED
+
+
+def outcomes() -> dict[str, pl.Expr]:
+    """Conditions on passages: what became of the offer."""
+    status = pl.col("status")
+    return {
+        "accepted": accepted(),
+        "rejected": status.cast(pl.String).str.starts_with("rejected_"),
+        "missed": status == PassageStatus.MISSED,
+        "not_available": status == PassageStatus.NOT_AVAILABLE,
+    }
+
+
+def acceptances() -> dict[str, pl.Expr]:
+    """Conditions on passages: acceptances by what the judge says of them; none re-judges."""
+    known = judged().fill_null(value=False)
+    return {
+        "accepted_judged": accepted() & known,
+        "unsafe_accepted": accepted() & (pl.col("judgement") == Judgement.WRONG).fill_null(value=False),
+        "unproven_accepted": accepted() & ~known,
+    }
 
 
 def balise_counts(passages: pl.DataFrame) -> Row:
     """What became of the virtual balises, and of those accepted what the judge says of their positions."""
-    virtual, status, judgement = pl.col("kind") == BaliseKind.VIRTUAL, pl.col("status"), pl.col("judgement")
-    accepted = virtual & (status == PassageStatus.ACCEPTED)
-    counts = {
-        "balises_on_path": virtual & is_passage(),
-        "balises_accepted": accepted,
-        "balises_rejected": virtual & status.is_in(_REJECTED),
-        "balises_missed": virtual & (status == PassageStatus.MISSED),
-        "balises_not_available": virtual & (status == PassageStatus.NOT_AVAILABLE),
-        "accepted_judged": accepted & judged(),
-        "unsafe_accepted": accepted & (judgement == Judgement.WRONG),
-        "unproven_accepted": accepted & ~judged().fill_null(value=False),
-    }
-    known = passages.filter(accepted)["location_error_m"]
-    return {**_counted(passages, counts), **_spread(known, "location_error", "count")}
+    virtual = passages.filter(pl.col("kind") == BaliseKind.VIRTUAL)
+    counts = {"balises_on_path": is_passage(), **{f"balises_{name}": met for name, met in outcomes().items()}}
+    errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
+    return _counted(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True)
 
 
 def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
@@ -160,17 +170,8 @@ def service_levels(
 ) -> Row:
     """Whether the failures were within the allowed T_D of each service level (TVB eq. 7); `unknown`: share of time."""
     hazardous_s, may_s = (failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s"))
-    safety = config.safety
-    allowed_s = [safety.allowed_time_to_detect_s(level) for level in safety.service_levels]
-    counts = [level_counts(hazardous_s, may_s, limit_s) for limit_s in allowed_s]
-    proven = is_proven(evidence, unknown, config.hazards.unknown_share_limit)
-    return {
-        "service_levels": list(safety.service_levels),
-        "level_allowed_s": allowed_s,
-        "level_within": [within for within, _ in counts],
-        "level_exceeded": [exceeded for _, exceeded in counts],
-        "level_verdict": [level_verdict(failures.height, *count, proven=proven) for count in counts],
-    }
+    rows = level_rows(hazardous_s, may_s, evidence, unknown, config)
+    return {name: [row[part] for row in rows] for part, name in LEVEL_LISTS.items()}
 
 
 def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence | None, clock: Clock) -> Row:
@@ -194,9 +195,7 @@ def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence 
         **{name: float(held.sum()) if epochs.height else None for name, held in times.items()},
         "alarms": alarms.height,
         "false_alarms": false if truth else None,
-        "false_alarm_rate_per_h": rate.value,
-        "false_alarm_rate_low_per_h": rate.low,
-        "false_alarm_rate_high_per_h": rate.high,
+        **columns_of("false_alarm_rate", rate, "_per_h"),
     }
 
 

@@ -79,14 +79,13 @@ def _extents(run: RunLog) -> Iterator[str]:
     if run.odometer is None:
         return
     (gnss_begin, gnss_end), (odometer_begin, odometer_end) = _extent_ns(run.gnss), _extent_ns(run.odometer)
-    if gnss_end > odometer_end + _SAME_TIME_NS:
-        yield "the odometer ends before the GNSS"
-    if odometer_begin > gnss_begin + _SAME_TIME_NS:
-        yield "the odometer begins after the GNSS"
-    if odometer_end > gnss_end + _SAME_TIME_NS:
-        yield "the GNSS ends before the odometer"
-    if gnss_begin > odometer_begin + _SAME_TIME_NS:
-        yield "the GNSS begins after the odometer"
+    apart_ns = {
+        "the odometer ends before the GNSS": gnss_end - odometer_end,
+        "the odometer begins after the GNSS": odometer_begin - gnss_begin,
+        "the GNSS ends before the odometer": odometer_end - gnss_end,
+        "the GNSS begins after the odometer": gnss_begin - odometer_begin,
+    }
+    yield from (text for text, apart in apart_ns.items() if apart > _SAME_TIME_NS)
 
 
 def _odometer(odometry: Odometry | None, straight_s: float) -> Iterator[str]:

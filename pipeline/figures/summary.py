@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import polars as pl
 
@@ -17,7 +16,7 @@ from pipeline.ingest.clean import StreamCounts
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Evidence, RunStatus, RunVerdict, VehicleFigures
+from schemas.enums import Evidence, RunStatus, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 
@@ -80,19 +79,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
         | _provenance(provenance)
     )
-    return _frame(row | {"verdict": _verdict(row, config.hazards.unknown_share_limit)})
-
-
-_JUDGED_BY = ("unsafe_accepted", "failures", "failures_within_budget", "failures_beyond_budget", "unproven_accepted")
-
-
-def _verdict(row: Mapping[str, Any], unknown_share_limit: float) -> RunVerdict:
-    return verdict_of(
-        **{name: row[name] for name in _JUDGED_BY},
-        accepted=row["balises_accepted"],
-        share_unknown=row["share_unknown"],
-        unknown_share_limit=unknown_share_limit,
-    )
+    return _frame(row | {"verdict": verdict_of(row, config.hazards.unknown_share_limit)})
 
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:

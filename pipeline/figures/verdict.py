@@ -2,36 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
 from schemas.enums import RunStatus, RunVerdict
 
+Row = Mapping[str, Any]
 
-def verdict_of(
-    *,
-    unsafe_accepted: int,
-    failures: int,
-    failures_within_budget: int,
-    failures_beyond_budget: int,
-    unproven_accepted: int,
-    accepted: int,
-    share_unknown: float | None,
-    unknown_share_limit: float,
-) -> RunVerdict:
-    """The worst that applies, from the counts and the share of one `runs` row (DOMAIN section 5.4).
+
+def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
+    """The worst that applies, from the counts and the share of one `runs` row (DOMAIN section 5.4)."""
+    unsafe, unproven = _reasons(run, unknown_share_limit)
+    return RunVerdict.UNSAFE if unsafe else RunVerdict.UNPROVEN if unproven else RunVerdict.SAFE
+
+
+def verdict_reasons(run: Row, unknown_share_limit: float) -> str:
+    """Why the verdict is what it is."""
+    unsafe, unproven = _reasons(run, unknown_share_limit)
+    return "; ".join(unsafe + unproven) or "every acceptance was right, and every position failure within the budget"
+
+
+def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]]:
+    """What makes a run unsafe, and what leaves it unproven.
 
     A failure of which the evidence cannot say whether it was within the budget leaves the run unproven. So does a
     `share_unknown` of None: the position was never in use while the train moved.
     """
-    if unsafe_accepted or failures_beyond_budget:
-        return RunVerdict.UNSAFE
-    undecided = failures > failures_within_budget or unproven_accepted > 0
-    if undecided or not accepted or share_unknown is None or share_unknown > unknown_share_limit:
-        return RunVerdict.UNPROVEN
-    return RunVerdict.SAFE
+    share = run["share_unknown"]
+    undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
+    unsafe = {
+        "{} VBs accepted despite a wrong position": run["unsafe_accepted"],
+        "{} position failures in use beyond the budget": run["failures_beyond_budget"],
+    }
+    unproven = {
+        "{} VBs accepted of which nothing says whether the position was right": run["unproven_accepted"],
+        "{} position failures of which nothing says whether they were within the budget": undecided,
+        "no position was in use while the train moved": share is None,
+        f"{share or 0.0:.1%} of the moving time in use cannot be judged": share is not None
+        and share > unknown_share_limit,
+        "no VB was accepted": not run["balises_accepted"],
+    }
+    said, left = ([text.format(count) for text, count in found.items() if count] for found in (unsafe, unproven))
+    return said, left
 
 
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:

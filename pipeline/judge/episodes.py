@@ -57,6 +57,11 @@ class Episode:
     hazardous_s: float
     hazardous_may_s: float
 
+    def holds(self, number: Ints) -> Bools:
+        """Valid positions that belong to the episode."""
+        inside: Bools = (number >= self.onset) & (number < self.end)
+        return inside
+
 
 def find_episodes(
     series: Series, marked: Bools, log: FailureLog, faults: pl.DataFrame | None, config: HazardConfig
@@ -72,7 +77,7 @@ def find_episodes(
             continue
         episode = _episode(series, mark, until, calm_from, quiet, log, faults, config)
         episodes.append(episode)
-        until = max(episode.end, mark + 1)
+        until = max(episode.end, mark + 1, 0 if episode.jump_back is None else episode.jump_back.last + 1)
     return episodes
 
 
@@ -168,13 +173,15 @@ def _onset_ns(
 
 
 def _named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
+    """Begin of the fault that a `faults` stream names: the last one before the onset as seen, else the first after."""
     if faults is None or faults.is_empty():
         return None
-    begin, end = faults["t_start"].dt.timestamp("ns"), faults["t_end"].dt.timestamp("ns")
-    of_gnss = ~faults["target"].str.contains(_ODOMETER)
-    lasts = (begin <= mark_ns) & (end.is_null() | (end >= onset_ns)).fill_null(value=True)
-    named = begin.filter(lasts & of_gnss)
-    return int(named.max()) if named.len() else None  # type: ignore[arg-type]
+    of_gnss = ~pl.col("target").str.contains(_ODOMETER)
+    begin, end = (pl.col(name).dt.timestamp("ns") for name in ("t_start", "t_end"))
+    lasts = of_gnss & (begin <= mark_ns) & (end.is_null() | (end >= onset_ns))
+    begins = faults.filter(lasts).select(begin).to_series().sort().to_list()
+    before = [t_ns for t_ns in begins if t_ns <= onset_ns]
+    return before[-1] if before else next(iter(begins), None)
 
 
 def _detection(log: FailureLog, onset_ns: int, end_ns: int) -> tuple[int | None, str | None, bool]:

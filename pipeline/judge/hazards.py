@@ -138,27 +138,33 @@ def _class_of(crossed: list[int], offers: VirtualOffers) -> Hazard:
     return Hazard.VB_JUMP_1A if len(distinct) > 1 else Hazard.VB_JUMP_1B
 
 
-def size_m(draft: Draft, series: Series, offers: VirtualOffers) -> float | None:
-    """The largest |e| of the episode with its sign; of a jump back its step, and so where no error is known."""
+def size_m(draft: Draft, series: Series, offers: VirtualOffers, known_to_m: float) -> float | None:
+    """The largest known |e| of the episode with its sign; of a jump back its step, as of a jump without known errors.
+
+    Where no error is known closely, the largest that is sure.
+    """
     episode, jump = draft.episode, draft.jump
     if jump is not None and jump is episode.jump_back:
         return jump.step_m
-    errors = series.judged.middle_m[episode.onset : episode.end]
-    known = np.concatenate([errors, offers.judged.middle_m[draft.hits]])
+    lasting = series.judged.take(np.arange(episode.onset, episode.end))
+    hit = offers.judged.take(np.array(draft.hits, dtype=np.int64))
+    known = np.concatenate([lasting.known_m(known_to_m), hit.known_m(known_to_m)])
+    if not np.isfinite(known).any():
+        if jump is not None:
+            return jump.step_m
+        known = np.concatenate([np.sign(one.middle_m) * one.least_m for one in (lasting, hit)])
     known = known[np.isfinite(known)]
-    if known.size:
-        return float(known[np.argmax(np.abs(known))])
-    return None if jump is None else jump.step_m
+    return float(known[np.argmax(np.abs(known))]) if known.size else None
 
 
-def rate_mps(draft: Draft, series: Series) -> float | None:
+def rate_mps(draft: Draft, series: Series, known_to_m: float) -> float | None:
     """Slope of the error from onset to failure [m/s]; None for a step, or where it is not known."""
     episode = draft.episode
     if episode.step is not None or draft.jump is not None:
         return None
     until = episode.mark if episode.failure is None else episode.failure
     part = slice(episode.onset, until + 1)
-    error, t_s = series.judged.middle_m[part], (series.t_ns[part] - episode.onset_ns) / 1e9
+    error, t_s = series.judged.known_m(known_to_m)[part], (series.t_ns[part] - episode.onset_ns) / 1e9
     known = np.isfinite(error)
     if known.sum() < 2 or np.ptp(t_s[known]) == 0.0:
         return None

@@ -57,17 +57,25 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
     episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)
     drafts = drafts_of(episodes, series, offers, _travel(bench, series), bench.config.hazards)
     witnesses = _witnesses(bench)
-    spans = [(one.onset_ns, one.end_ns if one.detected_ns is None else one.detected_ns) for one in episodes]
+    spans = [_undetected_ns(one, series) for one in episodes]
     passages = _passages(bench, drafts, offers, spans)
     return Judged(
-        hazards=hazards_table(drafts, series, offers, passages, witnesses, bench),
+        hazards=hazards_table(drafts, series, offers, witnesses, bench),
         alarms=_alarms(bench, log, witnesses, drafts),
         passages=passages,
-        failures=failures_table(episodes, drafts, series, passages, bench),
+        failures=failures_table(episodes, drafts, series, offers, bench),
         epochs_columns=_epochs(bench, used_s, _odometer_wrong(bench), spans, reference),
         distance_m=_distance_m(bench),
         evidence=_evidence(bench),
     )
+
+
+def _undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
+    """From onset to detection, or to the end; what a step offers on its way lies before its first position."""
+    begin_ns = episode.onset_ns
+    if episode.step is not None:
+        begin_ns = min(begin_ns, int(series.t_ns[episode.step.first - 1]) + 1)
+    return begin_ns, episode.end_ns if episode.detected_ns is None else episode.detected_ns
 
 
 def _series(bench: Bench, used_s: Floats) -> Series:
@@ -249,9 +257,8 @@ def _epochs(
 def _distance_m(bench: Bench) -> float | None:
     """Way driven: by the odometer, else by the reference, else by the positions; None where none of them tells."""
     if bench.odometry is not None:
-        driven = bench.odometry.travelled_at(bench.at_ns[[0, -1]])
-        scale = bench.epochs["odometer_scale"].drop_nulls()
-        return float(driven[-1] - driven[0]) * (scale[-1] if scale.len() else 1.0)
+        begin_m, end_m = bench.odometry.travelled_at(bench.at_ns[[0, -1]]).tolist()
+        return float(end_m - begin_m) * (bench.odometry.scale or 1.0)
     train = bench.train_m[np.isfinite(bench.train_m)]
     place = train if train.size > 1 else bench.path_m[np.isfinite(bench.path_m)]
     return float(np.abs(np.diff(place)).sum()) if place.size > 1 else None

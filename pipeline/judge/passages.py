@@ -79,7 +79,10 @@ def _of_crossings(passages: pl.DataFrame, offers: Offers) -> list[pl.Series]:
 
 
 def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.Series:
-    """The true passing of each passage [ns]: the nearest in time to its offer or to its reckoning, each given once."""
+    """The true passing of each passage [ns]: the nearest in time to its offer or to its reckoning, each given once.
+
+    A passage with neither takes what is left, in order.
+    """
     about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
     balises = passages["balise_id"].to_list()
     pairs = sorted(
@@ -94,6 +97,11 @@ def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.
         if result[row] is None and (balises[row], instant) not in taken:
             result[row] = instant
             taken.add((balises[row], instant))
+    for row, (balise, t_ns) in enumerate(zip(balises, about, strict=True)):
+        left = [one.t_ns for one in passings.get(balise, ()) if (balise, one.t_ns) not in taken]
+        if t_ns is None and left:
+            result[row] = left[0]
+            taken.add((balise, left[0]))
     return pl.Series("t_true", result, dtype=pl.Int64)
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.evidence.evidence import Alternative, EvidenceSet
-from pipeline.evidence.routes import Place
+from pipeline.evidence.routes import Place, Route
 from schemas.arrays import Bools, Floats, Ints
 
 
@@ -31,6 +31,7 @@ def train_passings(
     `rearm_m` from a balise since it passed it has not passed it again.
     """
     alone = _alone(evidence, t_ns.size)
+    places_before = _places_of(evidence, alone, known_to_m)
     names, spots = list(places), list(places.values())
     elements = np.array([place.element for place in spots], dtype=np.int64)
     measures = np.array([place.measure_m for place in spots])
@@ -38,6 +39,7 @@ def train_passings(
     for alternative in evidence.alternatives:
         close = (alternative.high_m - alternative.low_m <= 2.0 * known_to_m) & alone[alternative.rows]
         rows, at_m = alternative.rows[close], (0.5 * (alternative.low_m + alternative.high_m))[close]
+        rows, at_m = _with_places_before(rows, at_m, alternative.route, places_before)
         for balise, visit_m, sense in _on_route(alternative, elements, measures, at_m):
             instants = _crossed(t_ns, rows, at_m - visit_m, rearm_m)
             found[names[balise]] += [one._replace(sense=one.sense * sense) for one in instants]
@@ -52,6 +54,29 @@ def _alone(evidence: EvidenceSet, size: int) -> Bools:
     count[evidence.rival_row] += 1
     alone: Bools = count == 1
     return alone
+
+
+Places = tuple[Ints, Floats]
+"""Per instant the net element (-1: not known) and the measure of the train."""
+
+
+def _places_of(evidence: EvidenceSet, alone: Bools, known_to_m: float) -> Places:
+    element, measure = np.full(alone.size, -1), np.full(alone.size, np.nan)
+    for one in evidence.alternatives:
+        close = (one.high_m - one.low_m <= 2.0 * known_to_m) & alone[one.rows]
+        rows = one.rows[close]
+        element[rows], measure[rows], _ = one.route.locate((0.5 * (one.low_m + one.high_m))[close])
+    return element, measure
+
+
+def _with_places_before(rows: Ints, at_m: Floats, route: Route, places: Places) -> tuple[Ints, Floats]:
+    """The instants just before the route is told of, where the train was on it by what was told before."""
+    before = np.setdiff1d(rows[rows > 0] - 1, rows)
+    near_m = at_m[np.searchsorted(rows, before)]
+    there_m, _ = route.coordinate(places[0][before], places[1][before], near_m)
+    known = np.isfinite(there_m)
+    order = np.argsort(np.concatenate([rows, before[known]]), kind="stable")
+    return np.concatenate([rows, before[known]])[order], np.concatenate([at_m, there_m[known]])[order]
 
 
 def _on_route(alternative: Alternative, elements: Ints, measures: Floats, at_m: Floats) -> list[tuple[int, float, int]]:

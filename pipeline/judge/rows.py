@@ -13,32 +13,26 @@ from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series
 from pipeline.judge.hazards import Draft, VirtualOffers, rate_mps, size_m
 from pipeline.judge.in_use import reaction_s
+from pipeline.judge.judgement import UNKNOWN, WRONG
 from pipeline.judge.suspect import Witnesses, suspect_of
 from schemas.arrays import NS_PER_S, floats
 from schemas.conform import dtypes
-from schemas.enums import Evidence, FailureMode, Hazard, Judgement, PassageStatus, Timing
+from schemas.enums import Evidence, FailureMode, Hazard, Timing
 from schemas.stages import Failures
 from schemas.tables import Hazards
 
 
-def within_budget(episode: Episode, accepted: Sequence[str], budget_s: float) -> bool | None:
-    """Whether an episode kept the allowed T_D; `accepted`: judgements of the VBs accepted in it."""
-    if Judgement.WRONG.value in accepted or episode.hazardous_s > budget_s:
+def within_budget(episode: Episode, offers: VirtualOffers, budget_s: float) -> bool | None:
+    """Whether an episode kept the allowed T_D: not where a VB was accepted wrong in it; null where nobody knows."""
+    accepted = offers.judged.code[offers.accepted & episode.holds(offers.number)]
+    if (accepted == WRONG).any() or episode.hazardous_s > budget_s:
         return False
-    proved = episode.hazardous_may_s <= budget_s and Judgement.UNKNOWN.value not in accepted
+    proved = episode.hazardous_may_s <= budget_s and not (accepted == UNKNOWN).any()
     return True if proved else None
 
 
-def accepted_in(episode: Episode, passages: pl.DataFrame) -> list[str]:
-    """Judgements of the virtual balises that the LDS accepted during an episode."""
-    t_ns = pl.col("t_offered").dt.timestamp("ns")
-    inside = (t_ns >= episode.onset_ns) & (t_ns < episode.end_ns) & pl.col("judgement").is_not_null()
-    accepted = pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value
-    return passages.filter(inside & accepted)["judgement"].cast(pl.String).to_list()
-
-
 def failures_table(
-    episodes: Sequence[Episode], drafts: Sequence[Draft], series: Series, passages: pl.DataFrame, bench: Bench
+    episodes: Sequence[Episode], drafts: Sequence[Draft], series: Series, offers: VirtualOffers, bench: Bench
 ) -> pl.DataFrame:
     """One row per episode with time judged wrong in use."""
     first_row = {id(draft.episode): number for number, draft in reversed(list(enumerate(drafts)))}
@@ -50,7 +44,7 @@ def failures_table(
             "t_end": episode.end_ns,
             "hazardous_s": episode.hazardous_s,
             "hazardous_may_s": episode.hazardous_may_s,
-            "within_budget": within_budget(episode, accepted_in(episode, passages), budget_s),
+            "within_budget": within_budget(episode, offers, budget_s),
             "wrong_track": bool(series.judged.wrong_track[episode.onset : episode.end].any()),
             "hazard_id": first_row.get(id(episode)),
         }
@@ -64,7 +58,6 @@ def hazards_table(
     drafts: Sequence[Draft],
     series: Series,
     offers: VirtualOffers,
-    passages: pl.DataFrame,
     witnesses: Witnesses,
     bench: Bench,
 ) -> pl.DataFrame:
@@ -76,12 +69,12 @@ def hazards_table(
             "hazard_id": number,
             "caused_by": None if draft.caused_by is None else ids[id(draft.caused_by)],
             "suspect": suspect_of(witnesses, draft.episode.onset_ns, draft.episode.end_ns).value,
-            "size_m": size_m(draft, series, offers),
-            "rate_mps": rate_mps(draft, series),
+            "size_m": size_m(draft, series, offers, bench.config.hazards.known_error_m),
+            "rate_mps": rate_mps(draft, series, bench.config.hazards.known_error_m),
             "evidence": _evidence(draft, series, offers).value,
             **_kind(draft, offers),
             **_instants(draft, series, offers, bench),
-            **_budget(draft, passages, bench),
+            **_budget(draft, offers, bench),
         }
         for number, draft in enumerate(drafts)
     ]
@@ -164,13 +157,13 @@ def _known(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _budget(draft: Draft, passages: pl.DataFrame, bench: Bench) -> dict[str, Any]:
+def _budget(draft: Draft, offers: VirtualOffers, bench: Bench) -> dict[str, Any]:
     episode, budget_s = draft.episode, bench.config.budget_s
     return {
         "hazardous_s": episode.hazardous_s,
         "hazardous_may_s": episode.hazardous_may_s,
         "budget_s": budget_s,
-        "within_budget": within_budget(episode, accepted_in(episode, passages), budget_s),
+        "within_budget": within_budget(episode, offers, budget_s),
     }
 
 

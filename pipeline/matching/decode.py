@@ -128,15 +128,12 @@ def _follow(chains: list[Chain], at: int, move: Move | None, other: int) -> int:
         number = chains[-1].high + 1
         chains.append(Chain((other,), number))
         return number
-    if not move.leaves:
-        return at
-    sense = 1 if move.displacement_m >= 0 else -1
-    for oriented in (*move.between, other):
-        chain, number = chains[-1], at + sense
+    for oriented in (*move.between, other) if move.sense else ():
+        chain, number = chains[-1], at + move.sense
         if not chain.low <= number <= chain.high:
-            chains[-1] = _extended(chain, oriented, sense)
+            chains[-1] = _extended(chain, oriented, move.sense)
         elif chain.oriented[number - chain.low] != oriented:
-            chains.append(_branched(chain, at, oriented, sense))
+            chains.append(_branched(chain, at, oriented, move.sense))
         at = number
     return at
 

@@ -36,11 +36,14 @@ class Ways:
 
 
 class Move(NamedTuple):
-    """Displacement [m] along the path, the elements between, and whether the element is left."""
+    """Displacement [m] along the path, the elements between, and how the element is left.
+
+    `sense`: +1 ahead, -1 behind, 0 not at all; between places at one joint the displacement is 0 either way.
+    """
 
     displacement_m: float
     between: tuple[int, ...]
-    leaves: bool
+    sense: int
 
 
 def move_scores(
@@ -73,15 +76,15 @@ def best_move(
 ) -> Move | None:
     """The most plausible move between two places and what lies between, none where the network has none."""
     limit_m = float(way.limit_m[0])
-    moves = [(0, Move(other_m - one_m, (), False))] if one == other else []
+    moves = [(0, Move(other_m - one_m, (), 0))] if one == other else []
     ahead = network.reach(one, limit_m).get(other)
     if ahead is not None:
         displacement = network.length_m(one) - one_m + ahead.distance_m + other_m
-        moves.append((ahead.barred_forward, Move(displacement, ahead.between, True)))
+        moves.append((ahead.barred_forward, Move(displacement, ahead.between, 1)))
     behind = network.reach(other, limit_m).get(one)
     if behind is not None:
         displacement = -(one_m + behind.distance_m + network.length_m(other) - other_m)
-        moves.append((behind.barred_backward, Move(displacement, behind.between[::-1], True)))
+        moves.append((behind.barred_backward, Move(displacement, behind.between[::-1], -1)))
     if not moves:
         return None
     distances = np.array([move.displacement_m for _, move in moves])

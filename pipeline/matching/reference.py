@@ -5,10 +5,14 @@ It never sees a position of a solution, nor an odometer.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import polars as pl
 
 from pipeline.matching.match import Match, match
-from schemas.config import FixSigma, MatchingConfig, Vehicle
+from schemas.arrays import flags, floats
+from schemas.config import FixSigma, HazardConfig, MatchingConfig, Vehicle
 from schemas.enums import Fix
 from schemas.errors import InputError
 from schemas.run import Site
@@ -21,23 +25,35 @@ def match_reference(
     reference: pl.DataFrame,
     site: Site,
     config: MatchingConfig,
-    sigma_default_m: float,
+    hazards: HazardConfig,
     balise_reads: pl.DataFrame | None = None,
 ) -> Match | None:
     """Place the reference's samples (ordered, unique `t`) on the site's track, none where no sample comes near any.
 
-    `reference` has `t, latitude_deg, longitude_deg, height_m, sigma_m`; where `sigma_m` is null, `sigma_default_m` [m]
-    per axis holds. That sigma is also the bias of the run. Balise reads are evidence like the reference itself: they
-    prove net elements. Path positions and heights are those of the place that the
-    reference gives, which is the GNSS antenna: the caller takes off its lever arm.
+    `reference` has `t, latitude_deg, longitude_deg, height_m, sigma_m`; where `sigma_m` is null,
+    `reference_sigma_m` per axis holds. That sigma, and `reference_aside_m` at least, is also the bias of the run,
+    and no sample lies farther beside its track than that allows. Balise reads are evidence like the reference itself: they prove net
+    elements. A route holds only as far as the reference lies on it. Path positions and heights are those of the place
+    that the reference gives, which is the GNSS antenna: the caller takes off its lever arm.
     """
-    fixes = _as_fixes(reference, sigma_default_m)
-    typical_m = fixes["cov_ee_m2"].sqrt().median()
-    own = config.model_copy(update={"cross_bias_sigma_m": typical_m})
+    fixes = _as_fixes(reference, hazards.reference_sigma_m)
+    aside_m = max(float(np.median(np.sqrt(floats(fixes, "cov_ee_m2")))), hazards.reference_aside_m)
+    own = config.model_copy(update={"cross_bias_sigma_m": aside_m, "on_track_bias_m": aside_m})
+    sites = [site] if site.route is None else [site, replace(site, route=None)]
+    found = [one for one in (_matched(fixes, own, each, balise_reads) for each in sites) if one is not None]
+    return max(found, key=_placed, default=None)
+
+
+def _matched(fixes: pl.DataFrame, own: MatchingConfig, site: Site, balise_reads: pl.DataFrame | None) -> Match | None:
     try:
         return match(fixes, None, site, Vehicle(), own, FixSigma(), balise_reads)
     except InputError:
         return None
+
+
+def _placed(found: Match) -> int:
+    """How many samples lie on the track."""
+    return int(flags(found.epochs, "on_track").sum())
 
 
 def _as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:

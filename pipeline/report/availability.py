@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.export.places import Ground, ground_of, plane_m
-from pipeline.report.packing import Json
-from pipeline.track.survey import track_of
+from pipeline.export.places import element_lines_m, ground_of, origin_of, plane_m, thinned
+from pipeline.report.columns import Row
+from pipeline.report.markup import Json
+from schemas.arrays import Floats
 from schemas.run import Site
 
 _PIECES = 400
+_TRACK_POINTS = 3000
 _STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 
 
@@ -56,10 +58,15 @@ def availability_map(pieces: pl.DataFrame, hazards: pl.DataFrame, site: Site | N
     return {
         "geographic": site is not None,
         "elements": elements,
-        "track": _track_lines(site) if site is not None else [],
+        "track": [] if site is None else [_track_line(*line) for line in element_lines_m(site)],
         "pieces": [_piece(row, elements, site) for row in pieces.iter_rows(named=True)],
         "hazards": _hazards(placed, elements, site),
     }
+
+
+def _track_line(name: str, east: Floats, north: Floats) -> Json:
+    x, y = (np.round(thinned(values, _TRACK_POINTS), 1).tolist() for values in (east, north))
+    return {"name": name, "x": x, "y": y}
 
 
 def _hazards(hazards: pl.DataFrame, elements: list[str], site: Site | None) -> list[Json]:
@@ -68,7 +75,7 @@ def _hazards(hazards: pl.DataFrame, elements: list[str], site: Site | None) -> l
     if site is None:
         x, y = measure_m, np.array([float(elements.index(name)) for name in hazards["netelement_id"]])
     else:
-        x, y = plane_m(ground_of(site.track, hazards["netelement_id"], measure_m), _origin(site))
+        x, y = plane_m(ground_of(site.track, hazards["netelement_id"], measure_m), origin_of(site))
     names = hazards.select("run_id", "hazard_id", pl.col("hazard").cast(pl.String)).iter_rows()
     return [
         [round(float(east), 1), round(float(north), 1), f"{run} {number}: {kind}"]
@@ -77,9 +84,8 @@ def _hazards(hazards: pl.DataFrame, elements: list[str], site: Site | None) -> l
     ]
 
 
-def _piece(row: dict[str, object], elements: list[str], site: Site | None) -> Json:
-    from_m, to_m = float(str(row["from_m"])), float(str(row["to_m"]))
-    name, count, tvb = str(row["netelement_id"]), int(str(row["epochs"])), int(str(row["tvb"]))
+def _piece(row: Row, elements: list[str], site: Site | None) -> Json:
+    name, from_m, to_m = row["netelement_id"], row["from_m"], row["to_m"]
     if site is None:
         x, y = np.array([from_m, to_m]), np.full(2, float(elements.index(name)))
     else:
@@ -89,37 +95,16 @@ def _piece(row: dict[str, object], elements: list[str], site: Site | None) -> Js
         "name": name,
         "from_m": from_m,
         "to_m": to_m,
-        "epochs": count,
-        "share": round(tvb / count, 4),
+        "epochs": row["epochs"],
+        "share": round(row["tvb"] / row["epochs"], 4),
         "x": np.round(x[known], 1).tolist(),
         "y": np.round(y[known], 1).tolist(),
     }
 
 
-def _line(site: Site, name: str, measure_m: np.ndarray[tuple[int], np.dtype[np.float64]]) -> tuple[np.ndarray, ...]:
+def _line(site: Site, name: str, measure_m: Floats) -> tuple[np.ndarray, ...]:
     own = site.track.filter(pl.col("netelement_id") == name)
     if own.is_empty():
         return np.full(len(measure_m), np.nan), np.full(len(measure_m), np.nan)
     inside = np.clip(measure_m, float(own["measure_m"][0]), float(own["measure_m"][-1]))
-    return plane_m(ground_of(own, pl.Series([name] * len(inside)), inside), _origin(site))
-
-
-def _track_lines(site: Site) -> list[Json]:
-    survey = track_of(site.track)
-    nothing = np.full(len(survey.latitude_deg), np.nan)
-    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), _origin(site))
-    stride = max(1, len(east) // 20_000)
-    return [
-        {"name": name, "x": _thin(east[rows], stride), "y": _thin(north[rows], stride)}
-        for _, name, rows in survey.elements()
-    ]
-
-
-def _thin(values: np.ndarray[tuple[int], np.dtype[np.float64]], stride: int) -> list[float]:
-    kept: list[float] = np.round(np.append(values[:-1:stride], values[-1:]), 1).tolist()
-    return kept
-
-
-def _origin(site: Site) -> tuple[float, float]:
-    first = site.track.row(0, named=True)
-    return float(first["latitude_deg"]), float(first["longitude_deg"])
+    return plane_m(ground_of(own, pl.Series([name] * len(inside)), inside), origin_of(site))

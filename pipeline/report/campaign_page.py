@@ -5,58 +5,67 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
-from typing import Any
 
 import polars as pl
 
 from pipeline.campaign.outcome import worst
+from pipeline.figures.campaign_figures import failures_of
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts, word_of
-from pipeline.report.architectures import architectures_section, map_section
+from pipeline.report.architectures import architectures_section
 from pipeline.report.availability import availability_map
-from pipeline.report.campaign_figures import Figure, headline, level_figures, share_text
-from pipeline.report.markup import Cell, badge, cell, figure, link, number, page, pairs, section, table, verdict_head
-from pipeline.report.packing import Json, script_json
-from pipeline.report.run_page import Made, hazard_hash
-from pipeline.safety.measured import failed_runs, failures_of
+from pipeline.report.columns import Row, figures, frame_table
+from pipeline.report.markup import (
+    Cell,
+    Json,
+    badge,
+    figure,
+    link,
+    number,
+    page,
+    pairs,
+    script_json,
+    section,
+    verdict_head,
+)
+from pipeline.report.run_page import Made, configuration, hazard_cell
+from pipeline.safety.sentences import level_statements, plain_statements
+from schemas.campaign import CampaignBalises, CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunStatus, RunVerdict
-
-Row = Mapping[str, Any]
+from schemas.tables import Hazards
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """Tables of all runs, `run_id` in front; `pieces` as from `availability_pieces`; `hrefs` of the runs' pages;
-    `architectures` as from `over_all_runs`, `map` as from `map_places`.
+    """Tables of all runs, `run_id` in front, and `derived` from them by the name of their file; `pieces` as from
+    `availability_pieces`; `hrefs` of the runs' pages; `architectures` as from `added`.
     """
 
     runs: pl.DataFrame
     hazards: pl.DataFrame
     passages: pl.DataFrame
+    derived: Mapping[str, pl.DataFrame]
     pieces: pl.DataFrame
     hrefs: Mapping[str, str]
     architectures: pl.DataFrame
-    map: pl.DataFrame
 
 
-_RUN_COLUMNS = (
-    ("share_unknown", "share unknown"),
-    ("duration_s", "duration [s]"), ("distance_m", "distance [m]"), ("availability", "availability"),
-    ("evidence", "evidence"), ("hazards", "hazards"), ("hazards_detected", "detected"),
-    ("missed_detections", "missed detections"), ("time_to_detect_max_s", "T_D max [s]"),
-    ("hazardous_max_s", "hazardous max [s]"), ("balises_accepted", "VBs accepted"),
-    ("balises_on_path", "VBs passed"), ("unsafe_accepted", "unsafe accepted"),
-    ("unproven_accepted", "unproven accepted"), ("failures", "failures"), ("failures_within_budget", "within budget"),
-    ("location_error_p95_m", "location error 95 % [m]"), ("along_error_p95_m", "error along 95 % [m]"),
-    ("alarms", "alarms"), ("false_alarms", "false alarms"), ("exposure_max_s", "exposure max [s]"),
-    ("outages", "outages"),
-)  # fmt: skip
+RUN_COLUMNS = (
+    *("verdict", "run_id", "status", "error", "notes", "solution", "share_unknown", "duration_s", "distance_m"),
+    *("availability", "evidence", *HAZARD_COUNTS, "hazards_detected", "missed_detections", "time_to_detect_max_s"),
+    *("hazardous_max_s", "balises_accepted", "balises_on_path", "unsafe_accepted", "unproven_accepted", "failures"),
+    *("failures_within_budget", "location_error_p95_m", "along_error_p95_m", "alarms", "false_alarms"),
+    *("exposure_max_s", "outages"),
+)
 _HAZARD_COLUMNS = (
-    ("failure_mode", "ETCS failure"), ("size_m", "size [m]"), ("t_onset", "onset"), ("monitor", "detected by"),
-    ("time_to_detect_s", "T_D [s]"), ("time_since_failure_s", "T_dsf [s]"), ("hazardous_s", "hazardous [s]"),
-    ("hazardous_may_s", "with what is unknown [s]"), ("within_budget", "within budget"), ("balise_ids", "VBs hit"),
-    ("accepted_ids", "accepted despite the fault"), ("suspect", "suspect"),
-)  # fmt: skip
+    *("run_id", "hazard", "failure_mode", "size_m", "t_onset", "monitor", "time_to_detect_s", "time_since_failure_s"),
+    *("hazardous_s", "hazardous_may_s", "within_budget", "balise_ids", "accepted_ids", "suspect"),
+)
+_BALISE_COLUMNS = (
+    *("balise_id", "kind", "passages", "accepted", "accepted_share", "deletions", "deletion_rate", "accepted_judged"),
+    *("unsafe_accepted", "unsafe_rate", "unproven_accepted", "location_error_mean_m", "location_error_max_m"),
+)
+_LEVEL_COLUMNS = ("service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged", "within_share")
 _PLOTS = (
     ("classes", "Hazards by class", "Within the budget, beyond it, not known."),
     ("detection", "Time to detect", "Share of all hazards detected by then, and of all failures in use no longer; "
@@ -71,18 +80,17 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
     body = [
-        *(_solution(f"s{index}", name, campaign, made, len(solutions) > 1) for index, name in enumerate(solutions)),
+        *(_solution(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
-        map_section(campaign.map),
+        _map_in_doubt(campaign.derived["map"]),
         section("runs", "Runs", _run_counts(campaign.runs), _runs_table(campaign)),
-        section("provenance", "Provenance", _provenance(campaign.runs), _configuration(made)),
+        section("provenance", "Provenance", _provenance(campaign.runs), _budget(made), configuration(made)),
     ]
+    safety = made.config.safety
     data = {
         "order": solutions,
         "solutions": {name: _solution_data(name, campaign, made) for name in solutions},
-        "levels": [
-            [level, made.config.safety.allowed_time_to_detect_s(level)] for level in made.config.safety.service_levels
-        ],
+        "levels": [[level, safety.allowed_time_to_detect_s(level)] for level in safety.service_levels],
         "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
     }
     verdicts = run_verdicts(campaign.runs)
@@ -108,85 +116,57 @@ def _runs_table(campaign: Campaign) -> str:
     failed = 1
     runs = (
         known_counts(campaign.runs)
-        .with_columns(
-            hazards=pl.sum_horizontal(HAZARD_COUNTS, ignore_nulls=False),
-            order=pl.col("verdict").cast(pl.String).replace_strict(order, default=failed, return_dtype=pl.Int64),
-        )
+        .with_columns(order=pl.col("verdict").cast(pl.String).replace_strict(order, default=failed))
         .sort("order", "run_id", "solution")
     )
-    rows = []
-    for row in runs.iter_rows(named=True):
-        name = Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"]))
+
+    def verdict(row: Row) -> Cell:
         word = word_of(row["verdict"])
-        verdict = Cell(word, str(row["order"]), badge(word))
-        status = Cell(str(row["status"]), str(row["status"]), badge(str(row["status"])))
-        reason = cell("; ".join(text for text in (row["error"], row["notes"]) if text) or None)
-        figures = [cell(row[key]) for key, _ in _RUN_COLUMNS]
-        rows.append([verdict, name, status, reason, cell(row["solution"] or None), *figures])
-    titles = ["verdict", "run", "status", "reason or notes", "solution", *(title for _, title in _RUN_COLUMNS)]
-    return table("table-runs", "Runs, unsafe and failed ones first", titles, rows)
+        return Cell(word, str(row["order"]), badge(word))
+
+    special = {
+        "verdict": verdict,
+        "run_id": lambda row: Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"])),
+        "status": lambda row: Cell(row["status"], row["status"], badge(row["status"])),
+    }
+    caption = "Runs, unsafe and failed ones first"
+    return frame_table("table-runs", caption, runs, RUN_COLUMNS, CampaignRuns, special)
 
 
-def _solution(key: str, name: str, campaign: Campaign, made: Made, several: bool) -> str:
-    hazards = _only(campaign.hazards, name)
-    figures = headline(
-        _only(campaign.runs, name),
-        failed_runs(campaign.runs, name),
-        hazards,
-        _only(campaign.passages, name),
-        made.config.safety,
-    )
-    title = f"Solution {name}" if several else "Figures"
+def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
+    found, levels, balises = (_only(campaign.derived[table], name) for table in ("figures", "detection", "balises"))
+    said = "".join(f"<p>{escape(text)}</p>" for text in (*plain_statements(found), *level_statements(levels)))
     note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
+    title = "Position failures in use against the allowed T_D (TVB eq. 7)"
     return section(
         key,
-        title,
-        _headline(figures),
+        f"Solution {name}" if several else "Figures",
+        said,
+        *(figures(row, CampaignFigures) for row in found.drop("solution").iter_rows(named=True)),
         note,
-        _levels(key, _only(campaign.runs, name), made),
+        frame_table(f"table-levels-{key}", title, levels, _LEVEL_COLUMNS, CampaignDetection),
         *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
-        _hazards_table(key, hazards, campaign),
+        frame_table(f"table-balises-{key}", "Balises over all runs", balises, _BALISE_COLUMNS, CampaignBalises),
+        _hazards_table(key, _only(campaign.hazards, name), campaign),
     )
-
-
-def _headline(figures: list[Figure]) -> str:
-    items = "".join(
-        f"<div><dt>{escape(item.name)}</dt><dd><strong>{escape(item.value)}</strong><br>{escape(item.bounds)}</dd></div>"
-        for item in figures
-    )
-    return f'<dl class="headline">{items}</dl>'
-
-
-def _levels(key: str, runs: pl.DataFrame, made: Made) -> str:
-    rows = [
-        [
-            cell(row.level),
-            cell(row.allowed_s, 4),
-            *(cell(count) for count in (row.within, row.exceeded, row.unknown)),
-            cell(share_text(row.share)),
-        ]
-        for row in level_figures(runs, made.config.safety)
-    ]
-    titles = [
-        "service level",
-        "allowed T_D [s]",
-        "within it",
-        "beyond it",
-        "not known",
-        "share within it, by a truth",
-    ]
-    return table(f"table-levels-{key}", "Position failures in use against the allowed T_D (TVB eq. 7)", titles, rows)
 
 
 def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
-    rows = []
-    for row in hazards.sort("run_id", "hazard_id").iter_rows(named=True):
-        href = campaign.hrefs[row["run_id"]] + hazard_hash(row["solution"], row["hazard_id"])
-        first = Cell(row["run_id"], row["run_id"], link(href, f"{row['run_id']} {row['hazard_id']}"))
-        kind = Cell(str(row["hazard"]), str(row["hazard"]), tone="" if row["detected"] else "bad")
-        rows.append([first, kind, *(cell(row[column]) for column, _ in _HAZARD_COLUMNS)])
-    titles = ["run and hazard", "class", *(title for _, title in _HAZARD_COLUMNS)]
-    return table(f"table-hazards-{key}", "Hazards of all runs", titles, rows)
+    special = {
+        "run_id": lambda row: hazard_cell(row, f"{row['run_id']} {row['hazard_id']}", campaign.hrefs[row["run_id"]]),
+    }
+    ordered = hazards.sort("run_id", "hazard_id")
+    return frame_table(f"table-hazards-{key}", "Hazards of all runs", ordered, _HAZARD_COLUMNS, Hazards, special)
+
+
+def _map_in_doubt(places: pl.DataFrame) -> str:
+    """Places where several runs raised the same alarm across the track; nothing where there are none."""
+    if places.is_empty():
+        return ""
+    columns = ("netelement_id", "from_m", "to_m", "axis", "runs", "alarms", "solutions", "run_ids")
+    note = "<p>Monitors across the track alone failed there in several runs: look at the survey first.</p>"
+    shown = frame_table("table-map", "Map in doubt", places, columns, CampaignMap)
+    return section("map", "Places where the map is in doubt", note, shown)
 
 
 def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
@@ -233,9 +213,5 @@ def _provenance(runs: pl.DataFrame) -> str:
     return pairs((name, ", ".join(runs[name].unique().sort().to_list())) for name in names)
 
 
-def _configuration(made: Made) -> str:
-    budget = f"<p>Budget of the hazards: {number(made.config.budget_s, 4)} s ({made.config.hazards.service_level}).</p>"
-    if made.config_text is None:
-        return budget + '<p class="notice partial">The result holds no config.toml: limits are the defaults.</p>'
-    text = f'<pre tabindex="0">{escape(made.config_text)}</pre>'
-    return budget + f"<details><summary>Resolved configuration (TOML)</summary>{text}</details>"
+def _budget(made: Made) -> str:
+    return f"<p>Budget of the hazards: {number(made.config.budget_s, 4)} s ({made.config.hazards.service_level}).</p>"

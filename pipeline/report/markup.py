@@ -1,11 +1,19 @@
-"""Pieces of HTML: text is escaped, tables can be sorted and searched by the page's script."""
+"""Pieces of a page: HTML whose text is escaped, and numbers for its script, the same bytes for the same content."""
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from html import escape
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Json = Any
 
 UNKNOWN = "–"
 _LONG = 32
@@ -60,17 +68,16 @@ def link(href: str, text: str, **attributes: str) -> str:
     return f'<a href="{escape(href)}"{extra}>{escape(text)}</a>'
 
 
-def table(identity: str, caption: str, titles: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
-    """A table with sortable heads; the script adds a search field where there are more than a few rows."""
-    cells = [list(row) for row in rows]
-    if not cells:
+def table(identity: str, caption: str, heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Cell]]) -> str:
+    """A table whose columns have a title and a meaning; the script sorts it, and searches a long one."""
+    if not rows:
         return f'<p class="none">{escape(caption)}: none.</p>'
-    body = [f"<tr>{''.join(_td(item) for item in row)}</tr>" for row in cells]
-    heads = "".join(_th(title, [row[column] for row in cells]) for column, title in enumerate(titles))
+    body = "\n".join(f"<tr>{''.join(_td(item) for item in row)}</tr>" for row in rows)
+    titles = "".join(_th(*head, [row[column] for row in rows]) for column, head in enumerate(heads))
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
         f'<table class="data" id="{identity}"><caption>{escape(caption)}</caption>'
-        f"<thead><tr>{heads}</tr></thead><tbody>\n" + "\n".join(body) + "\n</tbody></table></div>"
+        f"<thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
     )
 
 
@@ -134,9 +141,10 @@ def page(title: str, heading: str, body: str, data: str, assets: str, script: st
 """
 
 
-def _th(title: str, cells: Sequence[Cell]) -> str:
+def _th(title: str, meaning: str, cells: Sequence[Cell]) -> str:
     kind = ' class="number"' if any(isinstance(item.order, float) for item in cells) else ""
-    return f'<th scope="col"{kind}>{escape(title)}</th>'
+    told = f' title="{escape(meaning)}"' if meaning else ""
+    return f'<th scope="col"{kind}{told}>{escape(title)}</th>'
 
 
 def _td(item: Cell) -> str:
@@ -146,3 +154,16 @@ def _td(item: Cell) -> str:
     kinds = [name for name in (shape, item.tone) if name]
     classes = f' class="{" ".join(kinds)}"' if kinds else ""
     return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"
+
+
+def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:
+    """Little-endian numbers as base64; `kind` is `f4`, `u4` or `u1`. NaN stands for not known."""
+    array = np.asarray(values).astype(f"<{kind}")
+    return {"kind": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def script_json(value: Json) -> str:
+    """JSON that may stand inside a script element."""
+    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False, sort_keys=True)
+    # Neither an end tag nor a comment of HTML may arise from data.
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

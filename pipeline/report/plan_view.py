@@ -10,12 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.export.places import Ground, Stretches, beside, ground_at, ground_of, plane_m, sign_of, stretches_of
+from pipeline.export.places import (
+    Stretches,
+    beside,
+    element_lines_m,
+    ground_at,
+    ground_of,
+    origin_of,
+    plane_m,
+    sign_of,
+    stretches_of,
+    thinned,
+)
 from pipeline.report.decimate import detail_rows
-from pipeline.report.packing import Json, packed
-from pipeline.report.series import UNKNOWN, column_of
-from pipeline.track.survey import track_of
-from schemas.arrays import Floats, Ints
+from pipeline.report.markup import Json, packed
+from pipeline.report.series import UNKNOWN
+from schemas.arrays import Floats, Ints, floats
 from schemas.enums import Direction, LdsState, PassageStatus
 from schemas.run import Site
 
@@ -39,17 +49,17 @@ class _View:
         return plane_m(ground_at(self.site.track, self.stretches, path_m), self.origin)
 
     def gnss(self, epochs: pl.DataFrame) -> tuple[Floats, Floats]:
-        cross_m = column_of(epochs, "cross_track_m")
+        cross_m = floats(epochs, "cross_track_m")
         if self.site is None:
-            return column_of(epochs, "path_m"), cross_m
-        rails: Ground = ground_of(self.site.track, epochs["netelement_id"], column_of(epochs, "measure_m"))
+            return floats(epochs, "path_m"), cross_m
+        rails = ground_of(self.site.track, epochs["netelement_id"], floats(epochs, "measure_m"))
         sign = sign_of(epochs, self.stretches)
         return plane_m(beside(rails, sign, cross_m, np.zeros(len(cross_m))), self.origin)
 
 
 def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, moments_ns: Ints) -> Json:
     """Everything that the plan of one solution draws; lengths in metres."""
-    view = _View(site, stretches_of(epochs), _origin(site))
+    view = _View(site, stretches_of(epochs), (0.0, 0.0) if site is None else origin_of(site))
     shown = epochs.filter(pl.col("path_m").is_not_null())
     t_ns = shown["t"].to_physical().to_numpy()
     rows = _shown_rows(t_ns, moments_ns)
@@ -60,7 +70,7 @@ def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, m
     return {
         "geographic": site is not None,
         "states": list(STATES),
-        "track": _track(site, x, y, view.origin) if site is not None else _axis(x),
+        "track": _track(site, x, y) if site is not None else _axis(x),
         "x": packed(x, "f4"),
         "y": packed(y, "f4"),
         "t": packed((t_ns[rows] - t0_ns) // 1_000_000, "u4"),
@@ -70,45 +80,27 @@ def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, m
     }
 
 
-def _origin(site: Site | None) -> tuple[float, float]:
-    if site is None:
-        return 0.0, 0.0
-    first = site.track.row(0, named=True)
-    return float(first["latitude_deg"]), float(first["longitude_deg"])
-
-
 def _shown_rows(t_ns: Ints, moments_ns: Ints) -> Ints:
     stride = max(1, -(-len(t_ns) // _POINTS))
     near = detail_rows(t_ns, moments_ns, reach_s=30.0) if stride > 1 else np.zeros(len(t_ns), dtype=np.bool_)
     return np.flatnonzero(near | (np.arange(len(t_ns)) % stride == 0))
 
 
-def _track(site: Site, x: Floats, y: Floats, origin: tuple[float, float]) -> list[Json]:
+def _track(site: Site, x: Floats, y: Floats) -> list[Json]:
     """The net elements near the run, as lines."""
     known = np.isfinite(x)
     if not known.any():
         return []
-    box = [x[known].min(), x[known].max(), y[known].min(), y[known].max()]
-    survey = track_of(site.track)
-    nothing = np.full(len(survey.latitude_deg), np.nan)
-    east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin)
-    lines = []
-    for _, name, rows in survey.elements():
-        a, b = east[rows], north[rows]
-        outside = (
-            a.max() < box[0] - _AROUND_M
-            or a.min() > box[1] + _AROUND_M
-            or b.max() < box[2] - _AROUND_M
-            or b.min() > box[3] + _AROUND_M
-        )
-        if not outside:
-            lines.append({"name": name, "x": packed(_thin(a), "f4"), "y": packed(_thin(b), "f4")})
-    return lines
-
-
-def _thin(values: Floats) -> Floats:
-    stride = max(1, -(-len(values) // _TRACK_POINTS))
-    return np.append(values[:-1:stride], values[-1:])
+    low = np.array([x[known].min(), y[known].min()]) - _AROUND_M
+    high = np.array([x[known].max(), y[known].max()]) + _AROUND_M
+    return [
+        {
+            "name": name,
+            **{axis: packed(thinned(line, _TRACK_POINTS), "f4") for axis, line in (("x", east), ("y", north))},
+        }
+        for name, east, north in element_lines_m(site)
+        if (low <= [east.max(), north.max()]).all() and (high >= [east.min(), north.min()]).all()
+    ]
 
 
 def _axis(x: Floats) -> list[Json]:
@@ -125,7 +117,7 @@ def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
         pl.col("path_m").first(), pl.len().alias("count"), pl.col("kind").first(), pl.col("measure_m").first(),
         pl.col("netelement_id").first(),
     )  # fmt: skip
-    x, y = view.at(column_of(groups, "path_m"))
+    x, y = view.at(floats(groups, "path_m"))
     return [
         {
             "id": row["balise_id"],

@@ -11,33 +11,64 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.figures.known_counts import known_counts
-from pipeline.figures.verdict import word_of, worst_verdict
+from pipeline.figures.levels import LEVEL_LISTS
+from pipeline.figures.verdict import verdict_reasons, word_of, worst_verdict
 from pipeline.report.architectures import architectures_section
-from pipeline.report.markup import (
-    Cell,
-    badge,
-    cell,
-    figure,
-    link,
-    page,
-    pairs,
-    section,
-    table,
-    verdict_head,
-)
-from pipeline.report.packing import Json, script_json
+from pipeline.report.columns import Row, figures, frame_table
+from pipeline.report.markup import Cell, Json, badge, figure, link, page, pairs, script_json, section, verdict_head
 from pipeline.report.plan_view import plan_data
-from pipeline.report.run_columns import ALARM_COLUMNS, HAZARD_COLUMNS, PASSAGE_COLUMNS, PLOTS
-from pipeline.report.run_summary import figures, levels, verdict_reasons
-from pipeline.report.series import moments_of, reasons, time_data
-from pipeline.report.stanford import stanford_data
-from pipeline.safety.side_by_side import Key, side_by_side_table
-from pipeline.safety.tally import Tally
+from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
+from schemas.campaign import STANFORD, CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
 from schemas.run import RunTables, Site
+from schemas.tables import Alarms, Hazards, Passages, Runs
 
-Row = Mapping[str, Any]
+_FIGURES = (
+    *("verdict", "duration_s", "distance_m", "epochs", "gnss_rate_hz", "evidence", "share_unknown", "vehicle"),
+    *("odometer_contradicted", "availability", "outages", "longest_outage_s", "along_error_p95_m"),
+    *("along_error_max_m", "along_error_epochs", "cross_error_p95_m", "up_error_p95_m", "balises_on_path"),
+    *("balises_accepted", "balises_rejected", "balises_missed", "balises_not_available", "unsafe_accepted"),
+    *("unproven_accepted", "location_error_p95_m", "location_error_count", "failures", "failures_within_budget"),
+    *("failures_beyond_budget", "missed_detections", "time_to_detect_max_s", "hazardous_max_s", "alarms"),
+    *("false_alarms", "false_alarm_rate_per_h", "exposure_max_s", "exposure_p99_s", "mtbf_h", "latency_s"),
+    *("odometer_scale", "ambiguous_stretches", "duplicates", "out_of_order"),
+    *(f"share_{state}" for state in ("p0", "p1", "p2", "p3")),
+    *(f"{prefix}_{kind}" for prefix in ("stanford", "stanford_hpl") for kind in STANFORD),
+)
+_HAZARDS = (
+    *("hazard_id", "failure_mode", "timing", "size_m", "rate_mps", "t_onset", "t_failure", "t_detected", "monitor"),
+    *("time_to_detect_s", "time_since_failure_s", "hazardous_s", "hazardous_may_s", "budget_s", "within_budget"),
+    *("balise_ids", "accepted_ids", "suspect", "evidence", "speed_mps", "caused_by"),
+)
+_PASSAGES = (
+    *("balise_id", "status", "kind", "direction", "t_offered", "t_true", "judgement", "location_error_m"),
+    *("location_accuracy_m", "speed_mps", "window_open_m", "odometer_distance_m", "window_close_m", "confidence_m"),
+    *("linking_error", "reaction", "failure_mode", "cause", "suspect_after_the_fact", "hazard_id"),
+)
+_ALARMS = (
+    *("t_start", "t_end", "monitors", "peak_ratio", "verdict", "suspect", "hazard_id", "netelement_id", "measure_m"),
+)
+_PLOTS = (
+    ("plan", "Plan", "GNSS positions coloured by the state of the LDS; balises by what became of them; "
+     "thick lines are expectation windows."),
+    ("bands", "LDS mode, state, TVB and alarm", "Where nothing is drawn there was no epoch. Hazards are shaded; "
+     "of the chosen one the dotted line is the onset, the solid one the detection, the dashed one the failure."),
+    ("speed", "Speed", ""),
+    ("along", "Error along the track", "Positive ahead of the train, drawn where it is known to 5 m; the confidence "
+     "interval is dashed. Where it is never known: GNSS minus odometer."),
+    ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
+    ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
+     "in odometer distance; markers are the offers."),
+    ("exposure", "Exposure", "Time since the last linked TVB or accepted VB."),
+    ("monitors-along", "Monitors along the track", "Value over threshold: beyond ±1 the monitor fails."),
+    ("monitors-cross", "Monitors across the track", "Value over threshold."),
+    ("monitors-up", "Monitors of height", "Value over threshold."),
+    ("monitors-other", "Other monitors", "Value over threshold."),
+    ("states", "State of every monitor", "Not evaluated is not the same as passed."),
+    ("stanford", "Stanford diagram", "Epochs of known error: error along the track against the confidence claimed. "
+     "Below the diagonal the claim was wrong."),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,7 +81,7 @@ class Made:
 
 
 def run_page(
-    tables: RunTables, metadata: Mapping[str, str], made: Made, architectures: Mapping[Key, Tally] | None = None
+    tables: RunTables, metadata: Mapping[str, str], made: Made, architectures: pl.DataFrame | None = None
 ) -> str:
     """HTML of one run with all its solutions; one is shown at a time, all of them are in the page.
 
@@ -59,7 +90,7 @@ def run_page(
     rows = list(tables.runs.iter_rows(named=True))
     names = [row["solution"] for row in rows if row["solution"]]
     parts = [_solution(f"s{number}", row, tables, len(rows) > 1) for number, row in enumerate(rows)]
-    side_by_side = architectures_section("architectures", side_by_side_table(dict(architectures or {})))
+    side_by_side = "" if architectures is None else architectures_section("architectures", architectures)
     body = "\n".join([_navigation(names), *parts, side_by_side, _provenance(rows, metadata, made)])
     data = {
         "run": tables.run_id,
@@ -110,19 +141,15 @@ def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
 
 
 def _hazard_data(row: Row) -> Json:
-    moments = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
-    return {
-        "id": row["hazard_id"],
-        "class": str(row["hazard"]),
-        **{name: milliseconds(row[name]) for name in moments},
-    }
+    moments = {name: _milliseconds(row[name]) for name in MOMENTS}
+    return {"id": row["hazard_id"], "class": row["hazard"], **moments}
 
 
 def _passage_data(row: Row) -> Json:
     return {
         "id": row["balise_id"],
         "status": str(row["status"]),
-        "t_ms": milliseconds(row["t_offered"] if row["t_offered"] is not None else row["t_true"]),
+        "t_ms": _milliseconds(row["t_offered"] or row["t_true"]),
         "error_m": row["location_error_m"],
         "open_m": row["window_open_m"],
         "close_m": row["window_close_m"],
@@ -130,12 +157,13 @@ def _passage_data(row: Row) -> Json:
     }
 
 
-def hazard_hash(solution: str, hazard_id: int) -> str:
-    """The part of an address that zooms a run's page to a hazard."""
-    return f"#s={quote(solution, safe='')}&h={hazard_id}"
+def hazard_cell(row: Row, title: str, page_href: str = "", **attributes: str) -> Cell:
+    """A link that zooms a run's page to a hazard; one that no monitor found stands out."""
+    href = f"{page_href}#s={quote(row['solution'], safe='')}&h={row['hazard_id']}"
+    return Cell(title, title, link(href, title, **attributes), "" if row["detected"] else "bad")
 
 
-def milliseconds(value: Any) -> float | None:
+def _milliseconds(value: Any) -> float | None:
     """An instant as the page's scripts take it."""
     return None if value is None else round(value.timestamp() * 1000.0, 3)
 
@@ -171,7 +199,7 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
     known = known_counts(tables.runs.filter(pl.col("solution") == name)).row(0, named=True)
     title = f"Figures of {name}" if several else "Figures"
     parts = [
-        section(f"figures-{key}", title, *notes, figures(known), levels(key, row)),
+        section(f"figures-{key}", title, *notes, figures(known, Runs, _FIGURES), _levels(key, row)),
         section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
         _drawings(key),
         section(f"passages-{key}", "Passages", _passages(key, passages)),
@@ -183,8 +211,14 @@ def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
 
 
 def _drawings(key: str) -> str:
-    figures = (figure(f"{key}-{plot}", title, note) for plot, title, note in PLOTS)
-    return section(f"drawings-{key}", "Drawings", *figures)
+    return section(f"drawings-{key}", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in _PLOTS))
+
+
+def _levels(key: str, run: Row) -> str:
+    """What the run would be worth at each service level."""
+    shown = pl.DataFrame({name: run[column] or [] for name, column in LEVEL_LISTS.items()})
+    title = "Position failures against the allowed T_D (TVB eq. 7)"
+    return frame_table(f"table-levels-{key}", title, shown, contract=CampaignLevels)
 
 
 def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
@@ -199,49 +233,39 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
         share = run["share_unknown"]
         left = "; no position was in use" if share is None else f"; {share:.1%} of the moving time in use is not judged"
         return f'<p class="none">No hazard was found; judged by: {escape(str(run["evidence"]))}{left}.</p>'
-    rows = []
-    for row in hazards.iter_rows(named=True):
-        title = f"{row['hazard_id']} {row['hazard']}"
-        anchor = link(hazard_hash(row["solution"], row["hazard_id"]), title, data_hazard=str(row["hazard_id"]))
-        first = Cell(title, float(row["hazard_id"]), anchor, "" if row["detected"] else "bad")
-        rows.append([first, *(cell(row[key]) for key, _ in HAZARD_COLUMNS)])
-    titles = ["hazard", *(title for _, title in HAZARD_COLUMNS)]
-    return table(f"table-hazards-{key}", "Hazards; a link zooms every drawing to its hazard", titles, rows)
+
+    def named(row: Row) -> Cell:
+        return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
+
+    caption = "Hazards; a link zooms every drawing to its hazard"
+    return frame_table(f"table-hazards-{key}", caption, hazards, _HAZARDS, Hazards, {"hazard_id": named})
 
 
 def _passages(key: str, passages: pl.DataFrame) -> str:
-    rows = [
-        [
-            cell(row["balise_id"]),
-            Cell(str(row["status"]), str(row["status"]), tone="" if row["status"] == "accepted" else "bad"),
-            *(cell(row[key], 4) for key, _ in PASSAGE_COLUMNS),
-        ]
-        for row in passages.iter_rows(named=True)
-    ]
-    titles = ["balise", "status", *(title for _, title in PASSAGE_COLUMNS)]
-    return table(f"table-passages-{key}", "Passages of balises", titles, rows)
+    def status(row: Row) -> Cell:
+        return Cell(row["status"], row["status"], tone="" if row["status"] == "accepted" else "bad")
+
+    caption = "Passages of balises"
+    return frame_table(f"table-passages-{key}", caption, passages, _PASSAGES, Passages, {"status": status})
 
 
 def _alarms(key: str, alarms: pl.DataFrame) -> str:
-    rows = [[cell(row[key]) for key, _ in ALARM_COLUMNS] for row in alarms.iter_rows(named=True)]
-    return table(f"table-alarms-{key}", "Alarm episodes", [title for _, title in ALARM_COLUMNS], rows)
+    return frame_table(f"table-alarms-{key}", "Alarm episodes", alarms, _ALARMS, Alarms)
 
 
 def _reasons(key: str, epochs: pl.DataFrame) -> str:
-    by_reason: dict[tuple[str, int], list[str]] = {}
-    for monitor, reason, count in reasons(epochs):
-        by_reason.setdefault((reason, count), []).append(monitor)
-    rows = [[cell(reason), cell(count), cell(names)] for (reason, count), names in by_reason.items()]
-    return table(f"table-reasons-{key}", "Why monitors could not judge", ["reason", "epochs", "monitors"], rows)
+    return frame_table(f"table-reasons-{key}", "Why monitors could not judge", reasons(epochs))
 
 
 def _provenance(rows: Sequence[Row], metadata: Mapping[str, str], made: Made) -> str:
     first = rows[0]
     named = {key: str(first[key]) for key in ("software", "contract", "config_digest", "input_digest")}
-    text = made.config_text
-    shown = (
-        f'<details><summary>Resolved configuration (TOML)</summary><pre tabindex="0">{escape(text)}</pre></details>'
-        if text is not None
-        else '<p class="notice partial">The result holds no config.toml: limits drawn here are the defaults.</p>'
-    )
-    return section("provenance", "Provenance", pairs(sorted((named | dict(metadata)).items())), shown)
+    return section("provenance", "Provenance", pairs(sorted((named | dict(metadata)).items())), configuration(made))
+
+
+def configuration(made: Made) -> str:
+    """The resolved configuration, folded."""
+    if made.config_text is None:
+        return '<p class="notice partial">The result holds no config.toml: limits are the defaults.</p>'
+    text = f'<pre tabindex="0">{escape(made.config_text)}</pre>'
+    return f"<details><summary>Resolved configuration (TOML)</summary>{text}</details>"

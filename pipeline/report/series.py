@@ -1,4 +1,4 @@
-"""What the time axes of a run's page show, one solution at a time."""
+"""What the time axes and the Stanford diagram of a run's page show, one solution at a time."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import polars as pl
 
 from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
 from pipeline.report.decimate import Band, band, detail_rows, kept_rows
-from pipeline.report.packing import Json, packed
-from schemas.arrays import Bools, Floats, Ints
+from pipeline.report.markup import Json, packed
+from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
 from schemas.tables import MONITORS
 
@@ -28,7 +28,8 @@ SERIES = (
 )
 NO_EPOCH, UNKNOWN = "no epoch", "not known"
 MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)
-_MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
+_BINS = 56
+MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end")
 
 
 def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
@@ -43,7 +44,7 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
     gaps = np.flatnonzero(np.diff(t_ms) > hold_ms) + 1
     shown_ms = np.insert(t_ms, gaps, t_ms[gaps - 1] + hold_ms)
     whole = detail_rows(shown_ms * 1_000_000, moments_ns - t0_ms * 1_000_000)
-    columns = {name: column_of(epochs, name) for name in SERIES} | _ratios(epochs)
+    columns = {name: floats(epochs, name) for name in SERIES} | _ratios(epochs)
     columns["residual_m"] = _residual(epochs)
     known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     return {
@@ -56,34 +57,27 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
 
 def moments_of(*frames: pl.DataFrame) -> Ints:
     """Every instant that hazards and alarms name [ns]."""
-    names = (*_MOMENTS, "t_start")
+    names = (*MOMENTS, "t_start")
     columns = [frame[name].drop_nulls() for frame in frames for name in names if name in frame.columns]
     parts = [column.to_physical().to_numpy() for column in columns]
     return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
 
 
-def column_of(frame: pl.DataFrame, name: str) -> Floats:
-    """A column with NaN for null."""
-    return frame[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-
-
-def reasons(epochs: pl.DataFrame) -> list[Json]:
-    """Why monitors were not evaluated, with the epochs that it was so."""
-    rows: list[Json] = []
-    for monitor in MONITORS:
-        named = epochs[f"{monitor}_reason"].drop_nulls()
-        if named.is_empty():
-            continue
-        counts = named.value_counts(sort=True, name="epochs").sort("epochs", named.name, descending=[True, False])
-        rows += [[monitor, reason, count] for reason, count in counts.head(4).iter_rows()]
-    return rows
+def reasons(epochs: pl.DataFrame) -> pl.DataFrame:
+    """Why monitors were not evaluated: `reason, epochs, monitors`; of each monitor the four most frequent."""
+    counts = [
+        epochs.select(reason=f"{name}_reason").drop_nulls().group_by("reason").len("epochs").with_columns(monitor=pl.lit(name))
+        .sort("epochs", "reason", descending=[True, False]).head(4)
+        for name in MONITORS
+    ]  # fmt: skip
+    return pl.concat(counts).group_by("reason", "epochs", maintain_order=True).agg(monitors="monitor")
 
 
 def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
     """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
     ratios = {}
     for monitor in MONITORS:
-        value, threshold = column_of(epochs, f"{monitor}_value"), column_of(epochs, f"{monitor}_threshold")
+        value, threshold = floats(epochs, f"{monitor}_value"), floats(epochs, f"{monitor}_threshold")
         evaluated = (epochs[f"{monitor}_state"] != MonitorState.NOT_EVALUATED).to_numpy() & (threshold > 0)
         ratios[f"ratio_{monitor}"] = np.divide(value, threshold, out=np.full(len(value), np.nan), where=evaluated)
     return ratios
@@ -91,7 +85,7 @@ def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
 
 def _residual(epochs: pl.DataFrame) -> Floats:
     """GNSS minus odometer along the path, from where both are first known [m]."""
-    both = column_of(epochs, "path_m") - column_of(epochs, "odometer_m")
+    both = floats(epochs, "path_m") - floats(epochs, "odometer_m")
     known = np.flatnonzero(np.isfinite(both))
     return both - both[known[0]] if len(known) else both
 
@@ -133,4 +127,27 @@ def _band(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints,
         "starts": packed(pieces.starts_ms, "u4"),
         "codes": packed(pieces.codes, "u1"),
         "end_ms": pieces.end_ms,
+    }
+
+
+def stanford_data(epochs: pl.DataFrame, limit_m: float) -> Json:
+    """Counts of epochs of known error on a square grid up to twice the limit; the last bin holds all beyond it."""
+    known = epochs.select(error=pl.col("error_along_m").abs(), bound=pl.col("confidence_m")).drop_nulls()
+    width = 2.0 * limit_m / _BINS
+    cells = (
+        known.select(
+            x=(pl.col("error") / width).floor().clip(0, _BINS - 1).cast(pl.Int64),
+            y=(pl.col("bound") / width).floor().clip(0, _BINS - 1).cast(pl.Int64),
+        )
+        .group_by("x", "y")
+        .len("count")
+        .sort("x", "y")
+    )
+    counts = np.array(cells["count"].to_list(), dtype=np.int64)
+    return {
+        "width_m": width,
+        "bins": _BINS,
+        "limit_m": limit_m,
+        "cells": [list(row) for row in cells.iter_rows()],
+        "epochs": int(counts.sum()),
     }

@@ -14,7 +14,7 @@ import polars as pl
 
 from pipeline.campaign.plan import software_digest
 from pipeline.campaign.workers import each
-from pipeline.figures.map_errors import map_places
+from pipeline.figures.derived_tables import derived_tables
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, run_page
@@ -27,9 +27,8 @@ from pipeline.results.store import (
     read_table,
     table_address,
 )
-from pipeline.safety.assessment import over_all_runs
-from pipeline.safety.side_by_side import Key, side_by_side
-from pipeline.safety.tally import Tally
+from pipeline.safety.side_by_side import side_by_side
+from pipeline.safety.tally import added
 from schemas.config import Configuration, read_toml, settings_from
 from schemas.errors import OutputError
 from schemas.run import Site
@@ -64,12 +63,12 @@ def write_report(
     names = {run: page_name(run) for run in runs}
     pages = [_Page(out, run, out / "report" / "runs" / name, made) for run, name in names.items()]
     written = [*_write_assets(out / "report" / "assets")]
-    found: dict[str, dict[Key, Tally]] = {}
+    found: dict[str, pl.DataFrame] = {}
     for done, (page, tallies) in enumerate(
         zip(pages, each(_written, pages, jobs or _worth(len(pages))), strict=True), start=1
     ):
         written.append(page.path)
-        if tallies:
+        if tallies is not None:
             found[page.run] = tallies
         if progress is not None:
             progress(done, len(pages))
@@ -90,7 +89,7 @@ def _worth(pages: int) -> int:
     return min(os.cpu_count() or 1, 1 + pages // _PAGES_PER_PROCESS)
 
 
-def _written(page: _Page) -> dict[Key, Tally] | None:
+def _written(page: _Page) -> pl.DataFrame | None:
     """Write the page, unless it is there already; returns the run's solutions side by side where it has several."""
     metadata = metadata_of(Path(str(table_address(page.out, "runs", page.run))))
     check_site(page.made.site, metadata.get("site_digest"), page.run)
@@ -127,17 +126,19 @@ def _made(out: Path, site: Site | None) -> Made:
     return Made(config, path.read_text(encoding="utf-8"), site)
 
 
-def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, dict[Key, Tally]]) -> Campaign:
+def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, pl.DataFrame]) -> Campaign:
     needed = ("solution", "netelement_id", "measure_m", "moving", "tvb", "alarm")
     epochs = read_table(out, "epochs").select(pl.col(name) for name in needed)
+    small = ("runs", "hazards", "passages", "alarms")
+    runs, hazards, passages, alarms = (read_table(out, name).collect() for name in small)
     return Campaign(
-        runs=read_table(out, "runs").collect(),
-        hazards=read_table(out, "hazards").collect(),
-        passages=read_table(out, "passages").collect(),
+        runs=runs,
+        hazards=hazards,
+        passages=passages,
+        derived=derived_tables(runs, hazards, passages, alarms, made.config),
         pieces=availability_pieces(epochs),
         hrefs=hrefs,
-        architectures=over_all_runs(found),
-        map=map_places(read_table(out, "alarms").collect()),
+        architectures=added(found.values()),
     )
 
 

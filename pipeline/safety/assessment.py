@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import polars as pl
@@ -17,8 +18,8 @@ from pipeline.safety.sentences import (
     slow_receivers,
     verdict_statement,
 )
-from pipeline.safety.side_by_side import EPOCH_COLUMNS, Key, side_by_side, side_by_side_table
-from pipeline.safety.tally import Tally
+from pipeline.safety.side_by_side import EPOCH_COLUMNS, side_by_side
+from pipeline.safety.tally import added, architecture_figures
 from pipeline.storage.address import Address
 from schemas.config import Configuration
 from schemas.enums import TRUTH, RunStatus, ThrVerdict
@@ -52,9 +53,9 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
         "levels": levels_summary(derived["levels"]),
         "levels_of_runs": derived["levels"],
         "accuracy": derived["accuracy"],
-        "side_by_side": over_all_runs(of_runs),
+        "side_by_side": architecture_figures(added(of_runs.values())),
         "side_by_side_of_runs": by_run(of_runs),
-        "alarms": alarm_causes(alarms),
+        "alarms": alarm_causes(alarms, settings.hazards.map_reach_m),
         "map": derived["map"],
     }
     said = [
@@ -75,7 +76,7 @@ def _table(out: Address, name: str) -> pl.DataFrame:
 
 def compare_architectures(
     out: Address, runs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
-) -> dict[str, dict[Key, Tally]]:
+) -> dict[str, pl.DataFrame]:
     """`side_by_side` of every run that holds several solutions; one run's epochs in memory at a time."""
     done = runs.filter(pl.col("status") != RunStatus.FAILED)
     several = done.group_by("run_id").len().filter(pl.col("len") > 1)["run_id"].sort()
@@ -87,27 +88,12 @@ def compare_architectures(
     return found
 
 
-def by_run(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
+def by_run(found: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
     """The architectures of each run, one run below the other."""
     parts = [
-        side_by_side_table(of_run).insert_column(0, pl.lit(run_id).alias("run_id")) for run_id, of_run in found.items()
+        architecture_figures(counts).insert_column(0, pl.lit(run).alias("run_id")) for run, counts in found.items()
     ]
-    return pl.concat(parts, how="vertical_relaxed") if parts else pl.DataFrame()
-
-
-def over_all_runs(found: dict[str, dict[Key, Tally]]) -> pl.DataFrame:
-    """The architectures over all runs that hold the solutions concerned; `runs` says how many."""
-    total: dict[Key, Tally] = {}
-    runs: dict[Key, int] = {}
-    for of_run in found.values():
-        for key, tally in of_run.items():
-            total[key] = total[key] + tally if key in total else tally
-            runs[key] = runs.get(key, 0) + 1
-    table = side_by_side_table(total)
-    if table.is_empty():
-        return table
-    keys = zip(table["solution"], table["architecture"], table["other"], strict=True)
-    return table.insert_column(3, pl.Series("runs", [runs[key] for key in keys], dtype=pl.Int64))
+    return pl.concat(parts) if parts else pl.DataFrame()
 
 
 def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
@@ -127,9 +113,9 @@ def levels_summary(levels: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def alarm_causes(alarms: pl.DataFrame) -> pl.DataFrame:
+def alarm_causes(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     """Alarms by verdict and suspect, the map held to be at fault where several runs agree on a place."""
-    named = map_suspects(alarms).with_columns(pl.col("verdict", "suspect").cast(pl.String))
+    named = map_suspects(alarms, reach_m).with_columns(pl.col("verdict", "suspect").cast(pl.String))
     keys = ("solution", "verdict", "suspect")
     counts = {"alarms": pl.len().cast(pl.Int64), "runs": pl.col("run_id").n_unique().cast(pl.Int64)}
     return named.group_by(keys).agg(**counts).sort(keys)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import polars as pl
 
+from pipeline.figures.bounds import hours_to_substantiate
 from schemas.config import SafetyConfig
 
 S_PER_H = 3600.0
@@ -57,14 +56,9 @@ def tolerable_table(
     config: SafetyConfig, times_s: tuple[float, ...] = (2.0 * RECEIVER_PERIOD_S, 1.0, 10.0, 30.0, 100.0)
 ) -> pl.DataFrame:
     """The other way round: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
-    demands = config.demands_per_hour
+    thr, demands = config.thr_vb_per_h, config.demands_per_hour
     rows = [
-        (
-            time_s,
-            tolerable_gnss_rate_per_h(config.thr_vb_per_h, time_s),
-            demands,
-            tolerable_gnss_rate_per_h(config.thr_vb_per_h, time_s, demands),
-        )
+        (time_s, tolerable_gnss_rate_per_h(thr, time_s), demands, tolerable_gnss_rate_per_h(thr, time_s, demands))
         for time_s in times_s
     ]
     columns = ["time_to_detect_s", "tolerable_published_per_h", "demands_per_hour", "tolerable_per_h"]
@@ -76,35 +70,16 @@ def demands_per_hour(speed_kmh: float, spacing_m: float) -> float:
     return speed_kmh * 1000.0 / spacing_m
 
 
-@dataclass(frozen=True)
-class ReceiverCheck:
-    """Whether a receiver's epochs come quickly enough: period + negation within the allowed time."""
-
-    needed_s: float
-    allowed_s: float
-
-    @property
-    def fulfilled(self) -> bool:
-        return self.needed_s <= self.allowed_s
-
-    @property
-    def margin_s(self) -> float:
-        return self.allowed_s - self.needed_s
-
-
-def receiver_check(period_s: float, negation_s: float, allowed_s: float) -> ReceiverCheck:
-    """The quickest possible negation takes one epoch and the negation time (TVB section 5)."""
-    return ReceiverCheck(period_s + negation_s, allowed_s)
-
-
 def allowed_table(
     config: SafetyConfig, period_s: float = RECEIVER_PERIOD_S, negation_s: float = RECEIVER_PERIOD_S
 ) -> pl.DataFrame:
-    """Allowed time to detect per service level, as published and with the configured demands."""
+    """Allowed time to detect per service level, as published and with the configured demands.
+
+    The quickest possible negation takes one epoch and the negation time (TVB section 5).
+    """
     rows = []
     for level, service in config.service_levels.items():
         allowed_s = config.allowed_time_to_detect_s(level)
-        check = receiver_check(period_s, negation_s, allowed_s)
         rows.append(
             {
                 "service_level": level,
@@ -114,8 +89,8 @@ def allowed_table(
                 "allowed_published_s": allowed_time_to_detect_s(config.thr_vb_per_h, service.hazard_rate_per_h),
                 "demands_per_hour": config.demands_per_hour,
                 "allowed_s": allowed_s,
-                "receiver_needs_s": check.needed_s,
-                "receiver_quick_enough": check.fulfilled,
+                "receiver_needs_s": period_s + negation_s,
+                "receiver_quick_enough": period_s + negation_s <= allowed_s,
             }
         )
     return pl.DataFrame(rows)
@@ -136,3 +111,16 @@ def demands_table(
                 rows.append((level, speed_kmh, spacing_m, demands, allowed_s))
     columns = ["service_level", "speed_kmh", "spacing_m", "demands_per_hour", "allowed_s"]
     return pl.DataFrame(rows, schema=columns, orient="row")
+
+
+def substantiation_table(config: SafetyConfig, events: tuple[int, ...] = (0, 1, 2, 5)) -> pl.DataFrame:
+    """Hours [h] that show a rate at 95 %, by events seen, for THR_VB and the rate of each service level."""
+    targets = {"THR_VB": config.thr_vb_per_h} | {
+        f"signal in space, {level}": service.hazard_rate_per_h for level, service in config.service_levels.items()
+    }
+    rows = [
+        (target, rate, count, hours_to_substantiate(rate, count), hours_to_substantiate(rate, count) / 8766.0)
+        for target, rate in targets.items()
+        for count in events
+    ]
+    return pl.DataFrame(rows, schema=["target", "rate_per_h", "events", "hours", "years"], orient="row")

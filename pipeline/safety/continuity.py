@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import polars as pl
 
+from pipeline.figures.estimates import continuity
 from pipeline.safety.budget import S_PER_H
 
 APV_CONTINUITY_RISK = 8e-6  # LOC section VI: ICAO, APV I, per 15 s
 APV_INTERVAL_S = 15.0
 REQUIRED_MTBF_ONBOARD_H = 3e5  # LOC section VI: MTBF-S_ONB
-
-
-def continuity(t_s: float, mtbf_h: float) -> float:
-    """Probability of working through `t_s`, having worked at its beginning (LOC eq. 8)."""
-    return math.exp(-t_s / S_PER_H / mtbf_h)
 
 
 def mtbf_h(continuity_risk: float, t_s: float) -> float:
@@ -43,7 +37,7 @@ def continuity_table() -> pl.DataFrame:
     ]
     table = pl.DataFrame(rows, schema=["architecture", "mtbf_h", "source"], orient="row")
     return table.with_columns(
-        continuity_15s=(-APV_INTERVAL_S / S_PER_H / pl.col("mtbf_h")).exp(),
+        continuity_15s=pl.Series([continuity(APV_INTERVAL_S, row[1]) for row in rows]),
         required_mtbf_h=pl.lit(REQUIRED_MTBF_ONBOARD_H),
         share_of_required=pl.col("mtbf_h") / REQUIRED_MTBF_ONBOARD_H,
         fulfilled=pl.col("mtbf_h") >= REQUIRED_MTBF_ONBOARD_H,

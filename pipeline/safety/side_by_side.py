@@ -16,18 +16,20 @@ from pipeline.epochs.clock import Clock, flags, trusted
 from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import held_s, uptime
 from pipeline.figures.bounds import threshold_factor
+from pipeline.figures.independent import independent_episodes, missed_detection
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
-from pipeline.safety.composite_alarms import Side, verdicts_of
-from pipeline.safety.tally import Alarms, Faults, Row, Tally, Working
+from pipeline.safety.composite_alarms import Solution, verdict_of_both
+from pipeline.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
 
+Row = dict[str, object]
+
 COMPARISON = "channel"
-REACTIVE, COMPOSITE, REDUNDANT = "reactive 1oo1", "composite 2oo2", "reactive 1oo2"
 _DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
 _ALONG = tuple(f"along_{scale}" for scale in SCALES)
 EPOCH_COLUMNS = (
@@ -36,9 +38,6 @@ EPOCH_COLUMNS = (
     *(f"{name}_{part}" for name in _DIAGNOSIS for part in ("state", "value", "threshold")),
 )
 """Columns of the epochs that the comparison takes."""
-
-Key = tuple[str, str, str | None]
-"""Solution, architecture, and the other solution where it takes two."""
 
 
 @dataclass(frozen=True)
@@ -53,24 +52,10 @@ class _Channel:
     wrong: Bools
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Tables of one solution; `faults` one row per fault."""
-
-    epochs: pl.DataFrame
-    faults: pl.DataFrame
-    alarms: pl.DataFrame
-    with_truth: bool
-
-    @property
-    def side(self) -> Side:
-        return Side(self.epochs, self.faults, self.alarms, self.with_truth)
-
-
 def side_by_side(
     epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
-) -> dict[Key, Tally]:
-    """What each architecture made of one run, from its tables with all solutions.
+) -> pl.DataFrame:
+    """What each architecture made of one run (`COUNTS`), from its tables with all solutions.
 
     `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
     are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
@@ -79,79 +64,34 @@ def side_by_side(
     names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
     channels = {name: _reactive(one, config) for name, one in solutions.items()}
-    found: dict[Key, Tally] = {}
+    rows: list[Row] = []
     for name, channel in channels.items():
         one = solutions[name]
         verdicts = _verdicts_in_table(channel.fails, one.alarms)
-        found[name, REACTIVE, None] = _tally(channel, _faults(one.faults, None, channel), verdicts)
+        found = _faults(one.faults, None, channel) | _alarms(channel, verdicts) | _working(channel)
+        rows.append({"architecture": REACTIVE, "solution": name, **found})
     for name, other in permutations(names, 2):
-        found[name, COMPOSITE, other] = _composite(solutions[name], solutions[other], config)
+        pair = {"solution": name, "other": other}
+        rows.append({"architecture": COMPOSITE, **pair, **_composite(solutions[name], solutions[other], config)})
         if name < other:
-            found[name, REDUNDANT, other] = Tally(None, None, _redundant(channels[name], channels[other]))
-    return found
-
-
-def side_by_side_table(found: dict[Key, Tally]) -> pl.DataFrame:
-    """One row per architecture and solution or pair; `mtbf_expected_h` from the MTBF of the channels alone.
-
-    Of two independent channels: both needed, half the MTBF where they are equal; one enough, their product over
-    one hour (LOC eq. 11), which holds for MTBFs well beyond that hour and is left out below it.
-    """
-    rows: list[Row] = []
-    for (solution, architecture, other), tally in sorted(found.items(), key=lambda item: _order(item[0])):
-        expected = None if other is None else _expected_h(architecture, found, solution, other)
-        rows.append(
-            {"architecture": architecture, "solution": solution, "other": other}
-            | tally.row()
-            | {"mtbf_expected_h": expected}
-        )
-    return pl.DataFrame(rows, infer_schema_length=None)
-
-
-def _order(key: Key) -> tuple[int, str, str]:
-    return (REACTIVE, COMPOSITE, REDUNDANT).index(key[1]), key[0], key[2] or ""
-
-
-def _expected_h(architecture: str, found: dict[Key, Tally], solution: str, other: str) -> float | None:
-    alone = [found[name, REACTIVE, None].working for name in (solution, other)]
-    one, two = (part.up_s / part.losses / 3600.0 if part.losses else None for part in alone)
-    if one is None or two is None:
-        return None
-    if architecture == COMPOSITE:
-        return one * two / (one + two)
-    return one * two if min(one, two) > 1.0 else None
+            rows.append({"architecture": REDUNDANT, **pair, **_redundant(channels[name], channels[other])})
+    return pl.DataFrame(rows, schema=COUNTS)
 
 
 def _solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
-) -> _Solution:
+) -> Solution:
     own = pl.col("solution") == name
     evidence = runs.filter(own)["evidence"].cast(pl.String).to_list()
-    return _Solution(
+    return Solution(
         epochs=epochs.filter(own).sort("t"),
-        faults=_one_per_fault(hazards.filter(own)),
+        faults=independent_episodes(hazards.filter(own)),
         alarms=alarms.filter(own),
         with_truth=len(evidence) == 1 and evidence[0] in TRUTH,
     )
 
 
-def _one_per_fault(hazards: pl.DataFrame) -> pl.DataFrame:
-    """`begin, failure, end` [ns], `budget_s` and `with_truth`; rows of one fault, and those its end made, are one."""
-    instants = [pl.col(name).to_physical() for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
-    return (
-        hazards.filter(pl.col("caused_by").is_null())
-        .select(*instants, "budget_s", with_truth=pl.col("evidence").is_in(TRUTH))
-        .group_by(begin=pl.coalesce("t_onset", "t_hazard"), maintain_order=True)
-        .agg(
-            failure=pl.col("t_failure").min(),
-            end=pl.when(pl.col("t_end").is_null().any()).then(None).otherwise(pl.col("t_end").max()),
-            budget_s=pl.col("budget_s").first(),
-            with_truth=pl.col("with_truth").all(),
-        )
-    )
-
-
-def _reactive(one: _Solution, config: Configuration) -> _Channel:
+def _reactive(one: Solution, config: Configuration) -> _Channel:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
     return _channel(one, one.epochs, _DIAGNOSIS, judged, trusted(config), config)
 
@@ -160,7 +100,7 @@ def _evaluated(monitor: str) -> pl.Expr:
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
-def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally:
+def _composite(one: Solution, other: Solution, config: Configuration) -> Row:
     placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     factor = threshold_factor(config.monitors.false_alarm_probability)
@@ -171,12 +111,12 @@ def _composite(one: _Solution, other: _Solution, config: Configuration) -> Tally
     frame = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared).hstack(met)
     trust = pl.col("own_trusted") & pl.col("other_trusted")
     channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
-    verdicts = verdicts_of(channel.fails.alarms, (one.side, other.side), config.hazards)
-    return _tally(channel, _faults(one.faults, other.faults, channel), verdicts)
+    verdicts = [verdict_of_both(alarm, (one, other), config.hazards) for alarm in channel.fails.alarms]
+    return _faults(one.faults, other.faults, channel) | _alarms(channel, verdicts) | _working(channel)
 
 
 def _channel(
-    one: _Solution,
+    one: Solution,
     epochs: pl.DataFrame,
     monitors: tuple[str, ...],
     judged: pl.Expr,
@@ -197,51 +137,62 @@ def _channel(
     return _Channel(clock, fails, seen, working, known, wrong)
 
 
-def _tally(channel: _Channel, faults: Faults, verdicts: list[Verdict]) -> Tally:
-    judged_s = float(channel.clock.held_s[channel.judged].sum())
-    alarms = Alarms(len(verdicts), verdicts.count(Verdict.FALSE), verdicts.count(Verdict.UNKNOWN), judged_s)
-    return Tally(faults, alarms, _working(channel))
+def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
+    return {
+        "alarms": len(verdicts),
+        "false_alarms": verdicts.count(Verdict.FALSE),
+        "open_alarms": verdicts.count(Verdict.UNKNOWN),
+        "judged_s": float(channel.clock.held_s[channel.judged].sum()),
+    }
 
 
-def _working(channel: _Channel) -> Working:
+def _working(channel: _Channel) -> Row:
     clock, held = channel.clock, channel.clock.held_s
     up = uptime(clock.t_ns, channel.working, clock.limit_s)
-    return Working(
-        held_s=float(held.sum()),
-        working_s=float(held[channel.working].sum()),
-        up_s=up.up_s,
-        losses=up.losses,
-        truth_s=float(held[channel.known].sum()),
-        wrong_s=float(held[channel.wrong & channel.working].sum()),
-    )
+    return {
+        "held_s": float(held.sum()),
+        "working_s": float(held[channel.working].sum()),
+        "up_s": up.up_s,
+        "losses": up.losses,
+        "truth_s": float(held[channel.known].sum()),
+        "wrong_s": float(held[channel.wrong & channel.working].sum()),
+    }
 
 
-def _redundant(one: _Channel, other: _Channel) -> Working:
+def _redundant(one: _Channel, other: _Channel) -> Row:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
     parts = [pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working}) for channel in (one, other)]
     merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working").any()).sort("t_ns")
     t_ns, working = merged["t_ns"].to_numpy(), merged["working"].to_numpy()
     limit_s = max(one.clock.limit_s, other.clock.limit_s)
     whole_s, up = float(held_s(t_ns, limit_s).sum()), uptime(t_ns, working, limit_s)
-    return Working(whole_s, min(up.up_s, whole_s), up.up_s, up.losses)
+    return {"held_s": whole_s, "working_s": min(up.up_s, whole_s), "up_s": up.up_s, "losses": up.losses}
 
 
-def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Faults:
+def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Row:
     """`others`: faults of the other solution, so that common ones can be told apart."""
-    hazards = failures = missed = common = common_missed = judged = missed_judged = 0
-    delays: list[float] = []
-    columns = ("begin", "failure", "end", "budget_s", "with_truth")
-    for begin, failure, end, budget_s, with_truth in faults.select(columns).iter_rows():
-        last = int(channel.clock.t_ns[-1]) if end is None else end
-        detected = _detected_ns(channel.fails, begin, last)
-        late = failure is not None and _is_late(detected, failure, budget_s)
-        shared = failure is not None and others is not None and _overlaps(others, begin, last)
-        hazards, failures, missed = hazards + 1, failures + (failure is not None), missed + late
-        common, common_missed = common + shared, common_missed + (shared and late)
-        judged, missed_judged = judged + (failure is not None and with_truth), missed_judged + (late and with_truth)
-        if detected is not None:
-            delays.append((detected - begin) / 1e9)
-    return Faults(hazards, failures, missed, common, common_missed, tuple(delays), judged, missed_judged)
+    last, kind = int(channel.clock.t_ns[-1]), faults.schema["begin"]
+    ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
+    found = [_detected_ns(channel.fails, *span) for span in ends]
+    failed, missed, common = pl.col("failed"), pl.col("missed"), pl.col("failed") & pl.col("common")
+    counts = (
+        faults.with_columns(
+            t_detected=pl.Series(found, dtype=pl.Int64).cast(kind),
+            common=pl.Series([others is not None and _overlaps(others, *span) for span in ends], dtype=pl.Boolean),
+        )
+        .with_columns(missed=missed_detection().fill_null(value=False))
+        .select(
+            hazards=pl.len(),
+            failures=failed.sum(),
+            missed=missed.sum(),
+            common_failures=common.sum(),
+            common_missed=(common & missed).sum(),
+            failures_judged=(failed & pl.col("with_truth")).sum(),
+            missed_judged=(missed & pl.col("with_truth")).sum(),
+        )
+    )
+    delays = [(moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None]
+    return counts.row(0, named=True) | {"delays_s": delays}
 
 
 def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
@@ -252,14 +203,10 @@ def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
     return None if first is None else first[0]
 
 
-def _is_late(detected: int | None, failure: int, budget_s: float | None) -> bool:
-    """A missed detection: no fail by the failure + budget (DOMAIN section 5.3)."""
-    return detected is None or detected > failure + round((budget_s or 0.0) * 1e9)
-
-
 def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
-    meets = (pl.col("begin") <= last) & (pl.col("end").is_null() | (pl.col("end") >= begin))
-    return faults.filter(pl.col("failure").is_not_null() & meets).height > 0
+    end = pl.col("t_end").to_physical()
+    meets = (pl.col("begin").to_physical() <= last) & (end.is_null() | (end >= begin))
+    return faults.filter(pl.col("failed") & meets).height > 0
 
 
 def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:

@@ -1,142 +1,75 @@
-"""What one architecture did over some time, as counts that add up over runs."""
+"""What architectures did, as counts that add up over runs, and the figures that the counts come to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Iterable, Mapping
 
-import numpy as np
+import polars as pl
 
-from pipeline.epochs.timeline import Uptime
-from pipeline.figures.bounds import UNKNOWN, Estimate, clopper_pearson, poisson_rate
-from pipeline.figures.run_figures import CONTINUITY_S
-from pipeline.safety.continuity import continuity
+from pipeline.figures.bounds import clopper_pearson, poisson_rate
+from pipeline.figures.estimates import continuity_15s, mtbf, with_estimates
 
-Row = dict[str, object]
+REACTIVE, COMPOSITE, REDUNDANT = "reactive 1oo1", "composite 2oo2", "reactive 1oo2"
 
+_KEYS = ("architecture", "solution", "other")
+_WHOLE = (
+    *("hazards", "failures", "missed", "failures_judged", "missed_judged", "common_failures", "common_missed"),
+    *("alarms", "false_alarms", "open_alarms", "losses"),
+)
+_TIMES = ("judged_s", "held_s", "working_s", "up_s", "truth_s", "wrong_s")
+COUNTS: Mapping[str, pl.DataType] = {
+    **{name: pl.String() for name in _KEYS},
+    **{name: pl.Int64() for name in _WHOLE},
+    **{name: pl.Float64() for name in _TIMES},
+    "delays_s": pl.List(pl.Float64),
+}
+"""Per architecture and solution (`other`: of a pair).
 
-def columns_of(name: str, estimate: Estimate, unit: str = "") -> Row:
-    """An estimate as three columns `name`, `name_low`, `name_high`, with their unit at the end."""
-    return {
-        f"{name}{unit}": estimate.value,
-        f"{name}_low{unit}": estimate.low,
-        f"{name}_high{unit}": estimate.high,
-    }
-
-
-@dataclass(frozen=True)
-class Faults:
-    """Faults of the position and what became of them; `common`: the other solution had one at the same time; `judged`:
-    failures that a reference or balise reads tell.
-    """
-
-    hazards: int = 0
-    failures: int = 0
-    missed: int = 0
-    common: int = 0
-    common_missed: int = 0
-    time_to_detect_s: tuple[float, ...] = ()
-    judged: int = 0
-    missed_judged: int = 0
+Faults of the position and what became of them (`common`: the other solution had one at the same time; `judged`: by a
+reference or balise reads; `delays_s`: T_D of those detected). Alarms (`open`: nobody can tell whether false) in the
+time in which the monitors judged. Time with epochs, of this in work, and how often work was lost after it had gone on
+for `up_s`; time judged by a truth, and of this in work and judged wrong, whether it hit a virtual balise or not (the
+architecture's P1). Null what an architecture is not judged by.
+"""
 
 
-@dataclass(frozen=True)
-class Alarms:
-    """Alarm episodes, and the time in which the monitors judged [s]."""
-
-    alarms: int = 0
-    false: int = 0
-    unknown: int = 0
-    judged_s: float = 0.0
+def added(parts: Iterable[pl.DataFrame]) -> pl.DataFrame:
+    """Counts over several runs; `runs`: how many hold the solutions concerned."""
+    sums = [pl.when(pl.col(name).count() > 0).then(pl.col(name).sum()) for name in (*_WHOLE, *_TIMES)]
+    found = pl.concat([pl.DataFrame(schema=COUNTS), *parts]).group_by(_KEYS, maintain_order=True)
+    return found.agg(pl.len().cast(pl.Int64).alias("runs"), *sums, pl.col("delays_s").explode().drop_nulls())
 
 
-@dataclass(frozen=True)
-class Working:
-    """Time with epochs, of this in work [s], and how often work was lost after it had gone on for `up_s`.
-
-    `truth_s`: time judged right or wrong by a reference or balise reads; `wrong_s`: of this in work and judged wrong,
-    whether it hit a virtual balise or not (the architecture's P1).
-    """
-
-    held_s: float = 0.0
-    working_s: float = 0.0
-    up_s: float = 0.0
-    losses: int = 0
-    truth_s: float = 0.0
-    wrong_s: float = 0.0
-
-
-@dataclass(frozen=True)
-class Tally:
-    """`faults` and `alarms` are None for an architecture that is judged by its continuity alone."""
-
-    faults: Faults | None
-    alarms: Alarms | None
-    working: Working
-
-    def __add__(self, other: Tally) -> Tally:
-        return Tally(
-            _added(self.faults, other.faults), _added(self.alarms, other.alarms), _added(self.working, other.working)
-        )
-
-    def row(self) -> Row:
-        """Figures with exact 95 % bounds."""
-        return {
-            **_fault_columns(self.faults),
-            **_alarm_columns(self.alarms),
-            "availability": self.working.working_s / self.working.held_s if self.working.held_s > 0 else None,
-            "wrong_in_use_s": self.working.wrong_s if self.working.truth_s > 0 else None,
-            "wrong_in_use_share": self.working.wrong_s / self.working.truth_s if self.working.truth_s > 0 else None,
-            **continuity_columns(Uptime(self.working.up_s, self.working.losses)),
-        }
+def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
+    """Figures with exact 95 % bounds, one row per architecture and solution or pair."""
+    delays, held, truth = pl.col("delays_s"), pl.col("held_s"), pl.col("truth_s")
+    order = {name: number for number, name in enumerate((REACTIVE, COMPOSITE, REDUNDANT))}
+    table = counts.with_columns(
+        detected=pl.when(pl.col("hazards").is_not_null()).then(delays.list.len().cast(pl.Int64)),
+        time_to_detect_median_s=delays.list.median(),
+        time_to_detect_max_s=delays.list.max(),
+        judged_h=pl.col("judged_s") / 3600.0,
+        up_h=pl.col("up_s") / 3600.0,
+        told=pl.when(pl.col("open_alarms") == 0).then(pl.col("false_alarms")),
+        availability=pl.when(held > 0.0).then(pl.col("working_s") / held),
+        wrong_in_use_s=pl.when(truth > 0.0).then(pl.col("wrong_s")),
+        wrong_in_use_share=pl.when(truth > 0.0).then(pl.col("wrong_s") / truth),
+    )
+    table = with_estimates(
+        table,
+        ("missed_share", "", clopper_pearson, "missed_judged", "failures_judged"),
+        ("false_alarm_rate", "_per_h", poisson_rate, "told", "judged_h"),
+        ("mtbf", "_h", mtbf, "losses", "up_h"),
+        ("continuity_15s", "", continuity_15s, "losses", "up_h"),
+    )
+    ordered = table.sort(pl.col("architecture").replace_strict(order, return_dtype=pl.Int64), "solution", "other")
+    return ordered.select(*_KEYS, *(name for name in ("runs",) if name in counts.columns), *_SHOWN)
 
 
-def _added(one: Any, other: Any) -> Any:
-    if one is None or other is None:
-        return None
-    return type(one)(*(getattr(one, item.name) + getattr(other, item.name) for item in fields(one)))
-
-
-def _fault_columns(faults: Faults | None) -> Row:
-    if faults is None:
-        names = list(_fault_columns(Faults()))
-        return dict.fromkeys(names)
-    detected = faults.time_to_detect_s
-    return {
-        "hazards": faults.hazards,
-        "detected": len(detected),
-        "failures": faults.failures,
-        "missed": faults.missed,
-        "failures_judged": faults.judged,
-        "missed_judged": faults.missed_judged,
-        **columns_of("missed_share", clopper_pearson(faults.missed_judged, faults.judged)),
-        "common_failures": faults.common,
-        "common_missed": faults.common_missed,
-        "time_to_detect_median_s": float(np.median(detected)) if detected else None,
-        "time_to_detect_max_s": max(detected, default=None),
-    }
-
-
-def _alarm_columns(alarms: Alarms | None) -> Row:
-    if alarms is None:
-        names = list(_alarm_columns(Alarms()))
-        return dict.fromkeys(names)
-    rate = UNKNOWN if alarms.unknown else poisson_rate(alarms.false, alarms.judged_s / 3600.0)
-    return {
-        "alarms": alarms.alarms,
-        "false_alarms": alarms.false,
-        **columns_of("false_alarm_rate", rate, "_per_h"),
-        "judged_h": alarms.judged_s / 3600.0,
-    }
-
-
-def continuity_columns(up: Uptime) -> Row:
-    """MTBF [h] and its continuity over 15 s (LOC eq. 8), with bounds from the losses counted.
-
-    Without a loss the value is not known, but it has a lower bound.
-    """
-    rate = poisson_rate(up.losses, up.up_s / 3600.0)
-    mtbf = Estimate(*(1.0 / per_h if per_h else None for per_h in (rate.value, rate.high, rate.low)))
-    parts = (mtbf.value, mtbf.low, mtbf.high)
-    kept = Estimate(*(None if part is None else continuity(CONTINUITY_S, part) for part in parts))
-    return {**columns_of("mtbf", mtbf, "_h"), **columns_of("continuity_15s", kept)}
+_SHOWN = (
+    *("hazards", "detected", "failures", "missed", "failures_judged", "missed_judged", "missed_share"),
+    *("missed_share_low", "missed_share_high", "common_failures", "common_missed", "time_to_detect_median_s"),
+    *("time_to_detect_max_s", "alarms", "false_alarms", "false_alarm_rate_per_h", "false_alarm_rate_low_per_h"),
+    *("false_alarm_rate_high_per_h", "judged_h", "availability", "wrong_in_use_s", "wrong_in_use_share", "mtbf_h"),
+    *("mtbf_low_h", "mtbf_high_h", "continuity_15s", "continuity_15s_low", "continuity_15s_high"),
+)

@@ -18,26 +18,20 @@ T = TypeVar("T")
 
 
 def exists(path: Address) -> bool:
-    if not is_url(path):
-        return Path(path).exists()
-    return on_store(path, lambda store, inner: bool(store.exists(inner)), kind=InputError)
+    return _either(path, Path.exists, lambda store, inner: bool(store.exists(inner)))
 
 
 def is_dir(path: Address) -> bool:
-    if not is_url(path):
-        return Path(path).is_dir()
-    return on_store(path, lambda store, inner: bool(store.isdir(inner)), kind=InputError)
+    return _either(path, Path.is_dir, lambda store, inner: bool(store.isdir(inner)))
 
 
 def list_dir(path: Address) -> list[str]:
     """Names in a folder, sorted."""
-    if not is_url(path):
-        return _local(path, lambda folder: sorted(entry.name for entry in folder.iterdir()))
-
-    def names(store: Any, inner: str) -> list[str]:
-        return sorted(name_of(f"x://{entry}") for entry in store.ls(inner, detail=False))
-
-    return on_store(path, names, kind=InputError)
+    return _either(
+        path,
+        lambda folder: sorted(entry.name for entry in folder.iterdir()),
+        lambda store, inner: sorted(name_of(f"x://{entry}") for entry in store.ls(inner, detail=False)),
+    )
 
 
 def open_binary(path: Address) -> IO[bytes]:
@@ -54,9 +48,12 @@ def read_bytes(path: Address) -> bytes:
 
 def size_of(path: Address) -> int:
     """Size in bytes."""
-    if not is_url(path):
-        return _local(path, lambda file: file.stat().st_size)
-    return on_store(path, lambda store, inner: int(store.size(inner)), kind=InputError)
+    return _either(path, lambda file: file.stat().st_size, lambda store, inner: int(store.size(inner)))
+
+
+def _either(path: Address, local: Callable[[Path], T], remote: Callable[[Any, str], T]) -> T:
+    """The operation that suits the place."""
+    return on_store(path, remote, kind=InputError) if is_url(path) else _local(path, local)
 
 
 def _local(path: Address, operation: Callable[[Path], T]) -> T:

@@ -10,7 +10,7 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,27 +77,25 @@ def discard(staged: list[tuple[Address, Address]]) -> None:
 
 def remove(address: Address) -> None:
     """Remove a file; its absence is no error."""
-    if not is_url(address):
-        with as_output_error(address):
-            Path(address).unlink(missing_ok=True)
+    if is_url(address):
+        _remove_remote(address, lambda store, path: store.rm_file(path))
         return
-
-    def delete(store: Any, path: str) -> None:
-        with contextlib.suppress(FileNotFoundError):
-            store.rm_file(path)
-
-    on_store(address, delete)
+    with as_output_error(address):
+        Path(address).unlink(missing_ok=True)
 
 
 def remove_folder(address: Address) -> None:
     """Remove a folder with all that is in it; its absence is no error."""
-    if not is_url(address):
+    if is_url(address):
+        _remove_remote(address, lambda store, path: store.rm(path, recursive=True))
+    else:
         shutil.rmtree(address, ignore_errors=True)
-        return
 
+
+def _remove_remote(address: Address, operation: Callable[[Any, str], None]) -> None:
     def delete(store: Any, path: str) -> None:
         with contextlib.suppress(FileNotFoundError):
-            store.rm(path, recursive=True)
+            operation(store, path)
 
     on_store(address, delete)
 

@@ -224,7 +224,7 @@ def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: 
     assert {outcome.run_id: outcome.attempts for outcome in summary.outcomes if outcome.attempts > 1} == {unlucky: 2}
     log = (tmp_path / "replay.log").read_text()
     assert f" {unlucky}: its worker died at attempt 1; tried again\n" in log
-    assert re.search(f" {unlucky}: ok in .* \\(attempt 2\\)\n", log)
+    assert re.search(f" {unlucky}: unproven in .* \\(attempt 2\\)\n", log)
     assert summary.count(RunStatus.OK) == 4
     assert result_bytes(tmp_path) == result_bytes(undisturbed)
 

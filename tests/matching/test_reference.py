@@ -9,7 +9,7 @@ import pytest
 from pipeline.matching.match import Match
 from pipeline.matching.reference import match_reference
 from schemas.arrays import Floats
-from schemas.config import MatchingConfig
+from schemas.config import HazardConfig, MatchingConfig
 from schemas.run import Site
 from tests.matching.builders import line, run, site
 
@@ -23,7 +23,7 @@ X_M = np.arange(100.0, 1900.0, 20.0)
 def placed(y_m: Floats, sigma_m: float | None, place: Site = TRACKS) -> Match | None:
     sigma = pl.Series("sigma_m", [sigma_m] * len(X_M), dtype=pl.Float64)
     stream = run(X_M, y_m).select("t", "latitude_deg", "longitude_deg", "height_m").with_columns(sigma)
-    return match_reference(stream, place, MatchingConfig(), 1.0)
+    return match_reference(stream, place, MatchingConfig(), HazardConfig())
 
 
 def test_an_exact_reference_leaves_one_track() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ from typer.testing import CliRunner
 
 from cli import app
 from pipeline.report import page_name, write_report
-from pipeline.report.campaign_page import _RUN_COLUMNS
+from pipeline.report.campaign_page import RUN_COLUMNS
 from pipeline.results.store import write_run
+from schemas.campaign import STANFORD
 from schemas.errors import UsageError
 from schemas.run import RunTables, Site
-from schemas.tables import MONITORS
+from schemas.tables import MONITORS, Runs
 from tests.report.conftest import FAILED, REASON, RUNS
 
 
@@ -130,15 +132,14 @@ def test_an_outage_is_a_gap(out: Path, replayed: dict[str, RunTables], tmp_path:
 
 
 def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
-    """Three faults in five rows for `primary`, one of them missed; two failures in use, one within the budget."""
+    """Three faults for `primary`, one of them missed; two failures in use, one within the budget."""
     text = text_of(out, "index.html")
     section = text[text.index('id="s1"') : text.index("table-levels-s1")]
-    assert "3 in 5 rows" in section
-    assert "1 of 3 with a failure" in section
-    assert "of the 3 judged by a truth 33.3% (95 %: 0.8% to 90.6%)" in section
-    assert "of the 3 hazards detected; 2 were not" in section
-    assert "2, 1 beyond the budget" in section
-    assert "1 within it, 0 not known" in section
+    assert "of 2 position failures in use, at a virtual balise or not, 1 were within the budget and 1 beyond" in section
+    assert "Of 3 faults with a failure that a truth judged 1 were missed detections" in section
+    assert "<dt>share of missed ones of these</dt><dd>0.333 (95 %: 0.0084 to 0.906)</dd>" in section
+    assert "<dt>runs that were replayed</dt><dd>3</dd>" in section
+    assert "<dt>runs that could not be, with this solution or before any was known</dt><dd>1</dd>" in section
 
 
 def test_allowed_times_of_every_level_are_drawn(out: Path) -> None:
@@ -172,7 +173,6 @@ def test_availability_map_counts_moving_epochs(out: Path, replayed: dict[str, Ru
 
 def test_failed_runs_come_behind_unsafe_ones_with_their_reason(out: Path) -> None:
     text = text_of(out, "index.html")
-    assert "3 ok, 0 partial; 1 more failed and count nowhere" in text
     table = text[text.index('id="table-runs"') :]
     first, second = table[table.index("<tbody>") :].split("</tr>")[:2]
     assert "jump_one_no_odometer" in first
@@ -198,15 +198,14 @@ def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_
     write_report(tmp_path)
     run, index = text_of(tmp_path, "runs/blind.html"), text_of(tmp_path, "index.html")
     assert "there was nothing to judge the positions by" in run
-    for figure in ("accepted despite a wrong position", "missed detections", "epochs by error and confidence"):
-        assert re.search(rf"{figure}</dt>\s*<dd>not known<", run), figure
+    for name in ("unsafe_accepted", "missed_detections", "stanford_nominal"):
+        assert f"<dt>{escape(Runs.columns()[name].description or '')}</dt><dd>not known<" in run, name
     (row,) = rows_of_table(index, "table-runs")
-    names = [title for _, title in _RUN_COLUMNS]
-    told = dict(zip(names, row[-len(names) :], strict=True))
-    assert {told[name] for name in ("hazards", "detected", "missed detections", "unsafe accepted")} == {"–"}
-    assert told["VBs accepted"] != "–"
-    assert "no run with a truth that judges every alarm" in index
-    assert "rate not known" in index
+    told = dict(zip(RUN_COLUMNS, row, strict=True))
+    names = ("hazards_1a", "hazards_detected", "missed_detections", "unsafe_accepted")
+    assert {told[name] for name in names} == {"–"}
+    assert told["balises_accepted"] != "–"
+    assert "<dt>false alarms per judged hour</dt><dd>not known</dd>" in index
 
 
 def test_by_the_odometer_alone_no_hazard_is_no_health(replayed: dict[str, RunTables], tmp_path: Path) -> None:
@@ -225,7 +224,7 @@ def test_by_the_odometer_alone_no_hazard_is_no_health(replayed: dict[str, RunTab
     run, index = text_of(tmp_path, "runs/seen.html"), text_of(tmp_path, "index.html")
     assert "the odometer alone can only show that a position was wrong, never that it was right" in run
     assert "truth was taken from" not in run
-    assert "0 of 0 judged by a truth" in index
+    assert "Of 0 accepted virtual balises judged by a truth 0 were accepted despite a wrong position" in index
 
 
 def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
@@ -333,17 +332,18 @@ def test_architectures_stand_side_by_side_where_there_are_two_solutions(out: Pat
 def test_levels_stand_on_the_page_of_a_run(out: Path) -> None:
     rows = rows_of_table(text_of(out, "runs/jump_two.html"), "table-levels-s0")
     assert [row[0] for row in rows] == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
-    assert {row[5] for row in rows} <= {"kept", "exceeded", "no failure", "unknown"}
+    assert {row[4] for row in rows} <= {"kept", "exceeded", "no_failure", "unknown"}
 
 
 def test_stanford_counts_stand_beside_the_figures(out: Path, replayed: dict[str, RunTables]) -> None:
     row = replayed["jump_two"].runs.row(0, named=True)
     page = text_of(out, "runs/jump_two.html")
-    for bound, prefix in (("confidence", "stanford"), ("HPL", "stanford_hpl")):
-        counts = [row[f"{prefix}_{kind}"] for kind in ("nominal", "misleading", "hazardous", "unavailable")]
-        shown = re.search(rf"<dt>epochs by error and {bound}</dt><dd>(.*?)</dd>", page)
-        assert shown is not None
-        assert [int(text.replace("\u202f", "")) for text in re.findall(r"[\d\u202f]+(?= )", shown[1])] == counts
+    for prefix in ("stanford", "stanford_hpl"):
+        for kind in STANFORD:
+            meaning = escape(Runs.columns()[f"{prefix}_{kind}"].description or "")
+            shown = re.search(rf"<dt>{re.escape(meaning)}</dt><dd>([\d\u202f]+)</dd>", page)
+            assert shown is not None
+            assert int(shown[1].replace("\u202f", "")) == row[f"{prefix}_{kind}"]
 
 
 def test_places_where_the_map_is_in_doubt(replayed: dict[str, RunTables], tmp_path: Path) -> None:

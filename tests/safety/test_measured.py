@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 
 from pipeline.figures.bounds import clopper_pearson, poisson_rate, poisson_rate_upper
+from pipeline.figures.campaign_figures import detection_by_level, measured_figures
 from pipeline.figures.independent import independent_episodes
-from pipeline.safety import detection_by_level, measured_figures, plain_statements
+from pipeline.safety.sentences import plain_statements
 from schemas.config import SafetyConfig
 from schemas.tables import Runs
 from tests.summary.tables import NS, hazards, table
@@ -148,7 +149,7 @@ def test_no_runs_no_rows() -> None:
 
 def test_solutions_are_counted_apart() -> None:
     catalogue = runs(4, solution=["gps", "primary", "gps", "primary"], duration_s=[3600.0, 3600.0, 1800.0, 1800.0])
-    figures = measured_figures(catalogue, fault(2), CONFIG)
+    figures = measured_figures(catalogue, with_run(fault(2), "r1"), CONFIG)
     assert figures["solution"].to_list() == ["gps", "primary"]
     assert figures["hazards"].to_list() == [0, 2]
     assert figures["hours"].to_list() == [1.5, 1.5]

@@ -15,9 +15,9 @@ from pipeline.safety.architectures import (
     linking_time_s,
 )
 from pipeline.safety.budget import (
+    allowed_table,
     allowed_time_to_detect_s,
     demands_per_hour,
-    receiver_check,
     tolerable_gnss_rate_per_h,
 )
 from pipeline.safety.continuity import (
@@ -27,7 +27,6 @@ from pipeline.safety.continuity import (
     mtbf_h,
     mtbf_one_of_two_h,
 )
-from pipeline.safety.errata import errata
 from pipeline.safety.markov import lds_hazard_rate_per_h
 from schemas.config import SafetyConfig
 
@@ -138,9 +137,8 @@ class TestAllowedTimeToDetect:
 )
 def test_receiver(period_s: float, negation_s: float, level: str, fulfilled: bool) -> None:
     """TVB section 5: at 10 Hz all allowed times are realistic; at 1 Hz 0.5025 s is not."""
-    check = receiver_check(period_s, negation_s, allowed(level))
-    assert check.fulfilled is fulfilled
-    assert check.margin_s == pytest.approx(allowed(level) - period_s - negation_s)
+    (row,) = allowed_table(SafetyConfig(), period_s, negation_s).filter(service_level=level).to_dicts()
+    assert row["receiver_quick_enough"] is fulfilled
 
 
 class TestArchitectures:
@@ -216,8 +214,8 @@ def test_hours_for_the_thr_of_a_virtual_balise() -> None:
     ],
 )
 def test_misprints_are_stated_and_the_figure_in_use_recalculated(printed: str, used: str, value: float) -> None:
-    entry = next(item for item in errata() if item.printed == printed)
-    assert (entry.kind, entry.used) == ("misprint", used)
+    entry = TABLES["errata"].row(by_predicate=pl.col("printed") == printed, named=True)
+    assert (entry["kind"], entry["used"]) == ("misprint", used)
     digits = len(used.split(maxsplit=1)[0].split("e", maxsplit=1)[0].replace(".", "").lstrip("0"))
     assert float(used.split(maxsplit=1)[0]) == pytest.approx(value, rel=0.5 * 10.0 ** (1 - digits))
 

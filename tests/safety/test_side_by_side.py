@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 
 from pipeline.figures.bounds import clopper_pearson
-from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, REDUNDANT, side_by_side, side_by_side_table
-from pipeline.safety.tally import Alarms, Faults, Tally, Working
+from pipeline.safety.side_by_side import side_by_side
+from pipeline.safety.tally import COMPOSITE, REACTIVE, REDUNDANT, added, architecture_figures
 from schemas.config import Configuration
 from schemas.tables import Runs
 from tests.summary.tables import NS, alarms, epochs, hazards, table
@@ -65,7 +65,7 @@ def compared(
     runs = table(Runs, len(names), solution=names, evidence=evidence)
     known = alarms() if found is None else found
     tallies = side_by_side(pl.concat(solutions), rows_of() if faults is None else faults, known, runs, config)
-    rows = side_by_side_table(tallies).iter_rows(named=True)
+    rows = architecture_figures(tallies).iter_rows(named=True)
     return {(row["solution"], row["architecture"]): row for row in rows}
 
 
@@ -257,17 +257,6 @@ class TestRedundantChannels:
         assert (row["availability"], row["mtbf_h"]) == (1.0, None)
         alone = [found[name, REACTIVE]["mtbf_h"] for name in ("galileo", "gps")]
         assert alone == pytest.approx([188 / 3600] * 2)
-        assert row["mtbf_expected_h"] is None
-        assert found["galileo", COMPOSITE]["mtbf_expected_h"] == pytest.approx(94 / 3600)
-
-    def test_expected_as_published(self) -> None:
-        """LOC eq. 11 with 520.8 h: 2.71e5 h, as the trial's own channels would have it."""
-        working = Working(held_s=1e9, working_s=1e9, up_s=520.8 * 3600 * 4, losses=4)
-        alone = {(name, REACTIVE, None): Tally(Faults(), Alarms(), working) for name in ("galileo", "gps")}
-        pairs = {("galileo", kind, "gps"): Tally(None, None, working) for kind in (COMPOSITE, REDUNDANT)}
-        rows = {row["architecture"]: row for row in side_by_side_table(alone | pairs).iter_rows(named=True)}
-        assert rows[REDUNDANT]["mtbf_expected_h"] == pytest.approx(2.712e5, rel=1e-3)
-        assert rows[COMPOSITE]["mtbf_expected_h"] == pytest.approx(260.4)
 
     def test_lost_only_where_both_are(self) -> None:
         row = self.both(list(range(50, 60)), list(range(55, 65)))["galileo", REDUNDANT]
@@ -285,11 +274,13 @@ def test_tallies_of_runs_add_up() -> None:
     faults = rows_of(fault("gps", 100, 109))
     one = side_by_side(pl.concat([solution("gps", {105: BEYOND}), solution("galileo")]), faults, alarms(), runs, CONFIG)
     two = side_by_side(pl.concat([solution("gps"), solution("galileo")]), faults, alarms(), runs, CONFIG)
-    total = (one["gps", COMPOSITE, "galileo"] + two["gps", COMPOSITE, "galileo"]).row()
-    assert (total["failures"], total["missed"], total["missed_share"]) == (2, 1, 0.5)
+    counts = added([one, two])
+    rows = {(row["solution"], row["architecture"]): row for row in architecture_figures(counts).iter_rows(named=True)}
+    total = rows["gps", COMPOSITE]
+    assert (total["runs"], total["failures"], total["missed"], total["missed_share"]) == (2, 2, 1, 0.5)
     assert (total["time_to_detect_max_s"], total["judged_h"]) == (5.0, pytest.approx(2 * 199 / 3600))
-    redundant = one["galileo", REDUNDANT, "gps"] + two["galileo", REDUNDANT, "gps"]
-    assert (redundant.row()["hazards"], redundant.working.held_s) == (None, 398.0)
+    redundant = counts.filter(architecture=REDUNDANT)
+    assert redundant.select("hazards", "held_s").rows() == [(None, 398.0)]
 
 
 def test_one_solution_has_nothing_to_be_compared_with() -> None:

@@ -102,7 +102,7 @@ def test_the_map_is_the_suspect_where_runs_agree(found: Assessment) -> None:
     assert found.tables["alarms"].rows() == [("primary", "false", "map", 2, 2)]
     assert found.tables["map"].select("from_m", "to_m", "runs").rows() == [(500.0, 540.0, 2)]
     one = alarms(1, solution="primary", measure_m=500.0, **ACROSS).with_columns(run_id=pl.lit("a"))
-    assert alarm_causes(one)["suspect"].to_list() == ["unknown"]
+    assert alarm_causes(one, 100.0)["suspect"].to_list() == ["unknown"]
 
 
 def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:

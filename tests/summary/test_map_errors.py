@@ -5,7 +5,10 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.figures.map_errors import map_places, map_suspects
+from schemas.config import HazardConfig
 from tests.summary.tables import NS, alarms
+
+REACH_M = HazardConfig().map_reach_m
 
 
 def alarms_of(run_id: str, at_s: float, monitors: tuple[str, ...] = ("cross_raw",)) -> pl.DataFrame:
@@ -17,7 +20,7 @@ def alarms_of(run_id: str, at_s: float, monitors: tuple[str, ...] = ("cross_raw"
 
 
 def suspects(*frames: pl.DataFrame) -> list[str]:
-    return map_suspects(pl.concat(frames))["suspect"].to_list()
+    return map_suspects(pl.concat(frames), REACH_M)["suspect"].to_list()
 
 
 def test_same_place_in_two_runs_is_the_map() -> None:
@@ -44,7 +47,7 @@ def test_along_track_monitors_speak_against_the_map() -> None:
 
 def test_order_and_other_columns_are_kept() -> None:
     frames = pl.concat([alarms_of("b", 52.0), alarms_of("a", 50.0)])
-    found = map_suspects(frames)
+    found = map_suspects(frames, REACH_M)
     assert found.drop("suspect").equals(frames.drop("suspect"))
     assert alarms_of("a", 50.0)["measure_m"].to_list() == [1000.0]
 
@@ -52,7 +55,7 @@ def test_order_and_other_columns_are_kept() -> None:
 def test_places_gather_what_is_near() -> None:
     frames = [alarms_of("a", 50.0), alarms_of("b", 52.0, ("up_raw",)), alarms_of("c", 53.0)]
     far = [alarms_of("a", 80.0), alarms_of("c", 81.0), alarms_of("b", 20.0)]
-    found = map_places(pl.concat([*far, *frames]))
+    found = map_places(pl.concat([*far, *frames]), REACH_M)
     assert found.select("netelement_id", "from_m", "to_m", "axis", "runs", "alarms").rows() == [
         ("A", 1000.0, 1060.0, "cross up", 3, 3),
         ("A", 1600.0, 1620.0, "cross", 2, 2),
@@ -61,4 +64,4 @@ def test_places_gather_what_is_near() -> None:
 
 
 def test_no_alarms_no_places() -> None:
-    assert map_places(alarms_of("a", 50.0).clear()).is_empty()
+    assert map_places(alarms_of("a", 50.0).clear(), REACH_M).is_empty()

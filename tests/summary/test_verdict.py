@@ -18,9 +18,8 @@ CLEAN: dict[str, Any] = {
     "failures_within_budget": 0,
     "failures_beyond_budget": 0,
     "unproven_accepted": 0,
-    "accepted": 10,
+    "balises_accepted": 10,
     "share_unknown": 0.0,
-    "unknown_share_limit": 0.01,
 }
 
 
@@ -32,7 +31,7 @@ CLEAN: dict[str, Any] = {
         ({"share_unknown": 0.01}, SAFE),
         ({"share_unknown": 0.0101}, UNPROVEN),
         ({"share_unknown": None}, UNPROVEN),
-        ({"accepted": 0}, UNPROVEN),
+        ({"balises_accepted": 0}, UNPROVEN),
         ({"unproven_accepted": 1}, UNPROVEN),
         ({"failures": 2, "failures_within_budget": 1}, UNPROVEN),
         ({"failures": 2, "failures_within_budget": 1, "failures_beyond_budget": 1}, UNSAFE),
@@ -41,7 +40,7 @@ CLEAN: dict[str, Any] = {
     ],
 )
 def test_the_worst_that_applies(found: dict[str, Any], verdict: RunVerdict) -> None:
-    assert verdict_of(**(CLEAN | found)) is verdict
+    assert verdict_of(CLEAN | found, 0.01) is verdict
 
 
 @pytest.mark.parametrize(

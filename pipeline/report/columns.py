@@ -1,0 +1,94 @@
+"""Columns of tables on a page: titles and units from their names, meanings from their contract, values with bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import dataframely as dy
+import polars as pl
+
+from pipeline.report.markup import UNKNOWN, Cell, cell, number, pairs, table
+
+Row = Mapping[str, Any]
+Special = Mapping[str, Callable[[Row], Cell]]
+"""How the cells of some columns are made."""
+
+_UNITS = {"_per_h": "1/h", "_mps": "m/s", "_hz": "Hz", "_m": "m", "_s": "s", "_h": "h"}
+
+
+def frame_table(
+    identity: str,
+    caption: str,
+    frame: pl.DataFrame,
+    names: Sequence[str] = (),
+    contract: type[dy.Schema] | None = None,
+    special: Special | None = None,
+) -> str:
+    """A frame as a table; `names`: all columns unless said otherwise. Bounds stand beside their figure."""
+    special = special or {}
+    shown = list(names) or [name for name in frame.columns if not _is_bound(name, frame.columns)]
+    meanings = _meanings(contract)
+    rows = [
+        [special[name](row) if name in special else _cell(row, name) for name in shown]
+        for row in frame.iter_rows(named=True)
+    ]
+    return table(identity, caption, [(_title(name), meanings.get(name, "")) for name in shown], rows)
+
+
+def figures(row: Row, contract: type[dy.Schema], names: Sequence[str] = ()) -> str:
+    """What columns of one row mean, and their values with unit and bounds."""
+    shown = list(names) or [name for name in row if not _is_bound(name, row)]
+    meanings = _meanings(contract)
+    return pairs((meanings[name], _text(row, name)) for name in shown)
+
+
+def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:
+    columns = {} if contract is None else contract.columns()
+    return {name: column.description or "" for name, column in columns.items()}
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """A column's name without its unit, and the ending that says the unit."""
+    ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
+    return name.removesuffix(ending), ending
+
+
+def _title(name: str) -> str:
+    stem, ending = _parts(name)
+    words = stem.replace("_", " ")
+    return f"{words} [{_UNITS[ending]}]" if ending else words
+
+
+def _is_bound(name: str, names: Sequence[str] | Row) -> bool:
+    stem, ending = _parts(name)
+    figure, _, part = stem.rpartition("_")
+    return part in ("low", "high") and f"{figure}{ending}" in names
+
+
+def _bounds(row: Row, name: str) -> tuple[float | None, float | None] | None:
+    """Lower and upper bound of a figure that has some."""
+    stem, ending = _parts(name)
+    low, high = (f"{stem}_{part}{ending}" for part in ("low", "high"))
+    return (row[low], row[high]) if low in row and high in row else None
+
+
+def _cell(row: Row, name: str) -> Cell:
+    bounds = _bounds(row, name)
+    return Cell(_bounded(row[name], *bounds, UNKNOWN), row[name]) if bounds else cell(row[name], 4)
+
+
+def _text(row: Row, name: str) -> str:
+    value, unit = row[name], _UNITS.get(_parts(name)[1], "")
+    if bounds := _bounds(row, name):
+        text = _bounded(value, *bounds, "not known")
+    else:
+        text = "not known" if value is None else cell(value, 4).text
+    return text if text == "not known" else f"{text} {unit}".strip()
+
+
+def _bounded(value: float | None, low: float | None, high: float | None, unknown: str) -> str:
+    """A figure with its 95 % bounds; `at least` where only the lower one is known."""
+    if value is None:
+        return unknown if low is None else f"at least {number(low)}"
+    return f"{number(value)} (95 %: {number(low)} to {number(high)})"
