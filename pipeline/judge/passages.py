@@ -17,7 +17,7 @@ from schemas.tables import Passages
 
 
 class Found(NamedTuple):
-    """Per offer: its error where known closely [m], the hazard it belongs to (-1 none), and whether it is an insertion."""
+    """Per offer: its error where known closely [m], its hazard (-1 none), and whether it is an insertion."""
 
     known_m: Floats
     hazard: Ints
