@@ -112,11 +112,12 @@ def outcome(made: Journey, config: Configuration) -> Outcome:
     aligned, lds = lds_of(made, config)
     path_m = aligned["path_m"].cast(pl.Float64).to_numpy()
     error_m = np.abs(path_m - made.true_m - np.median(path_m[:300] - made.true_m[:300]))
-    in_use = ~lds.epochs["negated"].to_numpy() & (aligned["confidence_m"].to_numpy() <= config.lds.ci_limit_m)
-    ends = [negation.end_epoch for negation in lds.negations if negation.end_epoch is not None]
-    after = np.arange(path_m.size) >= (ends[0] if ends else path_m.size)
+    negated = lds.epochs["negated"].to_numpy()
+    in_use = ~negated & (aligned["confidence_m"].to_numpy() <= config.lds.ci_limit_m)
+    returns = np.flatnonzero(negated[:-1] & ~negated[1:]) + 1
+    after = np.arange(path_m.size) >= (returns[0] if returns.size else path_m.size)
     beyond_s = float((in_use & after & (error_m > LIMIT_M)).sum())
-    return Outcome(made.drift_mps, bool(lds.negations), bool(ends), beyond_s)
+    return Outcome(made.drift_mps, bool(negated.any()), bool(returns.size), beyond_s)
 
 
 def measure(out: Path, cases: int = CASES) -> list[Figure]:

@@ -6,13 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from math import isnan
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
 from pipeline.lds.journey import Journey
-from schemas.arrays import Floats, Ints
 from schemas.enums import BaliseKind, PassageStatus, Reaction
 from schemas.stages import Crossings
 
@@ -63,19 +61,6 @@ class Crossing:
     status: PassageStatus | None = None
 
 
-class _Step(NamedTuple):
-    """Two successive valid epochs, by row, time, path and odometer."""
-
-    before: int
-    epoch: int
-    t_before_ns: int
-    t_ns: int
-    path_before_m: float
-    path_m: float
-    odometer_before_m: float
-    odometer_m: float
-
-
 def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
     """Balises of one kind in order of leg, path position and identity."""
     rows = frame.filter(pl.col("kind").cast(pl.String) == kind.value).sort("leg", "path_m", "balise_id")
@@ -111,17 +96,10 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         passed_before = np.searchsorted(at_m, journey.path_m[before], side="right")
         passed_after = np.searchsorted(at_m, journey.path_m[after], side="right")
         passing = np.flatnonzero(passed_before != passed_after)
-        counts = zip(passed_before[passing].tolist(), passed_after[passing].tolist(), strict=True)
-        for step, (first, last) in zip(_steps(journey, before[passing], after[passing]), counts, strict=True):
-            found += [_crossing(journey, balise, step, sense) for balise, sense in _in_order(on_leg, first, last)]
+        for step in passing.tolist():
+            i, k, first, last = (int(rows[step]) for rows in (before, after, passed_before, passed_after))
+            found += [_crossing(journey, balise, i, k, sense) for balise, sense in _in_order(on_leg, first, last)]
     return sorted(found, key=lambda crossing: crossing.epoch)
-
-
-def _steps(journey: Journey, before: Ints, after: Ints) -> Iterator[_Step]:
-    columns: list[Ints | Floats] = [before, after]
-    for values in (journey.t_ns, journey.path_m, journey.odometer_m):
-        columns += [values[before], values[after]]
-    return (_Step(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tuple[Balise, int]]:
@@ -131,30 +109,31 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
         yield from ((balise, -1) for balise in reversed(balises[after:before]))
 
 
-def _crossing(journey: Journey, balise: Balise, step: _Step, sense: int) -> Crossing:
-    k, seen, share = step.epoch, _seen(journey, step), 1.0
+def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
+    seen, share = _seen(journey, before, k), 1.0
+    t_ns, path_m, odometer_m = journey.t_ns, journey.path_m, journey.odometer_m
     if seen is Seen.CROSSED:
-        share = (balise.path_m - step.path_before_m) / (step.path_m - step.path_before_m)
-    back_m = 0.0 if share == 1.0 else (1.0 - share) * (step.odometer_m - step.odometer_before_m)
+        share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
+    back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[k] - odometer_m[before])
     direction = int(journey.direction[k]) if journey.has_odometer else sense
     return Crossing(
         balise=balise,
-        before=step.before,
+        before=before,
         epoch=k,
-        t_ns=step.t_before_ns + round(share * (step.t_ns - step.t_before_ns)),
+        t_ns=int(t_ns[before]) + round(share * int(t_ns[k] - t_ns[before])),
         sense=sense,
         direction=direction,
-        odometer_m=_known(step.odometer_m - back_m),
+        odometer_m=_known(float(odometer_m[k]) - back_m),
         travelled_m=float(journey.travelled_m[k]) - back_m * direction,
         confidence_m=_known(float(journey.confidence_m[k])),
         seen=seen,
     )
 
 
-def _seen(journey: Journey, step: _Step) -> Seen:
-    if step.t_ns - step.t_before_ns <= journey.gap_ns:
+def _seen(journey: Journey, before: int, k: int) -> Seen:
+    if journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns:
         return Seen.CROSSED
-    return Seen.UNPLACED if journey.placed_nowhere[step.before + 1 : step.epoch].any() else Seen.IN_GAP
+    return Seen.UNPLACED if journey.placed_nowhere[before + 1 : k].any() else Seen.IN_GAP
 
 
 def _known(value: float) -> float | None:
@@ -168,28 +147,28 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
 
 def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFrame:
     """The table of crossings (`Crossings`), `crossings` in order of time."""
-    columns: dict[str, list[object]] = {
-        "crossing_id": list(range(len(crossings))),
-        "balise_id": [crossing.balise.balise_id for crossing in crossings],
-        "kind": [crossing.balise.kind.value for crossing in crossings],
-        "netelement_id": [crossing.balise.netelement_id for crossing in crossings],
-        "measure_m": [crossing.balise.measure_m for crossing in crossings],
-        "leg": [crossing.balise.leg for crossing in crossings],
-        "path_m": [crossing.balise.path_m for crossing in crossings],
-        "before": [crossing.before for crossing in crossings],
-        "epoch": [crossing.epoch for crossing in crossings],
-        "t": [crossing.t_ns for crossing in crossings],
-        "sense": [crossing.sense for crossing in crossings],
-        "direction": [journey.direction_at(crossing.t_ns, crossing.direction) for crossing in crossings],
-        "odometer_m": [crossing.odometer_m for crossing in crossings],
-        "offered": [crossing.offered for crossing in crossings],
-        "status": [crossing.status and crossing.status.value for crossing in crossings],
+    rows = [_row(number, crossing, journey) for number, crossing in enumerate(crossings)]
+    return frame_of(rows, {name: column.dtype for name, column in Crossings.columns().items()})
+
+
+def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]:
+    own = {name: getattr(crossing, name) for name in ("before", "epoch", "sense", "odometer_m", "offered")}
+    place = {
+        name: getattr(crossing.balise, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")
     }
-    kinds = {name: column.dtype for name, column in Crossings.columns().items()}
-    series = [
-        pl.Series(name, columns[name], dtype=pl.Int64).cast(kind)
-        if kind == pl.Datetime
-        else pl.Series(name, columns[name], dtype=kind)
-        for name, kind in kinds.items()
-    ]
-    return pl.DataFrame(series)
+    return {
+        "crossing_id": number,
+        **own,
+        **place,
+        "kind": crossing.balise.kind.value,
+        "t": crossing.t_ns,
+        "direction": journey.direction_at(crossing.t_ns, crossing.direction),
+        "status": crossing.status and crossing.status.value,
+    }
+
+
+def frame_of(rows: Sequence[dict[str, object]], kinds: dict[str, pl.DataType]) -> pl.DataFrame:
+    """Rows as a frame of these types; in the rows an instant is int64 [ns], an enum its text."""
+    plain = {pl.Datetime: pl.Int64, pl.Enum: pl.String}
+    schema = {name: plain.get(kind.base_type(), kind) for name, kind in kinds.items()}
+    return pl.DataFrame(rows, schema=schema, orient="row").cast(pl.Schema(kinds))

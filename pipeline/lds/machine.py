@@ -15,7 +15,7 @@ from pipeline.lds.detection import BaliseDetection
 from pipeline.lds.journey import Journey, mission_epochs, segment_epochs
 from pipeline.lds.link_monitors import LinkDistance
 from pipeline.lds.linking import LrvbChange
-from pipeline.lds.relink import Anchor, Negation, Recovery, Relink, Return, breaks
+from pipeline.lds.relink import Anchor, Recovery, Relink, breaks
 from schemas.arrays import NS_PER_S
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
@@ -39,8 +39,6 @@ class LocationSystem:
         self._journey, self._bank, self._config = journey, bank, config
         self.balises = BaliseDetection(journey, balises, crossings, config, limits)
         self.distance = LinkDistance(journey, config, limits)
-        self.restarts: list[int] = []
-        self.negations: list[Negation] = []
         self.lrvb_changes = [LrvbChange(0, None, chain_begun=False)]
         self.accepted_at_ns: dict[int, int] = {}
         self.tvb, self.alarm, self.negated, self.evaluated = ([False] * journey.t_ns.size for _ in range(4))
@@ -160,7 +158,6 @@ class LocationSystem:
     def _negate(self, k: int) -> None:
         self._relink.note_alarm(k)
         self._recovery = Recovery(k, self._journey, self._bank, self._config)
-        self.negations.append(Negation(k))
         self.negated[k] = True
         self._consistent_since_ns = None
 
@@ -171,7 +168,7 @@ class LocationSystem:
         if not self._validated:
             self._initialise_anew(k)
         elif self._relink.compare(k).holds:
-            self._return(k, "re-link")
+            self._return(k)
             self.distance.measure_from(Anchor.at_epoch(self._journey, k), k)
 
     def _initialise_anew(self, k: int) -> None:
@@ -181,15 +178,13 @@ class LocationSystem:
         self._chain_from = self._consistent_since_ns = None
         self._validated = False
         if self._recovery is not None:
-            self._return(k, "initialisation")
+            self._return(k)
         self._note_lrvb(k)
 
-    def _return(self, k: int, by: Return) -> None:
-        self.negations[-1].end(k, by)
+    def _return(self, k: int) -> None:
         self._recovery = None
         self.negated[k] = False
         self._bank.restart(k)
-        self.restarts.append(k)
         # What still rang at this epoch belonged to the fault that is over.
         self.evaluated[k] = self._bank.along_evaluated(k)
         self.alarm[k] = self._bank.failed(k)

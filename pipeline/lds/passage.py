@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.lds.crossings import Balise, Crossing
+from pipeline.lds.crossings import Balise, Crossing, frame_of
 from pipeline.lds.journey import Journey
 from pipeline.lds.windows import Window
 from schemas.enums import Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
@@ -52,11 +52,7 @@ def passage_rows(
     when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
     order = sorted(range(len(rows)), key=lambda i: (when[i], passages[i].balise.balise_id))
     kinds = {name: column.dtype for name, column in Passages.columns().items()}
-    schema = kinds | {"t_reckoned": pl.Datetime("ns", "UTC")}
-    plain = {name: pl.String if isinstance(kind, pl.Enum) else kind for name, kind in schema.items()}
-    instants = {name: pl.Int64 if kind == pl.Datetime else kind for name, kind in plain.items()}
-    frame = pl.DataFrame([rows[i] for i in order], schema=instants, orient="row")
-    return frame.cast(pl.Schema(schema))
+    return frame_of([rows[i] for i in order], kinds | {"t_reckoned": pl.Datetime("ns", "UTC")})
 
 
 def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
-from typing import Literal
 
 import numpy as np
 
@@ -136,21 +135,6 @@ class Relink:
         scale_sigma = limits.odometer_scale_sigma or 0.0
         variance_m2 = drift_m2(positions_m2, waited_s, way_m, limits.odometer_sigma_mps, scale_sigma)
         return float(relink_bound_m(variance_m2, limits.threshold_factor, limits.failure_limit_m))
-
-
-Return = Literal["re-link", "initialisation"]
-
-
-@dataclass(slots=True)
-class Negation:
-    """The position was not used from `first_epoch` on until `end_epoch` (`None`: to the end)."""
-
-    first_epoch: int
-    end_epoch: int | None = None
-    ended_by: Return | None = None
-
-    def end(self, k: int, by: Return) -> None:
-        self.end_epoch, self.ended_by = k, by
 
 
 class Recovery:

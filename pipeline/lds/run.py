@@ -13,7 +13,6 @@ from pipeline.lds.journey import journey_of
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
 from pipeline.lds.reads import reads_of
-from pipeline.lds.relink import Negation
 from schemas.config import LdsConfig
 from schemas.enums import BaliseKind
 
@@ -25,15 +24,12 @@ class LdsResult:
     `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: as in `schemas.stages.Crossings`, each
     balise crossed or read. `passages`: as in the contract, in order of time, joined to crossings by `crossing_id`;
     what needs a truth is null or `none`; beside it `t_reckoned`: when the train passes a balise that was not offered,
-    by LRVB and odometer. `restarts`: epochs at which the bank was restarted after the first. `unknown_reads`:
-    telegrams of balises not on the path.
+    by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path.
     """
 
     epochs: pl.DataFrame
     crossings: pl.DataFrame
     passages: pl.DataFrame
-    restarts: list[int]
-    negations: list[Negation]
     unknown_reads: pl.DataFrame
 
 
@@ -51,9 +47,9 @@ def run_lds(
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
     where unknown)`, odometer_segment, direction` (+1/-1, used where there is no odometer).
-    `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, optionally `odometer_m`
-    at the read; without it the odometer is interpolated between near epochs. A run without that
-    stream has no reader, so its physical balises have no passages.
+    `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the
+    read where the run has an odometer. A run without that stream has no reader, so its physical balises have no
+    passages.
     """
     journey = journey_of(epochs, config, limits)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
@@ -67,7 +63,5 @@ def run_lds(
         epochs=epoch_columns(epochs["t"], system, journey, config),
         crossings=crossing_rows(crossings, journey),
         passages=passage_rows(passages, crossings, journey, solution),
-        restarts=system.restarts,
-        negations=system.negations,
         unknown_reads=unknown,
     )

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.track.geodesy import Points, points_of
 from pipeline.track.network import Network
-from pipeline.track.segments import on_segments
+from pipeline.track.segments import Feet, downhill
 from pipeline.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 
@@ -113,8 +113,9 @@ def candidates_of(points: Points, network: Network, segments: Segments, reach_m:
     element = segments.element[segment]
     fresh = np.ones(len(step), dtype=bool)
     fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
-    step, segment = step[fresh], _downhill(points, segments, step[fresh], segment[fresh])
-    return _candidates(points, network, segments, step, segment, reach_m)
+    feet = downhill(points.take(step[fresh]), segments, segment[fresh], segments.element)
+    near = np.flatnonzero(feet.distance_m <= reach_m)
+    return _candidates(len(points), network, segments, step[fresh][near], feet.take(near))
 
 
 def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candidates:
@@ -127,12 +128,8 @@ def merged(some: Candidates, others: Candidates, step_of_others: Ints) -> Candid
     return Candidates(first=np.searchsorted(columns["step"], np.arange(steps + 1)), **columns)
 
 
-def _candidates(
-    points: Points, network: Network, segments: Segments, step: Ints, segment: Ints, reach_m: float
-) -> Candidates:
-    feet = on_segments(points.take(step), segments, segment)
-    near = np.flatnonzero(feet.distance_m <= reach_m)
-    feet, step, segment = feet.take(near), step[near], segment[near]
+def _candidates(points: int, network: Network, segments: Segments, step: Ints, feet: Feet) -> Candidates:
+    segment = feet.segment
     element = segments.element[segment]
     held = np.clip(feet.fraction, 0.0, 1.0)
     measure = segments.measure_start_m[segment]
@@ -146,7 +143,7 @@ def _candidates(
     along = measure + held * span - track.measure_m[track.first[element]]
     linked = network.linked_ends()
     return Candidates(
-        first=np.searchsorted(step, np.arange(len(points) + 1)),
+        first=np.searchsorted(step, np.arange(points + 1)),
         step=step,
         element=element,
         along_m=along,
@@ -160,27 +157,6 @@ def _candidates(
         linked_start=linked[element, 0],
         linked_end=linked[element, 1],
     )
-
-
-def _downhill(points: Points, segments: Segments, step: Ints, segment: Ints) -> Ints:
-    """Each candidate's nearest segment, walking along its element while that gets nearer."""
-    segment = segment.copy()
-    feet = on_segments(points.take(step), segments, segment)
-    active = np.flatnonzero((feet.fraction < 0) | (feet.fraction > 1))
-    while len(active):
-        other = segment[active] + np.where(feet.fraction[active] < 0, -1, 1)
-        inside = (other >= 0) & (other < len(segments))
-        active, other = active[inside], other[inside]
-        same = segments.element[other] == segments.element[segment[active]]
-        active, other = active[same], other[same]
-        trial = on_segments(points.take(step[active]), segments, other)
-        better: Bools = trial.distance_m < feet.distance_m[active] - 1e-9
-        rows = np.flatnonzero(better)
-        active = active[rows]
-        segment[active] = other[rows]
-        feet.put(active, trial.take(rows))
-        active = active[(feet.fraction[active] < 0) | (feet.fraction[active] > 1)]
-    return segment
 
 
 def _probes(start: Floats, end: Floats, element: Ints) -> tuple[Floats, Ints]:

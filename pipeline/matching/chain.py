@@ -11,7 +11,6 @@ from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.orientation import grows_with
-from pipeline.matching.steps import travelled
 from pipeline.odometry import Odometry
 from pipeline.track.geodesy import Points
 from pipeline.track.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
@@ -35,7 +34,7 @@ def path_on_chain(
     position[known] = np.where(near, path_at(leg, feet), np.nan)
     used = leg.visit[feet.segment[near]]
     part = slice(int(used.min()), int(used.max()) + 1)
-    forward = grows_with(position, np.arange(len(fixes)), travelled(fixes, odometry), config.orientation_distance_m)
+    forward = grows_with(position, fixes.t_ns, odometry, config.orientation_distance_m)
     if forward and len(leg.visits[part]) == len(leg.visits):
         covered = leg
     else:

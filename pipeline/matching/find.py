@@ -56,7 +56,7 @@ def find_path(
     decoded = aligned(trellis, decode(trellis, found.best))
     legs = legs_of(trellis, decoded)
     at = positions_m(decoded, legs)
-    if not grows_with(at, trellis.steps.epoch, way, config.orientation_distance_m):
+    if not grows_with(at, fixes.t_ns[trellis.steps.epoch], odometry, config.orientation_distance_m):
         decoded = decoded.turned(network, range(len(decoded.chains)))
         legs = legs_of(trellis, decoded)
     doubt = doubt_of(trellis, found, decoded)

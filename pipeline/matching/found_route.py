@@ -7,8 +7,8 @@ import polars as pl
 
 from pipeline.matching.match import Match
 from pipeline.matching.rivals import Posterior
-from pipeline.track.leg import Leg
-from schemas.arrays import Bools, Floats, Ints, floats
+from pipeline.track.leg import Leg, segments_at
+from schemas.arrays import Bools, Ints, floats
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "netelement_id": pl.String,
@@ -39,7 +39,8 @@ def found_route(found: Match, sure: float) -> pl.DataFrame:
 
 def _row(found: Match, number: int, leg: Leg, visit: int, on_leg: Bools, sure: float) -> tuple[object, ...]:
     path_m, probability = floats(found.epochs, "path_m"), floats(found.epochs, "path_probability")
-    inside = np.flatnonzero(on_leg & (leg.visit[_segment(leg, path_m)] == visit) & np.isfinite(probability))
+    segment, _ = segments_at(leg, np.nan_to_num(path_m))
+    inside = np.flatnonzero(on_leg & (leg.visit[segment] == visit) & np.isfinite(probability))
     least = float(probability[inside].min()) if len(inside) else None
     name = found.path.track.ids[leg.visits[visit].element]
     times = found.epochs["t"]
@@ -53,12 +54,6 @@ def _row(found: Match, number: int, leg: Leg, visit: int, on_leg: Bools, sure: f
         times[int(inside[0])] if len(inside) else None,
         times[int(inside[-1])] if len(inside) else None,
     )
-
-
-def _segment(leg: Leg, path_m: Floats) -> Ints:
-    """Segment of a leg for path positions, the first or last beyond its ends."""
-    found = np.searchsorted(leg.path_start_m, np.nan_to_num(path_m, nan=-np.inf), side="right") - 1
-    return np.clip(found, 0, len(leg.path_start_m) - 1)
 
 
 def _rivals(found: Match, rows: Ints, least: float) -> str:

@@ -4,45 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.matching.steps import Travelled
+from pipeline.odometry import Odometry
+from pipeline.odometry.polarity import polarity
 from schemas.arrays import Floats, Ints
 
 
-def grows_with(position_m: Floats, epoch: Ints, way: Travelled, distance_m: float) -> bool:
+def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
     """Whether the run's first `distance_m` of net movement went with the given positions (NaN: not known).
 
-    The odometer says between which epochs that distance was covered, the positions which way it went: the
-    median over starts within twice the distance, so that a GNSS that jumps back at the start does not turn
-    the run round. Without an odometer the positions say both.
+    The odometer says when that distance was covered and in which sense, and its `polarity` against the positions which
+    way they went. Without an odometer the positions say both.
     """
-    known = np.flatnonzero(np.isfinite(position_m))
-    if len(known) == 0:
+    known = np.isfinite(position_m)
+    if not known.any():
         return True
-    position, rows = position_m[known], epoch[known]
-    moved = _moved_by_odometer(position, rows, way, distance_m)
-    if moved is not None:
-        return moved > 0
+    position, at_ns = position_m[known], t_ns[known]
+    if odometry is not None:
+        recorded = odometry.distance_at(at_ns)
+        moved = recorded[np.isfinite(recorded)] - recorded[np.isfinite(recorded)][:1]
+        covered = np.flatnonzero(np.abs(moved) >= distance_m)
+        if covered.size:
+            return bool(polarity(odometry, at_ns, position, distance_m) * moved[covered[0]] > 0)
     away = position - position[0]
     far = np.flatnonzero(np.abs(away) >= distance_m)
     return bool(away[far[0]] > 0) if len(far) else bool(away[-1] >= 0)
-
-
-def _moved_by_odometer(position_m: Floats, rows: Ints, way: Travelled, distance_m: float) -> float | None:
-    """Median displacement while the odometer covered the distance, none where it did not or is not known."""
-    known = np.isfinite(way.distance_m[rows])
-    if not known.any():
-        return None
-    since = way.between(np.full(len(rows), rows[known][0]), rows)
-    known = np.isfinite(since)
-    position_m, rows, since = position_m[known], rows[known], since[known]
-    covered = np.flatnonzero(np.abs(since) >= distance_m)
-    if len(covered) == 0:
-        return None
-    sense = np.sign(since[covered[0]])
-    forward = sense * since
-    beyond = np.flatnonzero(forward >= 2.0 * distance_m)
-    starts = np.arange(beyond[0] if len(beyond) else covered[0])
-    later = np.searchsorted(np.maximum.accumulate(forward), forward[starts] + distance_m)
-    within = later < len(rows)
-    moved = position_m[later[within]] - position_m[starts[within]]
-    return (float(np.median(moved)) or None) if len(moved) else None

@@ -67,8 +67,8 @@ def _blocks(trellis: Trellis) -> Iterator[_Block]:
     yield _Block(0, int(ends[0]), nothing, nothing)
     for rows in _batches(trellis, begins[1:]):
         pairs = trellis.pairs(begins[1:][rows])
-        for number, (begin, end) in enumerate(zip(begins[1:][rows].tolist(), ends[1:][rows].tolist(), strict=True)):
-            yield _Block(begin, end, *pairs.at(number))
+        for begin, end, pair in zip(begins[1:][rows].tolist(), ends[1:][rows].tolist(), pairs, strict=True):
+            yield _Block(begin, end, *pair)
 
 
 def _batches(trellis: Trellis, steps: Ints) -> Iterator[slice]:

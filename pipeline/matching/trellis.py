@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,46 +49,27 @@ class Trellis:
     def __len__(self) -> int:
         return len(self.first) - 1
 
-    def states(self, step: int) -> range:
-        return range(int(self.first[step]), int(self.first[step + 1]))
+    def pairs(self, steps: Ints) -> list[tuple[Floats, Floats]]:
+        """Per given step, for its states and those of the step before: how probable each move is.
 
-    def pairs(self, steps: Ints) -> Pairs:
-        """All pairs of states of the given steps and of the steps before them, with how probable each move is."""
-        before, after = (np.diff(self.first)[at] for at in (steps - 1, steps))
-        sizes = before * after
-        begin = np.concatenate([[0], np.cumsum(sizes)])
-        step = np.repeat(steps, sizes)
-        number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
-        width = np.repeat(after, sizes)
-        one, other = self.first[step - 1] + number // width, self.first[step] + number % width
+        Two arrays `[before, after, hypothesis]`, the largest of a step being one: moves that stay on an element, and
+        those that change to another; zero elsewhere.
+        """
+        begin, step, number, one, other = _pairs(self.first, steps)
         changes = self.oriented[one] != self.oriented[other]
         score = step_score(self.offset_m[one], self.offset_m[other], self.candidate[other], changes, self.like)
         move = self.pair_move[self.pair_first[step] + number]
         score = np.maximum(move[:, None] + score, BREAK + self.initial[other])
         most = np.maximum.reduceat(score.max(axis=1), begin[:-1])
-        weight = np.exp(score - np.repeat(most, sizes)[:, None])
-        return Pairs(before, after, begin, weight * ~changes[:, None], weight * changes[:, None])
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Of several steps: `begin[k] : begin[k + 1]` are the pairs of step k, `before` times `after` states, row by row.
-
-    `same`, `other`: probability of each under each hypothesis, the largest of a step being one, in `same` of those that
-    stay on an element and in `other` of those that change to another; zero elsewhere.
-    """
-
-    before: Ints
-    after: Ints
-    begin: Ints
-    same: Floats
-    other: Floats
-
-    def at(self, number: int) -> tuple[Floats, Floats]:
-        """`same` and `other` of one step: `[before, after, hypothesis]`."""
-        part = slice(int(self.begin[number]), int(self.begin[number + 1]))
-        shape = int(self.before[number]), int(self.after[number]), self.same.shape[1]
-        return self.same[part].reshape(shape), self.other[part].reshape(shape)
+        weight = np.exp(score - np.repeat(most, np.diff(begin))[:, None])
+        parts = [slice(*ends) for ends in itertools.pairwise(begin.tolist())]
+        count = np.diff(self.first)
+        shapes = [(*shape, weight.shape[1]) for shape in zip(count[steps - 1], count[steps], strict=True)]
+        moves = weight * ~changes[:, None], weight * changes[:, None]
+        return [
+            (moves[0][part].reshape(shape), moves[1][part].reshape(shape))
+            for part, shape in zip(parts, shapes, strict=True)
+        ]
 
 
 def trellis_of(
@@ -126,16 +108,22 @@ def _ways(steps: Steps, polarity: int) -> Ways:
     return Ways(distance, known & (polarity != 0), limit)
 
 
+def _pairs(first: Ints, steps: Ints) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+    """All pairs of states of the given steps and of the steps before them, row by row.
+
+    Where those of each step begin; per pair its step, its number there, and the numbers of both states.
+    """
+    count = np.diff(first)
+    sizes = count[steps - 1] * count[steps]
+    begin = np.concatenate([[0], np.cumsum(sizes)])
+    step, width = np.repeat(steps, sizes), np.repeat(count[steps], sizes)
+    number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
+    return begin, step, number, first[step - 1] + number // width, first[step] + number % width
+
+
 def _pair_moves(trellis: Trellis, steps: Ints) -> tuple[Ints, Floats]:
     """Moves of all the given steps: where those of each step begin, and all of them, row by row."""
-    count = np.diff(trellis.first)
-    before, after = count[steps - 1], count[steps]
-    sizes = before * after
-    begin = np.concatenate([[0], np.cumsum(sizes)])
-    step = np.repeat(steps, sizes)
-    number = np.arange(begin[-1]) - np.repeat(begin[:-1], sizes)
-    one = trellis.first[step - 1] + number // np.repeat(after, sizes)
-    other = trellis.first[step] + number % np.repeat(after, sizes)
+    begin, step, _, one, other = _pairs(trellis.first, steps)
     moves = move_scores(
         trellis.network,
         trellis.oriented[one],

@@ -50,12 +50,6 @@ def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(ways)])
 
 
-def way_m(distance_m: Floats, width_m: Floats) -> float:
-    """Way driven, to and fro [m], to the last row."""
-    beyond_m = distance_m[-1] - with_hysteresis(distance_m, width_m)[-1]
-    return float(driven_m(distance_m, width_m)[-1] + abs(beyond_m))
-
-
 def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s: float) -> Bools:
     """Per step between samples: mean speed beyond the dead band, over `window_s` at least, centred on the step."""
     half_s, centre_s = 0.5 * np.maximum(np.diff(t_s), window_s), 0.5 * (t_s[1:] + t_s[:-1])

@@ -97,21 +97,10 @@ class Odometry:
         """Number of the continuity segment: distances can be compared only where it is the same."""
         return self.segment_at_s(self.seconds(t_ns))
 
-    def slip_at(self, t_ns: Ints) -> Bools:
-        """Whether the odometer itself reports slip or slide at the instant, or in a row next to it."""
-        t_s = self.seconds(t_ns)
-        before, after = self._around(t_s)
-        return np.asarray(self._inside(t_s) & (self.slip[before] | self.slip[after]))
-
     def distance_at(self, t_ns: Ints) -> Floats:
         """Distance at these instants [m], as recorded; NaN where it is not known."""
         t_s = self.seconds(t_ns)
         return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
-
-    def speed_at(self, t_ns: Ints) -> Floats:
-        """Mean speed over the second before [m/s], as recorded; NaN where the distance is not known."""
-        t_s = self.seconds(t_ns)
-        return np.where(self.known_at_s(t_s), self.speed_at_s(t_s), np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
         """Way driven since the first row [m], turns included, as recorded; a best guess where it is not known.

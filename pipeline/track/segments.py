@@ -88,24 +88,30 @@ def nearest(points: Points, line: Polyline) -> Feet:
     _, sample = tree.query(points.surface, distance_upper_bound=_NEAR_M)
     far = np.flatnonzero(sample == tree.n)
     sample[far] = tree.query(points.surface[far])[1]
-    return downhill(points, line, segment[sample])
+    return held_to_line(downhill(points, line, segment[sample]), len(line))
 
 
-def downhill(points: Points, line: Polyline, segment: Ints) -> Feet:
-    """The nearest place from a first guess, walking along the line while that gets nearer."""
+def downhill(points: Points, line: HasSegments, segment: Ints, line_of: Ints | None = None) -> Feet:
+    """The nearest place from a first guess, walking along the line while that gets nearer; `fraction` is not limited.
+
+    `line_of`: per segment the line that it belongs to, where there are several.
+    """
     feet = on_segments(points, line, segment)
     active = np.flatnonzero((feet.fraction < 0) | (feet.fraction > 1))
     while len(active):
         step = np.where(feet.fraction[active] < 0, -1, 1)
         other = feet.segment[active] + step
-        inside = (other >= 0) & (other < len(line))
+        inside = (other >= 0) & (other < len(line.start))
         active, other = active[inside], other[inside]
+        if line_of is not None:
+            same = line_of[other] == line_of[feet.segment[active]]
+            active, other = active[same], other[same]
         trial = on_segments(points.take(active), line, other)
         better = np.flatnonzero(trial.distance_m < feet.distance_m[active] - 1e-9)
         active = active[better]
         feet.put(active, trial.take(better))
         active = active[(feet.fraction[active] < 0) | (feet.fraction[active] > 1)]
-    return held_to_line(feet, len(line))
+    return feet
 
 
 def on_segments(points: Points, line: HasSegments, segment: Ints) -> Feet:

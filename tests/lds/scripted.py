@@ -113,7 +113,23 @@ def run(
     limits: LdsLimits = LIMITS,
     **config: Any,
 ) -> LdsResult:
-    return run_lds(epochs, bank or ScriptedBank(), balises, reads, LdsConfig(**config), limits)
+    on_odometer = None if reads is None else with_odometer(reads, epochs)
+    return run_lds(epochs, bank or ScriptedBank(), balises, on_odometer, LdsConfig(**config), limits)
+
+
+def with_odometer(reads: pl.DataFrame, epochs: pl.DataFrame) -> pl.DataFrame:
+    """Telegrams with the odometer at each, by a straight line between the epochs about it; null where it is unknown."""
+    t_ns, at_ns = (frame["t"].to_physical().to_numpy() for frame in (epochs, reads))
+    odometer_m = epochs["odometer_m"].cast(pl.Float64).to_numpy()
+    here_m = np.interp(at_ns, t_ns, odometer_m, left=np.nan, right=np.nan)
+    return reads.with_columns(odometer_m=pl.Series(here_m, nan_to_null=True))
+
+
+def negations(result: LdsResult) -> list[tuple[int, int | None]]:
+    """First epoch of each negation, and that of the return (none to the end)."""
+    negated = np.concatenate([[False], result.epochs["negated"].to_numpy(), [False]])
+    begins, ends = np.flatnonzero(np.diff(negated.astype(np.int8))).reshape(-1, 2).T.tolist()
+    return [(begin, end if end < result.epochs.height else None) for begin, end in zip(begins, ends, strict=True)]
 
 
 def told(result: LdsResult, *columns: str) -> list[tuple[Any, ...]]:
