@@ -109,8 +109,8 @@ class _Learner:
             joints = np.concatenate([joints[current:], new_joints])
             self._put(np.maximum(use_from, position), joints)
             series = self._series(position, end, begin)
-            result, bank = run_axis(series, self._alphas, bank)
-            beyond = ~(np.abs(result.value) <= self._factor * result.sigma)  # what cannot be compared is no pass
+            value, sigma, bank = run_axis(series, self._alphas, bank)
+            beyond = ~(np.abs(value) <= self._factor * sigma)  # what cannot be compared is no pass
             failing = np.flatnonzero(beyond.any(axis=1) & ~series.fresh)
             if failing.size:
                 alarm = position + int(failing[0])
@@ -200,8 +200,8 @@ class _Learner:
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
             t_s, series = self._t_s[position:end], self._series(position, end, begin)
-            result, bank = run_axis(series, self._alphas[:1], bank)
-            failing = ~(np.abs(result.value) <= self._factor * result.sigma).all(axis=1)
+            value, sigma, bank = run_axis(series, self._alphas[:1], bank)
+            failing = ~(np.abs(value) <= self._factor * sigma).all(axis=1)
             failing |= np.arange(position, end) <= begin + 1
             failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
             away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)

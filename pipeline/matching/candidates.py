@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.track.geodesy import Points, points_of
 from pipeline.track.network import Network
-from pipeline.track.segments import Feet, downhill
+from pipeline.track.segments import Feet, Polyline, downhill
 from pipeline.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 
@@ -18,11 +18,9 @@ PROBE_SPACING_M = 40.0
 
 
 @dataclass(frozen=True)
-class Segments:
+class Segments(Polyline):
     """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e."""
 
-    start: Floats
-    end: Floats
     element: Ints
     first: Ints
     measure_start_m: Floats
@@ -31,9 +29,6 @@ class Segments:
     sigma_m: Floats
     tree: cKDTree
     probe_segment: Ints
-
-    def __len__(self) -> int:
-        return len(self.element)
 
 
 @dataclass(frozen=True)

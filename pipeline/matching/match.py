@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import polars as pl
@@ -13,7 +12,6 @@ from pipeline.matching.doubt import no_doubt
 from pipeline.matching.epochs import Assignment, epoch_frame
 from pipeline.matching.find import find_path
 from pipeline.matching.fixes import Fixes, fixes_of
-from pipeline.matching.residuals import biases
 from pipeline.matching.resolution import digit_noise
 from pipeline.matching.rivals import Posterior, Rivals, rivals_of
 from pipeline.odometry import Odometry
@@ -31,7 +29,7 @@ from schemas.run import Site
 
 @dataclass(frozen=True)
 class Match:
-    """Epochs on the path, the path, and stretches of doubt.
+    """Epochs on the path, the path, and when it was in doubt.
 
     `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
     possible at the steps of the search; none where nothing was to be searched. `odometer_sign`: of the recorded
@@ -44,11 +42,6 @@ class Match:
     antenna_ahead_m: float
     posterior: Posterior | None = None
     odometer_sign: int = 1
-
-    @cached_property
-    def biases(self) -> pl.DataFrame:
-        """Cross-track biases per element."""
-        return biases(self.epochs)
 
     def rivals(self, limit: float) -> Rivals:
         """Per epoch the net elements whose posterior reaches `limit` there, the path's own among them."""

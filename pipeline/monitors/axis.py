@@ -49,14 +49,6 @@ class AxisSeries:
         return AxisSeries(**{item.name: getattr(self, item.name)[low:high] for item in fields(self)})
 
 
-@dataclass(frozen=True)
-class AxisResult:
-    """Statistic and its sigma [m/s], shape (rows, 1 + alphas): raw first, then the EWMAs."""
-
-    value: Floats
-    sigma: Floats
-
-
 def with_memory(sigma_m: Floats, decorrelation: Floats, config: MonitorConfig) -> dict[str, Floats]:
     """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j, best in Fortran order.
 
@@ -78,8 +70,11 @@ def decorrelation_of(dt_s: Floats, taus_s: Floats) -> Floats:
     return -np.expm1(-dt_s / taus_s[:, None])
 
 
-def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None) -> tuple[AxisResult, AxisState]:
-    """Values and sigmas of the axis from `state`, or from a restart, on, and the state to carry on with."""
+def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None) -> tuple[Floats, Floats, AxisState]:
+    """Values and sigmas of the axis [m/s] from `state`, or from a restart, on, and the state to carry on with.
+
+    Shapes (rows, 1 + alphas): raw first, then the EWMAs.
+    """
     state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
     moving = ~series.fresh
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
@@ -96,10 +91,10 @@ def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None)
     latency = _response(keep, weight, series.latency_mps, state.latency_response)
     raw_variance = _raw_variance(series, increment_m2)
     sigma = np.sqrt(np.column_stack([raw_variance, variance + steady**2 + latency**2]))
-    result = AxisResult(np.column_stack([series.rate_mps, ewma]), sigma)
+    value = np.column_stack([series.rate_mps, ewma])
     if series.epoch.size == 0:
-        return result, state
-    return result, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
+        return value, sigma, state
+    return value, sigma, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
 
 
 def _response(keep: Floats, weight: Floats, rate_mps: Floats, before: Floats) -> Floats:

@@ -11,6 +11,7 @@ import polars as pl
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import AxisState
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, Axis, axes_of
+from pipeline.monitors.single import blind_monitor
 from schemas.arrays import Floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
@@ -45,8 +46,8 @@ class _AxisBank:
         while self._done < rows.size and rows[self._done] <= epoch:
             end = min(self._done + self._block, rows.size)
             part = self._series.between(self._done, end)
-            result, self._carry = run_axis(part, self._alphas, self._carry)
-            self._store(part, result.value, self._factor * result.sigma)
+            value, sigma, self._carry = run_axis(part, self._alphas, self._carry)
+            self._store(part, value, self._factor * sigma)
             self._done, self._block = end, min(2 * self._block, _BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
@@ -71,10 +72,7 @@ class _AxisBank:
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
         columns: list[pl.Series] = []
-        reasons = {
-            on: self.axis.reasons.fill_null(FIRST_EPOCH if on else DISABLED)
-            for on in dict.fromkeys(self._enabled.tolist())
-        }
+        reasons = {on: self.axis.reasons.fill_null(FIRST_EPOCH if on else DISABLED) for on in (True, False)}
         for index, scale in enumerate(SCALES):
             name = f"{self.axis.name}_{scale}"
             state = self.state[:, index]
@@ -96,7 +94,7 @@ def _where_not_evaluated(name: str, codes: npt.NDArray[np.int8], reasons: pl.Ser
 
 
 class MonitorBank:
-    """The bank as the location determination system sees it.
+    """The bank as the location determination system sees it (`pipeline.lds.bank_protocol.Bank`).
 
     `single` are monitors without memory beyond an epoch, evaluated beforehand: frames `value, threshold, state,
     reason` by monitor name. A fail of any monitor at an epoch is an alarm.
@@ -110,8 +108,9 @@ class MonitorBank:
             _AxisBank(axis, count, alphas, factor, [f"{axis.name}_{scale}" not in disabled for scale in SCALES])
             for axis in axes_of(epochs, config)
         )
-        self._single = {name: frame for name, frame in single.items() if name not in disabled}
-        self._switched_off = [name for name in single if name in disabled]
+        self._single = {
+            name: blind_monitor(count, DISABLED) if name in disabled else frame for name, frame in single.items()
+        }
         self._single_fails = np.zeros(count, dtype=np.bool_)
         for frame in self._single.values():
             self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
@@ -133,29 +132,24 @@ class MonitorBank:
         self._along[part] = (self._axes[0].state[part] != _NOT_EVALUATED).any(axis=1)
 
     def failed(self, epoch: int) -> bool:
-        """Any monitor fails at this epoch."""
         self._look(epoch)
         return bool(self._any[epoch])
 
     def fast_failed(self, epoch: int) -> bool:
-        """A raw, fastest-EWMA or memoryless monitor fails at this epoch: only these hold back recovery."""
         self._look(epoch)
         return bool(self._fast[epoch])
 
     def along_evaluated(self, epoch: int) -> bool:
-        """The along-track monitors have a verdict at this epoch."""
         self._look(epoch)
         return bool(self._along[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        """The first epoch from `epoch` on at which a monitor fails, or that is not looked at yet; at most `end`."""
         self._look(epoch)
         ahead = self._any[epoch : min(self._known_to + 1, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> npt.NDArray[np.bool_]:
-        """`along_evaluated` of the epochs [epoch, end)."""
         return self._along[epoch:end]
 
     def restart(self, epoch: int) -> None:
@@ -171,14 +165,4 @@ class MonitorBank:
         columns = [column for axis in self._axes for column in axis.columns()]
         for name, frame in self._single.items():
             columns += [frame[part].alias(f"{name}_{part}") for part in ("value", "threshold", "state", "reason")]
-        for name in self._switched_off:
-            columns += not_evaluated(name, DISABLED, self._any.size)
         return columns
-
-
-def not_evaluated(name: str, reason: str, count: int) -> list[pl.Series]:
-    """Columns of a monitor that has nothing to look at, with the reason."""
-    nothing = pl.Series([None] * count, dtype=pl.Float64)
-    state = _state_series(f"{name}_state", np.full(count, _NOT_EVALUATED, dtype=np.int8))
-    why = pl.Series(f"{name}_reason", [reason] * count, dtype=pl.String)
-    return [nothing.alias(f"{name}_value"), nothing.alias(f"{name}_threshold"), state, why]

@@ -81,34 +81,25 @@ class _Track:
 
 
 def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame) -> _Ranges:
-    t_ns = epochs["t"].dt.timestamp("ns").to_numpy()
-    sorted_rows = (
+    at = epochs.select(t_ns=pl.col("t").to_physical()).with_row_index("epoch")
+    kept = (
         satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
         .unique(["t", "sv"], keep="first", maintain_order=True)
         .sort("t", maintain_order=True)
+        .with_columns(t_ns=pl.col("t").to_physical())
+        .join_asof(at, on="t_ns", strategy="nearest", tolerance=_TOLERANCE_NS)
+        .drop_nulls("epoch")
     )
-    stamps = sorted_rows["t"].dt.timestamp("ns").to_numpy()
-    epoch = _nearest(t_ns, stamps)
-    kept = sorted_rows.filter(pl.Series(np.abs(t_ns[epoch] - stamps) <= _TOLERANCE_NS))
-    epoch = _nearest(t_ns, kept["t"].dt.timestamp("ns").to_numpy())
     azimuth, elevation = kept["azimuth_deg"].to_numpy(), kept["elevation_deg"].to_numpy()
     stated = kept["sigma_m"].cast(pl.Float64).to_numpy().astype(np.float64) ** 2
     _, system = np.unique(kept["sv"].str.slice(0, 1).to_numpy(), return_inverse=True)
     return _Ranges(
-        epoch,
+        kept["epoch"].to_numpy().astype(np.int64),
         system,
         line_of_sight_rows(azimuth, elevation),
         kept["residual_m"].to_numpy(),
         np.where(np.isfinite(stated), stated, range_variances_m2(elevation).sum(axis=-1)),
     )
-
-
-def _nearest(t_ns: Ints, stamps: Ints) -> Ints:
-    """Index of the epoch nearest to each stamp."""
-    after = np.searchsorted(t_ns, stamps).clip(0, t_ns.size - 1)
-    before = np.maximum(after - 1, 0)
-    nearest: Ints = np.where(stamps - t_ns[before] <= t_ns[after] - stamps, before, after)
-    return nearest
 
 
 def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:

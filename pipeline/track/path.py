@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.track.geodesy import Points, points_of
+from pipeline.track.geodesy import Points
 from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.track.segments import Feet, no_feet
 from pipeline.track.survey import Track
@@ -85,32 +85,11 @@ class TravelledPath:
             measure[rows] = one.measure_start_m[segment] + fraction * span
         return element, measure
 
-    def project(
-        self,
-        latitude_deg: npt.ArrayLike,
-        longitude_deg: npt.ArrayLike,
-        height_m: npt.ArrayLike | None = None,
-        leg: npt.ArrayLike | None = None,
-        near_path_m: npt.ArrayLike | None = None,
-    ) -> Places:
-        """Positions [deg, m] on the path.
-
-        `leg` says on which leg each point lies (none: the nearest). `near_path_m` tells passages of the
-        same place apart; it never moves a point that has only one, so jumps stay what they are.
-        """
-        latitude, longitude = _column(latitude_deg), _column(longitude_deg)
-        height = np.full(len(latitude), np.nan) if height_m is None else _column(height_m)
-        near = None if near_path_m is None else np.broadcast_to(_column(near_path_m), latitude.shape)
-        known = np.isfinite(latitude) & np.isfinite(longitude)
-        points = points_of(latitude, longitude)
-        if leg is None:
-            number = self._nearest_leg(points, known)
-        else:
-            number = np.broadcast_to(np.asarray(leg, dtype=np.int64), latitude.shape)
-        return self.places(number, self.feet(points, number, known, near), height)
-
     def feet(self, points: Points, leg: Ints, known: Bools, near_path_m: Floats | None = None) -> Feet:
-        """The nearest place of each known point on its leg."""
+        """The nearest place of each known point on its leg.
+
+        `near_path_m` tells passages of the same place apart; it never moves a point that has only one, so jumps stay.
+        """
         feet = no_feet(len(points))
         for index, one in enumerate(self.legs):
             rows = np.flatnonzero((leg == index) & known)
@@ -145,12 +124,6 @@ class TravelledPath:
                 rows.setdefault((number, str(row[1]), round(float(str(row[5])), 3)), row)
         frame = pl.DataFrame(list(rows.values()), schema=BALISE_COLUMNS, orient="row")
         return frame.sort("leg", "path_m", "balise_id")
-
-    def _nearest_leg(self, points: Points, known: Bools) -> Ints:
-        distance = np.array(
-            [self.feet(points, np.full(len(points), index), known).distance_m for index in range(len(self.legs))]
-        )
-        return np.asarray(np.argmin(np.nan_to_num(distance), axis=0))
 
 
 def _balises_on(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -39,16 +38,6 @@ class Polyline:
         places = self.start.take(segment, axis=0) + fraction * way.take(segment, axis=0)
         # A tree without rebalancing builds faster and answers as fast on lines.
         return cKDTree(places, balanced_tree=False), segment
-
-
-class HasSegments(Protocol):
-    """Anything made of segments between earth-centred places at height zero."""
-
-    @property
-    def start(self) -> Floats: ...
-
-    @property
-    def end(self) -> Floats: ...
 
 
 @dataclass(frozen=True)
@@ -91,7 +80,7 @@ def nearest(points: Points, line: Polyline) -> Feet:
     return held_to_line(downhill(points, line, segment[sample]), len(line))
 
 
-def downhill(points: Points, line: HasSegments, segment: Ints, line_of: Ints | None = None) -> Feet:
+def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None = None) -> Feet:
     """The nearest place from a first guess, walking along the line while that gets nearer; `fraction` is not limited.
 
     `line_of`: per segment the line that it belongs to, where there are several.
@@ -101,7 +90,7 @@ def downhill(points: Points, line: HasSegments, segment: Ints, line_of: Ints | N
     while len(active):
         step = np.where(feet.fraction[active] < 0, -1, 1)
         other = feet.segment[active] + step
-        inside = (other >= 0) & (other < len(line.start))
+        inside = (other >= 0) & (other < len(line))
         active, other = active[inside], other[inside]
         if line_of is not None:
             same = line_of[other] == line_of[feet.segment[active]]
@@ -114,7 +103,7 @@ def downhill(points: Points, line: HasSegments, segment: Ints, line_of: Ints | N
     return feet
 
 
-def on_segments(points: Points, line: HasSegments, segment: Ints) -> Feet:
+def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
     """Each point on its given segment, in the tangent plane of the point; `fraction` is not limited."""
     to_start = line.start.take(segment, axis=0) - points.surface
     to_end = line.end.take(segment, axis=0) - points.surface

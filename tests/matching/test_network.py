@@ -290,18 +290,6 @@ def test_off_the_network_for_a_while() -> None:
         matched(run(x, np.full(len(x), 400.0)), site(SWITCH, SWITCH_LINKS))
 
 
-def test_biases_are_told_per_element_and_outlast_a_fault() -> None:
-    x = np.arange(100.0, 1900.0, 10.0)
-    y = np.where(x < 1000, 0.8, -0.4) + np.where((x > 300) & (x < 500), 12.0, 0.0)
-    found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(x))
-    table = dict(zip(found.biases["netelement_id"], found.biases["cross_bias_m"], strict=True))
-    assert table["s"] == pytest.approx(0.8, abs=0.01)
-    assert table["m"] == pytest.approx(-0.4, abs=0.01)
-    # Positions that no track explains tell no bias.
-    assert found.biases["epochs"].to_list() == [71, 90]
-    assert found.biases["cross_scatter_m"].max() < 0.01
-
-
 def test_an_unknown_track_error_is_no_certainty() -> None:
     """The same run over the same tracks: where the survey's sigma is not known, claims are weaker."""
     trip = journey(1)

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.matching.fixes import contradictory_covariances
+from pipeline.track.geodesy import points_of
 from pipeline.track.leg import Visit, leg_of
-from pipeline.track.path import TravelledPath
+from pipeline.track.path import Places, TravelledPath
 from pipeline.track.survey import track_of
 from schemas.config import Vehicle
 from schemas.errors import InputError
@@ -235,6 +236,12 @@ def curved() -> TravelledPath:
     return TravelledPath(track, (leg_of(track, [Visit(0, True), Visit(1, False)], 100.0),))
 
 
+def on_first_leg(path: TravelledPath, latitude_deg: np.ndarray, longitude_deg: np.ndarray) -> Places:
+    leg, height_m = np.zeros(len(latitude_deg), dtype=np.int64), np.full(len(latitude_deg), np.nan)
+    feet = path.feet(points_of(latitude_deg, longitude_deg), leg, np.isfinite(latitude_deg))
+    return path.places(leg, feet, height_m)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.floats(100.0, 3000.0), st.floats(-30.0, 30.0))
 def test_locating_and_projecting_are_inverse(path_m: float, away_m: float) -> None:
@@ -249,7 +256,8 @@ def test_locating_and_projecting_are_inverse(path_m: float, away_m: float) -> No
     longitude = np.interp(measures[0], path.track.measure_m[rows], path.track.longitude_deg[rows])
     heading = np.radians(leg.heading_deg[segment])
     north, east = away_m * np.sin(heading), -away_m * np.cos(heading)
-    found = path.project(
+    found = on_first_leg(
+        path,
         latitude + np.degrees(north / 6_372_955.9),
         longitude + np.degrees(east / (6_390_702.0 * np.cos(np.radians(latitude)))),
     )
@@ -263,13 +271,13 @@ def test_a_path_survives_the_way_between_processes() -> None:
     path = curved()
     other = pickle.loads(pickle.dumps(path))
     place = (np.array([50.0005]), np.array([14.01]))
-    assert other.project(*place).path_m[0] == path.project(*place).path_m[0]
+    assert on_first_leg(other, *place).path_m[0] == on_first_leg(path, *place).path_m[0]
     assert other.elements() == ["a", "b"]
 
 
 def test_unknown_places_are_nan_and_none() -> None:
     path = curved()
-    found = path.project([50.0, np.nan], [14.01, 14.01])
+    found = on_first_leg(path, np.array([50.0, np.nan]), np.array([14.01, 14.01]))
     assert np.isnan(found.path_m[1])
     assert path.locate(0, [np.nan, 200.0])[0][0] is None
 

@@ -198,8 +198,8 @@ def test_no_statistic_has_more_noise_of_the_rows_than_its_sigma(step_s, period_s
     at = np.arange(count) * step_s
     errors = np.interp(at, rows, np.random.default_rng(1).normal(0.0, 1.0, rows.size))
     series = along_series(standing(at, errors, period_s), Increments(np.zeros(count), np.zeros(count)), CONFIG)
-    result, _ = run_axis(series, np.array(Configuration().monitors.ewma_alphas[:2]))
-    spread = result.value[count // 5 :].std(axis=0) / result.sigma[-1]
+    value, sigma, _ = run_axis(series, np.array(Configuration().monitors.ewma_alphas[:2]))
+    spread = value[count // 5 :].std(axis=0) / sigma[-1]
     assert (spread < 1.06).all()
     # As far as the odometer is no slower than an epoch it is exact, but for straight lines between rows.
     assert (spread[1:] > 0.7).all()
