@@ -50,10 +50,7 @@ class Journey:
     @cached_property
     def ambiguous(self) -> Bools:
         """The place on the track is in doubt."""
-        ambiguous = np.zeros(len(self.refusal), dtype=bool)
-        for k in np.flatnonzero(~self.usable).tolist():
-            ambiguous[k] = self.refusal[k] is PassageStatus.REJECTED_AMBIGUOUS
-        return ambiguous
+        return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in self.refusal], dtype=bool)
 
     @cached_property
     def comparable(self) -> Bools:

@@ -156,9 +156,8 @@ def _order_reasons(journey: Journey, disabled: bool) -> Ints:
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
-    odometer, ambiguous, sigma = _odometer(journey), journey.ambiguous, np.isfinite(journey.sigma_m)
+    odometer, ambiguous, sigma = np.isfinite(journey.odometer_m), journey.ambiguous, np.isfinite(journey.sigma_m)
     masks = (
-        (np.full(odometer.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (before < 0, FIRST_EPOCH),
@@ -166,30 +165,23 @@ def _order_reasons(journey: Journey, disabled: bool) -> Ints:
         (ambiguous | ambiguous[before], AMBIGUOUS),
         (~(sigma & sigma[before]), NO_SIGMA),
     )
-    return _reasons(odometer.size, masks)
+    return _reasons(masks, disabled)
 
 
 def _distance_reasons(journey: Journey, disabled: bool) -> Ints:
-    odometer = _odometer(journey)
     masks = (
-        (np.full(odometer.size, disabled), DISABLED),
-        (~odometer, NO_ODOMETER),
+        (~np.isfinite(journey.odometer_m), NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (journey.ambiguous, AMBIGUOUS),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
     )
-    return _reasons(odometer.size, masks)
+    return _reasons(masks, disabled)
 
 
-def _odometer(journey: Journey) -> Bools:
-    known: Bools = np.isfinite(journey.odometer_m)
-    return known
-
-
-def _reasons(size: int, masks: tuple[tuple[Bools, str], ...]) -> Ints:
+def _reasons(masks: tuple[tuple[Bools, str], ...], disabled: bool) -> Ints:
     """The first reason that applies."""
-    reasons = np.full(size, _NO_REASON)
-    for mask, reason in reversed(masks):
+    reasons = np.full(masks[0][0].size, _REASONS.index(DISABLED) if disabled else _NO_REASON)
+    for mask, reason in () if disabled else reversed(masks):
         reasons[mask] = _REASONS.index(reason)
     return reasons
 
@@ -200,15 +192,11 @@ def _columns(monitor: str, value: Floats, threshold: Floats, reasons: Ints) -> d
     )
     state = np.where(np.isnan(value), unknown, np.where(np.abs(value) > threshold, fail, passed))
     kind = Epochs.columns()[f"{monitor}_state"].dtype
-    return {
-        f"{monitor}_value": _nullable(f"{monitor}_value", value),
-        f"{monitor}_threshold": _nullable(f"{monitor}_threshold", threshold),
-        f"{monitor}_state": pl.Series(f"{monitor}_state", _STATES, dtype=kind).gather(state),
-        f"{monitor}_reason": pl.Series(f"{monitor}_reason", [*_REASONS, None], dtype=pl.String).gather(
-            np.where(reasons == _NO_REASON, len(_REASONS), reasons)
-        ),
+    words = pl.Series([*_REASONS, None], dtype=pl.String)
+    columns = {
+        "value": pl.Series(value).fill_nan(None),
+        "threshold": pl.Series(threshold).fill_nan(None),
+        "state": pl.Series(_STATES, dtype=kind).gather(state),
+        "reason": words.gather(np.where(reasons == _NO_REASON, len(_REASONS), reasons)),
     }
-
-
-def _nullable(name: str, values: Floats) -> pl.Series:
-    return pl.Series(name, values).fill_nan(None)
+    return {f"{monitor}_{part}": column.alias(f"{monitor}_{part}") for part, column in columns.items()}

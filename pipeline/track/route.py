@@ -35,16 +35,9 @@ def network_along(track: Track, visits: list[Visit]) -> Network:
     """
     pieces, parts = _pieces(track, visits)
     split = _of_parts(track, [visit.element for visit in pieces], parts)
-    successors: list[list[Edge]] = [[] for _ in range(2 * len(pieces))]
-    ends = end_places(split)
-    for number in range(len(pieces) - 1):
-        here, there = pieces[number].forward, pieces[number + 1].forward
-        gap = float(gaps_m(ends[[number], [int(here)]], ends[[number + 1], [int(not there)]])[0])
-        leaving, entering = 2 * number + (not here), 2 * (number + 1) + (not there)
-        successors[leaving].append(Edge(entering, gap, True, True))
-        successors[entering ^ 1].append(Edge(leaving ^ 1, gap, True, True))
     usable = [bool(visit.forward) == (side == 0) for visit in pieces for side in (0, 1)]
-    return Network(split, successors, usable, orientable=True)
+    along = [Visit(number, piece.forward) for number, piece in enumerate(pieces)]
+    return Network(split, _joined(split, along), usable, orientable=True)
 
 
 def _pieces(track: Track, visits: list[Visit]) -> tuple[list[Visit], list[slice]]:
@@ -91,8 +84,8 @@ def _of_parts(track: Track, elements: list[int], parts: list[slice]) -> Track:
     )
 
 
-def network_on(track: Track, visits: list[Visit]) -> Network:
-    """The net elements of a survey with no other relations than those that the route uses."""
+def _joined(track: Track, visits: list[Visit]) -> list[list[Edge]]:
+    """Successors of each oriented element by the relations that the route uses, and no other."""
     successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
     ends = end_places(track)
     for here, there in itertools.pairwise(visits):
@@ -103,10 +96,13 @@ def network_on(track: Track, visits: list[Visit]) -> Network:
         for one, other in ((leaving, entering), (entering ^ 1, leaving ^ 1)):
             if all(edge.to != other for edge in successors[one]):
                 successors[one].append(Edge(other, gap, True, True))
-    return Network(track, successors, *oriented_sheet(successors))
+    return successors
 
 
 def site_network(site: Site) -> Network:
-    """The network of a site; where it gives a route, of that alone."""
+    """The network of a site; where it gives a route, the elements of the survey with its relations alone."""
     track = track_of(site.track)
-    return network_of(track, site.links) if site.route is None else network_on(track, visits_of(track, site.route))
+    if site.route is None:
+        return network_of(track, site.links)
+    successors = _joined(track, visits_of(track, site.route))
+    return Network(track, successors, *oriented_sheet(successors))

@@ -237,6 +237,7 @@ def curved() -> TravelledPath:
 
 
 def on_first_leg(path: TravelledPath, latitude_deg: np.ndarray, longitude_deg: np.ndarray) -> Places:
+    latitude_deg, longitude_deg = np.atleast_1d(latitude_deg), np.atleast_1d(longitude_deg)
     leg, height_m = np.zeros(len(latitude_deg), dtype=np.int64), np.full(len(latitude_deg), np.nan)
     feet = path.feet(points_of(latitude_deg, longitude_deg), leg, np.isfinite(latitude_deg))
     return path.places(leg, feet, height_m)
