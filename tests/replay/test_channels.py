@@ -11,7 +11,8 @@ from pipeline.monitors.channels import on_path_of, paired
 from pipeline.report import write_report
 from pipeline.results.store import write_run
 from pipeline.safety.assessment import assess
-from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
+from pipeline.safety.side_by_side import side_by_side
+from pipeline.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
 from pipeline.stages import replay
 from schemas.config import Configuration
 from schemas.errors import InputError
@@ -39,7 +40,8 @@ def two(first, second):
 def rows(tables, config=None):
     settings = config or Configuration()
     found = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, settings)
-    return {(row["solution"], row["architecture"]): row for row in side_by_side_table(found).iter_rows(named=True)}
+    figures = architecture_figures(added([found]))
+    return {(row["solution"], row["architecture"]): row for row in figures.iter_rows(named=True)}
 
 
 def with_reference(name):
@@ -165,9 +167,11 @@ def test_compared_after_the_fact_is_what_the_monitor_sees():
     fails = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") == "fail"))
     tallies = side_by_side(*_tables(replay(run, site, VEHICLE)), Configuration())
     judged = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") != "not_evaluated"))
-    composite = tallies["primary", COMPOSITE, "galileo"]
-    assert composite.faults.time_to_detect_s == pytest.approx([(fails["t"][0] - seen["t"][0]).total_seconds() - 150.0])
-    assert composite.alarms.judged_s == pytest.approx(judged.height * 0.1, abs=0.2)
+    composite = tallies.row(
+        by_predicate=(pl.col("solution") == "primary") & (pl.col("architecture") == COMPOSITE), named=True
+    )
+    assert composite["delays_s"] == pytest.approx([(fails["t"][0] - seen["t"][0]).total_seconds() - 150.0])
+    assert composite["judged_s"] == pytest.approx(judged.height * 0.1, abs=0.2)
 
 
 def _tables(tables):
