@@ -10,8 +10,8 @@ import polars as pl
 from pipeline.matching.diagnosis import off_the_network
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
-from pipeline.matching.orientation import grows_with
 from pipeline.odometry import Odometry
+from pipeline.odometry.polarity import grows_with
 from pipeline.track.geodesy import Points
 from pipeline.track.leg import Leg, Visit, leg_of, nearest_on_leg, path_at
 from pipeline.track.path import TravelledPath

@@ -96,7 +96,7 @@ def _over_switch(network: Network, one: int, other: int) -> bool:
 
 
 def no_doubt() -> pl.DataFrame:
-    """No stretch of doubt."""
+    """The path is never in doubt."""
     return pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
 
 

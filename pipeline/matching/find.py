@@ -14,12 +14,12 @@ from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.jumps import with_tracks_aside
 from pipeline.matching.likelihood import likelihood_of
-from pipeline.matching.orientation import grows_with
 from pipeline.matching.rivals import Posterior, posterior_of
 from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from pipeline.odometry import Odometry
+from pipeline.odometry.polarity import grows_with
 from pipeline.track.network import Network
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import end_places

@@ -149,7 +149,8 @@ class Odometry:
         """`known_at` in seconds on the odometer's own scale, as the functions below: for estimates of latency."""
         before, after = self._around(t_s)
         paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
-        known: Bools = self._inside(t_s) & ~paused & ~self.slip[before] & ~self.slip[after]
+        inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        known: Bools = inside & ~paused & ~self.slip[before] & ~self.slip[after]
         return known
 
     def segment_at_s(self, t_s: Floats) -> Ints:
@@ -173,10 +174,6 @@ class Odometry:
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
-
-    def _inside(self, t_s: Floats) -> Bools:
-        inside: Bools = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
-        return inside
 
     def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
         """Samples before and after each time, twice the same where it is that of a sample."""

@@ -1,4 +1,4 @@
-"""The odometer's sign against growing path, set once per solution from its first metres (DOMAIN section 2)."""
+"""Which way the path grows, and the odometer's sign against it: by a run's first metres (DOMAIN section 2)."""
 
 from __future__ import annotations
 
@@ -30,6 +30,27 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
     starts = starts[starts < min(window, way.size)]
     votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
     return -1 if sum(votes) < 0 else 1
+
+
+def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
+    """Whether the run's first `distance_m` of net movement went with the given positions (NaN: not known).
+
+    The odometer says when that distance was covered and in which sense, and its `polarity` against the positions which
+    way they went. Without an odometer the positions say both.
+    """
+    known = np.isfinite(position_m)
+    if not known.any():
+        return True
+    position, at_ns = position_m[known], t_ns[known]
+    if odometry is not None:
+        recorded = odometry.distance_at(at_ns)
+        moved = recorded[np.isfinite(recorded)] - recorded[np.isfinite(recorded)][:1]
+        covered = np.flatnonzero(np.abs(moved) >= distance_m)
+        if covered.size:
+            return bool(polarity(odometry, at_ns, position, distance_m) * moved[covered[0]] > 0)
+    away = position - position[0]
+    far = np.flatnonzero(np.abs(away) >= distance_m)
+    return bool(away[far[0]] > 0) if len(far) else bool(away[-1] >= 0)
 
 
 def _side(odometer: Floats, path: Floats, distance_m: float) -> int:
