@@ -109,8 +109,12 @@ def test_comparison_never_stands_on_a_fault_of_one_and_never_sees_one_of_both(se
         assert row["missed"] == row["common_missed"] == row["failures"]
 
 
-def test_receivers_that_promise_too_much_raise_false_alarms_in_both_architectures():
-    """Stated sigma a fifth of the true one: nothing is ever wrong by 5 m, and every alarm is false."""
+def test_receivers_that_promise_too_much_raise_alarms_in_both_architectures():
+    """Stated sigma a fifth of the true one: nothing is ever wrong by 5 m.
+
+    Alarms of the comparison, which looks along the track, are false. Those of the own monitors stand across the track
+    too, where positions 2 m aside leave ten stated sigmas: nobody can call these false.
+    """
     boastful = {"reported_factor": 0.2}
     one, site = journey(gnss=boastful)
     other, _ = journey(gnss=boastful, seed=9)
@@ -118,9 +122,12 @@ def test_receivers_that_promise_too_much_raise_false_alarms_in_both_architecture
     for name in ("primary", "galileo"):
         for architecture in (REACTIVE, COMPOSITE):
             row = found[name, architecture]
-            assert row["false_alarms"] == row["alarms"] > 0
-            assert row["false_alarm_rate_per_h"] == pytest.approx(row["alarms"] / row["judged_h"])
+            assert row["alarms"] > 0
             assert (row["hazards"], row["wrong_in_use_s"]) == (0, 0.0)
+        compared, alone = found[name, COMPOSITE], found[name, REACTIVE]
+        assert compared["false_alarms"] == compared["alarms"]
+        assert compared["false_alarm_rate_per_h"] == pytest.approx(compared["alarms"] / compared["judged_h"])
+        assert (alone["false_alarms"], alone["false_alarm_rate_per_h"]) == (0, None)
 
 
 def without_fix(run):
