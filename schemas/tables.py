@@ -177,8 +177,10 @@ class _EpochsAfterMonitors(dy.Schema):
     doubt_over_m = real("m", "over-reading amount of the reported position", min=0)
     doubt_under_m = real("m", "under-reading amount of the reported position", min=0)
     exposure_s = real("s", "time since the last linked TVB or accepted VB", min=0)
-    error_cross_m = real("m", "position across the track minus truth, left positive")
-    error_up_m = real("m", "height minus truth")
+    error_cross_m = real(
+        "m", "position across the track minus truth, left positive; null beyond the failure limit along"
+    )
+    error_up_m = real("m", "height minus truth; null beyond the failure limit along")
     direction = dy.Int8(
         nullable=True, description="direction of travel along growing path: 1 or -1", metadata={"unit": "1"}
     )

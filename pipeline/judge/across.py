@@ -10,11 +10,17 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 
 
 def errors_across(
-    fixes: pl.DataFrame, heading_deg: Floats, at_ns: Ints, reference: pl.DataFrame | None, gap_s: float
+    fixes: pl.DataFrame,
+    heading_deg: Floats,
+    at_ns: Ints,
+    reference: pl.DataFrame | None,
+    gap_s: float,
+    along_limit_m: float,
 ) -> tuple[Floats, Floats]:
     """Position minus reference, left of growing path and upwards [m]; NaN where the reference is silent.
 
-    `fixes`: those of the solution; `at_ns`: the instants that they are judged at.
+    `fixes`: those of the solution; `at_ns`: the instants that they are judged at. NaN too where the position is more than
+    `along_limit_m` ahead or behind: in a curve the track itself goes aside by metres over such a way, and up a slope.
     """
     nothing = np.full(at_ns.size, np.nan)
     if reference is None or reference.height < 2:
@@ -33,9 +39,11 @@ def errors_across(
     away = own.surface - there.surface
     east, north = np.einsum("ij,ij->i", away, own.east), np.einsum("ij,ij->i", away, own.north)
     heading = np.radians(heading_deg[known])
-    across = nothing.copy()
-    across[known] = north * np.sin(heading) - east * np.cos(heading)
-    return across, floats(fixes, "height_m") - height
+    comparable = np.abs(east * np.sin(heading) + north * np.cos(heading)) <= along_limit_m
+    across, up = nothing.copy(), nothing.copy()
+    across[known] = np.where(comparable, north * np.sin(heading) - east * np.cos(heading), np.nan)
+    up[known] = np.where(comparable, (floats(fixes, "height_m") - height)[known], np.nan)
+    return across, up
 
 
 def healthy_across(

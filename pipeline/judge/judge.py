@@ -108,8 +108,9 @@ def _marked(series: Series, offers: Offers) -> Bools:
 
 def _across(bench: Bench, reference: pl.DataFrame | None) -> tuple[Floats, Floats]:
     """Errors across the track and of height [m]."""
-    heading, gap_s = floats(bench.epochs, "heading_deg"), bench.config.hazards.reference_gap_s
-    return errors_across(bench.solution.fixes, heading, bench.at_ns, reference, gap_s)
+    heading, hazards = floats(bench.epochs, "heading_deg"), bench.config.hazards
+    limits = hazards.reference_gap_s, hazards.failure_limit_m
+    return errors_across(bench.solution.fixes, heading, bench.at_ns, reference, *limits)
 
 
 def _witnesses(bench: Bench) -> Witnesses:
