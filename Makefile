@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test check lint types bench dictionary lock clean
+.PHONY: install demo test quick check lint types bench mutations dictionary lock clean
 
 install: $(STAMP)
 
@@ -18,7 +18,10 @@ demo: install
 	$(BIN)/balise demo
 
 test: install
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+quick: install
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 lint: install
 	$(BIN)/ruff check .
@@ -31,6 +34,9 @@ check: lint types test
 
 bench: install
 	$(BIN)/python -m benchmarks
+
+mutations: install
+	$(BIN)/python -m benchmarks.mutations
 
 dictionary: install
 	$(BIN)/python -m schemas.dictionary > docs/dictionary.md

@@ -12,10 +12,9 @@ from pipeline.report import write_report
 from pipeline.results.store import write_run
 from pipeline.safety.assessment import assess
 from pipeline.safety.side_by_side import COMPOSITE, REACTIVE, side_by_side, side_by_side_table
-from pipeline.stages import replay
 from schemas.config import Configuration
 from schemas.errors import InputError
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, journey, replay
 
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
 SLOW = {"kind": "ramp", "rate_mps": 0.3, "start_s": 100.0, "duration_s": 120.0}
