@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Two test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
+TESTS := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
 .PHONY: install demo test quick check lint types bench mutations dictionary lock clean
@@ -18,10 +20,10 @@ demo: install
 	$(BIN)/balise demo
 
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(TESTS)
 
 quick: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(TESTS) -m "not slow"
 
 lint: install
 	$(BIN)/ruff check .

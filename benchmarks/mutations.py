@@ -125,7 +125,7 @@ def run_tests(
 ) -> subprocess.CompletedProcess[str] | None:
     """The tests of some folders; None where they took longer than the limit."""
     command = [sys.executable, "-B", "-m", "pytest", *folders, "-q", "--tb=no", "-p", "no:cacheprovider", *options]
-    environment = {**os.environ, "PYTHONPATH": str(copy)}
+    environment = {**os.environ, "PYTHONPATH": str(copy), "OPENBLAS_NUM_THREADS": "1"}
     try:
         return subprocess.run(
             command, cwd=copy, env=environment, capture_output=True, text=True, timeout=limit_s, check=False

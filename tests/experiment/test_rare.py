@@ -122,7 +122,7 @@ def test_many_near_thresholds_leave_runs_alive(
     constellation: Constellation, changes: dict[str, object], rate: float, epochs: int, decade: int
 ) -> None:
     system = linear_bank(default_geometry(constellation), 0.0, BankSpec(**changes))  # type: ignore[arg-type]
-    one, two = (missed_detection_probability(system, epochs, rate, runs=2000, seed=seed) for seed in (1, 2))
+    one, two = (missed_detection_probability(system, epochs, rate, runs=4000, seed=seed) for seed in (1, 2))
     assert np.floor(np.log10(one.value)) == decade
     assert one.relative_error < 0.3
     assert one.value == pytest.approx(two.value, abs=4 * np.hypot(one.relative_error, two.relative_error) * two.value)
