@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus, SigmaSource
+from schemas.enums import BaliseKind, PassageStatus, SigmaSource
 
 
 class Positions(dy.Schema):
@@ -22,7 +22,8 @@ class Positions(dy.Schema):
     path_m = real("m", "path position, raw: never smoothed")
     cross_track_m = real("m", "position left of growing path")
     vertical_m = real("m", "position above the track; null without a height in position or survey")
-    on_track = flag("a net element of the path is within reach")
+    on_track = flag("a net element of the path is within what the position's errors allow")
+    near_track = flag("a net element of the path is within `reach_m`: the monitors can compare the position with it")
     path_probability = real("1", "posterior of the path by the whole run (forward-backward)", min=0, max=1)
     gate_probability = real("1", "posterior of the path by what came before (forward): for detection", min=0, max=1)
     heading_deg = real("deg", "azimuth of growing path at the GNSS antenna, clockwise from north")
@@ -92,31 +93,6 @@ class Crossings(dy.Schema):
     status = one_of(
         PassageStatus, "what became of it; null where crossed again before the balise was re-armed", nullable=True
     )
-
-
-class EvidenceAt(dy.Schema):
-    """Where the train was at each of some instants, by evidence alone (DOMAIN section 5.1).
-
-    `low_m` and `high_m` are positions on the path of the solution that asks; nothing but this last change of
-    coordinates knows of that solution.
-    """
-
-    t = instant("the instant asked for")
-    evidence = one_of(Evidence, "what it rests on; null where nothing is known", nullable=True)
-    low_m = real("m", "least path position that the evidence leaves")
-    high_m = real("m", "largest path position that the evidence leaves")
-    tracks = dy.Int64(nullable=True, min=0, description="how many tracks the train may have been on")
-    same_track = flag("the net element of the position is one of these; null where not known", nullable=True)
-
-
-class Judged(dy.Schema):
-    """What the evidence says of each epoch or offer (DOMAIN section 5.2)."""
-
-    error_low_m = real("m", "least error along the track, in the direction of travel")
-    error_high_m = real("m", "largest error along the track")
-    error_along_m = real("m", "the middle of both where reference or balise tell it to `known_error_m`")
-    judgement = one_of(Judgement, "right, wrong or unknown")
-    wrong_track = flag("the position, unambiguous, is on a net element that the evidence excludes")
 
 
 class Failures(dy.Schema):

@@ -33,7 +33,9 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
         return _without_odometer(positions, vehicle, config)
     path_m = floats(positions, "path_m")
     matched = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy() & np.isfinite(path_m)
-    along_m, t_ns = unrolled(positions, matched), times_ns(positions)
+    # A position that has jumped aside is still compared: that is how the monitors see the jump.
+    near = positions["fix_valid"].to_numpy() & positions["near_track"].to_numpy() & np.isfinite(path_m)
+    along_m, t_ns = unrolled(positions, near), times_ns(positions)
     sigma_m, digits_m = floats(positions, "calibrated_along_m"), floats(positions, "digits_along_m")
     jitter_s = stamp_jitter_s(odometry.seconds(t_ns))
     arrays = EpochArrays(t_ns, along_m, sigma_m, digits_m, matched, jitter_s)

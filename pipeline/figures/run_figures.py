@@ -126,11 +126,10 @@ def _counted(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
 def is_passage() -> pl.Expr:
     """A row of `passages` that is no offer beyond the passages of the train.
 
-    An offer beyond is one that the evidence judges, but for which it knows no true crossing; an offer that it cannot
-    judge counts as a passage.
+    An offer beyond is one that is judged wrong and for which the evidence knows no true crossing.
     """
-    beyond = pl.col("t_true").is_null() & pl.col("t_offered").is_not_null() & judged()
-    return ~beyond.fill_null(value=False)
+    wrong = (pl.col("judgement") == Judgement.WRONG.value).fill_null(value=False)
+    return ~(pl.col("t_true").is_null() & wrong)
 
 
 def hazard_counts(hazards: pl.DataFrame) -> Row:

@@ -20,6 +20,9 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, t
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, PassageStatus
 
+# Without an odometer the train's way over this time says which way it goes.
+_TURN_S = 2.0
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -96,7 +99,26 @@ class Bench:
 
     @cached_property
     def positions(self) -> Positions:
-        """The positions of all epochs."""
+        """The positions of all epochs.
+
+        Without an odometer the direction of travel is that of the train's own place, where the evidence tells it: a
+        position that jumps back does not turn the train.
+        """
+        told = self._positions(ints(self.epochs["direction"], 1))
+        if self.odometry is not None:
+            return told
+        found = judge_positions(told, self.evidence.at(self.at_ns), self.legs, self.config.hazards)
+        train_m = self.path_m - found.known_m(self.config.hazards.known_error_m) * told.direction
+        ahead = np.searchsorted(self.t_ns, self.t_ns + round(_TURN_S * NS_PER_S)).clip(0, self.t_ns.size - 1)
+        with np.errstate(invalid="ignore"):
+            came_m = train_m[ahead] - train_m
+            sure = np.flatnonzero(np.abs(came_m) > found.half_m + found.half_m[ahead])
+        if sure.size == 0:
+            return told
+        last = np.maximum(np.searchsorted(sure, np.arange(self.t_ns.size), side="right") - 1, 0)
+        return self._positions(np.sign(came_m[sure]).astype(np.int64)[last])
+
+    def _positions(self, direction: Ints) -> Positions:
         epochs, index = self.epochs, self.evidence.network.track.index
         element = epochs["netelement_id"].replace_strict(index, default=-1, return_dtype=pl.Int64).fill_null(-1)
         return Positions(
@@ -104,7 +126,7 @@ class Bench:
             measure_m=floats(epochs, "measure_m"),
             leg=ints(epochs["leg"]),
             path_m=self.path_m,
-            direction=ints(epochs["direction"], 1),
+            direction=direction,
             unambiguous=unambiguous(epochs, self.config),
         )
 

@@ -72,7 +72,8 @@ def epoch_frame(
     shape = shape_at(path, found.leg, places.path_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
     allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
-    on_track = fixes.valid & (np.nan_to_num(places.distance_m, nan=np.inf) <= np.nan_to_num(allowed_m))
+    distance_m = np.nan_to_num(places.distance_m, nan=np.inf)
+    on_track = fixes.valid & (distance_m <= np.nan_to_num(allowed_m))
     source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
     columns: dict[str, npt.NDArray[Any] | pl.Series] = {
         "leg": pl.Series(found.leg, dtype=pl.Int32),
@@ -82,6 +83,7 @@ def epoch_frame(
         "cross_track_m": places.cross_m,
         "vertical_m": places.vertical_m - vehicle.antenna_height_m,
         "on_track": on_track,
+        "near_track": fixes.valid & (distance_m <= config.reach_m),
         "path_probability": np.where(on_track, found.path_probability, np.nan),
         "gate_probability": np.where(on_track, found.gate_probability, np.nan),
         "heading_deg": shape.heading_deg,

@@ -61,7 +61,7 @@ def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
     no_sigma = epochs["sigma_along_m"].is_null() | epochs["sigma_cross_m"].is_null()
     return _first_of(
         _where(~epochs["fix_valid"], NO_POSITION),
-        _where(~epochs["on_track"], OFF_TRACK),
+        _where(~epochs["near_track"], OFF_TRACK),
         _where(epochs["path_m"].is_null(), NO_POSITION),
         _where(no_sigma, NO_SIGMA),
     )

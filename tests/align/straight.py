@@ -88,6 +88,7 @@ def epochs_of(t_s, path_m, sigma_m=1.0, **columns):
             "sigma_up_m": np.full(n, 1.5 * sigma_m),
             "fix_valid": np.ones(n, dtype=bool),
             "on_track": np.ones(n, dtype=bool),
+            "near_track": np.ones(n, dtype=bool),
             "survey_sigma_m": pl.Series([None] * n, dtype=pl.Float64),
             "interpolation_error_m": np.zeros(n),
             "curvature_per_m": np.zeros(n),

@@ -106,7 +106,7 @@ def test_a_run_that_turned_back_over_a_switch_takes_its_own_route_again(tmp_path
     [
         ("netelement_id,direction\nq,AB\n", "names q"),
         ("netelement_id,direction\na,up\n", "'up'"),
-        ("x\n1\n", "no column"),
+        ("x\n1\n", "column netelement_id: is missing"),
     ],
 )
 def test_a_route_that_does_not_fit_the_site_is_named(tmp_path: Path, text: str, message: str) -> None:

@@ -77,7 +77,7 @@ def test_uncertain_scale_and_latency_widen_the_raw_threshold():
 
 def test_absence_of_data_is_never_a_pass():
     epochs, odometer = steady(6, fix_valid=[True, True, False, True, True, True])
-    epochs = epochs.with_columns(on_track=pl.Series([True, True, True, True, False, True]))
+    epochs = epochs.with_columns(near_track=pl.Series([True, True, True, True, False, True]))
     result = table(bank_of(epochs, odometer))
     assert result["along_raw_state"].to_list() == [
         "not_evaluated",
