@@ -2,9 +2,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Two test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
+TESTS := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test check lint types bench dictionary lock clean
+.PHONY: install demo test quick check lint types bench mutations dictionary lock clean
 
 install: $(STAMP)
 
@@ -18,7 +20,10 @@ demo: install
 	$(BIN)/balise demo
 
 test: install
-	$(BIN)/python -m pytest -n 2
+	$(TESTS)
+
+quick: install
+	$(TESTS) -m "not slow"
 
 lint: install
 	$(BIN)/ruff check .
@@ -31,6 +36,9 @@ check: lint types test
 
 bench: install
 	$(BIN)/python -m benchmarks
+
+mutations: install
+	$(BIN)/python -m benchmarks.mutations
 
 dictionary: install
 	$(BIN)/python -m schemas.dictionary > docs/dictionary.md

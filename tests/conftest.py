@@ -21,6 +21,39 @@ settings.load_profile("suite")
 
 _LENGTH_S = 40
 
+# Not part of `make quick`: tests that start processes, draw many random numbers, or replay one journey after the other.
+_SLOW = (
+    "calibration",
+    "campaign",
+    "cli",
+    "datasets/test_demo.py",
+    "datasets/test_recordings.py",
+    "datasets/test_samples.py",
+    "datasets/test_sky.py",
+    "docs/test_commands.py",
+    "docs/test_queries.py",
+    "experiment",
+    "export",
+    "golden",
+    "ingest/test_fuzz.py",
+    "judge/test_ladder.py",
+    "replay/test_channels.py",
+    "replay/test_evidence.py",
+    "replay/test_moving.py",
+    "replay/test_properties.py",
+    "replay/test_random_trials.py",
+    "report",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `make quick` leaves out."""
+    here = Path(__file__).parent
+    slow = [here / name for name in _SLOW]
+    for item in items:
+        if any(item.path.is_relative_to(place) for place in slow):
+            item.add_marker(pytest.mark.slow)
+
 
 @dataclass(frozen=True)
 class SmallTrial:

@@ -19,8 +19,8 @@ def errors_across(
 ) -> tuple[Floats, Floats]:
     """Position minus reference, left of growing path and upwards [m]; NaN where the reference is silent.
 
-    `fixes`: those of the solution; `at_ns`: the instants that they are judged at. NaN too where the position is more than
-    `along_limit_m` ahead or behind: in a curve the track itself goes aside by metres over such a way, and up a slope.
+    `fixes`: those of the solution; `at_ns`: the instants that they are judged at. NaN too where the position is more
+    than `along_limit_m` ahead or behind: a curve goes aside by metres over such a way, and a slope up.
     """
     nothing = np.full(at_ns.size, np.nan)
     if reference is None or reference.height < 2:

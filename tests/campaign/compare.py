@@ -63,10 +63,10 @@ def start(arguments: Sequence[str]) -> subprocess.Popen[str]:
 
 
 def run(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(arguments, cwd=ROOT, text=True, capture_output=True, timeout=120, check=False)
+    return subprocess.run(arguments, cwd=ROOT, text=True, capture_output=True, timeout=300, check=False)
 
 
-def wait_for(condition: Callable[[], bool], limit_s: float = 60.0) -> None:
+def wait_for(condition: Callable[[], bool], limit_s: float = 240.0) -> None:
     """Wait until something is so; a test that waits in vain fails."""
     until = time.monotonic() + limit_s
     while not condition():

@@ -49,7 +49,7 @@ def replay(trial: SmallTrial, out: Path, shift_years: float, runs: list[Path], c
         cwd=ROOT,
         text=True,
         capture_output=True,
-        timeout=120,
+        timeout=300,
         check=False,
         env={
             **os.environ,

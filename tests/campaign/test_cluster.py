@@ -55,7 +55,7 @@ def test_killed_worker_and_scheduler(
     cluster.kill_workers()
     cluster.nanny = cluster.start_workers()
     cluster.kill_scheduler()
-    _, said = first.communicate(timeout=90)
+    _, said = first.communicate(timeout=300)
     assert "Traceback" not in said
     assert first.returncode in (0, 2)
     again = run(replay_command(small_trial, out, "--jobs", "2"))
@@ -144,7 +144,7 @@ def test_hanging_worker_is_given_up(small_trial: SmallTrial, cluster: Cluster, t
             os.kill(seen[0], signal.SIGSTOP)
 
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths[:2]])
-    outcomes = by_run(run_campaign(plan, scheduler=cluster.address, time_limit_s=2.0, watches=[Spy(stop)]))
-    assert outcomes["hanging"].error == overdue(2.0)
+    outcomes = by_run(run_campaign(plan, scheduler=cluster.address, time_limit_s=10.0, watches=[Spy(stop)]))
+    assert outcomes["hanging"].error == overdue(10.0)
     assert outcomes["hanging"].attempts == 1
     assert [outcomes[f"run{number}"].status for number in range(2)] == [RunStatus.OK] * 2

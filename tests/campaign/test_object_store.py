@@ -223,7 +223,7 @@ def test_store_that_is_not_there(bucket: str, small_trial: SmallTrial) -> None:
 @pytest.fixture
 def _quick_beat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock, "_BEAT_S", 0.4)
-    monkeypatch.setattr(lock, "_SILENCE_S", 2.0)
+    monkeypatch.setattr(lock, "_SILENCE_S", 5.0)
 
 
 @pytest.mark.usefixtures("_quick_beat")

@@ -193,7 +193,7 @@ def test_every_float_of_the_contract_has_a_tolerance(table: str) -> None:
     assert all(tolerance_of(TABLES[table].columns()[name]) <= 1e-6 for name in floats)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(
     row=st.integers(0, 4),
     column=st.sampled_from(list(Epochs.columns())),

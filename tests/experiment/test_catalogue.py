@@ -218,6 +218,6 @@ def test_it_is_written_and_does_not_depend_on_jobs(tmp_path: Path, monkeypatch: 
     few: tuple[CatalogueFault, ...] = (FAULTS["step along 25 m"], FAULTS["healthy short"])
     monkeypatch.setattr(module, "catalogue", lambda: few)
     for jobs in (1, 2):
-        EXPERIMENTS["catalogue"](tmp_path / str(jobs), 2, 1, jobs, None)
+        EXPERIMENTS["catalogue"](tmp_path / str(jobs), 1, 1, jobs, None)
     for name in ("catalogue.parquet", "monitors.parquet", "runs.parquet", "catalogue.md", "settings.json"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()

@@ -67,7 +67,7 @@ def test_missed_detections_agree_with_counting() -> None:
     for changes, rate, epochs in (({}, 0.3, 62), ({"sensors": "odometer_and_track"}, 0.3, 45)):
         system = bank(**changes)
         clever = missed_detection_probability(system, epochs, rate, runs=4000, seed=4)
-        plain = plain_missed_detection(system, epochs, rate, runs=40_000, seed=5)
+        plain = plain_missed_detection(system, epochs, rate, runs=20_000, seed=5)
         assert 1e-4 < plain.value < 0.3
         spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
         assert clever.value == pytest.approx(plain.value, abs=4 * spread)
@@ -105,7 +105,7 @@ def test_probabilities_of_1e_9_are_within_reach(sensors: str) -> None:
 
 def test_results_do_not_depend_on_the_number_of_jobs() -> None:
     system = bank()
-    one, two = (missed_detection_probability(system, 60, 0.3, runs=1000, seed=8, jobs=jobs) for jobs in (1, 2))
+    one, two = (missed_detection_probability(system, 60, 0.3, runs=500, seed=8, jobs=jobs) for jobs in (1, 2))
     assert one == two
 
 

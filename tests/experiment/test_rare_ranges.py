@@ -40,7 +40,7 @@ def test_residuals_are_white_at_an_epoch_and_related_over_time_as_simulated(cons
 def test_misses_agree_with_counting(constellation: Constellation) -> None:
     system = range_system(plan(constellation), 0.0)
     clever = missed_by_ranges(system, 19, 0.1, runs=4_000, seed=2)
-    plain = plain_missed_by_ranges(system, 19, 0.1, runs=100_000, seed=3)
+    plain = plain_missed_by_ranges(system, 19, 0.1, runs=50_000, seed=3)
     assert 1e-4 < plain.value < 0.3
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)
@@ -58,7 +58,7 @@ def test_one_epoch_has_the_exact_probability_and_bounds_all_others() -> None:
 def test_false_alarms_agree_with_counting() -> None:
     system = range_system(plan(probability=1e-5), 0.0)
     clever = false_alarm_by_ranges(system, 100, runs=1_000, seed=5)
-    plain = plain_alarm_by_ranges(system, 100, runs=100_000, seed=6)
+    plain = plain_alarm_by_ranges(system, 100, runs=50_000, seed=6)
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)
     assert clever.value < 100 * 1e-5
@@ -81,6 +81,7 @@ def test_every_table_of_rare_events_is_written_for_a_configured_bank(
     monkeypatch.setattr(rare_tables, "_RATES_MPS", (1.0,))
     monkeypatch.setattr(rare_tables, "_HOUR_S", 60)
     monkeypatch.setattr(rare_tables, "_TRANSIENT_RATES_MPS", (1.0,))
+    monkeypatch.setattr(rare_range_tables, "_SEARCH_RUNS", 100)
     monkeypatch.setattr(rare_range_tables, "_ASKED", ((0.1, 30.0), (0.1, 30.0), (0.1, 30.0)))
     config = Configuration(monitors=MonitorConfig(ewma_alphas=(0.3, 0.1, 0.03), false_alarm_probability=1e-5))
     EXPERIMENTS["rare"](tmp_path, 100, 1, 1, config)

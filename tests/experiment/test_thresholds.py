@@ -65,7 +65,7 @@ def test_ratios_of_the_two_other_ways_are_near_one() -> None:
 def test_alarms_per_hour_of_twelve_monitors(rate_hz: float, hours: float) -> None:
     """What the experiment finds with more runs: one alarm in so many hours."""
     spec = BankSpec(sensors="odometer_and_track", rate_hz=rate_hz, map_m=1e-6)
-    row = alarm_rate(spec, runs=150)
+    row = alarm_rate(spec, runs=100 if rate_hz > 1.0 else 150)
     assert row["method"] == "importance_sampling"
     assert hours / 1.3 < float(row["hours_between"]) < hours * 1.3  # type: ignore[arg-type]
     assert float(row["alarms_per_h_low"]) <= float(row["alarms_per_h"]) <= float(row["alarms_per_h_high"])  # type: ignore[arg-type]
@@ -83,12 +83,12 @@ def test_counted_and_sampled_rates_agree() -> None:
 
 def test_the_pseudorange_monitor_alarms_as_often_as_intended_at_every_heading() -> None:
     """Surveys of the stated sigma give the intended share; a bias at one place its own, which theory gives too."""
-    table = range_alarms((1e-2, 1e-3), epochs=100_000, seed=5)
+    table = range_alarms((1e-2, 1e-3), epochs=40_000, seed=5)
     assert set(table["constellation"]) == {"gps", "gps_galileo"}
     assert table["heading_deg"].n_unique() == 12
     drawn = table.filter(pl.col("survey_error_sigmas").is_null())
     assert (drawn["expected"] == drawn["intended"]).all()
-    wanted = 100_000 * table["expected"].to_numpy()
+    wanted = 40_000 * table["expected"].to_numpy()
     assert (np.abs(table["alarms"].to_numpy() - wanted) < 4.0 * np.sqrt(wanted) + 2.0).all()
     by_survey = table.filter(pl.col("intended") == 1e-3).group_by("survey_error_sigmas").agg(pl.col("expected").mean())
     shares = dict(by_survey.iter_rows())

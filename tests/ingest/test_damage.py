@@ -291,7 +291,7 @@ def test_cut_anywhere(tmp_path, encoding, chunk_size):
     log = read(tmp_path, content)
     assert log.notes.partial_until_ns is None
     heights = set()
-    for end in [*range(0, len(content), 31), *range(len(content) - 40, len(content))]:
+    for end in [*range(0, len(content), 47), *range(len(content) - 40, len(content))]:
         path = samples.save(tmp_path, content[:end])
         try:
             part = read_run(path, CONFIG)

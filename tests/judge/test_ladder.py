@@ -13,7 +13,7 @@ from tests.judge.ride import Leg
 from tests.judge.sensors import Counter, Receiver
 from tests.judge.world import World, make_journey
 
-SEEDS_EACH = 12
+SEEDS_EACH = 8
 FIRST_SEEDS = (0, 100, 200, 300, 400, 500)
 
 

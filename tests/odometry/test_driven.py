@@ -7,8 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.odometry.driven import driven_m, evenly_driven, hysteresis_m, with_hysteresis
-from pipeline.stages import replay
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, journey, replay
 
 STOPS = {
     "start_m": 200.0,

@@ -11,10 +11,9 @@ from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
 from pipeline.monitors.axis import run_axis
 from pipeline.odometry.odometry import Increments
 from pipeline.odometry.quantisation import QuantisationNoise, count_step_m
-from pipeline.stages import replay
 from schemas.config import Configuration
 from tests.align.straight import align_run, epochs_of, odometer_of, odometry_from
-from tests.replay.journeys import VEHICLE, hides_no_fault, journey
+from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 
 WHITE_MPS = 0.05
 CONFIG = Configuration()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import polars as pl
@@ -10,8 +13,8 @@ import polars as pl
 from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
-from pipeline.stages import replay
-from schemas.config import Vehicle
+from pipeline import stages
+from schemas.config import Configuration, Vehicle
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, RunTables, Site
 
@@ -41,7 +44,13 @@ def journey(
     motion: dict[str, Any] | None = None,
     seed: int = 5,
 ) -> tuple[RunLog, Site]:
-    """One run with its site; physical balises are read where the train passes them."""
+    """One run with its site, built once; physical balises are read where the train passes them."""
+    return _built(json.dumps([faults, gnss, odometer, motion, seed]))
+
+
+@lru_cache(maxsize=64)
+def _built(asked: str) -> tuple[RunLog, Site]:
+    faults, gnss, odometer, motion, seed = json.loads(asked)
     spec: dict[str, Any] = {"id": "run", "motion": motion or MOTION, "faults": list(faults), "gnss": gnss or {}}
     spec["odometer"] = {"rate_hz": 20.0, **(odometer or {})}
     scenario = Scenario.model_validate({"name": "replay", "seed": seed, "line": LINE, "runs": [spec]})
@@ -56,6 +65,37 @@ def _reads(run: RunLog, scenario: Scenario) -> pl.DataFrame:
     times = [start_ns + round(motion.time_at(balise.at_m) * 1e9) for balise in names]
     stamps = pl.Series("t", times, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
     return BaliseReads.validate(pl.DataFrame([stamps, pl.Series("balise_id", [b.id for b in names])]), cast=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A replay that is asked for: the very same frames, vehicle and configuration."""
+
+    run: RunLog
+    site: Site
+    vehicle: Vehicle | None
+    config: Configuration | None
+
+    def _key(self) -> tuple[object, ...]:
+        parts = [id(getattr(whole, part.name)) for whole in (self.run, self.site) for part in fields(whole)]
+        told = [setting.model_dump_json() if setting else None for setting in (self.vehicle, self.config)]
+        return self.run.run_id, *parts, *told
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Asked) and self._key() == other._key()
+
+
+@lru_cache(maxsize=48)
+def _replayed(asked: _Asked) -> RunTables:
+    return stages.replay(asked.run, asked.site, asked.vehicle, asked.config)
+
+
+def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
+    """`pipeline.stages.replay`, once for the same frames: tests ask different questions about one journey."""
+    return _replayed(_Asked(run, site, vehicle, config))
 
 
 def replayed(*faults: dict[str, Any], **settings: Any) -> RunTables:

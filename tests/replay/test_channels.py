@@ -13,10 +13,9 @@ from pipeline.results.store import write_run
 from pipeline.safety.assessment import assess
 from pipeline.safety.side_by_side import side_by_side
 from pipeline.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
-from pipeline.stages import replay
 from schemas.config import Configuration
 from schemas.errors import InputError
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, journey, replay
 
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
 SLOW = {"kind": "ramp", "rate_mps": 0.3, "start_s": 100.0, "duration_s": 120.0}

@@ -8,9 +8,8 @@ from datetime import timedelta
 import polars as pl
 import pytest
 
-from pipeline.stages import replay
 from schemas.run import Finding
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, journey, replay
 
 JUMP = {"kind": "step", "size_m": 850.0, "start_s": 150.0, "duration_s": 6.0}
 OFFSET = {"kind": "step", "size_m": 50.0, "start_s": 140.0, "duration_s": 60.0}

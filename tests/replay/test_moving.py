@@ -7,8 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.report.availability import availability_pieces
-from pipeline.stages import replay
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, journey, replay
 
 STOP = {
     "start_m": 200.0,

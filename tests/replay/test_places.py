@@ -6,8 +6,7 @@ import polars as pl
 import pytest
 
 from datasets.motion import MotionSpec, build_motion
-from pipeline.stages import replay
-from tests.replay.journeys import PLACES_M, VEHICLE, journey
+from tests.replay.journeys import PLACES_M, VEHICLE, journey, replay
 
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
 BRAKING = {"start_m": 200.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": 8000.0, "acceleration_mps2": 0.2}]}

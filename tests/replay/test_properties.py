@@ -6,9 +6,8 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.stages import replay
 from schemas.run import RunLog, Site
-from tests.replay.journeys import PLACES_M, QUIET, VEHICLE, journey, replayed, seconds
+from tests.replay.journeys import PLACES_M, QUIET, VEHICLE, journey, replay, replayed, seconds
 
 JUMP = {"kind": "step", "size_m": 1000.0, "start_s": 120.0, "duration_s": 5.0}
 OFFSET = {"kind": "step", "size_m": -45.0, "start_s": 180.0, "duration_s": 60.0}

@@ -5,8 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.stages import replay
-from tests.replay.journeys import VEHICLE, journey
+from tests.replay.journeys import VEHICLE, journey, replay
 
 SLOW_TRAIN = {"start_m": 200.0, "phases": [{"speed_mps": 12.0}, {"stop_at_m": 7500.0}]}
 

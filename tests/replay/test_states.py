@@ -5,9 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.stages import replay
 from schemas.config import Configuration, Vehicle
-from tests.replay.journeys import QUIET, VEHICLE, journey, seconds
+from tests.replay.journeys import QUIET, VEHICLE, journey, replay, seconds
 
 # The wheel counts 1 m for 1.08 m, and the vehicle file admits it: no increment monitor can see that.
 WORN = {"scale": 1.08}

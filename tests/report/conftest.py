@@ -96,6 +96,6 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
     # Selenium would else look on the network for a driver, and report its use.
     os.environ["SE_OFFLINE"], os.environ["SE_AVOID_STATS"] = "true", "true"
     chrome = Chrome(options=options, service=Service(driver))
-    chrome.set_page_load_timeout(30)
+    chrome.set_page_load_timeout(120)
     yield chrome
     chrome.quit()

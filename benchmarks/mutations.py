@@ -1,0 +1,151 @@
+"""Seeded defects in the core, one at a time: which of them do the tests catch?
+
+`python -m benchmarks.mutations --count 50 --seed 1` changes one place of the core in a copy of the project, runs the
+tests of the room concerned, and says `caught`, `not caught` or `timed out` for each; the defects that no test caught
+stand at the end. Some of them change nothing that a run can show; the others ask for a test.
+
+`--tests-of FOLDER` takes the tests of another checkout: the same defects, judged by two states of the tests.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from random import Random
+
+from benchmarks.mutants import Mutant, mutants_of
+
+ROOT = Path(__file__).parents[1]
+COPIED = ("cli.py", "pyproject.toml", "Makefile", "README.md", "pipeline", "schemas", "datasets", "benchmarks", "docs")
+# A room of the core and the folders of tests that hold it, the quickest first.
+ROOMS: dict[str, tuple[str, ...]] = {
+    "pipeline/evidence": ("tests/judge", "tests/replay"),
+    "pipeline/judge": ("tests/judge", "tests/replay"),
+    "pipeline/lds": ("tests/lds", "tests/replay"),
+    "pipeline/monitors": ("tests/monitors", "tests/replay"),
+    "pipeline/alignment": ("tests/align", "tests/calibration", "tests/replay"),
+    "pipeline/odometry": ("tests/odometry", "tests/align", "tests/lds", "tests/judge"),
+    "pipeline/matching": ("tests/matching", "tests/replay"),
+    "pipeline/figures/verdict.py": ("tests/summary", "tests/judge"),
+}
+_FAILED = re.compile(r"^(?:FAILED|ERROR) ([^ ]+::.*?|[^ ]+)(?: - .*)?$", re.MULTILINE)
+_CAUGHT, _PASSED = 1, 0
+
+
+def main() -> int:
+    """Command line: how many defects, which, for how long, with whose tests, in which rooms."""
+    parser = argparse.ArgumentParser(prog="benchmarks.mutations", description=__doc__)
+    parser.add_argument("--count", type=int, default=50, help="number of defects")
+    parser.add_argument("--seed", type=int, default=1, help="the same seed makes the same defects of the same code")
+    parser.add_argument("--limit-s", type=float, default=900.0, help="time for the tests of one defect [s]")
+    parser.add_argument("--tests-of", type=Path, default=ROOT, metavar="FOLDER", help="checkout whose tests are run")
+    parser.add_argument("--rooms", nargs="*", default=list(ROOMS), choices=list(ROOMS), metavar="ROOM")
+    given = parser.parse_args()
+    chosen = choose(given.rooms, given.count, given.seed)
+    with tempfile.TemporaryDirectory(prefix="mutations-") as folder:
+        copy = copied(Path(folder) / "project", given.tests_of)
+        failing = failing_anyway(copy, {room for room, _ in chosen}, 8 * given.limit_s)
+        told = [judged(copy, room, mutant, failing, given.limit_s) for room, mutant in chosen]
+    show(told, chosen)
+    return 0
+
+
+def choose(rooms: list[str], count: int, seed: int) -> list[tuple[str, Mutant]]:
+    """Defects drawn from all that can be made, the same for the same code and seed."""
+    able = [(room, mutant) for room in rooms for path in sources(room) for mutant in mutants_of(path)]
+    return Random(seed).sample(able, min(count, len(able)))
+
+
+def sources(room: str) -> list[Path]:
+    place = ROOT / room
+    return [place] if place.is_file() else sorted(place.rglob("*.py"))
+
+
+def copied(folder: Path, tests_of: Path) -> Path:
+    """The project with the tests of a checkout, to be changed at will."""
+    folder.mkdir()
+    for name in COPIED:
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, folder / name)
+    shutil.copytree(tests_of / "tests", folder / "tests")
+    return folder
+
+
+def failing_anyway(copy: Path, rooms: set[str], limit_s: float) -> list[str]:
+    """Tests that fail without a defect; they can catch none and are left out."""
+    folders = sorted({folder for room in rooms for folder in ROOMS[room]})
+    done = run_tests(copy, folders, ["-rfE", "--continue-on-collection-errors"], limit_s)
+    if done is None:
+        raise TimeoutError(f"the tests take longer than {limit_s:g} s without a defect: raise --limit-s")
+    failing = _FAILED.findall(done.stdout)
+    print(f"{len(failing)} tests fail without a defect and are left out", *failing, sep="\n  ", flush=True)
+    return failing
+
+
+def judged(copy: Path, room: str, mutant: Mutant, failing: list[str], limit_s: float) -> str:
+    """`caught`, `not caught` or `timed out`, said as soon as it is known."""
+    place = copy / mutant.path.relative_to(ROOT)
+    original = place.read_text(encoding="utf-8")
+    place.write_text(mutant.source(), encoding="utf-8")
+    begin = time.monotonic()
+    try:
+        left_out = [word for name in failing for word in left_out_by(name)]
+        done = run_tests(copy, ROOMS[room], ["-x", *left_out], limit_s)
+    finally:
+        place.write_text(original, encoding="utf-8")
+    outcome = "timed out" if done is None else outcome_of(done)
+    print(f"{outcome:10}  {told_place(mutant)}  [{time.monotonic() - begin:.0f} s]", flush=True)
+    return outcome
+
+
+def left_out_by(name: str) -> tuple[str, str]:
+    """A test is deselected; a file that cannot be collected is ignored."""
+    return ("--deselect", name) if "::" in name else ("--ignore", name)
+
+
+def outcome_of(done: subprocess.CompletedProcess[str]) -> str:
+    """The exit status of pytest; a defect that stops the collection is caught too."""
+    if done.returncode == _PASSED:
+        return "not caught"
+    if done.returncode in (_CAUGHT, 2):
+        return "caught"
+    raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+
+
+def run_tests(
+    copy: Path, folders: Sequence[str], options: list[str], limit_s: float
+) -> subprocess.CompletedProcess[str] | None:
+    """The tests of some folders; None where they took longer than the limit."""
+    command = [sys.executable, "-B", "-m", "pytest", *folders, "-q", "--tb=no", "-p", "no:cacheprovider", *options]
+    environment = {**os.environ, "PYTHONPATH": str(copy), "OPENBLAS_NUM_THREADS": "1"}
+    try:
+        return subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=limit_s, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def told_place(mutant: Mutant) -> str:
+    return f"{mutant.path.relative_to(ROOT)}:{mutant.line}: {mutant.what}"
+
+
+def show(told: list[str], chosen: list[tuple[str, Mutant]]) -> None:
+    """Sums, and the defects that survived."""
+    counts = {outcome: told.count(outcome) for outcome in ("caught", "not caught", "timed out")}
+    print(", ".join(f"{number} {outcome}" for outcome, number in counts.items()) + f" of {len(told)}")
+    for outcome, (_, mutant) in zip(told, chosen, strict=True):
+        if outcome == "not caught":
+            print(f"survived: {told_place(mutant)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
