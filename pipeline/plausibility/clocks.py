@@ -1,0 +1,111 @@
+"""By how much two clocks differ, from two records of one journey's speed, whatever their units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from schemas.arrays import Floats
+
+# At most so many instants: a day of seconds is still quick, and a coarser grid finds hours as well.
+_MOST = 30_000
+# Less in common than this, and than this share of the shorter record, and any two journeys look alike.
+_LEAST_S = 90.0
+_LEAST_SHARE = 0.6
+# The right lag agrees so well (correlation), and so much better than the recorded clocks do.
+_AGREES = 0.9
+_BETTER = 0.35
+# Another lag that agrees nearly as well: a journey that repeats itself tells no lag.
+_RIVAL, _RIVAL_LEAST = 1.5, 0.003
+# Constant speed tells no lag: its scatter over its mean.
+_LEAST_CHANGE = 0.08
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """`lag_s`: the second record's stamp of a moment minus the first's [s], to the grid's `step_s`.
+
+    `agreement` with it and `as_recorded` without (correlations; NaN: nothing in common). `reason`: why nothing is told.
+    """
+
+    lag_s: float = 0.0
+    step_s: float = 1.0
+    agreement: float = float("nan")
+    as_recorded: float = float("nan")
+    reason: str = ""
+
+
+def compare_clocks(
+    one_s: tuple[float, float],
+    one: Callable[[Floats], Floats],
+    other_s: tuple[float, float],
+    other: Callable[[Floats], Floats],
+) -> Clocks:
+    """Compare two records of speed, each a function of its own time within its span [s]; NaN where not known."""
+    step_s = max(1.0, (one_s[1] - one_s[0]) / _MOST, (other_s[1] - other_s[0]) / _MOST)
+    times = [np.arange(begin, end + step_s / 2, step_s) for begin, end in (one_s, other_s)]
+    speeds = [_bounded(np.abs(one(times[0]))), _bounded(np.abs(other(times[1])))]
+    if any(np.isfinite(speed).sum() * step_s < _LEAST_S for speed in speeds):
+        return Clocks(step_s=step_s, reason=f"less than {_LEAST_S:.0f} s of movement are known")
+    if any(np.nanstd(speed) < _LEAST_CHANGE * max(np.nanmean(speed), 1e-9) for speed in speeds):
+        return Clocks(step_s=step_s, reason="the speed hardly changes")
+    rho = _correlations(speeds[0], speeds[1], _LEAST_S / step_s)
+    lags_s = other_s[0] - one_s[0] + (times[1].size - 1 - np.arange(rho.size)) * step_s
+    return _decided(lags_s, rho, step_s)
+
+
+def _decided(lags_s: Floats, rho: Floats, step_s: float) -> Clocks:
+    """The lag, if one agrees well, better than the clocks as recorded, and than any other lag."""
+    best = int(np.argmax(rho))
+    near_zero = np.abs(lags_s) <= 1.5 * step_s
+    as_recorded = float(rho[near_zero].max()) if near_zero.any() else float("nan")
+    as_recorded = as_recorded if as_recorded > -1.0 else float("nan")
+    found = Clocks(float(lags_s[best]), step_s, float(rho[best]), as_recorded)
+    before = np.nan_to_num(as_recorded, nan=0.0)
+    if abs(found.lag_s) <= 1.5 * step_s or 1.0 - found.agreement > _BETTER * (1.0 - before):
+        return Clocks(0.0, step_s, as_recorded, as_recorded)
+    if found.agreement < _AGREES:
+        return Clocks(0.0, step_s, as_recorded, as_recorded, "no shift of the clocks makes the speeds agree")
+    away = np.abs(lags_s - found.lag_s) > 20.0
+    if away.any() and 1.0 - rho[away].max() < _RIVAL * (1.0 - found.agreement) + _RIVAL_LEAST:
+        return Clocks(0.0, step_s, as_recorded, as_recorded, "several shifts of the clocks make the speeds agree")
+    return found
+
+
+def _bounded(speed: Floats) -> Floats:
+    """Without speeds that only a jump of the position has."""
+    known = speed[np.isfinite(speed)]
+    if not known.size:
+        return speed
+    return np.where(speed > 1.5 * np.quantile(known, 0.95) + 1e-9, np.nan, speed)
+
+
+def _correlations(one: Floats, other: Floats, least: float) -> Floats:
+    """Correlation at every shift over what both know; -2 where that is too little or does not change.
+
+    Element k pairs `one[i]` with `other[i - k + n - 1]`, n the length of `other` (Padfield 2012, masked FFT).
+    """
+    size = fft.next_fast_len(one.size + other.size - 1, real=True)
+    masks = [np.isfinite(values).astype(np.float64) for values in (one, other)]
+    filled = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (one, other)]
+    spectra = [fft.rfft(array, size) for array in (masks[0], filled[0], filled[0] ** 2)]
+    turned = [fft.rfft(array[::-1], size) for array in (masks[1], filled[1], filled[1] ** 2)]
+
+    def sums(left: int, right: int) -> Floats:
+        whole: Floats = fft.irfft(spectra[left] * turned[right], size)[: one.size + other.size - 1]
+        return whole
+
+    count = np.maximum(np.round(sums(0, 0)), 0.0)
+    need = max(least, _LEAST_SHARE * min(mask.sum() for mask in masks))
+    many = np.maximum(count, 1.0)
+    first, second = sums(1, 0), sums(0, 1)
+    covariance = sums(1, 1) - first * second / many
+    spread = (sums(2, 0) - first**2 / many) * (sums(0, 2) - second**2 / many)
+    enough = spread > (_LEAST_CHANGE**2 * many) ** 2 * 0.25
+    rho = covariance / np.sqrt(np.where(enough, spread, 1.0))
+    zero = np.where(enough & (count >= least), rho, -2.0)
+    result: Floats = np.where(count >= need, zero, -2.0)
+    return result
