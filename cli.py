@@ -208,6 +208,8 @@ def inspect(
     result: Annotated[
         str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
     ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site to hold a log against.")] = None,
+    vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -216,7 +218,7 @@ def inspect(
     from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result, settings.matching)
+    tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
     if as_json:
         _print_json(tables)
     else:
@@ -263,6 +265,7 @@ def convert(
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
     from pipeline.receivers import convert as convert_logs
+    from pipeline.results.fit_report import fit_report
 
     settings = _configuration(config)
     converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
@@ -272,6 +275,8 @@ def convert(
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
         print(f"not used: {count} x {reason}")
+    for line in fit_report(converted.run, settings.ingest).lines():
+        print(line)
 
 
 @app.command()

@@ -8,7 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.ingest.placeholders import without_placeholders
 from schemas.arrays import Bools
+from schemas.config import IngestConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import STREAMS, RunLog, Stream
 
@@ -28,13 +30,14 @@ class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
     Of GNSS also `contradicting`, how many of those dropped are of another place than the one that stays, and `far_off`,
-    how many were dropped for a time of another day.
+    how many were dropped for a time of another day, and `placeholders`, how many are no positions.
     """
 
     duplicates: int = 0
     out_of_order: int = 0
     contradicting: int = 0
     far_off: int = 0
+    placeholders: int = 0
 
 
 @dataclass(frozen=True)
@@ -45,10 +48,11 @@ class CleanCounts:
     streams: dict[str, StreamCounts] = field(default_factory=dict)
 
 
-def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
+def clean(run: RunLog, config: IngestConfig | None = None) -> tuple[RunLog, CleanCounts]:
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
-    A few positions more than a day from the others (a receiver that did not know the date yet) are left out.
+    A few positions more than a day from the others (a receiver that did not know the date yet) are left out;
+    placeholders stay as epochs without a fix.
     Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
     nothing can be replayed.
     """
@@ -64,6 +68,8 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
         streams[name], counts[name] = _in_order(frame, _KEYS.get(name, ["t"]))
     recorded = run.gnss.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
     solutions = {part["solution"][0]: _of_solution(part, far) for part in recorded}
+    streams["gnss"], placeholders = _with_fixes(streams["gnss"], config or IngestConfig())
+    solutions = {name: replace(one, placeholders=placeholders.get(name, 0)) for name, one in solutions.items()}
     gnss = streams["gnss"]
     parts = [] if gnss is None else gnss.select("solution").partition_by("solution", maintain_order=True)
     if parts and all(part.height < 2 for part in parts):
@@ -71,8 +77,27 @@ def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
     odometer = streams.get("odometer")
     if odometer is not None:
         require_two_times(odometer, f"{run.run_id}: odometer")
-        _require_common_time(run.run_id, gnss, odometer)
+        _require_common_time(run.with_streams(**streams))
     return run.with_streams(**streams), CleanCounts(solutions, counts)
+
+
+def _with_fixes(gnss: pl.DataFrame | None, config: IngestConfig) -> tuple[pl.DataFrame | None, dict[str, int]]:
+    """Positions without placeholders, and how many these were, by solution."""
+    if gnss is None or not {"fix", *_PLACE} <= set(gnss.columns):
+        return gnss, {}
+    names = gnss["solution"].unique().to_list()
+    counts: dict[str, int] = {}
+    for name in names:
+        part = gnss if len(names) == 1 else gnss.filter(pl.col("solution") == name)
+        marked, counts[name] = without_placeholders(part, config)
+        if counts[name]:
+            row = pl.int_range(pl.len()).over("solution")
+            kinds = marked.select("solution", row.alias("_row"), pl.col("fix").alias("_fix"))
+            joined = gnss.with_columns(row.alias("_row")).join(
+                kinds, on=["solution", "_row"], how="left", maintain_order="left"
+            )
+            gnss = joined.with_columns(pl.coalesce("_fix", "fix").alias("fix")).drop("_row", "_fix")
+    return gnss, counts
 
 
 def _strays(gnss: pl.DataFrame) -> Bools:
@@ -157,16 +182,29 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
         )
 
 
-def _require_common_time(run_id: str, gnss: pl.DataFrame | None, odometer: pl.DataFrame) -> None:
+def _require_common_time(run: RunLog) -> None:
     """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
-    if gnss is None or gnss.is_empty():
+    gnss, odometer = run.gnss, run.odometer
+    if gnss.is_empty() or odometer is None:
         return
     (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
     if odometer_begin > end or odometer_end < begin:
         raise InputError(
             "has no time in common with the GNSS",
-            place=f"{run_id}: odometer, column t",
+            place=f"{run.run_id}: odometer, column t",
             found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
             expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
-            remedy="Check date and time scale of the two recorders; leave the odometer out to replay without it.",
+            remedy=_clock_remedy(run),
         )
+
+
+def _clock_remedy(run: RunLog) -> str:
+    """What makes both records one journey, if anything does."""
+    # Imported here because only such a run needs it.
+    from pipeline.plausibility.fit import fit_run, remedy_of
+
+    known = "Check date and time scale of the two recorders; leave the odometer out to replay without it."
+    if not {"fix", *_PLACE} <= set(run.gnss.columns):
+        return known
+    found = fit_run(run, run.solutions()[0], Vehicle(), IngestConfig()).impossible
+    return " ".join([known, *(f"{check.sentence}." for check in found), remedy_of(found)]).rstrip(" ")

@@ -97,7 +97,9 @@ def _horizontal(moved: Floats, recorded: Floats) -> Check:
     if misfits[0] > _FITS and misfits[best] > _FITS:
         found = f"they point elsewhere, by {misfits[0]:.0%} of the speed"
         return Check(WHAT, State.MISFIT, found, "latitude and longitude may be exchanged, or the axes are of the train")
-    arrangement = ARRANGEMENTS[0] if misfits[0] <= _FITS or misfits[best] > _EXPLAINS * misfits[0] else ARRANGEMENTS[best]
+    arrangement = (
+        ARRANGEMENTS[0] if misfits[0] <= _FITS or misfits[best] > _EXPLAINS * misfits[0] else ARRANGEMENTS[best]
+    )
     return _told(ratio, arrangement, misfits)
 
 

@@ -41,7 +41,9 @@ WAY_UNITS = {
     "nautical miles": 1 / 1852,
 }
 # A speed that was summed up in its own unit instead of metres per second; cumulative only.
-_SUMMED = {f"a sum of {unit}": factor for unit, factor in SPEED_UNITS.items() if unit in ("km/h", "mph", "knots")}
+_SUMMED = {
+    f"speeds summed up in {unit}": factor for unit, factor in SPEED_UNITS.items() if unit in ("km/h", "mph", "knots")
+}
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; above the 3 % of bad odometers.
 _NEAR = 0.045
 # Units so near to 1 that a bad odometer could be taken for them.

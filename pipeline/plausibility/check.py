@@ -31,12 +31,6 @@ class Check:
     advice: str = ""
 
     @property
-    def remedy(self) -> str:
-        """What to do, with the lines at the end."""
-        pasted = f"Append to {self.into}:\n{self.lines}" if self.lines else ""
-        return " ".join(part for part in (self.advice, pasted) if part)
-
-    @property
     def sentence(self) -> str:
         """What does not fit, in one sentence."""
         return f"{self.what}: {self.found}" + (f" ({self.cause})" if self.cause else "")

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 
-
-
 def correction(
     stream: str,
     factors: Mapping[str, float] | None = None,

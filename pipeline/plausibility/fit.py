@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import polars as pl
 
 from pipeline.plausibility.axes import velocity_checks
@@ -12,7 +12,7 @@ from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, fits, not_checked
 from pipeline.plausibility.corrections import correction
 from pipeline.plausibility.counter import sign_check, turn_check
-from pipeline.plausibility.course import Course, Places, distance_course, places_of, speed_course
+from pipeline.plausibility.course import Places, distance_course, places_of, speed_course
 from pipeline.plausibility.pairs import PairFit, fit_pair
 from pipeline.plausibility.places import reads_lag, reference_lag, survey_checks
 from pipeline.plausibility.witnesses import Lag, lag_checks
@@ -45,9 +45,7 @@ class Fit:
         return (*self.impossible, *(check for check in self.checks if check.state is State.MISFIT))
 
 
-def fit_run(
-    run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, site: Site | None = None
-) -> Fit:
+def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, site: Site | None = None) -> Fit:
     """Compare the streams of a cleaned run with one solution, with the site and the vehicle file where there are any."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     if fixes.is_empty():
@@ -177,10 +175,21 @@ def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:
     found = fit.impossible
     if not found or config.plausibility == "warn":
         return
-    remedies = "\n".join(dict.fromkeys(check.remedy for check in found))
     raise InputError(
         "does not fit: " + "; ".join(check.sentence for check in found),
         place=place,
         expected="streams of one journey, in the units and times of the contract",
-        remedy='To replay it all the same: [ingest] plausibility = "warn". ' + remedies,
+        remedy='To replay it all the same: [ingest] plausibility = "warn". ' + remedy_of(found),
     )
+
+
+def remedy_of(checks: Sequence[Check]) -> str:
+    """What mends all of these: advice, then for each file its lines, which can be appended as they are."""
+    advice = list(dict.fromkeys(check.advice for check in checks if check.advice))
+    return " ".join([*advice, *(f"Append to {into}:\n{lines}" for into, lines in lines_of(checks).items())])
+
+
+def lines_of(checks: Sequence[Check]) -> dict[str, str]:
+    """The lines that mend these, by the file they belong into."""
+    files = dict.fromkeys(check.into for check in checks if check.lines)
+    return {into: "\n".join(dict.fromkeys(one.lines for one in checks if one.into == into)) for into in files}

@@ -47,7 +47,7 @@ def reference_lag(
     told = abs(found.lag_s) > max(config.fit_lag_told_s, 5.0 * found.lag_sigma_s)
     small = abs(found.lag_s) <= config.fit_lag_limit_s and found.agreeing >= _EXPLAINS
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=told and (explains or small))
-    words = f"{found.east_m:.1f} m east, {found.north_m:.1f} m north of them"
+    words = f"{towards(found.east_m, found.north_m)} of them"
     if found.agreeing < _EXPLAINS:
         return lag, [not_checked(_REFERENCE, "no one lag or shift explains them; the positions may be wrong")]
     if found.shift_m <= config.fit_shift_told_m:
@@ -136,7 +136,7 @@ def _exchange(exchanged: bool) -> tuple[str, str] | None:
 
 def _beside(found: SurveyFit, gnss: Places, config: IngestConfig) -> Check:
     words = (
-        f"the survey lies {found.east_m:.0f} m east, {found.north_m:.0f} m north of them"
+        f"the survey lies {towards(found.east_m, found.north_m)} of them"
         f"{' (along the track not known: one heading)' if found.one_heading else ''}"
     )
     constant = found.left_m < _LEAVES * found.aside_m and found.share > _SHARE
@@ -158,6 +158,12 @@ def _beside(found: SurveyFit, gnss: Places, config: IngestConfig) -> Check:
     advice = "Name the survey's EPSG code or mend the survey; only where the shift is known to be the map's:"
     cause = "a datum or map shift, or an antenna far from the track's middle"
     return Check(_SURVEY, State.MISFIT, words, cause, "the configuration", lines, advice)
+
+
+def towards(east_m: float, north_m: float) -> str:
+    """A shift in words."""
+    east, north = ("east" if east_m >= 0 else "west"), ("north" if north_m >= 0 else "south")
+    return f"{abs(east_m):.0f} m {east}, {abs(north_m):.0f} m {north}"
 
 
 def _shift_lines(stream: str, east_m: float, north_m: float) -> str:

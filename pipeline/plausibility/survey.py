@@ -173,4 +173,3 @@ def _regressed(across: Floats, apart: Floats, shift: Floats) -> tuple[Floats, bo
 def _median(values: Floats) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else float("nan")
-

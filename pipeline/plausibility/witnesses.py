@@ -28,7 +28,9 @@ class Lag:
     reason: str = ""
 
 
-def lag_checks(lags: list[Lag], streams: list[str], solution: str | None, t_ns: int, config: IngestConfig) -> list[Check]:
+def lag_checks(
+    lags: list[Lag], streams: list[str], solution: str | None, t_ns: int, config: IngestConfig
+) -> list[Check]:
     """One check per stream; `streams`: what the run holds, `solution`: the GNSS solution if there are several.
 
     What two recorders say against the GNSS is the GNSS's own.
@@ -66,7 +68,9 @@ def _check(
     at_gnss = gnss_is_wrong or (not contradicted and _rather_gnss(lag.lag_s, cause, t_ns))
     if at_gnss:
         lines = "".join(
-            correction(stream, shift_s=exact_s, solution=solution) for stream in ("gnss", "satellites") if stream in streams
+            correction(stream, shift_s=exact_s, solution=solution)
+            for stream in ("gnss", "satellites")
+            if stream in streams
         )
         return Check(what, State.IMPOSSIBLE, found, f"{cause}, in the GNSS", "the configuration", lines)
     lines = correction(lag.stream, shift_s=-exact_s)
