@@ -217,7 +217,8 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.config.align.straight_s,
     )
     fit = context.fits[name]
-    notes = (*fit_notes(fit), *notes, *reading_notes(ride.aligned, context.config), *reference_notes(context.evidence.disputed))
+    notes = (*fit_notes(fit), *notes, *reading_notes(ride.aligned, context.config))
+    notes = (*notes, *reference_notes(context.evidence.disputed))
     return SolutionResults(
         solution=name,
         epochs=epochs,

@@ -45,10 +45,8 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
         one, other = correction.exchange
         mended = mended.with_columns(pl.col(other).alias(one), pl.col(one).alias(other))
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
-    shift_ns = round(correction.shift_s * NS_PER_S)
-    mended = (
-        mended.with_columns(pl.col("t") + pl.duration(nanoseconds=shift_ns, time_unit="ns")) if shift_ns else mended
-    )
+    shift = pl.duration(nanoseconds=round(correction.shift_s * NS_PER_S), time_unit="ns")
+    mended = mended.with_columns(pl.col("t") + shift) if correction.shift_s else mended
     if correction.shift_east_m or correction.shift_north_m or correction.shift_up_m:
         mended = _moved(mended, correction)
     _refuse_no_place(mended, correction, run_id)

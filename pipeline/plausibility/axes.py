@@ -10,8 +10,8 @@ import polars as pl
 from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, fits, not_checked
 from pipeline.plausibility.corrections import correction
-from pipeline.plausibility.course import Places
-from schemas.arrays import Bools, Floats, floats, times_ns
+from pipeline.plausibility.course import Places, seconds_since
+from schemas.arrays import Bools, Floats, floats
 
 WHAT = "GNSS velocity against displacement"
 _UP = "GNSS vertical velocity against height"
@@ -55,7 +55,7 @@ ARRANGEMENTS = tuple(
 
 def velocity_checks(fixes: pl.DataFrame, gnss: Places, epoch_ns: int) -> list[Check]:
     """Checks of the recorded velocity; none where nothing was recorded."""
-    t_s = (times_ns(fixes) - epoch_ns) * 1e-9
+    t_s = seconds_since(epoch_ns, fixes)
     velocity = np.column_stack([floats(fixes, f"vel_{axis}_mps") for axis in "enu"])
     rows = np.isfinite(velocity[:, :2]).all(axis=1)
     if rows.sum() < 2:

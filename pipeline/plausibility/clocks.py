@@ -46,15 +46,19 @@ def compare_clocks(
 ) -> Clocks:
     """Compare two records of speed, each a function of its own time within its span [s]; NaN where not known."""
     step_s = max(1.0, (one_s[1] - one_s[0]) / _MOST, (other_s[1] - other_s[0]) / _MOST)
-    times = [np.arange(begin, end + step_s / 2, step_s) for begin, end in (one_s, other_s)]
+    times = [_grid(begin, end, step_s) for begin, end in (one_s, other_s)]
     speeds = [_bounded(np.abs(one(times[0]))), _bounded(np.abs(other(times[1])))]
     if any(np.isfinite(speed).sum() * step_s < _LEAST_S for speed in speeds):
         return Clocks(step_s=step_s, reason=f"less than {_LEAST_S:.0f} s of movement are known")
-    if any(np.nanstd(speed) < _LEAST_CHANGE * max(np.nanmean(speed), 1e-9) for speed in speeds):
+    if any(np.nanstd(speed) < _LEAST_CHANGE * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
         return Clocks(step_s=step_s, reason="the speed hardly changes")
     rho = _correlations(speeds[0], speeds[1], _LEAST_S / step_s)
-    lags_s = other_s[0] - one_s[0] + (times[1].size - 1 - np.arange(rho.size)) * step_s
+    lags_s = other_s[0] - one_s[0] + step_s * np.arange(times[1].size - 1.0, times[1].size - 1.0 - rho.size, -1.0)
     return _decided(lags_s, rho, step_s)
+
+
+def _grid(begin_s: float, end_s: float, step_s: float) -> Floats:
+    return np.arange(begin_s, end_s + step_s / 2, step_s, dtype=np.float64)
 
 
 def _decided(lags_s: Floats, rho: Floats, step_s: float) -> Clocks:

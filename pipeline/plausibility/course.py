@@ -92,7 +92,7 @@ def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     valid = np.isfinite(latitude) & np.isfinite(longitude)
     if "fix" in frame.columns:
         valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
-    t_s = (times_ns(frame) - epoch_ns) * 1e-9
+    t_s = seconds_since(epoch_ns, frame)
     rows = np.flatnonzero(valid)
     rows = rows[_thinned(t_s[rows])]
     if rows.size < 10:
@@ -105,9 +105,14 @@ def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     return Places(t_s[rows], latitude[rows], longitude[rows], height, ecef)
 
 
+def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
+    """Times of a stream from an instant on [s]."""
+    return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
+
+
 def distance_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
     """The recorded distance; None where hardly any row has one."""
-    t_s, distance = (times_ns(odometer) - epoch_ns) * 1e-9, floats(odometer, "distance_m")
+    t_s, distance = seconds_since(epoch_ns, odometer), floats(odometer, "distance_m")
     rows = np.flatnonzero(np.isfinite(distance))
     rows = rows[_thinned(t_s[rows])]
     return Course(t_s[rows], distance[rows]) if rows.size >= 10 else None
@@ -115,7 +120,7 @@ def distance_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
 
 def speed_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
     """The recorded speed, summed up; None where hardly any row has one."""
-    t_s, speed = (times_ns(odometer) - epoch_ns) * 1e-9, floats(odometer, "speed_mps")
+    t_s, speed = seconds_since(epoch_ns, odometer), floats(odometer, "speed_mps")
     rows = np.flatnonzero(np.isfinite(speed))
     if rows.size < 10:
         return None

@@ -46,7 +46,7 @@ class Fit:
 
 
 def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, site: Site | None = None) -> Fit:
-    """Compare the streams of a cleaned run with one solution, with the site and the vehicle file where there are any."""
+    """Compare the streams of a cleaned run with one solution, the site and the vehicle file where there are any."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     if fixes.is_empty():
         return Fit((not_checked(_POSITIONS, "none"),))
@@ -59,7 +59,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
     if any(check.state is State.IMPOSSIBLE for check in surveyed):
         return Fit(tuple(surveyed))
     several = solution if len(run.solutions()) > 1 else None
-    streams = [name for name in ("gnss", "satellites", "odometer", "reference") if run.stream(name) is not None]  # type: ignore[arg-type]
+    streams = [name for name in ("gnss", "satellites", "odometer", "reference") if run.stream(name) is not None]
     checks, lags = _odometer(run, gnss, epoch_ns, vehicle, config)
     if run.reference is not None and run.reference.height:
         lag, more = reference_lag(gnss, run.reference, epoch_ns, config)

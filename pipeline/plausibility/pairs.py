@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class PairFit:
     windows: int = 0
     reason: str = ""
     stands: bool = False
-    clocks: Clocks = Clocks()
+    clocks: Clocks = field(default_factory=Clocks)
 
     @property
     def told(self) -> bool:

@@ -7,13 +7,13 @@ import polars as pl
 
 from pipeline.plausibility.check import Check, State, fits, not_checked
 from pipeline.plausibility.corrections import correction
-from pipeline.plausibility.course import Places, places_of
+from pipeline.plausibility.course import Places, places_of, seconds_since
 from pipeline.plausibility.frames import SLIPS, datum_of
 from pipeline.plausibility.reference import PlaceFit, common_lag, fit_places
 from pipeline.plausibility.survey import SurveyFit, fit_survey, line_of
 from pipeline.plausibility.witnesses import Lag
 from pipeline.track.geodesy import earth_centred_m, points_of
-from schemas.arrays import Floats, times_ns
+from schemas.arrays import Floats
 from schemas.config import IngestConfig, Vehicle
 from schemas.run import Site
 
@@ -73,7 +73,7 @@ def _elsewhere(gnss: Places, record: Places, found: PlaceFit) -> Check:
 def reads_lag(gnss: Places, reads: pl.DataFrame, site: Site, epoch_ns: int) -> Lag:
     """The clock of the balise reads: where the positions pass a balise that was read."""
     places = _balise_places(site)
-    t_s = (times_ns(reads) - epoch_ns) * 1e-9
+    t_s = seconds_since(epoch_ns, reads)
     surface = points_of(gnss.latitude_deg, gnss.longitude_deg).surface
     lags: list[float] = []
     read = 0
