@@ -47,8 +47,10 @@ _SUMMED = {
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; above the 3 % of bad odometers.
 _NEAR = 0.045
 # Units so near to 1 that a bad odometer could be taken for them.
-_EXACT = 0.02
+_EXACT = 0.035
 
+# Streams are late by so much besides [s].
+_LATENCY_S = 2.2
 # GPS time is ahead of UTC by so many seconds since (IERS Bulletin C); TAI by 19 s more.
 _LEAPS = {2017.0: 18, 2015.5: 17, 2012.5: 16, 2009.0: 15, 2006.0: 14, 1999.0: 13}
 TAI_OVER_GPS_S = 19
@@ -77,7 +79,7 @@ def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None
     """What makes two clocks differ by `lag_s`, known to within `precision_s`, at an instant; the simplest cause."""
     size = abs(lag_s)
     for explained in _lags(size, t_ns):
-        if abs(size - explained.exact) <= max(precision_s, 0.6):
+        if abs(size - explained.exact) <= max(precision_s, _LATENCY_S):
             return Explained(explained.cause, explained.exact if lag_s > 0 else -explained.exact)
     return None
 

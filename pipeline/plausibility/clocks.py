@@ -1,8 +1,8 @@
-"""By how much two clocks differ, from two records of one journey's speed, whatever their units."""
+"""By how much two clocks may differ, from two records of one journey's speed, whatever their units."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,68 +15,56 @@ _MOST = 30_000
 # Less in common than this, and than this share of the shorter record, and any two journeys look alike.
 _LEAST_S = 90.0
 _LEAST_SHARE = 0.6
-# The right lag agrees so well (correlation), and so much better than the recorded clocks do.
-_AGREES = 0.9
-_BETTER = 0.35
-# Another lag that agrees nearly as well: a journey that repeats itself tells no lag.
-_RIVAL, _RIVAL_LEAST = 1.5, 0.003
+# Shifts of the clocks that are worth a closer look: so many, so well correlated, so far from each other [s].
+_CANDIDATES, _LEAST_CORRELATION, _APART_S = 4, 0.4, 15.0
 # Constant speed tells no lag: its scatter over its mean.
 _LEAST_CHANGE = 0.08
 
 
 @dataclass(frozen=True)
-class Clocks:
-    """`lag_s`: the second record's stamp of a moment minus the first's [s], to the grid's `step_s`.
+class Candidates:
+    """Lags that two clocks may have [s]: the second record's stamp of a moment minus the first's, to `step_s`.
 
-    `agreement` with it and `as_recorded` without (correlations; NaN: nothing in common). `reason`: why nothing is told.
+    Best correlated first. `reason`: why there are none.
     """
 
-    lag_s: float = 0.0
+    lags_s: tuple[float, ...] = ()
     step_s: float = 1.0
-    agreement: float = float("nan")
-    as_recorded: float = float("nan")
     reason: str = ""
 
 
-def compare_clocks(
+def possible_lags(
     one_s: tuple[float, float],
     one: Callable[[Floats], Floats],
     other_s: tuple[float, float],
     other: Callable[[Floats], Floats],
-) -> Clocks:
-    """Compare two records of speed, each a function of its own time within its span [s]; NaN where not known."""
+) -> Candidates:
+    """Lags at which two records of speed look alike, each a function of its own time within its span [s]."""
     step_s = max(1.0, (one_s[1] - one_s[0]) / _MOST, (other_s[1] - other_s[0]) / _MOST)
     times = [_grid(begin, end, step_s) for begin, end in (one_s, other_s)]
     speeds = [_bounded(np.abs(one(times[0]))), _bounded(np.abs(other(times[1])))]
     if any(np.isfinite(speed).sum() * step_s < _LEAST_S for speed in speeds):
-        return Clocks(step_s=step_s, reason=f"less than {_LEAST_S:.0f} s of movement are known")
+        return Candidates(step_s=step_s, reason=f"less than {_LEAST_S:.0f} s of movement are known")
     if any(np.nanstd(speed) < _LEAST_CHANGE * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
-        return Clocks(step_s=step_s, reason="the speed hardly changes")
+        return Candidates(step_s=step_s, reason="the speed hardly changes")
     rho = _correlations(speeds[0], speeds[1], _LEAST_S / step_s)
     lags_s = other_s[0] - one_s[0] + step_s * np.arange(times[1].size - 1.0, times[1].size - 1.0 - rho.size, -1.0)
-    return _decided(lags_s, rho, step_s)
+    return Candidates(tuple(_peaks(lags_s, rho)), step_s)
 
 
 def _grid(begin_s: float, end_s: float, step_s: float) -> Floats:
     return np.arange(begin_s, end_s + step_s / 2, step_s, dtype=np.float64)
 
 
-def _decided(lags_s: Floats, rho: Floats, step_s: float) -> Clocks:
-    """The lag, if one agrees well, better than the clocks as recorded, and than any other lag."""
-    best = int(np.argmax(rho))
-    near_zero = np.abs(lags_s) <= 1.5 * step_s
-    as_recorded = float(rho[near_zero].max()) if near_zero.any() else float("nan")
-    as_recorded = as_recorded if as_recorded > -1.0 else float("nan")
-    found = Clocks(float(lags_s[best]), step_s, float(rho[best]), as_recorded)
-    before = np.nan_to_num(as_recorded, nan=0.0)
-    if abs(found.lag_s) <= 1.5 * step_s or 1.0 - found.agreement > _BETTER * (1.0 - before):
-        return Clocks(0.0, step_s, as_recorded, as_recorded)
-    if found.agreement < _AGREES:
-        return Clocks(0.0, step_s, as_recorded, as_recorded, "no shift of the clocks makes the speeds agree")
-    away = np.abs(lags_s - found.lag_s) > 20.0
-    if away.any() and 1.0 - rho[away].max() < _RIVAL * (1.0 - found.agreement) + _RIVAL_LEAST:
-        return Clocks(0.0, step_s, as_recorded, as_recorded, "several shifts of the clocks make the speeds agree")
-    return found
+def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:
+    """Lags of the highest correlations that are not beside a higher one."""
+    left = rho.copy()
+    for _ in range(_CANDIDATES):
+        best = int(np.argmax(left))
+        if left[best] < _LEAST_CORRELATION:
+            return
+        yield float(lags_s[best])
+        left[np.abs(lags_s - lags_s[best]) < _APART_S] = -2.0
 
 
 def _bounded(speed: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import polars as pl
@@ -82,7 +82,7 @@ def _odometer(
     if distance is None and speed is None:
         return [not_checked("odometer against the GNSS", "hardly any row")], []
     fitted = {name: fit_pair(gnss, one) for name, one in (("distance", distance), ("speed", speed)) if one is not None}
-    checks = [_factor_check(name, pair, config) for name, pair in fitted.items()]
+    checks = [_factor_check(name, pair, _base(name, fitted, config), config) for name, pair in fitted.items()]
     usable = [(name, pair) for name, pair in fitted.items() if pair.told]
     main = usable[0][1] if usable else next(iter(fitted.values()))
     counter = distance if distance is not None and (not usable or usable[0][0] == "distance") else speed
@@ -95,21 +95,25 @@ def _odometer(
 
 def _odometer_lag(pair: PairFit, vehicle: Vehicle, config: IngestConfig) -> Lag:
     """The clock of the odometer; a latency that the vehicle file tells is no lag."""
-    coarse = abs(pair.clocks.lag_s) > 1.5 * pair.clocks.step_s
     if not pair.told:
         return Lag("odometer", reason=pair.reason)
-    if not coarse and (pair.clocks.reason or not pair.lag_told):
-        return Lag("odometer", reason=pair.clocks.reason or "the speed changes too little")
-    if coarse:
-        lag_s = pair.lag_s if abs(pair.lag_s - pair.clocks.lag_s) < 8.0 else pair.clocks.lag_s
-        return Lag("odometer", lag_s, min(pair.lag_sigma_s, pair.clocks.step_s), sure=True)
+    if pair.shifted:
+        return Lag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
+    if pair.clock_reason or not pair.lag_told:
+        return Lag("odometer", reason=pair.clock_reason or "the speed changes too little")
     from_file_s = -(vehicle.gnss_latency_s or 0.0)
     told = vehicle.gnss_latency_s is None and pair.other_lag(0.0, config.fit_lag_told_s)
     within = abs(pair.lag_s - from_file_s) <= config.fit_lag_limit_s
     return Lag("odometer", pair.lag_s, pair.lag_sigma_s, sure=told and within)
 
 
-def _factor_check(name: str, pair: PairFit, config: IngestConfig) -> Check:
+def _base(name: str, fitted: Mapping[str, PairFit], config: IngestConfig) -> float:
+    """The wheel's own factor as the odometer's other column shows it, if that is one; else 1."""
+    others = [abs(pair.factor) for other, pair in fitted.items() if other != name and pair.told]
+    return others[0] if others and abs(others[0] - 1.0) <= config.fit_scale_limit else 1.0
+
+
+def _factor_check(name: str, pair: PairFit, base: float, config: IngestConfig) -> Check:
     what = f"odometer {name} against the positions"
     if not pair.told:
         return Check(what, State.MISFIT, pair.reason) if pair.stands else not_checked(what, pair.reason)
@@ -123,7 +127,7 @@ def _factor_check(name: str, pair: PairFit, config: IngestConfig) -> Check:
         return Check(what, State.MISFIT, found, "a wheel diameter that is set wrongly", "the vehicle file", lines)
     if pair.constant < _CONSTANT:
         return Check(what, State.MISFIT, f"no constant factor ({found} usually)")
-    explained = explain_factor(factor, name == "speed")
+    explained = explain_factor(factor / base, name == "speed")
     if explained is not None:
         lines = correction("odometer", {column: 1.0 / explained.exact})
         return Check(what, State.IMPOSSIBLE, found, f"the {name} is {explained.cause}", "the configuration", lines)

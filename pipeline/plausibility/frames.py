@@ -81,13 +81,29 @@ DATUMS = {
 _NEAR_M, _NEAR_SHARE = 12.0, 0.12
 
 
-def datum_of(latitude_deg: float, longitude_deg: float, east_m: float, north_m: float) -> tuple[str, int] | None:
-    """The national datum of which a survey, read as WGS 84, lies so far east and north of the positions."""
+@dataclass(frozen=True)
+class Datum:
+    """A national datum, and how far a survey in it, read as WGS 84, lies east and north of the positions here."""
+
+    name: str
+    epsg: int
+    east_m: float
+    north_m: float
+
+    def explains(self, east_m: float, north_m: float, one_heading: bool) -> bool:
+        """Whether it is this shift; of a single heading only the part across it is known."""
+        size_m = float(np.hypot(east_m, north_m))
+        apart = np.array([self.east_m - east_m, self.north_m - north_m])
+        apart_m = abs(apart @ [east_m, north_m]) / size_m if one_heading else np.hypot(*apart)
+        return bool(apart_m < max(_NEAR_M, _NEAR_SHARE * size_m))
+
+
+def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:
+    """The national datums in use around a place."""
     # Imported here because it takes a tenth of a second, and hardly any run needs it.
     import pyproj
 
-    best: tuple[float, str, int] | None = None
-    size_m = float(np.hypot(east_m, north_m))
+    found: list[Datum] = []
     geod = pyproj.Geod(ellps="WGS84")
     for name, code in DATUMS.items():
         area = pyproj.CRS.from_epsg(code).area_of_use
@@ -95,17 +111,12 @@ def datum_of(latitude_deg: float, longitude_deg: float, east_m: float, north_m: 
             continue
         turn = pyproj.Transformer.from_crs(code, 4326, always_xy=True)
         longitude, latitude = turn.transform(longitude_deg, latitude_deg)
-        azimuth, _, distance_m = geod.inv(longitude, latitude, longitude_deg, latitude_deg)
-        apart_m = float(
-            np.hypot(
-                distance_m * np.sin(np.radians(azimuth)) - east_m, distance_m * np.cos(np.radians(azimuth)) - north_m
-            )
-        )
-        if apart_m < max(_NEAR_M, _NEAR_SHARE * size_m) and (best is None or apart_m < best[0]):
-            best = (apart_m, name, code)
-    return None if best is None else best[1:]
+        azimuth_deg, _, distance_m = geod.inv(longitude, latitude, longitude_deg, latitude_deg)
+        azimuth = np.radians(azimuth_deg)
+        found.append(Datum(name, code, float(distance_m * np.sin(azimuth)), float(distance_m * np.cos(azimuth))))
+    return found
 
 
 def _inside(bounds: tuple[float, float, float, float], latitude_deg: float, longitude_deg: float) -> bool:
     west, south, east, north = bounds
-    return south - 1 <= latitude_deg <= north + 1 and west - 1 <= longitude_deg <= east + 1
+    return south <= latitude_deg <= north and west <= longitude_deg <= east

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plausibility.clocks import Clocks, compare_clocks
+from pipeline.plausibility.clocks import Candidates, possible_lags
 from pipeline.plausibility.course import Course, Places
 from schemas.arrays import Bools, Floats
 
@@ -20,6 +20,15 @@ _SLOW_SHARE = 0.2
 _STANDS_MPS = 0.25
 # A window agrees if its ratio is within so much of the usual one.
 _AGREES = 0.12
+# Speeds agree at a lag in so much of the moving time; another lag has to do it in so much more, and leave so much less
+# of the rest. Both records have so much of the shorter one in common.
+_ALIKE, _MORE, _LESS, _LEAST_OVERLAP = 0.5, 0.08, 0.6, 0.6
+# A journey that repeats itself agrees nearly as well at another lag.
+_RIVAL = 0.05
+# Nobody looks for another lag where they agree in so much of it.
+_SURELY = 0.93
+# Steps in which a lag is improved, lags that are the same, and those that are none [s].
+_CLIMB_S, _SAME_S, _ZERO_S = (8.0, 4.0, 2.0, 1.0), 25.0, 1.5
 # Tukey's biweight, 95 % efficient on Gaussian noise (Huber and Ronchetti 2009); windows overlap by half.
 _BIWEIGHT, _OVERLAP = 4.685, 1.5
 _ROUNDS = 8
@@ -33,8 +42,8 @@ class PairFit:
 
     `factor`: counted units per metre, negative where the counter falls; `lag_s`: the counter's stamp of a moment minus
     the GNSS's; sigmas of both (inf: not told). `halves`: factor and lag of the first and the second half alone.
-    `constant`: share of windows that agree on the factor. `reason`: why the factor is not told; `clocks`: of the
-    coarse search.
+    `constant`: share of windows that agree on the factor. `reason`: why the factor is not told.
+    `shifted`: the lag is one of the clocks, found by the whole journey's speed; `clock_reason`: why that told nothing.
     """
 
     factor: float = float("nan")
@@ -46,7 +55,8 @@ class PairFit:
     windows: int = 0
     reason: str = ""
     stands: bool = False
-    clocks: Clocks = field(default_factory=Clocks)
+    shifted: bool = False
+    clock_reason: str = ""
 
     @property
     def told(self) -> bool:
@@ -87,25 +97,85 @@ class _Windows:
 def fit_pair(gnss: Places, counter: Course) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     spans = [(float(one.t_s[0]), float(one.t_s[-1])) for one in (gnss, counter)]
-    clocks = compare_clocks(spans[0], gnss.speed, spans[1], counter.speed)
-    lag_s, found = clocks.lag_s, PairFit(clocks=clocks)
+    possible = possible_lags(spans[0], gnss.speed, spans[1], counter.speed)
+    coarse_s, clock_reason = _clock_lag(gnss, counter, possible)
+    lag_s, found = coarse_s, PairFit()
     for _ in range(2):
-        found = _fitted(gnss, counter, lag_s, clocks)
-        if not found.lag_told or abs(found.lag_s - lag_s) > 8.0:
+        found = _fitted(gnss, counter, lag_s)
+        if not found.lag_told or abs(found.lag_s - coarse_s) > 5.0:
             break
         lag_s = found.lag_s
-    return found
+    if coarse_s and abs(found.lag_s - coarse_s) > 5.0:
+        found = replace(found, lag_s=coarse_s)
+    return replace(found, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
 
-def _fitted(gnss: Places, counter: Course, lag_s: float, clocks: Clocks) -> PairFit:
+def _clock_lag(gnss: Places, counter: Course, possible: Candidates) -> tuple[float, str]:
+    """The lag of the clocks that makes the speeds agree, 0 where they do as recorded; and why none is told.
+
+    A fault of one of both leaves part of the journey that agrees, and with it the right lag ahead of all others.
+    """
+    if possible.reason:
+        return 0.0, possible.reason
+    as_recorded = _agreement(gnss, counter, 0.0, 0.0)
+    if as_recorded >= _SURELY:
+        return 0.0, ""
+    rated = _rated(gnss, counter, possible)
+    if not rated or not _beats(rated[0][0], as_recorded):
+        alike = as_recorded >= _ALIKE
+        return 0.0, "" if alike else "no shift of the clocks makes the speeds agree"
+    if len(rated) > 1 and rated[0][0] - rated[1][0] < _RIVAL:
+        return 0.0, "several shifts of the clocks make the speeds agree"
+    return rated[0][1], ""
+
+
+def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[float, float]]:
+    """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
+    found: list[tuple[float, float]] = []
+    for first_s in possible.lags_s:
+        best = _agreement(gnss, counter, first_s, _LEAST_OVERLAP), first_s
+        for step_s in _CLIMB_S:
+            near = [best[1] - step_s, best[1] + step_s]
+            best = max(best, *((_agreement(gnss, counter, lag_s, _LEAST_OVERLAP), lag_s) for lag_s in near))
+        found.append(best)
+    found.sort(reverse=True)
+    apart = [one for one in found if one == found[0] or abs(one[1] - found[0][1]) > _SAME_S]
+    return [one for one in apart if abs(one[1]) > _ZERO_S]
+
+
+def _beats(share: float, other: float) -> bool:
+    return share >= _ALIKE and share - other >= _MORE and 1.0 - share <= _LESS * (1.0 - other)
+
+
+def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float) -> float:
+    """Share of the moving time in which both speeds agree at this lag; 0 where they have too little in common."""
+    begin_s = max(gnss.t_s[0], counter.t_s[0] - lag_s)
+    end_s = min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
+    shorter_s = min(gnss.t_s[-1] - gnss.t_s[0], counter.t_s[-1] - counter.t_s[0])
+    if end_s - begin_s < max(least_overlap * shorter_s, 20.0):
+        return 0.0
+    grid = np.linspace(begin_s, end_s, int(np.clip(end_s - begin_s, 20, 800)))
+    one, other = gnss.speed(grid), np.abs(counter.speed(grid + lag_s))
+    known = np.isfinite(one) & np.isfinite(other)
+    one, other = one[known], other[known]
+    bounds = _SLOW_SHARE * _usual(one), _SLOW_SHARE * _usual(other)
+    both = (one > bounds[0]) & (other > bounds[1])
+    if both.sum() < _LEAST_WINDOWS:
+        return 0.0
+    usual, factor = bounds[0] / _SLOW_SHARE, float(np.median(other[both] / one[both]))
+    moves = (one > bounds[0]) | (other > bounds[1])
+    return float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * usual)[moves]))
+
+
+def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
     begin_s = max(gnss.t_s[0], counter.t_s[0] - lag_s)
     end_s = min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_S[0]:
-        return PairFit(reason="nothing in common", clocks=clocks)
+        return PairFit(reason="nothing in common")
     windows, stands = _windows(gnss, counter, begin_s, end_s, lag_s)
     if windows.gnss_m.size < _LEAST_WINDOWS:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
-        return PairFit(reason=reason, stands=stands, clocks=clocks)
+        return PairFit(reason=reason, stands=stands)
     ratio = np.abs(windows.counted) / windows.gnss_m
     usual = float(np.median(ratio))
     agrees = np.abs(np.log(ratio / usual)) < _AGREES
@@ -119,7 +189,6 @@ def _fitted(gnss: Places, counter: Course, lag_s: float, clocks: Clocks) -> Pair
         halves=_halves(windows, usual, sign, lag_s),
         constant=float(agrees.mean()),
         windows=ratio.size,
-        clocks=clocks,
     )
 
 

@@ -8,9 +8,9 @@ import polars as pl
 from pipeline.plausibility.check import Check, State, fits, not_checked
 from pipeline.plausibility.corrections import correction
 from pipeline.plausibility.course import Places, places_of, seconds_since
-from pipeline.plausibility.frames import SLIPS, datum_of
+from pipeline.plausibility.frames import SLIPS, Datum, datums_at
 from pipeline.plausibility.reference import PlaceFit, common_lag, fit_places
-from pipeline.plausibility.survey import SurveyFit, fit_survey, line_of
+from pipeline.plausibility.survey import Line, SurveyFit, fit_survey, line_of
 from pipeline.plausibility.witnesses import Lag
 from pipeline.track.geodesy import earth_centred_m, points_of
 from schemas.arrays import Floats
@@ -20,8 +20,8 @@ from schemas.run import Site
 _REFERENCE = "places of the reference against the positions"
 _SURVEY = "positions against the survey"
 _HEIGHTS = "heights against the survey"
-# A lag of positions explains them if so many agree then, and so many more than as recorded.
-_EXPLAINS, _MORE = 0.8, 0.3
+# A lag explains places if so many agree then, and so many less do not than as recorded.
+_EXPLAINS, _LESS = 0.5, 0.6
 # A shift explains positions beside the track if it leaves at most this share of the distance.
 _LEAVES, _SHARE = 0.5, 0.75
 # Named datums are so far from WGS 84 at least, the least known to within some metres.
@@ -43,7 +43,7 @@ def reference_lag(
     found = fit_places(gnss, record)
     if found.reason:
         return Lag("reference", reason=found.reason), [_elsewhere(gnss, record, found)]
-    explains = found.agreeing >= _EXPLAINS and found.agreeing >= found.as_recorded + _MORE
+    explains = found.agreeing >= _EXPLAINS and 1.0 - found.agreeing <= _LESS * (1.0 - found.as_recorded)
     told = abs(found.lag_s) > max(config.fit_lag_told_s, 5.0 * found.lag_sigma_s)
     small = abs(found.lag_s) <= config.fit_lag_limit_s and found.agreeing >= _EXPLAINS
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=told and (explains or small))
@@ -112,7 +112,8 @@ def survey_checks(gnss: Places, site: Site, vehicle: Vehicle, config: IngestConf
     found = fit_survey(gnss, line_of(site.track))
     if found.far_m > 2_000.0:
         return [_far(found)]
-    checks = [_beside(found, gnss, config)]
+    found, datum = _by_datum(found, gnss, line_of(site.track), config)
+    checks = [_beside(found, datum, config)]
     if np.isfinite(found.up_m):
         checks.append(_heights(found, vehicle))
     return checks
@@ -134,24 +135,44 @@ def _exchange(exchanged: bool) -> tuple[str, str] | None:
     return ("latitude_deg", "longitude_deg") if exchanged else None
 
 
-def _beside(found: SurveyFit, gnss: Places, config: IngestConfig) -> Check:
+def _by_datum(found: SurveyFit, gnss: Places, line: Line, config: IngestConfig) -> tuple[SurveyFit, Datum | None]:
+    """The datum that the survey may be in; between curves a large shift is found only from near it."""
+    if max(found.shift_m, found.aside_m) < _DATUM_M or found.aside_m < config.fit_shift_told_m:
+        return found, None
+    datums = datums_at(float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg)))
+    fits_of = [(found, one) for one in datums if _constant(found)]
+    if not _constant(found):
+        fits_of = [(fit_survey(gnss, line, (one.east_m, one.north_m)), one) for one in datums]
+    named = [
+        (fit, one) for fit, one in fits_of if _constant(fit) and one.explains(fit.east_m, fit.north_m, fit.one_heading)
+    ]
+    return min(named, key=lambda item: _off_m(*item), default=(found, None))
+
+
+def _off_m(fit: SurveyFit, datum: Datum) -> float:
+    return float(np.hypot(fit.east_m - datum.east_m, fit.north_m - datum.north_m))
+
+
+def _constant(found: SurveyFit) -> bool:
+    """Whether one shift explains most of how the positions lie beside the track."""
+    return found.left_m < _LEAVES * found.aside_m and found.share > _SHARE
+
+
+def _beside(found: SurveyFit, datum: Datum | None, config: IngestConfig) -> Check:
     words = (
         f"the survey lies {towards(found.east_m, found.north_m)} of them"
         f"{' (along the track not known: one heading)' if found.one_heading else ''}"
     )
-    constant = found.left_m < _LEAVES * found.aside_m and found.share > _SHARE
     told = found.shift_m > config.fit_shift_told_m and found.aside_m > 0.4 * config.fit_shift_told_m
-    if not told or not constant:
+    if not told or not _constant(found):
         if found.aside_m > config.fit_shift_told_m:
             return Check(_SURVEY, State.MISFIT, f"they lie {found.aside_m:.0f} m beside the track, not by one shift")
         return fits(_SURVEY, f"{found.aside_m:.1f} m beside the track usually")
-    latitude, longitude = float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg))
-    named = None
-    if found.shift_m > _DATUM_M and not found.one_heading:
-        named = datum_of(latitude, longitude, found.east_m, found.north_m)
-    if named is not None:
-        cause = f"the survey is in {named[0]}, EPSG:{named[1]}, and read as WGS 84"
-        lines = f"# epsg: {named[1]}\n"
+    if datum is not None:
+        cause = (
+            f"the survey {'may be' if found.one_heading else 'is'} in {datum.name}, EPSG:{datum.epsg}, not in WGS 84"
+        )
+        lines = f"# epsg: {datum.epsg}\n"
         advice = "Name the code in the site's track: first line of track.csv, a column epsg, or crs of GeoJSON."
         return Check(_SURVEY, State.MISFIT, words, cause, "track.csv, as its first line", lines, advice)
     lines = _shift_lines("gnss", found.east_m, found.north_m)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.plausibility.clocks import compare_clocks
+from pipeline.plausibility.clocks import possible_lags
 from pipeline.plausibility.course import Places
 from schemas.arrays import Floats, Ints
 
@@ -50,13 +50,14 @@ def fit_places(gnss: Places, record: Places) -> PlaceFit:
     if far_m > _ELSEWHERE_M:
         return PlaceFit(reason=f"it is {far_m / 1000:.0f} km from the positions")
     spans = [(float(one.t_s[0]), float(one.t_s[-1])) for one in (gnss, record)]
-    clocks = compare_clocks(spans[0], gnss.speed, spans[1], record.speed)
-    fitted = [_refined(gnss, record, lag_s) for lag_s in {0.0, clocks.lag_s, _lag_by_place(gnss, record)}]
+    possible = possible_lags(spans[0], gnss.speed, spans[1], record.speed).lags_s
+    fitted = [_refined(gnss, record, lag_s) for lag_s in dict.fromkeys((0.0, *possible, _lag_by_place(gnss, record)))]
     told = [one for one in fitted if not one.reason]
     if not told:
         return fitted[0]
     # As recorded wins a tie: a shift of the clock has to explain more.
-    return max(told, key=lambda one: one.agreeing - (0.1 if abs(one.lag_s) > 2.0 else 0.0))
+    best = max(told, key=lambda one: one.agreeing - (0.1 if abs(one.lag_s) > 2.0 else 0.0))
+    return replace(best, as_recorded=0.0 if fitted[0].reason else fitted[0].as_recorded)
 
 
 def _lag_by_place(gnss: Places, record: Places) -> float:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.plausibility.course import Places
 from pipeline.plausibility.frames import SLIPS, Slip
-from pipeline.track.geodesy import points_of
+from pipeline.track.geodesy import Points, points_of
 from pipeline.track.survey import Track, track_of
 from schemas.arrays import Floats
 
@@ -98,8 +98,8 @@ def _line(key: _Key) -> Line:
     return Line(points, np.concatenate(along), np.concatenate(heights), cKDTree(points))
 
 
-def fit_survey(gnss: Places, line: Line) -> SurveyFit:
-    """Where the positions lie to the track, and what would bring them onto it."""
+def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
+    """Where the positions lie to the track, and what would bring them onto it; `start_m`: a shift to begin with."""
     moving = np.flatnonzero(np.nan_to_num(gnss.speed(gnss.t_s)) > _MOVES_MPS)
     rows = moving if moving.size >= 20 else np.arange(gnss.t_s.size)
     rows = rows[:: max(1, rows.size // _MOST)]
@@ -107,7 +107,7 @@ def fit_survey(gnss: Places, line: Line) -> SurveyFit:
     far_m = _usual_distance_m(latitude, longitude, line)
     if far_m > _FAR_M:
         return SurveyFit(far_m, _slip_of(latitude, longitude, line))
-    return _shifted(latitude, longitude, gnss.height_m[rows], far_m, line)
+    return _shifted(latitude, longitude, gnss.height_m[rows], far_m, line, start_m)
 
 
 def _usual_distance_m(latitude_deg: Floats, longitude_deg: Floats, line: Line) -> float:
@@ -123,12 +123,14 @@ def _slip_of(latitude_deg: Floats, longitude_deg: Floats, line: Line) -> Slip | 
     return SLIPS[best] if distances[best] < _FAR_M / 4 else None
 
 
-def _shifted(latitude: Floats, longitude: Floats, height: Floats, far_m: float, line: Line) -> SurveyFit:
+def _shifted(
+    latitude: Floats, longitude: Floats, height: Floats, far_m: float, line: Line, start_m: tuple[float, float]
+) -> SurveyFit:
     """The constant shift, by repeated projection and robust regression on the directions across the track."""
     points = points_of(latitude, longitude)
     axes = np.stack([points.east, points.north], axis=1)
-    shift, narrow = np.zeros(2), False
-    first: Floats | None = None
+    shift, narrow = np.array(start_m), False
+    aside_m = _aside_m(points, axes, line)
     apart, nearest = np.zeros(latitude.size), np.zeros(latitude.size, dtype=np.int64)
     for _ in range(_ROUNDS):
         moved = points.surface + np.einsum("ijk,j->ik", axes, shift)
@@ -136,25 +138,32 @@ def _shifted(latitude: Floats, longitude: Floats, height: Floats, far_m: float, 
         along = np.einsum("ijk,ik->ij", axes, line.along[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
         apart = np.einsum("ij,ij->i", np.einsum("ijk,ik->ij", axes, line.places_m[nearest] - points.surface), across)
-        first = apart if first is None else first
         shift, narrow = _regressed(across, apart, shift)
         apart = apart - across @ shift
     spread_m = 1.4826 * float(np.median(np.abs(apart)))
     up = line.height_m[nearest] - height
     ratio = np.where(np.abs(line.height_m[nearest]) > 30.0, height / line.height_m[nearest], np.nan)
-    assert first is not None
     return SurveyFit(
         far_m=far_m,
         east_m=float(shift[0]),
         north_m=float(shift[1]),
         up_m=_median(up),
-        aside_m=float(np.median(np.abs(first))),
+        aside_m=aside_m,
         left_m=float(np.median(np.abs(apart))),
         share=float(np.mean(np.abs(apart) < 3.0 * spread_m + 3.0)),
         sigma_m=spread_m,
         one_heading=narrow,
         height_ratio=_median(ratio),
     )
+
+
+def _aside_m(points: Points, axes: Floats, line: Line) -> float:
+    """Usual distance beside the track as recorded."""
+    nearest = line.tree.query(points.surface)[1]
+    along = np.einsum("ijk,ik->ij", axes, line.along[nearest])
+    off = np.einsum("ijk,ik->ij", axes, line.places_m[nearest] - points.surface)
+    size = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
+    return float(np.median(np.abs(off[:, 1] * along[:, 0] - off[:, 0] * along[:, 1]) / size))
 
 
 def _regressed(across: Floats, apart: Floats, shift: Floats) -> tuple[Floats, bool]:
