@@ -139,7 +139,7 @@ def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[fl
             best = max(best, *((_agreement(gnss, counter, lag_s, _LEAST_OVERLAP), lag_s) for lag_s in near))
         found.append(best)
     found.sort(reverse=True)
-    apart = [one for one in found if one == found[0] or abs(one[1] - found[0][1]) > _SAME_S]
+    apart = found[:1] + [one for one in found[1:] if abs(one[1] - found[0][1]) > _SAME_S]
     return [one for one in apart if abs(one[1]) > _ZERO_S]
 
 
