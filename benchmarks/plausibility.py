@@ -67,12 +67,12 @@ def _says(check: Check, wrong: Wrong) -> bool:
 
 
 def faulty(count: int, first: int = 0) -> Iterator[tuple[int, Trip, Fit | str, float]]:
-    """Plausible runs with faults in them: seed, trip, fit and seconds."""
+    """Plausible runs with faults in them: seed, trip, fit and seconds of the processor."""
     for seed in range(first, first + count):
         drawn = trip(10_000 + seed)
-        begun = time.perf_counter()
+        begun = time.process_time()
         fit = fit_of(drawn.run, drawn.site)
-        yield seed, drawn, fit, time.perf_counter() - begun
+        yield seed, drawn, fit, time.process_time() - begun
 
 
 def measure(_: Path) -> list[Figure]:

@@ -95,6 +95,13 @@ def _horizontal(moved: Floats, recorded: Floats) -> Check:
     ]
     best = int(np.argmin(misfits))
     if misfits[0] > _FITS and misfits[best] > _FITS:
+        middle = size.size // 2
+        halves = [
+            np.median(np.linalg.norm(recorded[part, :2] / ratio - moved[part], axis=1) / size[part])
+            for part in (slice(middle), slice(middle, None))
+        ]
+        if min(halves) <= _FITS:
+            return fits(WHAT, "they agree in one half of the run")
         found = f"they point elsewhere, by {misfits[0]:.0%} of the speed"
         return Check(WHAT, State.MISFIT, found, "latitude and longitude may be exchanged, or the axes are of the train")
     arrangement = (

@@ -12,7 +12,7 @@ from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, fits, not_checked
 from pipeline.plausibility.corrections import correction
 from pipeline.plausibility.counter import sign_check, turn_check
-from pipeline.plausibility.course import Places, distance_course, places_of, speed_course
+from pipeline.plausibility.course import Course, Places, distance_course, places_of, speed_course
 from pipeline.plausibility.pairs import PairFit, fit_pair
 from pipeline.plausibility.places import reads_lag, reference_lag, survey_checks
 from pipeline.plausibility.witnesses import Lag, lag_checks
@@ -60,11 +60,12 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
         return Fit(tuple(surveyed))
     several = solution if len(run.solutions()) > 1 else None
     streams = [name for name in ("gnss", "satellites", "odometer", "reference") if run.stream(name) is not None]
-    checks, lags = _odometer(run, gnss, epoch_ns, vehicle, config)
+    lag, of_reference = None, []
     if run.reference is not None and run.reference.height:
-        lag, more = reference_lag(gnss, run.reference, epoch_ns, config)
-        lags.append(lag)
-        checks += more
+        lag, of_reference = reference_lag(gnss, run.reference, epoch_ns, config)
+    checks, lags = _odometer(run, gnss, epoch_ns, vehicle, config, lag)
+    lags += [] if lag is None else [lag]
+    checks += of_reference
     if run.balise_reads is not None and run.balise_reads.height and site is not None:
         lags.append(reads_lag(gnss, run.balise_reads, site, epoch_ns))
     checks += velocity_checks(fixes, gnss, epoch_ns)
@@ -73,7 +74,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
 
 
 def _odometer(
-    run: RunLog, gnss: Places, epoch_ns: int, vehicle: Vehicle, config: IngestConfig
+    run: RunLog, gnss: Places, epoch_ns: int, vehicle: Vehicle, config: IngestConfig, reference: Lag | None
 ) -> tuple[list[Check], list[Lag]]:
     """Units, direction and clock of the odometer, and what the vehicle file says of it."""
     if run.odometer is None or run.odometer.height < 2:
@@ -89,7 +90,7 @@ def _odometer(
     checks += sign_check(distance, speed)
     if usable and counter is not None:
         checks.append(turn_check(gnss, counter, main.lag_s))
-        checks += _vehicle_checks(main, vehicle)
+        checks += _vehicle_checks(main, _by_reference(run, counter, reference, epoch_ns), reference, vehicle)
     return checks, [_odometer_lag(main, vehicle, config)]
 
 
@@ -142,14 +143,29 @@ def _scale_sigma(pair: PairFit) -> float:
     return max(2.0 * pair.factor_sigma / pair.factor**2, 2e-4)
 
 
-def _vehicle_checks(pair: PairFit, vehicle: Vehicle) -> list[Check]:
-    """Scale and latency of the vehicle file against what the run shows."""
+def _by_reference(run: RunLog, counter: Course, lag: Lag | None, epoch_ns: int) -> PairFit | None:
+    """The odometer against the reference, which no GNSS drift is in; None where it has none in its own time."""
+    if run.reference is None or lag is None or lag.reason:
+        return None
+    places = places_of(run.reference, epoch_ns)
+    found = None if places is None else fit_pair(places, counter)
+    return found if found is not None and found.told else None
+
+
+def _vehicle_checks(
+    pair: PairFit, by_reference: PairFit | None, reference: Lag | None, vehicle: Vehicle
+) -> list[Check]:
+    """Scale and latency of the vehicle file against what the run shows.
+
+    Where there is a reference it has to contradict the file too: else it is the positions that drift.
+    """
     checks: list[Check] = []
     if vehicle.odometer_scale is not None:
         what, scale = "odometer scale of the vehicle file", 1.0 / abs(pair.factor)
         least = max(_FILE_SCALE, _FILE_SIGMAS * (vehicle.odometer_scale_sigma or 0.0))
         found = f"{vehicle.odometer_scale:.4f}, the run shows {scale:.4f} (sigma {_scale_sigma(pair) / 2:.4f})"
-        if pair.other_factor(1.0 / vehicle.odometer_scale, least):
+        contradicts = pair.other_factor(1.0 / vehicle.odometer_scale, least)
+        if contradicts and (by_reference is None or by_reference.other_factor(1.0 / vehicle.odometer_scale, least)):
             lines = f"odometer_scale = {scale:.4f}\nodometer_scale_sigma = {_scale_sigma(pair):.4f}\n"
             checks.append(_wrong_file(what, found, lines))
         else:
@@ -160,7 +176,9 @@ def _vehicle_checks(pair: PairFit, vehicle: Vehicle) -> list[Check]:
             return [*checks, not_checked(what, "the speed changes too little")]
         least_s = max(_FILE_LATENCY_S, _FILE_SIGMAS * (vehicle.gnss_latency_sigma_s or 0.0))
         found = f"{vehicle.gnss_latency_s:.2f} s, the run shows {-pair.lag_s:.2f} s (sigma {pair.lag_sigma_s:.2f} s)"
-        if pair.other_lag(-vehicle.gnss_latency_s, least_s):
+        known = reference is not None and not reference.reason and abs(reference.lag_s) < 10.0
+        agrees = known and reference is not None and abs(reference.lag_s + vehicle.gnss_latency_s) < least_s
+        if pair.other_lag(-vehicle.gnss_latency_s, least_s) and not agrees:
             sigma_s = max(2 * pair.lag_sigma_s, 0.02)
             lines = f"gnss_latency_s = {-pair.lag_s:.2f}\ngnss_latency_sigma_s = {sigma_s:.2f}\n"
             checks.append(_wrong_file(what, found, lines))

@@ -45,16 +45,16 @@ def reference_lag(
         return Lag("reference", reason=found.reason), [_elsewhere(gnss, record, found)]
     explains = found.agreeing >= _EXPLAINS and 1.0 - found.agreeing <= _LESS * (1.0 - found.as_recorded)
     told = abs(found.lag_s) > max(config.fit_lag_told_s, 5.0 * found.lag_sigma_s)
-    small = abs(found.lag_s) <= config.fit_lag_limit_s and found.agreeing >= _EXPLAINS
+    small = abs(found.lag_s) <= config.fit_lag_limit_s and found.agreeing >= _EXPLAINS and found.lag_is_steady
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=told and (explains or small))
     words = f"{towards(found.east_m, found.north_m)} of them"
     if found.agreeing < _EXPLAINS:
         return lag, [not_checked(_REFERENCE, "no one lag or shift explains them; the positions may be wrong")]
-    if found.shift_m <= config.fit_shift_told_m:
+    if found.shift_m <= config.fit_shift_told_m or not found.shift_is_steady:
         return lag, [fits(_REFERENCE, words)]
-    lines = _shift_lines("reference", -found.east_m, -found.north_m)
-    cause = "another datum, or a fixed offset between both antennas"
-    return lag, [Check(_REFERENCE, State.MISFIT, words, cause, "the configuration", lines)]
+    # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
+    cause, advice = "another datum, or a fixed offset between both antennas", "Find out which of both is off."
+    return lag, [Check(_REFERENCE, State.MISFIT, words, cause, advice=advice)]
 
 
 def _elsewhere(gnss: Places, record: Places, found: PlaceFit) -> Check:
@@ -155,7 +155,7 @@ def _off_m(fit: SurveyFit, datum: Datum) -> float:
 
 def _constant(found: SurveyFit) -> bool:
     """Whether one shift explains most of how the positions lie beside the track."""
-    return found.left_m < _LEAVES * found.aside_m and found.share > _SHARE
+    return found.left_m < _LEAVES * found.aside_m and found.share > _SHARE and found.shift_is_steady
 
 
 def _beside(found: SurveyFit, datum: Datum | None, config: IngestConfig) -> Check:
@@ -194,7 +194,7 @@ def _shift_lines(stream: str, east_m: float, north_m: float) -> str:
 def _heights(found: SurveyFit, vehicle: Vehicle) -> Check:
     up_m = found.up_m + vehicle.antenna_height_m
     words = f"the survey lies {up_m:.0f} m above them"
-    if abs(up_m) <= _HEIGHT_TOLD_M:
+    if abs(up_m) <= _HEIGHT_TOLD_M or not found.up_is_steady:
         return fits(_HEIGHTS, words)
     if abs(found.height_ratio * _FOOT_M - 1.0) < 0.03:
         lines = correction("gnss", {"height_m": _FOOT_M})

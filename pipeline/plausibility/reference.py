@@ -30,7 +30,8 @@ class PlaceFit:
     """How a record of places fits the GNSS: `lag_s` is its stamp of a moment minus the GNSS's.
 
     `east_m`, `north_m`: the record's place minus the GNSS's. `agreeing`: share of moving epochs that agree then, and
-    `as_recorded` as they are. `reason`: why nothing is told.
+    `as_recorded` as they are. `halves`: lag, east and north of the first and the second half alone. `reason`: why
+    nothing is told.
     """
 
     lag_s: float = 0.0
@@ -39,11 +40,23 @@ class PlaceFit:
     north_m: float = 0.0
     agreeing: float = 0.0
     as_recorded: float = 0.0
+    halves: tuple[tuple[float, float, float], ...] = ()
     reason: str = ""
 
     @property
     def shift_m(self) -> float:
         return float(np.hypot(self.east_m, self.north_m))
+
+    @property
+    def lag_is_steady(self) -> bool:
+        """Whether both halves show the lag: a drift of the positions is none."""
+        return all(lag_s * self.lag_s > 0.5 * self.lag_s**2 for lag_s, _, _ in self.halves)
+
+    @property
+    def shift_is_steady(self) -> bool:
+        """Whether both halves show the shift."""
+        toward = [east_m * self.east_m + north_m * self.north_m for _, east_m, north_m in self.halves]
+        return all(one > 0.5 * self.shift_m**2 for one in toward)
 
 
 def fit_places(gnss: Places, record: Places) -> PlaceFit:
@@ -112,7 +125,10 @@ def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
     bound = _AGREES_M + 0.3 * np.linalg.norm(velocity, axis=1)
     agreeing, before = float(np.mean(left < bound)), float(np.mean(np.linalg.norm(apart, axis=1) < bound))
     # The record is ahead by `rest_s` of way at its stamp: it stamps a place so much too early.
-    return PlaceFit(lag_s - rest_s, sigma_s, float(shift[0]), float(shift[1]), agreeing, before)
+    middle = len(apart) // 2
+    parts = [_regressed(velocity[part], apart[part]) for part in (slice(middle), slice(middle, None))]
+    halves = tuple((lag_s - rest, float(moved[0]), float(moved[1])) for rest, moved, _ in parts)
+    return PlaceFit(lag_s - rest_s, sigma_s, float(shift[0]), float(shift[1]), agreeing, before, halves)
 
 
 def _regressed(velocity: Floats, apart: Floats) -> tuple[float, Floats, float]:

@@ -40,7 +40,8 @@ class SurveyFit:
     """How positions lie to the track; shifts [m] are the survey's place minus the positions'.
 
     `aside_m`: usual distance beside the track as recorded, `left_m`: with the shift; `share`: of positions within
-    `left_m` and some metres then. `one_heading`: the shift along the track is not known.
+    `left_m` and some metres then. `one_heading`: the shift along the track is not known. Steady is what both halves of
+    the run show: a drift of the positions is no shift.
     """
 
     far_m: float
@@ -54,6 +55,8 @@ class SurveyFit:
     sigma_m: float = 0.0
     one_heading: bool = False
     height_ratio: float = float("nan")
+    shift_is_steady: bool = True
+    up_is_steady: bool = True
 
     @property
     def shift_m(self) -> float:
@@ -139,7 +142,9 @@ def _shifted(
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
         apart = np.einsum("ij,ij->i", np.einsum("ijk,ik->ij", axes, line.places_m[nearest] - points.surface), across)
         shift, narrow = _regressed(across, apart, shift)
-        apart = apart - across @ shift
+        toward = (across @ shift) * apart
+    steady = all(np.sum(part[0]) > 0.5 * np.sum(part[1]) for part in _halves(toward, (across @ shift) ** 2))
+    apart = apart - across @ shift
     spread_m = 1.4826 * float(np.median(np.abs(apart)))
     up = line.height_m[nearest] - height
     ratio = np.where(np.abs(line.height_m[nearest]) > 30.0, height / line.height_m[nearest], np.nan)
@@ -154,6 +159,8 @@ def _shifted(
         sigma_m=spread_m,
         one_heading=narrow,
         height_ratio=_median(ratio),
+        shift_is_steady=bool(steady),
+        up_is_steady=all(_median(part[0]) * _median(up) > 0.5 * _median(up) ** 2 for part in _halves(up, up)),
     )
 
 
@@ -177,6 +184,11 @@ def _regressed(across: Floats, apart: Floats, shift: Floats) -> tuple[Floats, bo
         right = across.T @ (weight * apart) / weight.sum()
         shift = vectors[:, known] @ ((vectors[:, known].T @ right) / values[known])
     return shift, bool((~known).any())
+
+
+def _halves(one: Floats, other: Floats) -> list[tuple[Floats, Floats]]:
+    middle = one.size // 2
+    return [(one[:middle], other[:middle]), (one[middle:], other[middle:])]
 
 
 def _median(values: Floats) -> float:

@@ -97,6 +97,9 @@ def _small(what: str, found: str, lag: Lag) -> Check:
     if lag.stream == "odometer" and latency_s > 0:
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
         return Check(what, State.MISFIT, found, "positions arrive too old", "the vehicle file", lines)
-    cause = f"the {NAMES[lag.stream]} is stamped {'too late' if latency_s < 0 else 'too early'}, or the GNSS is not"
+    cause = f"one of both is stamped {'too late' if latency_s < 0 else 'too early'}, or the positions are off"
+    if lag.stream == "reference":
+        # The judge believes the reference: nobody should shift it to where the positions want it.
+        return Check(what, State.MISFIT, found, cause, advice="Find out which clock is wrong before one is corrected.")
     lines = correction(lag.stream, shift_s=latency_s)
     return Check(what, State.MISFIT, found, cause, "the configuration", lines)
