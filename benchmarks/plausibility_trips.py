@@ -36,7 +36,7 @@ def trip(seed: int, faulty: bool = True, place: tuple[float, float] | None = Non
     rng = np.random.default_rng([7, seed])
     hours = float(rng.choice([0.1, 0.2, 0.4, 1.0, 2.0], p=[0.3, 0.3, 0.2, 0.12, 0.08]))
     speed, stops, reverses = _speeds(rng, hours)
-    t_s = np.arange(speed.size) * _TICK_S
+    t_s: Floats = np.arange(speed.size, dtype=np.float64) * _TICK_S
     way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * _TICK_S])
     line = _Line.drawn(rng, float(way.min()) - 500.0, float(way.max()) + 500.0)
     line = line if place is None else replace(line, latitude_deg=place[0], longitude_deg=place[1])
@@ -58,7 +58,7 @@ def trip(seed: int, faulty: bool = True, place: tuple[float, float] | None = Non
 def _speeds(rng: np.random.Generator, hours: float) -> tuple[Floats, int, bool]:
     """Speed every 0.1 s [m/s]: cruises that waver, stops, perhaps a reversal."""
     wanted = int(hours * 3600 / _TICK_S)
-    parts, size, now, stops, sense, reverses = [np.zeros(int(rng.uniform(50, 600)))], 0, 0.0, 0, 1.0, False
+    parts, size, now, stops, sense = [np.zeros(int(rng.uniform(50, 600)))], 0, 0.0, 0, 1.0
     while size < wanted:
         target = float(rng.uniform(8.0, 60.0)) if rng.random() < 0.7 or now == 0.0 else 0.0
         steps = max(int(abs(target - now) / float(rng.uniform(0.3, 1.0)) / _TICK_S), 1)
@@ -67,11 +67,11 @@ def _speeds(rng: np.random.Generator, hours: float) -> tuple[Floats, int, bool]:
         parts += [sense * np.linspace(now, target, steps), sense * (target + waver)]
         if target == 0.0:
             stops += 1
-            turns = rng.random() < 0.15
-            reverses, sense = reverses or turns, -sense if turns else sense
+            sense = -sense if rng.random() < 0.15 else sense
         size, now = size + steps + hold, target
     parts += [sense * np.linspace(now, 0.0, int(now / 0.7 / _TICK_S) + 1), np.zeros(300)]
-    return np.concatenate(parts), stops, reverses
+    speed = np.concatenate(parts)
+    return speed, stops, bool((speed > 1.0).any() and (speed < -1.0).any())
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class _Line:
 
 
 def _meridian_m(latitude_deg: float) -> float:
-    return 6_335_439.0 / (1 - 0.00669438 * np.sin(np.radians(latitude_deg)) ** 2) ** 1.5
+    return float(6_335_439.0 / (1 - 0.00669438 * np.sin(np.radians(latitude_deg)) ** 2) ** 1.5)
 
 
 def _normal_m(latitude_deg: Floats) -> Floats:

@@ -130,7 +130,10 @@ _LAGS = {
     "1024 weeks": 619_315_200.0,
     "1 h and GPS time": 3618.0,
 }
-_O, _G, _R, _B = "odometer", "gnss", "reference", "balise_reads"
+_O: Stream = "odometer"
+_G: Stream = "gnss"
+_R: Stream = "reference"
+_B: Stream = "balise_reads"
 
 
 # A place in the middle of the area in which each is used.

@@ -14,6 +14,8 @@ _TURNS = "direction of the counter where the train reverses"
 # A stand in between, and the way before and after it that tells the heading.
 _STANDS_MPS, _HEADING_S, _HEADING_M = 0.7, 20.0, 40.0
 _OPPOSITE = 0.7
+# The counter gains what the positions move, but for this share.
+_SAME_WAY = 0.3
 # The same sign in so many windows is a constant one.
 _ALWAYS = 0.9
 
@@ -42,8 +44,8 @@ def sign_check(distance: Course | None, speed: Course | None) -> list[Check]:
     return [fits(_SIGNS, "the same")]
 
 
-def turn_check(gnss: Places, counter: Course, lag_s: float) -> Check:
-    """Whether the counter turns where the train does."""
+def turn_check(gnss: Places, counter: Course, factor: float, lag_s: float) -> Check:
+    """Whether the counter turns where the train does; stands beside a jump of the position tell nothing."""
     grid = np.arange(gnss.t_s[0], gnss.t_s[-1], 1.0)
     firsts, lasts = runs_of(gnss.speed(grid) < _STANDS_MPS)
     ends = grid[firsts], grid[lasts]
@@ -51,10 +53,14 @@ def turn_check(gnss: Places, counter: Course, lag_s: float) -> Check:
     sizes = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         cosine = np.einsum("ij,ij->i", before, after) / (sizes[0] * sizes[1])
-        product = counter.gained(ends[0] - _HEADING_S + lag_s, ends[0] + lag_s) * counter.gained(
-            ends[1] + lag_s, ends[1] + _HEADING_S + lag_s
+        gained = (
+            counter.gained(ends[0] - _HEADING_S + lag_s, ends[0] + lag_s) / factor,
+            counter.gained(ends[1] + lag_s, ends[1] + _HEADING_S + lag_s) / factor,
         )
-        told = (sizes[0] > _HEADING_M) & (sizes[1] > _HEADING_M) & np.isfinite(cosine) & (np.abs(product) > 0)
+        product = gained[0] * gained[1]
+        told = np.isfinite(cosine) & (sizes[0] > _HEADING_M) & (sizes[1] > _HEADING_M)
+        for size, way in zip(sizes, gained, strict=True):
+            told &= np.abs(np.abs(way) - size) < _SAME_WAY * size
         reversal, onward = told & (cosine < -_OPPOSITE), told & (cosine > _OPPOSITE)
     wrong = int((reversal & (product > 0)).sum()), int((onward & (product < 0)).sum())
     if wrong[0] and wrong[0] == reversal.sum():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import polars as pl
@@ -60,7 +60,8 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
         return Fit(tuple(surveyed))
     several = solution if len(run.solutions()) > 1 else None
     streams = [name for name in ("gnss", "satellites", "odometer", "reference") if run.stream(name) is not None]
-    lag, of_reference = None, []
+    lag: Lag | None = None
+    of_reference: list[Check] = []
     if run.reference is not None and run.reference.height:
         lag, of_reference = reference_lag(gnss, run.reference, epoch_ns, config)
     checks, lags = _odometer(run, gnss, epoch_ns, vehicle, config, lag)
@@ -89,8 +90,8 @@ def _odometer(
     counter = distance if distance is not None and (not usable or usable[0][0] == "distance") else speed
     checks += sign_check(distance, speed)
     if usable and counter is not None:
-        checks.append(turn_check(gnss, counter, main.lag_s))
-        checks += _vehicle_checks(main, _by_reference(run, counter, reference, epoch_ns), reference, vehicle)
+        checks.append(turn_check(gnss, counter, main.factor, main.lag_s))
+        checks += _vehicle_checks(main, lambda: _by_reference(run, counter, reference, epoch_ns), reference, vehicle)
     return checks, [_odometer_lag(main, vehicle, config)]
 
 
@@ -153,7 +154,7 @@ def _by_reference(run: RunLog, counter: Course, lag: Lag | None, epoch_ns: int) 
 
 
 def _vehicle_checks(
-    pair: PairFit, by_reference: PairFit | None, reference: Lag | None, vehicle: Vehicle
+    pair: PairFit, by_reference: Callable[[], PairFit | None], reference: Lag | None, vehicle: Vehicle
 ) -> list[Check]:
     """Scale and latency of the vehicle file against what the run shows.
 
@@ -164,8 +165,9 @@ def _vehicle_checks(
         what, scale = "odometer scale of the vehicle file", 1.0 / abs(pair.factor)
         least = max(_FILE_SCALE, _FILE_SIGMAS * (vehicle.odometer_scale_sigma or 0.0))
         found = f"{vehicle.odometer_scale:.4f}, the run shows {scale:.4f} (sigma {_scale_sigma(pair) / 2:.4f})"
-        contradicts = pair.other_factor(1.0 / vehicle.odometer_scale, least)
-        if contradicts and (by_reference is None or by_reference.other_factor(1.0 / vehicle.odometer_scale, least)):
+        factor = 1.0 / vehicle.odometer_scale
+        other = by_reference() if pair.other_factor(factor, least) else pair
+        if other is None or other.other_factor(factor, least):
             lines = f"odometer_scale = {scale:.4f}\nodometer_scale_sigma = {_scale_sigma(pair):.4f}\n"
             checks.append(_wrong_file(what, found, lines))
         else:

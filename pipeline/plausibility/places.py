@@ -31,6 +31,8 @@ _HEIGHT_TOLD_M, _GEOID_M = 12.0, 107.0
 _FOOT_M = 0.3048
 # A balise is read where the train is within so much of it.
 _READ_M = 60.0
+# So many reads agree on a lag, within so much [s]; a shorter one may be positions that are off by 150 m [s].
+_READ_SHARE, _READ_AGREES_S, _READ_LEAST_S = 0.7, 1.0, 12.0
 
 
 def reference_lag(
@@ -87,10 +89,11 @@ def reads_lag(gnss: Places, reads: pl.DataFrame, site: Site, epoch_ns: int) -> L
     if read < 3:
         return Lag("balise_reads", reason="fewer than three reads of balises of the site")
     lag_s = common_lag(np.array(lags))
-    if lag_s is None or len(lags) < 0.5 * read:
+    agreeing = 0 if lag_s is None else int(np.sum(np.abs(np.array(lags) - lag_s) <= _READ_AGREES_S))
+    if lag_s is None or agreeing < _READ_SHARE * read:
         return Lag("balise_reads", reason="no one lag explains the reads")
     # Epochs are up to half a second apart from the passage, and positions wrong by metres.
-    return Lag("balise_reads", lag_s, 1.0, sure=abs(lag_s) > 5.0)
+    return Lag("balise_reads", lag_s, 1.0, sure=abs(lag_s) > _READ_LEAST_S)
 
 
 def _balise_places(site: Site) -> dict[str, Floats]:
