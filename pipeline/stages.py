@@ -10,14 +10,12 @@ import polars as pl
 from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
-from pipeline.figures.bounds import threshold_factor
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
-from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
 from pipeline.matching.reference import match_reference
@@ -50,7 +48,6 @@ class _Context:
     counts: CleanCounts
     odometry: Odometry | None
     evidence: Evidence
-    factor: float
 
 
 @dataclass(frozen=True)
@@ -82,8 +79,7 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
     evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
-    factor = threshold_factor(config.monitors.false_alarm_probability)
-    return _Context(cleaned, site, vehicle, config, counts, odometry, evidence, factor)
+    return _Context(cleaned, site, vehicle, config, counts, odometry, evidence)
 
 
 def _reference_places(
@@ -181,9 +177,10 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     fixes = run.gnss.filter(pl.col("solution") == solution)
     odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, odometry, context.vehicle, config)
-    bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
+    bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config)
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
-    lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
+    scale_sigma = None if odometry is None else odometry.scale_sigma
+    lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
     monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
     seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
     return _Ride(seen, found, aligned, lds, odometry)
@@ -259,8 +256,8 @@ def _single_monitors(
     compared = on_path_of(aligned, matches[other].epochs) if other is not None and named else None
     absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
-        "along_doppler": doppler_monitor(aligned, context.config, context.factor),
-        "channel": channel_monitor(aligned, compared, context.factor, absent),
+        "along_doppler": doppler_monitor(aligned, context.config),
+        "channel": channel_monitor(aligned, compared, context.config, absent),
         "pseudorange": pseudorange_monitor(aligned, ranges, context.config),
     }
 

@@ -175,6 +175,13 @@ class AlignConfig(Settings):
     settling_tau_s: Positive = 25.0
 
 
+def threshold_factor(false_alarm_probability: float) -> float:
+    """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
+    from scipy.special import ndtri  # most commands that read a configuration test nothing
+
+    return float(-ndtri(false_alarm_probability / 2.0))
+
+
 class MonitorConfig(Settings):
     """Monitor bank (DIAG eq. 1-17; DOMAIN section 3)."""
 
@@ -206,6 +213,11 @@ class MonitorConfig(Settings):
     # The second receiver of composite fail-safety (LOC Fig. 3).
     channel_reference: str | None = None
     disabled: tuple[str, ...] = ()
+
+    @property
+    def threshold_factor(self) -> float:
+        """k_T of every monitor."""
+        return threshold_factor(self.false_alarm_probability)
 
     @field_validator("ewma_alphas")
     @classmethod

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.alignment.estimates import Estimate
+from pipeline.alignment.estimates import Estimates
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Floats
 from schemas.config import AlignConfig, Vehicle
@@ -50,15 +50,11 @@ class FilterState(NamedTuple):
     origin_m: float
     unsettled_m2: float = 0.0
 
-    def estimate(self) -> Estimate:
-        ((scale, scale_sigma, latency_s, latency_sigma_s),) = estimates_of(self.joint[None]).tolist()
-        return Estimate(scale, scale_sigma, latency_s, latency_sigma_s)
 
-
-def estimates_of(joints: Floats) -> Floats:
-    """Scale, its deviation, latency and its deviation [s] of joint states (k, states, states + 1); shape (k, 4)."""
-    means, deviations = joints[:, :, -1], np.sqrt(np.diagonal(joints, axis1=1, axis2=2))
-    return np.column_stack([1.0 + means[:, _SCALE], deviations[:, _SCALE], means[:, _LATENCY], deviations[:, _LATENCY]])
+def estimates_of(joints: Floats) -> Estimates:
+    """Scale and latency of joint states, shape (..., states, states + 1)."""
+    means, deviations = joints[..., -1], np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
+    return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,7 @@ class ScaleLatencyFilter:
     odometry: Odometry
     config: AlignConfig
 
-    def start(self, prior: Estimate, t_s: float, path_m: float) -> FilterState:
+    def start(self, prior: Estimates, t_s: float, path_m: float) -> FilterState:
         """A new state at this epoch: offset and GNSS errors unknown, scale and latency as in `prior`."""
         errors = self.shares.size
         origin_m = float(self.odometry.distance_at_s(np.array([t_s - prior.latency_s]))[0])
@@ -81,7 +77,7 @@ class ScaleLatencyFilter:
 
     def restart(self, state: FilterState, t_s: float, path_m: float, unsettled_m2: float = 0.0) -> FilterState:
         """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
-        fresh = self.start(state.estimate(), t_s, path_m)
+        fresh = self.start(estimates_of(state.joint), t_s, path_m)
         kept = slice(_SCALE, _ERRORS)
         fresh.joint[kept, kept] = state.joint[kept, kept]
         return fresh._replace(unsettled_m2=max(unsettled_m2, self._unsettled_m2(state, t_s)))
@@ -206,11 +202,11 @@ def _nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
-def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
+def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
     """Scale and latency as the vehicle file gives them, else the configured prior around 1 and 0."""
     scale_known = vehicle.odometer_scale is not None
     latency_known = vehicle.gnss_latency_s is not None
-    return Estimate(
+    return Estimates.of(
         scale=vehicle.odometer_scale if vehicle.odometer_scale is not None else 1.0,
         scale_sigma=(vehicle.odometer_scale_sigma or 0.0) if scale_known else config.scale_prior_sigma,
         latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,

@@ -9,9 +9,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
-from pipeline.lds.bank_protocol import LdsLimits
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
-from schemas.config import LdsConfig
+from schemas.config import Configuration, LdsConfig
 from schemas.enums import PassageStatus
 
 
@@ -23,7 +22,8 @@ class Journey:
     count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
     `travel`: that of the step from this epoch to the next, put back to where the train turned (for
     labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
-    segments its distance was lost. `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
+    segments its distance was lost; `scale_sigma`: of its scale, None unless a vehicle file gives both. `blind`: no
+    position for longer than a crossing is interpolated over (`gap_ns`).
     """
 
     t_ns: Ints
@@ -36,6 +36,7 @@ class Journey:
     confidence_m: Floats
     odometer_m: Floats
     segment: Ints
+    scale_sigma: float | None
     direction: Ints
     travel: Ints
     travelled_m: Floats
@@ -69,26 +70,27 @@ class Journey:
         return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
 
 
-def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Journey:
+def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> Journey:
     """Take the columns of matched and aligned epochs: the only place where the LDS reads them (see `run_lds`)."""
     t_ns = epochs["t"].dt.epoch("ns").to_numpy().astype(np.int64)
     path_m = floats(epochs, "path_m")
     fix_valid = epochs["fix_valid"].fill_null(False).to_numpy()
     positioned = fix_valid & np.isfinite(path_m)
     odometer_m = floats(epochs, "odometer_m")
-    direction, travel = _directions(odometer_m, epochs["direction"], config.odometer_fixed_m)
-    gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.crossing_gap_s) * NS_PER_S)
+    direction, travel = _directions(odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
+    gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.lds.crossing_gap_s) * NS_PER_S)
     return Journey(
         t_ns=t_ns,
         leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
         path_m=path_m,
         positioned=positioned,
         placed_nowhere=fix_valid & ~positioned,
-        refusal=_refusals(epochs, positioned, config, limits),
+        refusal=_refusals(epochs, positioned, config),
         sigma_m=floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m"),
         confidence_m=floats(epochs, "confidence_m"),
         odometer_m=odometer_m,
         segment=epochs["odometer_segment"].to_numpy().astype(np.int64),
+        scale_sigma=scale_sigma,
         direction=direction,
         travel=travel,
         travelled_m=_travelled_m(odometer_m, travel),
@@ -105,13 +107,11 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
     return blind
 
 
-def _refusals(
-    epochs: pl.DataFrame, positioned: Bools, config: LdsConfig, limits: LdsLimits
-) -> list[PassageStatus | None]:
+def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
     """Ambiguity before confidence; what is not known (null) is never taken as good."""
     on_track = epochs["on_track"].fill_null(False).to_numpy()
-    probable = floats(epochs, "gate_probability") >= limits.ambiguity_probability
-    confident = floats(epochs, "confidence_m") <= config.ci_limit_m
+    probable = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
+    confident = floats(epochs, "confidence_m") <= config.lds.ci_limit_m
     refusals: list[PassageStatus | None] = [None] * len(positioned)
     for k in np.flatnonzero(~(positioned & on_track & probable & confident)).tolist():
         if not positioned[k]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.axis import AxisSeries, decorrelation_of, error_model, with_memory
 from pipeline.odometry.odometry import Increments
 from schemas.arrays import Floats, Ints
@@ -83,5 +82,5 @@ def most_scatter_m(config: Configuration) -> float:
     With more, a position that leaves its place by the failure limit would be no more than rows of the odometer, or the
     digits, make of it. Alarms of a record that scatters by more are its own, but no failure passes.
     """
-    factor = threshold_factor(config.monitors.false_alarm_probability)
+    factor = config.monitors.threshold_factor
     return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

@@ -60,7 +60,7 @@ def blind_monitor(epochs: int, reason: str) -> pl.DataFrame:
     return judged(nothing, nothing, pl.Series([reason] * epochs, dtype=pl.String))
 
 
-def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) -> pl.DataFrame:
+def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """GNSS velocity along track against odometer speed, both over the second before [m/s].
 
     Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
@@ -93,11 +93,11 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
         .then(pl.lit(NO_POSITION))
         .otherwise(pl.lit(FIRST_EPOCH))
     ).to_series()
-    return judged(by_doppler - by_odometer, factor * np.sqrt(variance), reasons)
+    return judged(by_doppler - by_odometer, config.monitors.threshold_factor * np.sqrt(variance), reasons)
 
 
 def channel_monitor(
-    epochs: pl.DataFrame, other: pl.DataFrame | None, factor: float, absent: str = NO_OTHER_SOLUTION
+    epochs: pl.DataFrame, other: pl.DataFrame | None, config: Configuration, absent: str = NO_OTHER_SOLUTION
 ) -> pl.DataFrame:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
@@ -112,14 +112,14 @@ def channel_monitor(
     pairs = paired(epochs.select("t", path_m=placed), usable)
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
     value = floats(pairs, "path_m") - floats(met, "path_m")
-    threshold = factor * np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
+    both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
     reasons = epochs.select(
         pl.when(~pl.col("fix_valid") | ~pl.col("on_track") | pl.col("sigma_along_m").is_null())
         .then(pl.lit(NO_POSITION))
         .when(met["path_m"].is_null() | met["sigma_along_m"].is_null())
         .then(pl.lit(NO_OTHER_EPOCH))
     ).to_series()
-    return judged(value, threshold, reasons)
+    return judged(value, config.monitors.threshold_factor * both_m, reasons)
 
 
 def _window(

@@ -8,9 +8,8 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, odometer_at
-from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, Vehicle, threshold_factor
 from tests.align.straight import Straight, align_run, distance, odometry_from, run, times
 
 CONFIG = Configuration()
@@ -19,7 +18,7 @@ REAL = Straight(scale=1.004, latency_s=0.08)
 
 
 def alarms(aligned):
-    bank = MonitorBank(aligned, {}, CONFIG, FACTOR)
+    bank = MonitorBank(aligned, {}, CONFIG)
     return [k for k in range(aligned.height) if bank.failed(k)]
 
 

@@ -6,14 +6,13 @@ The train runs 20 m a second, one epoch a second, so V1 at 110 m is passed at 5.
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, negations, run, steps, told
+from tests.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, run, steps, told
 
 V1, V2 = {"V1": 110.0}, {"V1": 110.0, "V2": 510.0}
 STATUS = ("balise_id", "status", "t_offered")
@@ -259,7 +258,7 @@ def test_jump_over_two_balises_offers_both_in_order() -> None:
     # The linking distance fails at the same epoch, and a failing monitor comes first.
     seen = run(epochs_of(path_m, odometer_m), balises)
     assert [row[1] for row in told(seen, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
-    result = run(epochs_of(path_m, odometer_m), balises, limits=replace(LIMITS, disabled=("link_distance",)))
+    result = run(epochs_of(path_m, odometer_m), balises, disabled=["link_distance"])
     assert told(result, *STATUS, "odometer_distance_m", "linking_error") == [
         ("V1", "accepted", 5.5, None, "none"),
         ("V2", "rejected_window", 14.5, 180.0, "early"),
@@ -330,8 +329,7 @@ def test_overlapping_windows_cannot_tell_two_balises_apart() -> None:
     path_m = [value + (40.0 if k >= 12 else 0.0) for k, value in enumerate(odometer_m)]
     balises = balises_at({"V1": 110.0, "V2": 510.0, "V3": 550.0})
     epochs = epochs_of(path_m, odometer_m)
-    static_only = replace(LIMITS, disabled=("link_distance", "link_order"))
-    by_linking_alone = run(epochs, balises, ScriptedBank(), limits=static_only)
+    by_linking_alone = run(epochs, balises, ScriptedBank(), disabled=["link_distance", "link_order"])
     assert [row[1] for row in told(by_linking_alone, *STATUS)] == ["accepted"] * 3
     with_tvb = run(epochs, balises, ScriptedBank())
     assert [row[1] for row in told(with_tvb, *STATUS)] == ["accepted"] + ["rejected_monitor"] * 2

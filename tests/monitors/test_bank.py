@@ -7,11 +7,10 @@ import polars as pl
 import pytest
 
 from pipeline.alignment.align import NO_ODOMETER
-from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
 from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.tables import BANK_MONITORS
 from tests.align.straight import Straight, align_run, epochs_of, odometer_of, run
 
@@ -21,7 +20,7 @@ KNOWN = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
 
 
 def bank_of(epochs, odometer=None, config=CONFIG, vehicle=KNOWN):
-    return MonitorBank(align_run(epochs, odometer, vehicle, config), {}, config, FACTOR)
+    return MonitorBank(align_run(epochs, odometer, vehicle, config), {}, config)
 
 
 def table(bank):
@@ -160,7 +159,7 @@ def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
     path = epochs["path_m"].to_numpy().copy()
     path[2:] += 4.0
     aligned = align_run(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
-    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config, FACTOR)}, config, FACTOR)
+    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config)}, config)
     result = table(bank)
     assert result["along_raw_reason"].unique().to_list() == [DISABLED]
     assert result["along_doppler_reason"].unique().to_list() == [DISABLED]
@@ -178,7 +177,7 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
     slip = 5.0 * np.clip(odometer_t - 10.0, 0.0, 1.0)
     epochs = epochs_of(t, 20.0 * t, velocity_along_mps=np.full(t.size, 20.0))
     aligned = align_run(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
-    result = doppler_monitor(aligned, CONFIG, FACTOR)
+    result = doppler_monitor(aligned, CONFIG)
     fails = [t[k] for k in range(t.size) if result["state"][k] == "fail"]
     assert 10.0 < fails[0] < 10.5
     assert fails[-1] < 12.1
@@ -192,7 +191,7 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
 def test_channels_are_compared_where_both_have_a_position():
     one = epochs_of([0.0, 1.0, 2.0], [0.0, 20.0, 40.0])
     other = epochs_of([0.0, 1.0, 2.0], [0.0, 30.0, 41.0], fix_valid=[True, True, False])
-    result = channel_monitor(one, other, FACTOR)
+    result = channel_monitor(one, other, CONFIG)
     assert result["state"].to_list() == ["pass", "fail", "not_evaluated"]
     assert result["value"].to_list() == [0.0, -10.0, None]
     assert result["threshold"][0] == pytest.approx(FACTOR * np.sqrt(2.0))
