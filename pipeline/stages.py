@@ -12,7 +12,7 @@ from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
 from pipeline.figures.run_notes import run_notes
-from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
+from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
@@ -50,11 +50,9 @@ class _Context:
     evidence: Evidence
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Tables of one solution."""
-
-    tables: dict[str, pl.DataFrame]
+_AT_THE_END = ("latency_s", "latency_sigma_s", "odometer_scale")
+Tables = dict[str, pl.DataFrame]
+"""Those of one solution, by name."""
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
@@ -135,29 +133,22 @@ def _match(context: _Context, solution: str) -> Match:
     )
 
 
-def _failed(context: _Context, solution: str, error: InputError) -> _Part:
+def _failed(context: _Context, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     made = provenance(context.run, context.site, context.vehicle, context.config)
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return _Part(nothing | {"runs": failed_row(str(error), made, solution)})
+    return nothing | {"runs": failed_row(str(error), made, solution)}
 
 
-def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Part:
+def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> Tables:
     """One solution: what the train made of it, then what the judge says of that."""
     ride = _ride(context, solution, matches)
     bench = Bench(ride.solution, context.evidence, ride.odometry, context.vehicle, context.config)
     judged = judge(bench, context.run.reference, context.run.faults)
     epochs = pl.concat([ride.solution.epochs, judged.epochs_columns], how="horizontal")
     row = summarise(_results(context, ride, judged, epochs), context.config, _made(context))
-    return _Part(
-        {
-            "hazards": judged.hazards,
-            "passages": judged.passages,
-            "alarms": judged.alarms,
-            "epochs": epochs,
-            "runs": row,
-        }
-    )
+    found = {"hazards": judged.hazards, "passages": judged.passages, "alarms": judged.alarms}
+    return {**found, "epochs": epochs, "runs": row}
 
 
 @dataclass(frozen=True)
@@ -220,7 +211,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         evidence=judged.evidence,
         vehicle=_figures_from(context),
         odometer_contradicted=context.evidence.contradicted,
-        alignment=_alignment(ride.aligned),
+        alignment=ride.aligned.select(*_AT_THE_END, odometer_scale_sigma="scale_sigma").row(-1, named=True),
         counts=counts,
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
@@ -240,12 +231,6 @@ def _figures_from(context: _Context) -> VehicleFigures:
     return VehicleFigures.FILE if given else VehicleFigures.LEARNED
 
 
-def _alignment(aligned: pl.DataFrame) -> Alignment:
-    """Scale and latency as they stand at the end of the run."""
-    names = ("latency_s", "latency_sigma_s", "odometer_scale", "scale_sigma")
-    return Alignment(*(aligned[name][-1] for name in names))
-
-
 def _single_monitors(
     context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
 ) -> dict[str, pl.DataFrame]:
@@ -262,10 +247,9 @@ def _single_monitors(
     }
 
 
-def _tables(run_id: str, parts: list[_Part]) -> RunTables:
+def _tables(run_id: str, parts: list[Tables]) -> RunTables:
     """Rows of all solutions, by the contract."""
     whole = {
-        name: conform(pl.concat([shaped(part.tables[name], table) for part in parts]), table)
-        for name, table in TABLES.items()
+        name: conform(pl.concat([shaped(part[name], table) for part in parts]), table) for name, table in TABLES.items()
     }
     return RunTables(run_id=run_id, **whole)

@@ -68,15 +68,23 @@ def verdict_of(
     rows = np.arange(int(np.searchsorted(w.t_ns, since_ns)), span.last + 1)
     rows = rows[positioned[rows]]
     judged, margin = w.judged, w.margin_m[rows]
-    with np.errstate(invalid="ignore"):
-        beyond = (judged.least_m[rows] > margin) | judged.wrong_track[rows]
-        within = judged.by_truth[rows] & (judged.largest_m[rows] <= margin)
+    can_say_false = judged.by_truth[rows]
     for axis, well in healthy.items():
         if any(monitor.startswith(axis) for monitor in span.monitors):
-            within &= well[rows]
+            can_say_false &= well[rows]
+    if judged.wrong_track[rows].any():
+        return Verdict.TRUE
+    return verdict_within(judged.low_m[rows], judged.high_m[rows], margin, can_say_false)
+
+
+def verdict_within(low_m: Floats, high_m: Floats, margin_m: Floats, can_say_false: Bools) -> Verdict:
+    """By the intervals of the error (NaN: not known) at the positions of an alarm, against their margins."""
+    with np.errstate(invalid="ignore"):
+        beyond = (low_m > margin_m) | (high_m < -margin_m)
+        within = can_say_false & (low_m >= -margin_m) & (high_m <= margin_m)
     if beyond.any():
         return Verdict.TRUE
-    return Verdict.FALSE if rows.size and within.all() else Verdict.UNKNOWN
+    return Verdict.FALSE if within.size and within.all() else Verdict.UNKNOWN
 
 
 def _hazard_of(span: AlarmEpisode, drafts: Sequence[Draft]) -> int | None:

@@ -48,8 +48,8 @@ def run_lds(
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
     where unknown)`, odometer_segment, direction` (+1/-1, used where there is no odometer).
     `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has
-    an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of the
-    odometer, None unless a vehicle file gives it with the scale.
+    an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of
+    the odometer, None unless a vehicle file gives it with the scale.
     """
     journey = journey_of(epochs, scale_sigma, config)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
