@@ -99,7 +99,9 @@ def _reference_places(
     path_m, distance_m = floats(found.epochs, "path_m"), config.matching.orientation_distance_m
     facing = 1 if odometry is None else polarity(odometry, times_ns(found.epochs), path_m, distance_m)
     ahead_m = facing * vehicle.gnss_antenna_ahead_m
-    return ReferencePlaces.of(found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track)
+    return ReferencePlaces.of(
+        found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track, config.align
+    )
 
 
 def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:

@@ -36,7 +36,7 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
     near = positions["fix_valid"].to_numpy() & positions["near_track"].to_numpy() & np.isfinite(path_m)
     positions = positions.with_columns(pl.Series("along_m", unrolled(positions, near), nan_to_null=True))
-    jitter_s = stamp_jitter_s(odometry.seconds(times_ns(positions)))
+    jitter_s = stamp_jitter_s(odometry.seconds(times_ns(positions)), config.align.clock_periods)
     in_use = learn(positions, matched, jitter_s, odometry, vehicle, config)
     return positions.with_columns(_columns(times_ns(positions), jitter_s, odometry, in_use, config))
 
@@ -101,7 +101,10 @@ def _columns(
     total = np.where(known, np.cumsum(step), np.nan)
     speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
     rows_m = np.minimum(odometry.row_sigma_m(at), most_scatter_m(config))
-    turning = speed_of_positions(at, with_hysteresis(total, hysteresis_m(rows_m))) if rows_m.any() else speed
+    turning = speed
+    if rows_m.any():
+        held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
+        turning = speed_of_positions(at, held, config.align.speed_window_s)
     reason = (
         pl.when(pl.Series(known))
         .then(None)
@@ -138,7 +141,9 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     nothing = pl.lit(None, pl.Float64)
     t_s = times_ns(positions) * 1e-9
     valid = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy()
-    by_position = speed_of_positions(t_s - t_s[0], np.where(valid, floats(positions, "path_m"), np.nan))
+    by_position = speed_of_positions(
+        t_s - t_s[0], np.where(valid, floats(positions, "path_m"), np.nan), config.align.speed_window_s
+    )
     by_doppler = floats(positions, "velocity_along_mps")
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
@@ -153,7 +158,7 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     )
 
 
-def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float = 1.0) -> Floats:
+def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
     """Speed [m/s] from positions at least `window_s` apart, causal; NaN where there are none."""
     speed = np.full(t_s.size, np.nan)
     valid = np.flatnonzero(np.isfinite(path_m))

@@ -8,9 +8,6 @@ import numpy as np
 
 from schemas.arrays import Floats, Ints
 
-# Over more periods a step tells nothing of the clock: the receiver may have started anew.
-_REGULAR_PERIODS = 3
-
 
 class Estimates(NamedTuple):
     """Scale (true over odometer distance) and latency [s] with their standard deviations: of one, or epoch by epoch."""
@@ -39,15 +36,16 @@ class Estimates(NamedTuple):
             column[begins[0] :] = np.repeat(value, lengths)
 
 
-def stamp_jitter_s(t_s: Floats) -> float:
+def stamp_jitter_s(t_s: Floats, clock_periods: float) -> float:
     """Standard deviation of the stamps about a regular clock [s].
 
     A receiver measures at regular times; a recorder that stamps on receipt scatters them, and at 40 m/s ten
-    milliseconds are 0.4 m from one epoch to the next. Only the stamps are looked at, never a position.
+    milliseconds are 0.4 m from one epoch to the next. Only the stamps are looked at, never a position. Steps of more
+    than `clock_periods` tell nothing.
     """
     dt = np.diff(t_s)
     period = float(np.median(dt))
     periods = np.round(dt / period)
-    regular = (periods >= 1) & (periods <= _REGULAR_PERIODS)
+    regular = (periods >= 1) & (periods <= clock_periods)
     away = (dt - periods * period)[regular]
     return float(np.sqrt(np.mean(away**2) / 2.0)) if away.size else 0.0

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.estimates import Estimates
-from pipeline.alignment.odometer_filter import SPEED_SPAN_S, FilterState, ScaleLatencyFilter, estimates_of, prior_of
+from pipeline.alignment.odometer_filter import FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.epochs.timeline import gap_limit_s
 from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
 from pipeline.monitors.axis import AxisSeries, error_model, run_axis
@@ -145,7 +145,8 @@ class _Learner:
             observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
             joints[first:last] = self._filter.run(state, *observed, self._jitter_s)
             state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
-        use_from = np.searchsorted(self._t_s, self._t_s[due] + SPEED_SPAN_S)
+        # An update reads the odometer so long after its epoch, so its result may be used only after that.
+        use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
         return state, np.maximum(use_from, due + 1), joints
 
     def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:

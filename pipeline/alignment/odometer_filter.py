@@ -28,12 +28,6 @@ from schemas.config import AlignConfig, Vehicle
 
 _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
-# Receivers show a little noise without memory beside the modelled one; it also keeps the update well conditioned.
-_WHITE_SHARE = 0.01
-# An update reads the odometer so long before and after its epoch, so its result may be used only after that. Changes of
-# speed tell the latency. A speed over less time has noise that would pass for such changes: at constant speed the
-# filter would grow sure of any latency.
-SPEED_SPAN_S = 2.0
 # Half the square of so many sigmas that no doubt is left; beyond it the exponential would overflow.
 _CERTAIN = 100.0
 
@@ -94,7 +88,9 @@ class ScaleLatencyFilter:
         left_m2 = self._unsettled_m2(state, t_s)
         self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
-        variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
+        variance_m2 = (
+            row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
+        )
         probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
         # More than the offset's own prior would say no more, and leave no digits for the position's noise.
         brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
@@ -115,7 +111,7 @@ class ScaleLatencyFilter:
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
         unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
         settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
-        white_m2 = (_WHITE_SHARE * sigma_m**2).tolist()
+        white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
         epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)
         for joint, row, now_s, place_m, own_m2, step_ns, walked_m2 in epochs:
@@ -168,8 +164,8 @@ class ScaleLatencyFilter:
         The speed is centred, but at the ends of the odometer: one from the same odometer noise as the innovation would
         bias the latency upwards.
         """
-        times_s = self.odometry.t_s
-        begin_s, end_s = max(at_s - SPEED_SPAN_S, times_s.item(0)), min(at_s + SPEED_SPAN_S, times_s.item(-1))
+        times_s, span_s = self.odometry.t_s, self.config.latency_span_s
+        begin_s, end_s = max(at_s - span_s, times_s.item(0)), min(at_s + span_s, times_s.item(-1))
         before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()
         return distance - origin_m, (after - before) / (end_s - begin_s)
 

@@ -15,9 +15,6 @@ from dataclasses import dataclass
 from scipy.special import betaincinv, gammaincinv
 
 CONFIDENCE = 0.95
-# Beyond chance: two-sided Gaussian 1e-7, as the monitors' k_T by default (DOMAIN section 3). Evidence does not follow
-# their configuration: how easily they alarm tells nothing of the odometer.
-SURE_SIGMAS = 5.3267
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,6 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, t
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, PassageStatus
 
-# Without an odometer the train's way over this time says which way it goes.
-_TURN_S = 2.0
-
 
 @dataclass(frozen=True)
 class Solution:
@@ -109,7 +106,9 @@ class Bench:
             return told
         found = judge_positions(told, self.evidence.at(self.at_ns), self.legs, self.config.hazards)
         train_m = self.path_m - found.known_m(self.config.hazards.known_error_m) * told.direction
-        ahead = np.searchsorted(self.t_ns, self.t_ns + round(_TURN_S * NS_PER_S)).clip(0, self.t_ns.size - 1)
+        ahead = np.searchsorted(self.t_ns, self.t_ns + round(self.config.hazards.turn_s * NS_PER_S)).clip(
+            0, self.t_ns.size - 1
+        )
         with np.errstate(invalid="ignore"):
             came_m = train_m[ahead] - train_m
             sure = np.flatnonzero(np.abs(came_m) > found.half_m + found.half_m[ahead])

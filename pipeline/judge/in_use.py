@@ -9,8 +9,6 @@ from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, runs_of, times_ns
 from schemas.config import Configuration
 
-_LEAST_HELD_S = 1.0
-
 
 def reaction_s(t_ns: Ints, config: Configuration) -> float:
     """From detection to negation [s]: as configured, else one epoch."""
@@ -36,7 +34,7 @@ def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
     usable &= floats(epochs, "confidence_m") <= config.lds.ci_limit_m
     period_s = nominal_period_s(t_ns) or 0.0
     end_s = (t_ns - t_ns[:1]) / NS_PER_S
-    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), linking_gap_s(period_s, _LEAST_HELD_S))
+    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), linking_gap_s(period_s))
     blocked = np.zeros(t_ns.size)
     for from_s, until_s in _negated_spans(end_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
         blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)

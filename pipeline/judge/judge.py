@@ -11,6 +11,7 @@ import polars as pl
 from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from pipeline.evidence.evidence import KINDS, NOTHING
+from pipeline.evidence.gaps import LOOK_S
 from pipeline.evidence.routes import Place
 from pipeline.judge.across import errors_across, healthy_across
 from pipeline.judge.alarms import alarms_table, margins_m
@@ -29,8 +30,6 @@ from pipeline.judge.states import lds_states, odometer_beyond_confidence
 from pipeline.judge.suspect import Witnesses
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.enums import BaliseKind, Evidence, PassageStatus
-
-_LOOK_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +124,8 @@ def _witnesses(bench: Bench) -> Witnesses:
         velocity_mps=floats(epochs, "velocity_along_mps"),
         contradicted=stood | _odometer_wrong(bench),
         ambiguous=np.isfinite(bench.path_m) & ~bench.positions.unambiguous,
+        lookback_s=bench.config.hazards.suspect_lookback_s,
+        doppler_gap_s=bench.config.monitors.doppler_gap_s,
     )
 
 
@@ -180,9 +181,9 @@ def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, i
 def _look_at(bench: Bench) -> Ints:
     """The instants of the positions, and others between those that are far apart."""
     at_ns = bench.at_ns
-    long = np.flatnonzero(np.diff(at_ns) > 1.5 * _LOOK_S * NS_PER_S)
+    long = np.flatnonzero(np.diff(at_ns) > 1.5 * LOOK_S * NS_PER_S)
     between = [
-        np.arange(begin, end, round(_LOOK_S * NS_PER_S), dtype=np.int64)[1:]
+        np.arange(begin, end, round(LOOK_S * NS_PER_S), dtype=np.int64)[1:]
         for begin, end in zip(at_ns[long].tolist(), at_ns[long + 1].tolist(), strict=True)
     ]
     return np.unique(np.concatenate([at_ns, *between]))
@@ -215,6 +216,7 @@ def _epochs(
         bench.odometer_told,
         bench.stood,
         config.matching.deadband_mps,
+        config.align.speed_window_s,
     )
     suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
     known = np.isfinite(bench.path_m)

@@ -9,9 +9,6 @@ import numpy as np
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import HazardConfig
 
-# A jump spread over several epochs reaches from its first to its last increment of at least this share of the largest.
-_SHARE_OF_LARGEST = 0.3
-
 
 @dataclass(frozen=True)
 class Steps:
@@ -86,5 +83,5 @@ def _extent(steps: Steps, begin: int, end: int, sign: float, config: HazardConfi
     start = max(min(earliest + 1, begin), 1)
     increments = np.diff(steps.excess_m[start - 1 : end + 1]) * sign
     increments[~steps.linked[start : end + 1]] = 0.0
-    part = np.flatnonzero(increments >= _SHARE_OF_LARGEST * increments.max())
+    part = np.flatnonzero(increments >= config.jump_share * increments.max())
     return start + int(part[0]), start + int(part[-1])

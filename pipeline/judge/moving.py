@@ -6,8 +6,6 @@ import numpy as np
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 
-_WINDOW_S = 1.0
-
 
 def stood_spans(
     t_ns: Ints, path_m: Floats, odometer_moves: Bools, known: Bools, limit_m: float
@@ -34,13 +32,14 @@ def moving_by_evidence(
     known: Bools,
     stood: list[tuple[int, int]],
     deadband_mps: float,
+    window_s: float,
 ) -> tuple[Bools, Bools]:
     """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
 
-    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over a second it moved where it came
+    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over `window_s` it moved where it came
     farther than the dead band and that noise allow. It also tells where the odometer stands or is silent.
     """
-    ahead = np.searchsorted(t_ns, t_ns + round(_WINDOW_S * NS_PER_S)).clip(0, t_ns.size - 1)
+    ahead = np.searchsorted(t_ns, t_ns + round(window_s * NS_PER_S)).clip(0, t_ns.size - 1)
     with np.errstate(invalid="ignore"):
         came_m = np.abs(train_m[ahead] - train_m)
         by_reference = came_m > deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S + noise_m + noise_m[ahead]

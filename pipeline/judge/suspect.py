@@ -11,16 +11,13 @@ from pipeline.judge.judgement import Judgements
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.enums import Evidence, Suspect
 
-_LOOKBACK_S = 60.0
-_LONGEST_STEP_S = 2.0
-
 
 @dataclass(frozen=True)
 class Witnesses:
     """All epochs of a solution; NaN where a witness says nothing.
 
     `margin_m`: errors below it are those of a healthy position. `contradicted`: the odometer is, by reference, reads
-    or its own standing.
+    or its own standing. Velocities farther apart than `doppler_gap_s` do not tell the way between them.
     """
 
     t_ns: Ints
@@ -31,10 +28,12 @@ class Witnesses:
     velocity_mps: Floats
     contradicted: Bools
     ambiguous: Bools
+    lookback_s: float
+    doppler_gap_s: float
 
 
 def suspect_of(w: Witnesses, begin_ns: int, end_ns: int) -> Suspect:
-    """The decision table, from 60 s before the alarm or hazard to its end; the first row that applies.
+    """The decision table, from `lookback_s` before the alarm or hazard to its end; the first row that applies.
 
     | row | evidence | suspect |
     |---|---|---|
@@ -46,7 +45,7 @@ def suspect_of(w: Witnesses, begin_ns: int, end_ns: int) -> Suspect:
 
     The map is found over several runs (`pipeline/figures/map_errors.py`).
     """
-    first = int(np.searchsorted(w.t_ns, begin_ns - round(_LOOKBACK_S * NS_PER_S)))
+    first = int(np.searchsorted(w.t_ns, begin_ns - round(w.lookback_s * NS_PER_S)))
     rows = np.arange(first, max(first, int(np.searchsorted(w.t_ns, end_ns, side="right"))))
     with np.errstate(invalid="ignore"):
         left = (w.judged.least_m[rows] > w.margin_m[rows]) | w.judged.wrong_track[rows]
@@ -67,7 +66,7 @@ def _parted_together(w: Witnesses, rows: Ints) -> bool:
         return False
     dt_s = np.diff(w.t_ns[known]) / NS_PER_S
     mean_mps = 0.5 * (w.velocity_mps[known][1:] + w.velocity_mps[known][:-1])
-    doppler_m = np.concatenate([[0.0], np.cumsum(np.where(dt_s <= _LONGEST_STEP_S, mean_mps * dt_s, 0.0))])
+    doppler_m = np.concatenate([[0.0], np.cumsum(np.where(dt_s <= w.doppler_gap_s, mean_mps * dt_s, 0.0))])
     position_m, odometer_m = w.path_m[known] - w.path_m[known[0]], w.odometer_m[known] - w.odometer_m[known[0]]
     margin = 0.5 * w.margin_m[known]
     both = (np.abs(position_m - odometer_m) > margin) & (np.abs(doppler_m - odometer_m) > margin)

@@ -147,7 +147,7 @@ class BaliseDetection:
 
 
 class Disarmed:
-    """Balises just detected, re-armed once the odometer has moved max(`rearm_m`, 3 sigma) away (DOMAIN section 4).
+    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away by the odometer (DOMAIN section 4).
 
     Where the run has no odometer, the position's distance from the balise has to serve.
     """
@@ -169,7 +169,7 @@ class Disarmed:
 
     def rearm(self, k: int) -> None:
         """Re-arm what the train has left behind at epoch `k`."""
-        away_m = max(self._config.rearm_m, 3.0 * float(self._journey.sigma_m[k]))
+        away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[k]))
         for name, (balise, at_m) in list(self._at.items()):
             if abs(self._moved_m(k, balise, at_m)) >= away_m:
                 del self._at[name]

@@ -18,14 +18,12 @@ from scipy.special import chdtri
 from pipeline.monitors.series import NO_POSITION
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
 from pipeline.monitors.single import NO_RANGES, blind_monitor, judged
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration
 
 NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
 TOO_FEW = "too few satellites to test the ranges"
 AMBIGUOUS = "the track is ambiguous"
-# Stamps of positions and of satellites that belong together may differ by rounding.
-_TOLERANCE_NS = 1_000_000
 _LEAST_SURVEY_SIGMA_M = 1e-3
 _RIDGE = 1e-13
 _CHUNK = 8192
@@ -39,7 +37,7 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
     """
     if satellites is None or satellites.is_empty():
         return blind_monitor(epochs.height, NO_RANGES)
-    ranges = _ranges_by_epoch(epochs, satellites)
+    ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     track = _track_of(epochs, config)
     value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
     chosen = np.flatnonzero(track.usable)[np.isin(np.flatnonzero(track.usable), ranges.epoch)]
@@ -80,14 +78,14 @@ class _Track:
     matched: Bools
 
 
-def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame) -> _Ranges:
+def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: float) -> _Ranges:
     at = epochs.select(t_ns=pl.col("t").to_physical()).with_row_index("epoch")
     kept = (
         satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
         .unique(["t", "sv"], keep="first", maintain_order=True)
         .sort("t", maintain_order=True)
         .with_columns(t_ns=pl.col("t").to_physical())
-        .join_asof(at, on="t_ns", strategy="nearest", tolerance=_TOLERANCE_NS)
+        .join_asof(at, on="t_ns", strategy="nearest", tolerance=round(apart_s * NS_PER_S))
         .drop_nulls("epoch")
     )
     azimuth, elevation = kept["azimuth_deg"].to_numpy(), kept["elevation_deg"].to_numpy()

@@ -20,7 +20,6 @@ NO_VALUE = "nothing to compute it from"
 NO_RANGES = "no satellites stream"
 NO_OTHER_SOLUTION = "no other solution configured to compare with"
 NO_OTHER_EPOCH = "the other solution has no position at this epoch"
-_WINDOW_S = 1.0
 _STATES = pl.Enum([state.value for state in MonitorState])
 
 
@@ -68,7 +67,7 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
     t_s = (epochs["t"].dt.timestamp("ns") - epochs["t"].dt.timestamp("ns")[0]).to_numpy() * 1e-9
     velocity = floats(epochs, "velocity_along_mps")
     usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
-    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy())
+    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
     total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
     by_doppler = (total - total[first]) / span
     odometer = floats(epochs, "odometer_m")
@@ -123,14 +122,15 @@ def channel_monitor(
 
 
 def _window(
-    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64]
+    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64], config: Configuration
 ) -> tuple[npt.NDArray[np.int64], Floats]:
-    """Epoch at least a second before, and the time since; NaN unless all in between are usable and connected."""
-    first = np.maximum(np.searchsorted(t_s, t_s - _WINDOW_S * (1.0 - 1e-6), side="right") - 1, 0)
+    """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between are usable and connected."""
+    least_s = config.align.speed_window_s * (1.0 - 1e-6)
+    first = np.maximum(np.searchsorted(t_s, t_s - least_s, side="right") - 1, 0)
     bad = np.concatenate([[0], np.cumsum(~usable)])
     clean = bad[np.arange(t_s.size) + 1] == bad[first]
     span = t_s - t_s[first]
-    connected = clean & (span >= _WINDOW_S * (1.0 - 1e-6)) & (span <= 2.5 * _WINDOW_S)
+    connected = clean & (span >= least_s) & (span <= config.monitors.doppler_gap_s)
     connected &= segment == segment[first]
     return first, np.where(connected, span, np.nan)
 
