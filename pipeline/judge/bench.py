@@ -8,17 +8,20 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.evidence import Evidence
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.evidence import Evidence as AllEvidence
 from pipeline.evidence.accused import carried_forward
+from pipeline.evidence.evidence import KINDS
 from pipeline.evidence.routes import Route, routes_of_path
 from pipeline.judge.in_use import unambiguous
-from pipeline.judge.judgement import Judgements, Positions, judge_positions, with_own_anchors
+from pipeline.judge.judgement import Judgements, Positions, judge_positions, margins_m, with_own_anchors
 from pipeline.judge.moving import stood_spans
+from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
-from schemas.enums import BaliseKind, PassageStatus
+from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Bench:
     """One solution before the judge; `odometry` grows with its path."""
 
     solution: Solution
-    evidence: Evidence
+    evidence: AllEvidence
     odometry: Odometry | None
     vehicle: Vehicle
     config: Configuration
@@ -140,6 +143,13 @@ class Bench:
         return self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
 
     @cached_property
+    def accepted(self) -> pl.DataFrame:
+        """The virtual balises that the LDS accepted, in order of time."""
+        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+        virtual = (kind == BaliseKind.VIRTUAL.value) & (status == PassageStatus.ACCEPTED.value)
+        return self.offers.filter(virtual).sort("t")
+
+    @cached_property
     def offers_judged(self) -> Judgements:
         """What the evidence says of every offer: the balise against where the train was."""
         offers = self.offers
@@ -162,10 +172,7 @@ class Bench:
         found = judge_positions(positions, self.evidence.at(at_ns, self.stood), self.legs, hazards)
         if self.odometry is None:
             return found
-        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
-        accepted = (kind == BaliseKind.VIRTUAL.value) & (status == PassageStatus.ACCEPTED.value)
-        virtual = self.offers.filter(accepted).sort("t")
-        since_ns, path_m = self.instants(times_ns(virtual)), floats(virtual, "path_m")
+        since_ns, path_m = self.instants(times_ns(self.accepted)), floats(self.accepted, "path_m")
         trust, limit_m = self.evidence.trust, hazards.failure_limit_m
         carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, trust, limit_m)
         return with_own_anchors(found, positions, carried, hazards)
@@ -175,3 +182,34 @@ class Bench:
         """Path position of the train where reference or reads tell it closely enough [m], NaN elsewhere."""
         known = self.judged.known_m(self.config.hazards.known_error_m)
         return self.path_m - known * self.positions.direction
+
+    @cached_property
+    def by_reference_m(self) -> Floats:
+        """The same where the reference tells it."""
+        return np.where(self.judged.kind == KINDS.index(Evidence.REFERENCE), self.train_m, np.nan)
+
+    @cached_property
+    def margin_m(self) -> Floats:
+        """Errors below it are those of a healthy position."""
+        return margins_m(floats(self.epochs, "sigma_along_m"), self.config.hazards)
+
+    @cached_property
+    def odometer_wrong(self) -> Bools:
+        """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
+        half = np.where(np.isfinite(self.train_m), self.judged.half_m, np.nan)
+        odometer_m, since_ns = floats(self.epochs, "odometer_m"), times_ns(self.accepted)
+        return odometer_beyond_confidence(self.t_ns, odometer_m, self.train_m, half, since_ns, self.config.lds)
+
+    def speed_at(self, t_ns: Ints) -> Floats:
+        """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
+        speed = np.abs(floats(self.epochs, "speed_mps"))
+        known = np.isfinite(speed)
+        if not known.any():
+            return np.full(t_ns.size, np.nan)
+        at_s, stamps_s = ((values - self.t_ns[0]) / NS_PER_S for values in (t_ns, self.t_ns[known]))
+        return np.interp(at_s, stamps_s, speed[known])
+
+    @cached_property
+    def gap_ns(self) -> int:
+        """Longest time between epochs over which a movement is interpolated."""
+        return round(linking_gap_s(nominal_period_s(self.t_ns), self.config.lds.crossing_gap_s) * NS_PER_S)

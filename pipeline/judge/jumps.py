@@ -32,11 +32,11 @@ class Jump:
     step_m: float
 
 
-def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_s: float) -> Steps:
+def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_ns: int) -> Steps:
     """`train_m`: path position by the reference, NaN elsewhere; there `counted_m`, the odometer's steps, serves."""
     by_reference, by_odometer = np.diff(path_m - train_m), np.diff(path_m) - counted_m
     change = np.where(np.isfinite(by_reference), by_reference, by_odometer)
-    linked = np.isfinite(change) & (np.diff(t_ns) <= gap_s * NS_PER_S)
+    linked = np.isfinite(change) & (np.diff(t_ns) <= gap_ns)
     excess = np.concatenate([[0.0], np.cumsum(np.where(linked, change, 0.0))])
     return Steps(t_ns, excess[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
 

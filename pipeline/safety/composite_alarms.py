@@ -8,7 +8,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import AlarmEpisode
-from pipeline.judge.alarms import margins_m, verdict_within
+from pipeline.judge.alarms import verdict_within
+from pipeline.judge.judgement import margins_m
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
