@@ -192,11 +192,17 @@ class _Learner:
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=self._odometry.noise.white_m2_per_s,
-            rows_m=np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config)),
+            rows_m=self._rows_m(at_s),
             period_s=self._odometry.period_s,
         )
         odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)
         return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
+
+    def _rows_m(self, at_s: Floats) -> Floats | None:
+        """Quantisation noise of the odometer's rows; none at a stand may be some under way."""
+        if not self._odometry.noise.quantisation:
+            return None
+        return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
         """Position from which learning goes on after the alarm at `alarm`, and what it has still to settle [m2].

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, odometer_at
+from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at
 from pipeline.monitors.bank import MonitorBank
+from pipeline.odometry.odometry import Noise
+from pipeline.odometry.quantisation import QuantisationNoise
 from schemas.config import Configuration, Vehicle, threshold_factor
-from tests.align.straight import Straight, align_run, distance, odometry_from, run, times
+from tests.align.straight import Straight, align_run, distance, epochs_of, odometer_of, odometry_from, run, times
 
 CONFIG = Configuration()
-FACTOR = threshold_factor(1e-7)
 REAL = Straight(scale=1.004, latency_s=0.08)
 
 
@@ -172,3 +175,17 @@ def test_learning_counts_with_the_calibrated_sigma():
     learned = ["odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"]
     assert_frame_equal(found.select(learned), stated.select(learned), rel_tol=1e-9)
     assert stated["scale_sigma"][-1] < align_run(overstated, odometer, Vehicle(), CONFIG)["scale_sigma"][-1]
+
+
+def test_a_long_stand_where_rows_scatter_with_the_speed_alone():
+    """Stamps on receipt: no row scatters at a stand, and the thresholds' model of the errors stays the same."""
+    t_s = np.arange(0.0, 650.0, 0.1)
+    way_m = np.minimum(20.0 * t_s, 2000.0)
+    odometry = odometry_from(odometer_of(t_s, way_m), Vehicle(), CONFIG)
+    scattered = replace(odometry, noise=Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3)))
+    aligned = align(epochs_of(t_s[20:-20], way_m[20:-20]), scattered, Vehicle(), CONFIG)
+    # 0.03 s at 20 m/s, 0.6 m, counts under way alone; GNSS and odometer agree, so the scale stays 1.
+    rows_m = aligned["odometer_rows_m"]
+    assert rows_m[500] == pytest.approx(20.0 * 1e-3**0.5, rel=1e-3)
+    assert rows_m[-1] == 0.0
+    assert aligned["odometer_scale"][-1] == pytest.approx(1.0, abs=1e-4)

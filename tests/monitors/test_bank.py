@@ -183,7 +183,7 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
     assert fails[-1] < 12.1
     assert result["value"][120] == pytest.approx(-1.0, abs=4.1)
     without = doppler_monitor(
-        align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG, FACTOR
+        align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG
     )
     assert without["reason"].unique().to_list() == [NO_VELOCITY]
 
