@@ -10,7 +10,7 @@ from pipeline.alignment.learning import learn
 from pipeline.monitors.along import most_scatter_m
 from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
-from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 
 NO_ODOMETER = "no odometer"
@@ -31,13 +31,11 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
     positions = positions.with_columns(*_sigmas(config.monitors), _confidence(config.lds))
     if odometry is None:
         return _without_odometer(positions, vehicle, config)
-    path_m = floats(positions, "path_m")
-    matched = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy() & np.isfinite(path_m)
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
-    near = positions["fix_valid"].to_numpy() & positions["near_track"].to_numpy() & np.isfinite(path_m)
-    positions = positions.with_columns(pl.Series("along_m", unrolled(positions, near), nan_to_null=True))
+    along_m = unrolled(positions, flags(positions, "near_track"))
+    positions = positions.with_columns(pl.Series("along_m", along_m, nan_to_null=True))
     jitter_s = stamp_jitter_s(odometry.seconds(times_ns(positions)), config.align.clock_periods)
-    in_use = learn(positions, matched, jitter_s, odometry, vehicle, config)
+    in_use = learn(positions, flags(positions, "on_track"), jitter_s, odometry, vehicle, config)
     return positions.with_columns(_columns(times_ns(positions), jitter_s, odometry, in_use, config))
 
 
@@ -57,14 +55,14 @@ def _confidence(lds: LdsConfig) -> pl.Expr:
     return half_width.alias("confidence_m")
 
 
-def unrolled(epochs: pl.DataFrame, matched: Bools) -> Floats:
+def unrolled(epochs: pl.DataFrame, near: Bools) -> Floats:
     """Path position with the way taken out that a curve adds to a position beside the track [m]; NaN elsewhere.
 
     A point y left of a track that turns left by its curvature k moves dx / (1 - k y) along it while the train moves
     dx, whether y is an error of the position or of the survey. Both are known, so this is no noise of the monitor.
     """
-    along = np.full(matched.size, np.nan)
-    rows = np.flatnonzero(matched)
+    along = np.full(near.size, np.nan)
+    rows = np.flatnonzero(near)
     path_m = floats(epochs, "path_m")[rows]
     beside = np.nan_to_num(floats(epochs, "curvature_per_m")[rows] * floats(epochs, "cross_track_m")[rows])
     along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
@@ -140,10 +138,8 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     """No odometer: speed and direction from GNSS (velocity, else positions over the second before)."""
     nothing = pl.lit(None, pl.Float64)
     t_s = times_ns(positions) * 1e-9
-    valid = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy()
-    by_position = speed_of_positions(
-        t_s - t_s[0], np.where(valid, floats(positions, "path_m"), np.nan), config.align.speed_window_s
-    )
+    path_m = np.where(flags(positions, "on_track"), floats(positions, "path_m"), np.nan)
+    by_position = speed_of_positions(t_s - t_s[0], path_m, config.align.speed_window_s)
     by_doppler = floats(positions, "velocity_along_mps")
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s

@@ -19,7 +19,7 @@ from pipeline.judge.moving import stood_spans
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
@@ -73,8 +73,8 @@ class Bench:
 
     @cached_property
     def path_m(self) -> Floats:
-        """Path positions of valid fixes, NaN elsewhere."""
-        return np.where(flags(self.epochs, "fix_valid"), floats(self.epochs, "path_m"), np.nan)
+        """Path positions, NaN without a valid fix."""
+        return floats(self.epochs, "path_m")
 
     @cached_property
     def odometer_moves(self) -> Bools:

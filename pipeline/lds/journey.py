@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import PassageStatus
 
@@ -18,7 +18,7 @@ from schemas.enums import PassageStatus
 class Journey:
     """Epochs in order of time; a NaN is a value that is not known.
 
-    `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
+    `positioned`: placed on the path. `refusal`: why a detection at this epoch would not
     count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
     `travel`: that of the step from this epoch to the next, put back to where the train turned (for
     labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
@@ -72,10 +72,9 @@ class Journey:
 
 def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> Journey:
     """Take the columns of matched and aligned epochs: the only place where the LDS reads them (see `run_lds`)."""
-    t_ns = epochs["t"].dt.epoch("ns").to_numpy().astype(np.int64)
+    t_ns = times_ns(epochs)
     path_m = floats(epochs, "path_m")
-    fix_valid = epochs["fix_valid"].fill_null(False).to_numpy()
-    positioned = fix_valid & np.isfinite(path_m)
+    positioned = np.isfinite(path_m)
     odometer_m = floats(epochs, "odometer_m")
     direction, travel = _directions(odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
     gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.lds.crossing_gap_s) * NS_PER_S)
@@ -84,7 +83,7 @@ def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configur
         leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
         path_m=path_m,
         positioned=positioned,
-        placed_nowhere=fix_valid & ~positioned,
+        placed_nowhere=flags(epochs, "fix_valid") & ~positioned,
         refusal=_refusals(epochs, positioned, config),
         sigma_m=floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m"),
         confidence_m=floats(epochs, "confidence_m"),
@@ -109,14 +108,13 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
 
 def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
     """Ambiguity before confidence; what is not known (null) is never taken as good."""
-    on_track = epochs["on_track"].fill_null(False).to_numpy()
-    probable = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
+    sure = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
     confident = floats(epochs, "confidence_m") <= config.lds.ci_limit_m
     refusals: list[PassageStatus | None] = [None] * len(positioned)
-    for k in np.flatnonzero(~(positioned & on_track & probable & confident)).tolist():
+    for k in np.flatnonzero(~(positioned & sure & confident)).tolist():
         if not positioned[k]:
             refusals[k] = PassageStatus.NOT_AVAILABLE
-        elif on_track[k] and probable[k]:
+        elif sure[k]:
             refusals[k] = PassageStatus.REJECTED_CONFIDENCE
         else:
             refusals[k] = PassageStatus.REJECTED_AMBIGUOUS

@@ -62,7 +62,6 @@ def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
     return _first_of(
         _where(~epochs["fix_valid"], NO_POSITION),
         _where(~epochs["near_track"], OFF_TRACK),
-        _where(epochs["path_m"].is_null(), NO_POSITION),
         _where(no_sigma, NO_SIGMA),
     )
 

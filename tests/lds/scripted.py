@@ -78,7 +78,9 @@ def epochs_of(
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()
     ]
-    return frame.with_columns(series)
+    # As matching says it: without a fix no path position, off the track no probability of the path.
+    placed, sure = pl.when("fix_valid").then("path_m"), pl.when("on_track").then("gate_probability")
+    return frame.with_columns(series).with_columns(path_m=placed, gate_probability=sure)
 
 
 def balises_at(places: dict[str, float], **columns: Any) -> pl.DataFrame:
