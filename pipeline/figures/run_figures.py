@@ -133,14 +133,7 @@ def is_passage() -> pl.Expr:
 
 
 def hazard_counts(hazards: pl.DataFrame) -> Row:
-    classes = {
-        Hazard.VB_JUMP_1A: "hazards_1a",
-        Hazard.VB_JUMP_1B: "hazards_1b",
-        Hazard.VB_SHIFT: "hazards_shift",
-        Hazard.VB_WRONG_TRACK: "hazards_wrong_track",
-    }
-    counts = {column: pl.col("hazard") == kind for kind, column in classes.items()}
-    counts |= {
+    counts = {kind.counted_as: pl.col("hazard") == kind for kind in Hazard} | {
         "hazards_detected": pl.col("detected"),
         "hazards_within_budget": pl.col("within_budget"),
         "missed_detections": missed_detection(),

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import PassageStatus
@@ -132,32 +133,15 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
         direction = held.to_numpy().astype(np.int64)
         return direction, direction
     known = np.flatnonzero(np.isfinite(odometer_m))
-    direction = np.ones(odometer_m.size, dtype=np.int64)
-    travel = direction.copy()
-    for turned_at, confirmed_at, sign in _turns(odometer_m[known], turn_m):
-        direction[known[confirmed_at] :] = sign
-        travel[known[turned_at] :] = sign
+    direction, travel = np.ones((2, odometer_m.size), dtype=np.int64)
+    for turned_at, seen_at, sense in zip(*turns_of(odometer_m[known], turn_m), strict=True):
+        direction[known[seen_at] :] = sense
+        travel[known[turned_at] :] = sense
     return direction, travel
 
 
-def _turns(odometer_m: Floats, turn_m: float) -> list[tuple[int, int, int]]:
-    """Turning points: index of the extreme, index where it is confirmed, new direction."""
-    turns: list[tuple[int, int, int]] = []
-    start, sign = 0, 1
-    while True:
-        way_m = sign * odometer_m[start:]
-        back_m = np.maximum.accumulate(way_m) - way_m
-        confirmed = int(np.argmax(back_m >= turn_m))
-        if back_m[confirmed] < turn_m:
-            return turns
-        extreme = int(np.argmax(way_m[: confirmed + 1]))
-        sign = -sign
-        turns.append((start + extreme, start + confirmed, sign))
-        start += confirmed
-
-
 def _travelled_m(odometer_m: Floats, travel: Ints) -> Floats:
-    """Way run since the first epoch; signed sums, so that jitter at standstill adds up to nothing."""
+    """Way run since the first epoch, on the scale in use; signed sums: jitter at a stand adds up to nothing."""
     travelled_m = np.full(odometer_m.size, np.nan)
     known = np.flatnonzero(np.isfinite(odometer_m))
     if known.size:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import AlignConfig
 
 # Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
@@ -37,6 +37,20 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
         values.append(at)
     held[rows] = values
     return held
+
+
+def turns_of(distance_m: Floats, back_m: float) -> tuple[Ints, Ints, Ints]:
+    """Where the train turned, where that showed by its coming back so far, and the sense from then on (+1 or -1).
+
+    The distance grows at first, as far as anybody knows.
+    """
+    # A hysteresis half as wide, that has come from below.
+    width_m = np.full(distance_m.size + 1, 0.5 * back_m)
+    held = with_hysteresis(np.concatenate([distance_m[:1] - back_m, distance_m]), width_m)
+    moves = np.flatnonzero(np.diff(held))
+    sense = np.sign(np.diff(held)[moves]).astype(np.int64)
+    turns = np.flatnonzero(sense[1:] != sense[:-1])
+    return moves[turns], moves[turns + 1], sense[turns + 1]
 
 
 def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
