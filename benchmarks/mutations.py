@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 COPIED = ("cli.py", "pyproject.toml", "Makefile", "README.md", "pipeline", "schemas", "datasets", "benchmarks", "docs")
 # A room of the core and the folders of tests that hold it, the quickest first.
 ROOMS: dict[str, tuple[str, ...]] = {
-    "pipeline/evidence": ("tests/judge", "tests/replay"),
+    "pipeline/evidence": ("tests/evidence", "tests/judge", "tests/replay"),
     "pipeline/judge": ("tests/judge", "tests/replay"),
     "pipeline/lds": ("tests/lds", "tests/replay"),
     "pipeline/monitors": ("tests/monitors", "tests/replay"),

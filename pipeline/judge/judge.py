@@ -55,7 +55,7 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
     episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)
     drafts = drafts_of(episodes, series, offers, bench.config.hazards)
     across = _across(bench, reference)
-    spans = [_undetected_ns(one, series) for one in episodes]
+    spans = [undetected_ns(one, series) for one in episodes]
     return Judged(
         hazards=hazards_table(drafts, series, offers, bench),
         alarms=alarms_table(bench, log, _healthy(bench, across), drafts),
@@ -67,7 +67,7 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
     )
 
 
-def _undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
+def undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
     """From onset to detection, or to the end; what a step offers on its way lies before its first position."""
     begin_ns = episode.onset_ns
     if episode.step is not None:

@@ -206,3 +206,12 @@ def test_a_single_monitor_without_value_or_threshold_is_no_pass():
     )
     assert frame["state"].to_list() == ["pass", "fail", "not_evaluated", "not_evaluated", "not_evaluated"]
     assert frame["reason"].to_list() == [None, None, NO_VALUE, NO_VALUE, "why"]
+
+
+def test_an_axis_without_any_epoch_hides_no_fail_of_the_others():
+    """No heights; a step of 30 m along the track far behind what is looked at first."""
+    count = 8400
+    path_m = 20.0 * np.arange(count) + np.where(np.arange(count) >= 8300, 30.0, 0.0)
+    epochs, odometer = steady(count)
+    bank = bank_of(epochs.with_columns(path_m=pl.Series(path_m)), odometer)
+    assert [bank.failed(k) for k in (0, 8299, 8300)] == [False, False, True]
