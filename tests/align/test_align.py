@@ -216,3 +216,5 @@ def test_nothing_is_learned_from_positions_off_the_track():
     aligned = align_run(off, odometer, Vehicle(), CONFIG)
     assert aligned["odometer_scale"].is_finite().all()
     assert aligned["odometer_scale"][-1] == pytest.approx(1.004, abs=4.0 * aligned["scale_sigma"][-1])
+    # What comes after them still teaches.
+    assert aligned["scale_sigma"][-1] < 0.9 * aligned["scale_sigma"][149]
