@@ -19,7 +19,7 @@ from pipeline.judge.moving import stood_spans
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Evidence, PassageStatus
 
@@ -139,21 +139,25 @@ class Bench:
 
     @cached_property
     def offers(self) -> pl.DataFrame:
-        """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them."""
-        return self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
+        """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them.
+
+        `virtual`, and `accepted` (of a virtual one by the LDS), stand beside the columns of the LDS.
+        """
+        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+        virtual = kind == BaliseKind.VIRTUAL.value
+        accepted = (virtual & (status == PassageStatus.ACCEPTED.value)).fill_null(value=False)
+        crossings = self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
+        return crossings.with_columns(virtual=virtual, accepted=accepted)
 
     @cached_property
     def accepted(self) -> pl.DataFrame:
         """The virtual balises that the LDS accepted, in order of time."""
-        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
-        virtual = (kind == BaliseKind.VIRTUAL.value) & (status == PassageStatus.ACCEPTED.value)
-        return self.offers.filter(virtual).sort("t")
+        return self.offers.filter("accepted").sort("t")
 
     @cached_property
     def offers_judged(self) -> Judgements:
         """What the evidence says of every offer: the balise against where the train was."""
         offers = self.offers
-        telegram = (offers["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
         index = self.evidence.network.track.index
         sure = self.positions.unambiguous
         positions = Positions(
@@ -165,7 +169,7 @@ class Bench:
             unambiguous=sure[ints(offers["before"])] & sure[ints(offers["epoch"])],
         )
         t_ns = times_ns(offers)
-        return self._judge(positions, np.where(telegram, t_ns, self.instants(t_ns)))
+        return self._judge(positions, np.where(flags(offers, "virtual"), self.instants(t_ns), t_ns))
 
     def _judge(self, positions: Positions, at_ns: Ints) -> Judgements:
         hazards = self.config.hazards

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.monitors.channels import paired
 from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
-from schemas.arrays import Floats, floats
+from schemas.arrays import Floats, floats, times_ns
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 
@@ -64,7 +64,8 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
 
     Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
     """
-    t_s = (epochs["t"].dt.timestamp("ns") - epochs["t"].dt.timestamp("ns")[0]).to_numpy() * 1e-9
+    t_ns = times_ns(epochs)
+    t_s = (t_ns - t_ns[0]) * 1e-9
     velocity = floats(epochs, "velocity_along_mps")
     usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
     first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)

@@ -180,11 +180,6 @@ class Odometry:
         return before, after
 
     @cached_property
-    def _width_m(self) -> Floats:
-        """Hysteresis of each sample."""
-        return hysteresis_m(self.row_sigma_m(self.t_s), self.config)
-
-    @cached_property
     def _moving_s(self) -> tuple[Floats, Floats]:
         """Times [s], and the time moving up to each [s]."""
         at_s, at_m = self.t_s, self.distance_m
@@ -197,7 +192,7 @@ class Odometry:
     def _travelled_m(self) -> Floats:
         """Way driven up to each sample."""
         if self.noise.quantisation:
-            return driven_m(self.distance_m, self._width_m)
+            return driven_m(self.distance_m, hysteresis_m(self.row_sigma_m(self.t_s), self.config))
         moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
         return driven_or_left_m(self.distance_m, moving)
 

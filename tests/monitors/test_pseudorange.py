@@ -139,6 +139,7 @@ def test_each_gap_in_the_data_has_its_reason() -> None:
     epochs = epochs_of(
         6,
         fix_valid=[True, False, True, True, True, True],
+        on_track=[True, False, True, True, True, True],
         gate_probability=[1.0, 1.0, 0.5, 1.0, 1.0, None],
     )
     satellites = satellites_of(epochs, np.zeros((6, SKY.height)))
