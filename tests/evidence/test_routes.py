@@ -6,9 +6,11 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.evidence.anchors import read_anchors
 from pipeline.evidence.routes import Chain, Place, Route, chains_between, extended
 from pipeline.track.network import Network, network_of
 from pipeline.track.survey import track_of
+from schemas.config import HazardConfig
 
 LENGTHS_M = {"a": 100.0, "b": 100.0, "c": 50.0}
 DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
@@ -72,3 +74,19 @@ def test_of_two_visits_the_one_that_holds_the_measure_counts_else_the_nearer() -
     )
     assert at_m.tolist() == [510.0, 45.0, 50.0, 500.0]
     assert sense.tolist() == [1, 1, 1, 1]
+
+
+def test_a_read_counts_where_its_balise_lies_on_its_element() -> None:
+    """a is 100 m long; lists round to half a metre."""
+    stamps = pl.Series("t", [3, 1, 2, 4], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    reads = pl.DataFrame({"t": stamps, "balise_id": ["beyond", "end", "before", "off"]})
+    balises = pl.DataFrame(
+        {
+            "balise_id": ["end", "before", "beyond", "off", "virtual"],
+            "netelement_id": ["a", "a", "a", "z", "a"],
+            "measure_m": [100.4, -0.4, 100.6, 1.0, 1.0],
+            "kind": ["physical"] * 4 + ["virtual"],
+        }
+    )
+    found = read_anchors(reads, balises, line("both").track, HazardConfig())
+    assert [(anchor.t_ns, anchor.place) for anchor in found] == [(1, Place(0, 100.4)), (2, Place(0, -0.4))]

@@ -14,11 +14,11 @@ from pipeline.evidence.routes import Place, Route
 from pipeline.judge.across import errors_across
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.judge import undetected_ns
-from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG
+from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, margins_m
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.rows import within_budget
 from pipeline.judge.states import odometer_beyond_confidence
-from schemas.config import LdsConfig
+from schemas.config import HazardConfig, LdsConfig
 from schemas.enums import Verdict
 
 NS = 1_000_000_000
@@ -122,3 +122,8 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
     assert found == {"V1": [Passing(round(2.5 * NS), 1, True)], "V2": []}
     # Where the place is known to 0.5 m only, evidence of 1 m to both sides tells of no passing.
     assert train_passings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 0.5, 3.0) == {"V1": [], "V2": []}
+
+
+def test_the_margin_of_a_healthy_position() -> None:
+    """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
+    assert margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
