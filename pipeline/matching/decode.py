@@ -65,10 +65,8 @@ def decode(trellis: Trellis, best: Ints) -> Decoded:
     leg = np.zeros(len(best), dtype=np.int64)
     number = np.zeros(len(best), dtype=np.int64)
     at = 0
-    loops = [one for one in set(oriented.tolist()) if trellis.network.linked(one, one)]
-    moving = (oriented[1:] != oriented[:-1]) | np.isin(oriented[1:], loops)
     before = 0
-    for step in (np.flatnonzero(moving) + 1).tolist():
+    for step in (np.flatnonzero(oriented[1:] != oriented[:-1]) + 1).tolist():
         leg[before:step], number[before:step], before = len(chains) - 1, at, step
         one, other = int(oriented[step - 1]), int(oriented[step])
         move = _move(trellis, step, one, float(place[step - 1]), other, float(place[step]))

@@ -8,6 +8,7 @@ import polars as pl
 from pipeline.matching.match import Match
 from pipeline.matching.rivals import Posterior
 from pipeline.track.leg import Leg, segments_at
+from pipeline.track.survey import Track
 from schemas.arrays import Bools, Ints, floats
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
@@ -30,23 +31,38 @@ def found_route(found: Match, sure: float) -> pl.DataFrame:
     """
     leg = found.epochs["leg"].fill_null(-1).to_numpy()
     rows = [
-        _row(found, number, one, visit, leg == number, sure)
+        _row(found, number, one, visits, leg == number, sure)
         for number, one in enumerate(found.path.legs)
-        for visit in range(len(one.visits))
+        for visits in _passages(found.path.track, one)
     ]
     return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
 
 
-def _row(found: Match, number: int, leg: Leg, visit: int, on_leg: Bools, sure: float) -> tuple[object, ...]:
+def _passages(track: Track, leg: Leg) -> list[list[int]]:
+    """Visits that are one passage of an element: its pieces, one after the other. Each lap of a ring is another."""
+    passages: list[list[int]] = []
+    ended: object = None
+    for number, visit in enumerate(leg.visits):
+        measure = track.measure_m[track.vertices(visit.element)]
+        begin, end = (measure[0], measure[-1]) if visit.forward else (measure[-1], measure[0])
+        if passages and ended == (track.ids[visit.element], visit.forward, begin):
+            passages[-1].append(number)
+        else:
+            passages.append([number])
+        ended = (track.ids[visit.element], visit.forward, end)
+    return passages
+
+
+def _row(found: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, sure: float) -> tuple[object, ...]:
     path_m, probability = floats(found.epochs, "path_m"), floats(found.epochs, "path_probability")
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
-    inside = np.flatnonzero(on_leg & (leg.visit[segment] == visit) & np.isfinite(probability))
+    inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & np.isfinite(probability))
     least = float(probability[inside].min()) if len(inside) else None
-    name = found.path.track.ids[leg.visits[visit].element]
+    one = leg.visits[visits[0]]
     times = found.epochs["t"]
     return (
-        name,
-        "AB" if leg.visits[visit].forward else "BA",
+        found.path.track.ids[one.element],
+        "AB" if one.forward else "BA",
         number,
         least is None or least < sure,
         least,

@@ -19,6 +19,7 @@ from pipeline.odometry.polarity import polarity
 from pipeline.track.leg import leg_of
 from pipeline.track.network import network_of
 from pipeline.track.path import TravelledPath
+from pipeline.track.pieces import in_pieces
 from pipeline.track.route import network_along, visits_of
 from pipeline.track.survey import Track, track_of
 from schemas.arrays import Ints, floats, times_ns
@@ -100,7 +101,7 @@ def _path(
         leg = leg_of(track, visits)
         if not leg.returns:
             return *path_on_chain(fixes, odometry, track, leg, config), no_doubt(), None
-    network = network_of(track, site.links) if visits is None else network_along(track, visits)
+    network = network_of(in_pieces(track), site.links) if visits is None else network_along(track, visits)
     pinned = pins_of(fixes, site, network.track, balise_reads)
     return find_path(fixes, odometry, network, pinned, config)
 
