@@ -26,6 +26,8 @@ from schemas.run import Site
 
 # About a joint of two elements either is right, for positions are no better [m].
 JOINT_M = 30.0
+# At a switch two tracks are one until they are so far apart [m].
+ONE_TRACK_M = 2.0
 SURE = 0.99
 
 
@@ -327,12 +329,21 @@ def verdict(world: World, truth: Drive, epochs: pl.DataFrame, error_m: np.ndarra
     known = epochs["on_track"].to_numpy() & epochs["netelement_id"].is_not_null().to_numpy()
     lengths = np.array([world.length(name) for name in truth.element])
     near_joint = np.minimum(truth.measure_m, lengths - truth.measure_m) < JOINT_M + error_m
-    other = epochs["netelement_id"].fill_null("").to_numpy() != truth.element
-    wrong = known & other & ~near_joint
+    names = epochs["netelement_id"].fill_null("").to_numpy()
+    wrong = known & (names != truth.element) & ~near_joint
+    for row in np.flatnonzero(wrong).tolist():
+        wrong[row] = apart_m(world, names[row], truth.place[row]) > ONE_TRACK_M
     claims = np.fmax(*(np.nan_to_num(floats(epochs, f"{name}_probability")) for name in ("gate", "path")))
     sure = claims >= SURE
     off_m = path_off_m(truth, epochs, known)
     return Verdict(float(wrong.mean()), float((wrong & sure).mean()), float(sure.mean()), off_m)
+
+
+def apart_m(world: World, name: str, place: np.ndarray) -> float:
+    """How far an element lies from a place, above it or aside."""
+    points, along = world.elements[name], measures(world.elements[name])
+    at = np.arange(0.0, along[-1], 0.5)
+    return float(min(np.linalg.norm(place - np.column_stack([np.interp(at, along, p) for p in points.T]), axis=1)))
 
 
 def path_off_m(truth: Drive, epochs: pl.DataFrame, known: np.ndarray) -> float:

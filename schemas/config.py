@@ -112,6 +112,10 @@ class MatchingConfig(Settings):
     heading_sigma_deg: Positive = 10.0
     # Slower, the noise of the velocity decides its heading.
     heading_min_speed_mps: Positive = 2.0
+    # Heights tell tracks apart that lie over each other by so much: a train needs a clearance of 4.5 m and more.
+    # The bias is that of datum and antenna: one that the vehicle file does not know stands some 4 m over the rail.
+    clearance_m: Positive = 3.0
+    height_bias_sigma_m: Positive = 2.0
     # Newson & Krumm 2009, eq. 2, for ways by odometer.
     transition_scale_m: Positive = 5.0
     # DOMAIN section 2: the noise of a standing train is no turn; the first 20 m of net movement orient the path.

@@ -28,7 +28,8 @@ _TABLE_FLOOR_M = 0.1
 # Where a position is off every element, its offsets change by this share of the least from step to step.
 _OFF_S = 8.0
 _OFF_WANDER = 0.03
-_HEADING_LIMIT = 8.0
+# No direction and no height counts for more, whatever they are off.
+_DIRECT_LIMIT = 8.0
 _ENDS_SIGMA_M = 1.0
 _RULED_OUT = -50.0
 
@@ -39,8 +40,8 @@ class Likelihood:
     step before, and which part of the offset is expected to stay.
 
     `renewed_m2`: what a change of element adds. `fixed` is the log-likelihood that does not depend on the step before
-    (place past an element's end, reads of balises, heading as far as it is new, time off the track); `heading` is the
-    whole of it, for a first step.
+    (place past an element's end, reads of balises, heading and height as far as they are new, time off the track);
+    `direct` is the whole of heading and height, for a first step.
     """
 
     hypotheses: Hypotheses
@@ -49,7 +50,7 @@ class Likelihood:
     keep: Floats
     renewed_m2: Floats
     fixed: Floats
-    heading: Floats
+    direct: Floats
     outlier: float
     outlier_scale_m: float
 
@@ -77,7 +78,7 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     whole_m2 = gnss_m2 + survey_m2 + config.on_track_bias_m**2
     unexplained = candidates.distance_m > config.on_track_sigmas * np.sqrt(whole_m2)
     off = unexplained & (candidates.distance_m > config.outlier_scale_m)
-    heading = _heading(steps, candidates, config)
+    direct = _heading(steps, candidates, config) + _height(fixes, row, candidates, survey_m2, config)
     share_new = np.clip(gnss_m2 * renewed + wander_m2, np.minimum(floor_m2, whole_m2), whole_m2) / whole_m2
     return Likelihood(
         hypotheses=hypotheses,
@@ -87,9 +88,9 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
         keep=np.sqrt(1.0 - fast_m2 * renewed[:, None] / (variance + survey_m2[:, None])),
         renewed_m2=2.0 * (config.sigma_doubt**2) * survey_m2,
         fixed=_ends(candidates, gnss_m2 + survey_m2 + _ENDS_SIGMA_M**2, config)
-        + heading * share_new
+        + direct * share_new
         - _time_off(steps, candidates, off, config),
-        heading=heading,
+        direct=direct,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
     )
@@ -99,7 +100,7 @@ def initial_score(offset_m: Floats, candidate: Ints, like: Likelihood) -> Floats
     """Log-likelihood of states without a step before them, per hypothesis: `[state, hypothesis]`."""
     off_m = offset_m[:, None] - like.hypotheses.bias_m
     density = log_density(off_m, np.zeros(1), like.variance_m2[candidate], like)
-    return np.asarray(density + (like.fixed + like.heading)[candidate][:, None])
+    return np.asarray(density + (like.fixed + like.direct)[candidate][:, None])
 
 
 def step_score(before_m: Floats, offset_m: Floats, candidate: Ints, changes: Bools, like: Likelihood) -> Floats:
@@ -187,6 +188,19 @@ def _heading(steps: Steps, candidates: Candidates, config: MatchingConfig) -> Fl
     """Log-likelihood of the direction of travel, either way along the element; nothing at standstill."""
     difference = steps.heading_rad[candidates.step] - candidates.heading_rad
     folded = (np.degrees(difference) + 90.0) % 180.0 - 90.0
-    value = np.maximum(-0.5 * (folded / config.heading_sigma_deg) ** 2, -_HEADING_LIMIT)
+    value = np.maximum(-0.5 * (folded / config.heading_sigma_deg) ** 2, -_DIRECT_LIMIT)
     moving = steps.speed_mps[candidates.step] >= config.heading_min_speed_mps
     return np.where(moving & np.isfinite(value), value, 0.0)
+
+
+def _height(fixes: Fixes, row: Ints, candidates: Candidates, survey_m2: Floats, config: MatchingConfig) -> Floats:
+    """Log-likelihood of the height over the track, where tracks lie over each other; nothing without heights.
+
+    Tracks at one level differ by superelevation and errors of the survey, which say nothing of the train.
+    """
+    begin, track_m = candidates.first[:-1], candidates.height_m
+    apart_m = np.maximum.reduceat(track_m, begin) - np.minimum.reduceat(track_m, begin)
+    above_m = fixes.height_m[row] - track_m
+    variance = config.sigma_doubt**2 * fixes.cov_uu_m2[row] + survey_m2 + config.height_bias_sigma_m**2
+    value = np.maximum(-0.5 * above_m**2 / variance, -_DIRECT_LIMIT)
+    return np.where((apart_m[candidates.step] >= config.clearance_m) & np.isfinite(value), value, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
@@ -64,6 +64,7 @@ def match(
     epoch comes near any track.
     """
     arrays = fixes_of(fixes, fix_sigma)
+    arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     path, found, ambiguous, posterior = _path(arrays, odometry, site, config, balise_reads)

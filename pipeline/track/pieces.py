@@ -21,7 +21,10 @@ _DIRECTION_OVER_M = 10.0
 
 def in_pieces(track: Track) -> Track:
     """The track with its elements in pieces, each of its element's name and measures, in order."""
-    return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces_of(track)) for part in parts])
+    pieces = pieces_of(track)
+    if all(len(parts) == 1 for parts in pieces):
+        return track
+    return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces) for part in parts])
 
 
 def pieces_of(track: Track) -> list[list[slice]]:
