@@ -87,7 +87,7 @@ def _trellis(
     kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
     candidates = wide.take(np.flatnonzero(kept), len(steps)).renumbered(judged)
     steps = resumed(fixes, steps.epoch[judged], way)
-    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config.reach_m)
+    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config)
     like = likelihood_of(fixes, steps, candidates, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, like, config)

@@ -60,7 +60,7 @@ def hypotheses_of(cross_m2: float, survey_m2: float, doubt: float, config: Match
         bias_m=(kept * sigma_m[:, None] * _GRID_SIGMAS).ravel(),
         scale=np.repeat(scales, count),
         within_m=np.repeat(_WITHIN_SIGMAS * sigma_m, count),
-        log_prior=np.log(np.tile(prior / prior.sum(), len(scales)) / len(scales)),
+        log_prior=np.log(np.outer(scales / scales.sum(), prior / prior.sum()).ravel()),
         renewal=renewal,
     )
 
