@@ -96,8 +96,6 @@ def _trellis(
 def _thinned(fixes: Fixes, steps: Steps, network: Network, way: Travelled, config: MatchingConfig) -> Steps:
     """Fewer steps where no link is near, since nothing can be decided there that a later step does not show."""
     ends = end_places(network.track)[network.linked_ends()]
-    if len(ends) == 0 or len(steps) == 0:
-        return steps
     apart, _ = cKDTree(ends).query(fixes.points.surface[steps.epoch], distance_upper_bound=_CLEAR_M)
     moved = np.cumsum(np.nan_to_num(steps.chord_m)) / (_THINNING * config.step_distance_m)
     kept = np.isfinite(apart) | (np.nan_to_num(steps.elapsed_s) >= 0.5 * config.step_time_s)

@@ -63,18 +63,23 @@ def distance_scores(displacement_m: Floats, ways: Ways, config: MatchingConfig) 
     return np.asarray(-np.minimum(mismatch / scale, config.mismatch_limit))
 
 
-def best_move(
-    network: Network, one: int, one_m: float, other: int, other_m: float, way: Ways, config: MatchingConfig
-) -> Move | None:
-    """The most plausible move between two places, none where the network has none."""
-    places = np.array([one]), np.array([one_m]), np.array([other]), np.array([other_m])
-    scores = move_scores(network, *places, way, config)[:, 0]
-    limit_m, chosen = float(way.limit_m[0]), int(scores.argmax())
-    if not np.isfinite(scores[chosen]):
-        return None
+def best_moves(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, ways: Ways, config: MatchingConfig
+) -> list[Move | None]:
+    """The most plausible move of each pair of places, none where the network has none."""
+    scores = move_scores(network, one, one_m, other, other_m, ways, config)
+    chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
+    rows = zip(chosen.tolist(), one.tolist(), other.tolist(), ways.limit_m.tolist(), strict=True)
+    return [_move(network, *row) for row in rows]
+
+
+def _move(network: Network, chosen: int, one: int, other: int, limit_m: float) -> Move | None:
+    """The move of a row of `move_scores`, -1 for none."""
+    if chosen <= 0:
+        return None if chosen else Move((), 0)
     if chosen == 1:
         return Move(network.reach(one, limit_m)[other].between, 1)
-    return Move(network.reach(other, limit_m)[one].between[::-1], -1) if chosen else Move((), 0)
+    return Move(network.reach(other, limit_m)[one].between[::-1], -1)
 
 
 def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:

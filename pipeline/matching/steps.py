@@ -59,8 +59,6 @@ def travelled(fixes: Fixes, odometry: Odometry | None) -> Travelled:
 
 def steps_of(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Steps:
     """Steps every `step_distance_m` of movement and `step_time_s` of time among the given epochs."""
-    if len(rows) == 0:
-        return resumed(fixes, rows, way)
     moved = np.linalg.norm(np.diff(fixes.points.surface[rows], axis=0), axis=1)
     far = np.floor(np.concatenate([[0.0], np.cumsum(moved)]) / config.step_distance_m)
     late = np.floor((fixes.t_s[rows] - fixes.t_s[rows[0]]) / config.step_time_s)
@@ -140,7 +138,7 @@ def _reachable(
 
 def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
     """Given epochs as steps, each with what happened since the one before."""
-    unknown = np.full(min(1, len(rows)), np.nan)
+    unknown = np.full(1, np.nan)
     elapsed = np.concatenate([unknown, np.diff(fixes.t_s[rows])])
     moved = np.diff(fixes.points.surface[rows], axis=0, prepend=np.nan)
     chord = np.linalg.norm(moved, axis=1)
