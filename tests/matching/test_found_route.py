@@ -76,6 +76,9 @@ def test_one_run_of_two_is_corrected_and_nothing_of_it_is_in_doubt(tmp_path: Pat
     corrected.write_csv(routes / "one.csv")
     run_campaign(make_plan(runs, home, tmp_path / "second", routes=routes))
     one, two = (store.read_table(str(tmp_path / "second"), "epochs", name).collect() for name in ("one", "two"))
+    # The report takes the runs for those of this site, with a route of their own or not.
+    for name, metadata in store.completed_runs(str(tmp_path / "second")).items():
+        store.check_site(read_site(home), metadata["site_digest"], name)
     assert one["netelement_id"].unique().to_list() == ["c"]
     assert one["path_probability"].min() == 1.0
     assert two["path_probability"].max() < 0.99
