@@ -51,10 +51,10 @@ class World:
             one = name.lstrip("-")
             ends = (0.0, self.length(one)) if name == one else (self.length(one), 0.0)
             self.ride.append((one, *ends))
-        for at, by_m, end in ((0, start_m, 1), (-1, -stop_m, 2)):
-            leg = list(self.ride[at])
-            leg[end] += by_m * np.sign(leg[2] - leg[1])
-            self.ride[at] = (leg[0], leg[1], leg[2])
+        name, begin, end = self.ride[0]
+        self.ride[0] = (name, float(begin + start_m * np.sign(end - begin)), end)
+        name, begin, end = self.ride[-1]
+        self.ride[-1] = (name, begin, float(end - stop_m * np.sign(end - begin)))
 
 
 @dataclass(frozen=True)
