@@ -301,7 +301,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
 def _notices(row: Row) -> str:
     """The error, and what reading and matching found out."""
     told = [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
-    items = "".join(f"<li>{escape(text[:1].upper() + text[1:])}</li>" for text in told)
+    items = "".join(f"<li>{escape(text)}</li>" for text in told)
     return f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
 
 
