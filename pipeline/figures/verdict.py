@@ -12,8 +12,6 @@ from schemas.enums import RunStatus, RunVerdict
 
 Row = Mapping[str, Any]
 
-SAFE_REASON = "every accepted balise was at its place, and no wrong position stayed in use for longer than allowed"
-
 
 def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
     """The worst that applies, from the counts and the share of one `runs` row (DOMAIN section 5.4)."""
@@ -24,7 +22,7 @@ def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
 def verdict_reasons(run: Row, unknown_share_limit: float) -> str:
     """Why the verdict is what it is."""
     unsafe, unproven = _reasons(run, unknown_share_limit)
-    return "; ".join(unsafe + unproven) or SAFE_REASON
+    return "; ".join(unsafe + unproven) or "every acceptance right, every position failure within the time allowed"
 
 
 def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]]:
@@ -36,21 +34,18 @@ def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]
     share = run["share_unknown"]
     undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
     unsafe = {
-        "{} balise{s} accepted at a wrong place": run["unsafe_accepted"],
-        "{} wrong position{s} in use for longer than allowed": run["failures_beyond_budget"],
+        "VBs accepted despite a wrong position: {}": run["unsafe_accepted"],
+        "position failures in use for longer than allowed: {}": run["failures_beyond_budget"],
     }
     unproven = {
-        "{} accepted balise{s} could not be checked": run["unproven_accepted"],
-        "{} wrong position{s} of which nobody can say whether the time allowed was kept": undecided,
+        "VBs accepted that nothing can check: {}": run["unproven_accepted"],
+        "position failures of unknown length: {}": undecided,
         "no position was in use while the train moved": share is None,
         f"{share or 0.0:.1%} of the moving time in use could not be checked": share is not None
         and share > unknown_share_limit,
-        "no balise was accepted": not run["balises_accepted"],
+        "no VB was accepted": not run["balises_accepted"],
     }
-    said, left = (
-        [text.format(count, s="" if count == 1 else "s") for text, count in found.items() if count]
-        for found in (unsafe, unproven)
-    )
+    said, left = ([text.format(count) for text, count in found.items() if count] for found in (unsafe, unproven))
     return said, left
 
 

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.figures.verdict import SAFE_REASON, head_of, run_verdicts, verdict_reasons, word_of, worst_verdict
+from pipeline.figures.verdict import head_of, run_verdicts, verdict_reasons, word_of, worst_verdict
 from pipeline.report.columns import Row
 from pipeline.report.markup import number
 from pipeline.report.words import plural
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Hazard, Judgement, PassageStatus, RunVerdict
+
+_ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def campaign_headline(
     if head.verdict is None:
         return Headline(head.word, "no run could be replayed", said), None
     if head.verdict == RunVerdict.SAFE:
-        return Headline(head.word, SAFE_REASON, said), None
+        return Headline(head.word, _ALL_SAFE, said), None
     rows = runs.filter(pl.col("verdict") == head.verdict.value)
     order = ("unsafe_accepted", "hazardous_max_s", "unproven_accepted", "share_unknown")
     worst = rows.sort(*order, "run_id", descending=[True] * len(order) + [False], nulls_last=True).head(1)

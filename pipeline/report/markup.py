@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import itertools
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -199,8 +198,8 @@ def _css_text(text: str) -> str:
 def _numbered(body: str) -> str:
     """Figures and tables with their numbers, in the order of the page."""
     for opening, word in (("<figcaption><h3>", "Figure"), ("<caption>", "Table")):
-        count = itertools.count(1)
-        body = re.sub(opening, lambda found, word=word, count=count: f"{found[0]}{word} {next(count)}. ", body)
+        first, *parts = body.split(opening)
+        body = first + "".join(f"{opening}{word} {number}. {part}" for number, part in enumerate(parts, start=1))
     return body
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -20,6 +21,7 @@ from pipeline.report.headline import run_headline
 from pipeline.report.markup import (
     Cell,
     Json,
+    cell,
     figure,
     link,
     number,
@@ -27,6 +29,7 @@ from pipeline.report.markup import (
     pairs,
     script_json,
     section,
+    table,
     tiles,
     verdict_head,
 )
@@ -80,6 +83,7 @@ _TRAINS = {
     "learned": "no vehicle file: odometer scale and GNSS latency learned in the run",
     "none": "no odometer: no monitor along the track can work",
 }
+_FILES = "_files"
 _COUNTED = (
     ("accepted at a wrong place", "unsafe_accepted", "bad"),
     ("wrong in use for too long", "failures_beyond_budget", "bad"),
@@ -384,7 +388,21 @@ def _reasons(key: str, epochs: pl.DataFrame) -> str:
 
 
 def _provenance(metadata: Mapping[str, str], made: Made) -> str:
-    return section("provenance", "Provenance", pairs(sorted(metadata.items())), configuration(made))
+    digests = {name: value for name, value in metadata.items() if not name.endswith(_FILES)}
+    shown = pairs(sorted(digests.items()))
+    return section("provenance", "Provenance", _files(metadata), shown, configuration(made))
+
+
+def _files(metadata: Mapping[str, str]) -> str:
+    """The files that the run was made from, as `[name, bytes, SHA-256]` under each key that ends so."""
+    listed = {key: json.loads(value) for key, value in sorted(metadata.items()) if key.endswith(_FILES)}
+    heads = [("part", ""), ("file", ""), ("bytes", ""), ("SHA-256", "")]
+    rows = [
+        [Cell(part := key.removesuffix(_FILES), part), *(cell(value) for value in file)]
+        for key, files in listed.items()
+        for file in files
+    ]
+    return table("table-files", "Files that this run was made from", heads, rows) if rows else ""
 
 
 def configuration(made: Made) -> str:

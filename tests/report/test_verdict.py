@@ -53,7 +53,8 @@ def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTab
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("verdicts")
-    write_run(run_of("good", SAFE, []), out, {})
+    files = '[["good/gnss.parquet", 1200, "ab12"], ["good/<b>", 7, "cd34"]]'
+    write_run(run_of("good", SAFE, []), out, {"log_files": files, "log_digest": "ef56"})
     write_run(run_of("bad", UNSAFE, [0.2, 7.0, 0.1]), out, {})
     empty = {name: schema.create_empty() for name, schema in TABLES.items()}
     lost = failed_row("gnss.parquet: column t: not in order", Provenance("c", "i", "test"))
@@ -66,7 +67,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("page", "word", "reason"),
     [
         ("index.html", "unsafe", "VB2 accepted 500 m early, no monitor saw it (run bad)."),
-        ("runs/good.html", "safe", "every accepted balise was at its place, and no wrong position stayed in use"),
+        ("runs/good.html", "safe", "every acceptance right, every position failure within the time allowed."),
         ("runs/bad.html", "unsafe", "VB2 accepted 500 m early, no monitor saw it."),
         ("runs/lost.html", "failed", "gnss.parquet: column t: not in order."),
     ],
@@ -78,8 +79,8 @@ def test_the_verdict_is_the_first_word(report: Path, page: str, word: str, reaso
 
 def test_all_reasons_stand_behind_it(report: Path) -> None:
     page = (report / "runs" / "bad.html").read_text()
-    assert "1 balise accepted at a wrong place; 1 wrong position in use for longer than allowed" in page
-    assert "1 wrong position of which nobody can say whether the time allowed was kept" in page
+    assert "VBs accepted despite a wrong position: 1; position failures in use for longer than allowed: 1" in page
+    assert "position failures of unknown length: 1" in page
     assert "5.0% of the moving time in use could not be checked" in page
     assert "accepted despite the fault" in page
     assert "1 unsafe, 1 safe, 1 failed." in (report / "index.html").read_text()
@@ -103,3 +104,9 @@ def test_failures_against_the_levels(report: Path) -> None:
     levels = (report / "index.html").read_text().partition('id="table-levels-s0"')[2]
     row = levels.partition(">lpv200<")[2].partition("</tr>")[0]
     assert re.findall(r'data-order="([\d.]+)"', row)[1:4] == ["3.0", "2.0", "1.0"]
+
+
+def test_the_files_of_a_run_are_named(report: Path) -> None:
+    page = (report / "runs" / "good.html").read_text().partition('id="table-files"')[2].partition("</table>")[0]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in page.split("<tr>")[2:]]
+    assert rows == [["log", "good/gnss.parquet", "1\u202f200", "ab12"], ["log", "good/&lt;b&gt;", "7", "cd34"]]
