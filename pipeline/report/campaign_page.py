@@ -119,7 +119,7 @@ def _verdict_tiles(runs: pl.DataFrame) -> list[tuple[str, str, str]]:
 def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
     """When, where, with what, by which program."""
     runs = campaign.runs
-    begun, ended = runs["t_start"].min(), runs["t_end"].max()
+    begun, ended = runs.select(pl.col("t_start").min(), pl.col("t_end").max()).row(0)
     elements = campaign.pieces["netelement_id"].n_unique()
     trains = runs.select(pl.col("vehicle").cast(pl.String).fill_null("not known").value_counts(sort=True)).unnest(
         "vehicle"

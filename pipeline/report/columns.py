@@ -97,9 +97,16 @@ def _cell(row: Row, name: str) -> Cell:
         value = [*value[:_MOST_NAMES], f"and {len(value) - _MOST_NAMES} more"]
     plain = cell(value, 4)
     if isinstance(value, str):
-        words = OPINIONS if name == "suspect" else WORDS
-        return Cell(words.get(value, value), value, tone=_WORD_TONES.get(value, "") if name != "suspect" else "")
-    return Cell(plain.text, plain.order, tone=_TONES.get(name, "") if value else "")
+        opinion = name == "suspect"
+        words = (OPINIONS if opinion else WORDS).get(value, value)
+        return Cell(words, value, tone="" if opinion else _WORD_TONES.get(value, ""))
+    return Cell(plain.text, plain.order, tone=_tone(name, value))
+
+
+def _tone(name: str, value: object) -> str:
+    if name == "within_budget":
+        return "bad" if value is False else ""
+    return _TONES.get(name, "") if value else ""
 
 
 def _text(row: Row, name: str) -> str:
