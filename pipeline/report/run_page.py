@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -21,20 +20,18 @@ from pipeline.report.headline import run_headline
 from pipeline.report.markup import (
     Cell,
     Json,
-    cell,
     figure,
     link,
-    number,
     page,
     pairs,
     script_json,
     section,
-    table,
     tiles,
     verdict_head,
 )
 from pipeline.report.plan_view import plan_data
 from pipeline.report.route_found import route_section
+from pipeline.report.run_facts import FILES, JUDGES, facts, file_table, tile_figures
 from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
 from pipeline.report.words import WORDS
 from schemas.campaign import CampaignLevels
@@ -78,19 +75,6 @@ _PLOTS = (
      "Below the diagonal the claim was wrong."),
 )  # fmt: skip
 _KEYS = "Keys: n p next and previous hazard, + - 0 zoom, ← → time, [ ] previous and next run"
-_TRAINS = {
-    "file": "odometer and antenna as in the vehicle file",
-    "learned": "no vehicle file: odometer scale and GNSS latency learned in the run",
-    "none": "no odometer: no monitor along the track can work",
-}
-_FILES = "_files"
-_COUNTED = (
-    ("accepted at a wrong place", "unsafe_accepted", "bad"),
-    ("wrong in use for too long", "failures_beyond_budget", "bad"),
-    ("faults not found in time", "missed_detections", "bad"),
-    ("accepted, could not be checked", "unproven_accepted", "doubt"),
-)
-_JUDGES = {"reference": "a reference", "balise": "balise reads", "odometer": "the odometer alone"}
 
 
 @dataclass(frozen=True)
@@ -125,8 +109,8 @@ def run_page(
     names = [row["solution"] for row in rows if row["solution"]]
     parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
     side_by_side = "" if architectures is None else architectures_section("architectures", architectures)
-    facts = pairs(_facts(rows, tables, metadata))
-    body = "\n".join([facts, _navigation(names), *parts, side_by_side, _provenance(metadata, made)])
+    told = pairs(facts(rows, tables, metadata))
+    body = "\n".join([told, _navigation(names), *parts, side_by_side, _provenance(metadata, made)])
     data = {
         "run": tables.run_id,
         "limits": _limits(made.config),
@@ -150,51 +134,6 @@ def _ways(neighbours: Neighbours) -> str:
         if other is not None:
             ways.append(link(other[1], f"{words} {other[0]}", data_go=go))
     return f'<p class="ways">{" · ".join(ways)}</p>'
-
-
-def _facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -> list[tuple[str, str]]:
-    """When, where, with what, by which program, from which files."""
-    first = rows[0]
-    found = {
-        "Date": _span(first),
-        "Line": _line(first, tables.epochs),
-        "Train": _TRAINS.get(first["vehicle"], "not known"),
-        "Receivers": ", ".join(
-            f"{row['solution']} {number(row['gnss_rate_hz'])} Hz" for row in rows if row["solution"]
-        ),
-        "Judged by": _JUDGES.get(first["evidence"], "nothing: the log has no reference, no reads, no odometer"),
-        "Reading of the log": ", ".join(dict.fromkeys(_reading(row) for row in rows)),
-        "Program": f"{first['software']}, tables {first['contract']}",
-        "Digest of log and site": first["input_digest"],
-        "Digest of configuration and vehicle": first["config_digest"],
-        "Digest of the log": metadata.get("log_digest", ""),
-    }
-    return [(name, value) for name, value in found.items() if value]
-
-
-def _receiver(row: Row) -> str:
-    return f"{row['solution']} {number(row['gnss_rate_hz'])} Hz"
-
-
-def _span(row: Row) -> str:
-    if row["t_start"] is None:
-        return "not known"
-    hours = f"{row['t_start']:%Y-%m-%d, %H:%M:%S} to {row['t_end']:%H:%M:%S} UTC"
-    return f"{hours} ({row['duration_s'] / 60.0:.1f} min)" if row["duration_s"] is not None else hours
-
-
-def _line(row: Row, epochs: pl.DataFrame) -> str:
-    names = epochs["netelement_id"].drop_nulls().unique(maintain_order=True).to_list()
-    if not names:
-        return "not known"
-    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    driven = f", {row['distance_m'] / 1000.0:.1f} km driven" if row["distance_m"] is not None else ""
-    return f"{', '.join(names[:6])}{more}{driven}, {row['balises_on_path']} balises passed"
-
-
-def _reading(row: Row) -> str:
-    until = f" up to {row['partial_until']:%H:%M:%S} UTC" if row["partial_until"] is not None else ""
-    return f"{row['status']}: {WORDS[row['status']]}{until}"
 
 
 def _limits(config: Configuration) -> Json:
@@ -284,7 +223,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
     runs = tables.runs.filter(own)
     known = known_counts(runs).row(0, named=True)
     balises = _balises(tables.run_id, passages, runs)
-    shown = tiles(_tiles(known, balises, made.config.hazards.unknown_share_limit))
+    shown = tiles(tile_figures(known, balises, made.config.hazards.unknown_share_limit))
     sure = made.config.matching.ambiguity_probability
     parts = [
         section(f"figures-{key}", f"Summary of {name}" if several else "Summary", shown, notes),
@@ -307,29 +246,6 @@ def _notices(row: Row) -> str:
     told = [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
     items = "".join(f"<li>{escape(text)}</li>" for text in told)
     return f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
-
-
-def _tiles(run: Row, balises: pl.DataFrame, unknown_limit: float) -> list[tuple[str, str, str]]:
-    """What a reader must not miss; a tile that is bad looks bad. `balises`: as `lost_shares`."""
-    share = run["share_unknown"]
-    checked = share is not None and share <= unknown_limit
-    lost, passed = (int(balises[name].sum()) for name in ("lost", "passages"))
-    return [
-        *((words, number(run[name]), _tone(run[name], tone)) for words, name, tone in _COUNTED),
-        ("of the time in use not checked", _percent(share), "good" if checked else "doubt"),
-        ("balises lost, of those passed", f"{lost} of {passed}", _tone(lost, "lost")),
-        ("false alarms", number(run["false_alarms"]), _tone(run["false_alarms"], "lost")),
-        ("of moving time with a valid TVB", _percent(run["availability"]), "" if run["availability"] else "lost"),
-    ]
-
-
-def _tone(count: int | None, tone: str) -> str:
-    """Nobody counted: in doubt."""
-    return "doubt" if count is None else tone if count else "good"
-
-
-def _percent(share: float | None) -> str:
-    return "not known" if share is None else f"{share:.1%}"
 
 
 def _balises(run_id: str, passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
@@ -361,7 +277,7 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
         left = (
             "no position was in use" if share is None else f"{share:.1%} of the moving time in use could not be checked"
         )
-        return f'<p class="none">No hazard was found, judged by {_JUDGES[run["evidence"]]}; {left}.</p>'
+        return f'<p class="none">No hazard was found, judged by {JUDGES[run["evidence"]]}; {left}.</p>'
 
     def named(row: Row) -> Cell:
         return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
@@ -388,21 +304,9 @@ def _reasons(key: str, epochs: pl.DataFrame) -> str:
 
 
 def _provenance(metadata: Mapping[str, str], made: Made) -> str:
-    digests = {name: value for name, value in metadata.items() if not name.endswith(_FILES)}
+    digests = {name: value for name, value in metadata.items() if not name.endswith(FILES)}
     shown = pairs(sorted(digests.items()))
-    return section("provenance", "Provenance", _files(metadata), shown, configuration(made))
-
-
-def _files(metadata: Mapping[str, str]) -> str:
-    """The files that the run was made from, as `[name, bytes, SHA-256]` under each key that ends so."""
-    listed = {key: json.loads(value) for key, value in sorted(metadata.items()) if key.endswith(_FILES)}
-    heads = [("part", ""), ("file", ""), ("bytes", ""), ("SHA-256", "")]
-    rows = [
-        [Cell(part := key.removesuffix(_FILES), part), *(cell(value) for value in file)]
-        for key, files in listed.items()
-        for file in files
-    ]
-    return table("table-files", "Files that this run was made from", heads, rows) if rows else ""
+    return section("provenance", "Provenance", file_table(metadata), shown, configuration(made))
 
 
 def configuration(made: Made) -> str:
