@@ -25,6 +25,8 @@ PREFIX = "balise."
 _COMPRESSION_LEVEL = 3
 _ROWS_PER_GROUP = 262_144
 _MARKER = "runs"
+# Of 255 bytes that file systems allow, `run_id=` takes seven.
+LONGEST_NAME = 248
 
 
 def table_address(out: Address, table: str, run_id: str) -> Address:

@@ -16,7 +16,7 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
+from pipeline.campaign import Plan, RunOutcome, Summary, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost
 from pipeline.campaign.progress import LogWatch
 from pipeline.ingest import read_run
@@ -36,6 +36,7 @@ class Spy:
         self.act = act
         self.seen: list[RunOutcome] = []
         self.losses: list[tuple[str, int]] = []
+        self.notes: list[str] = []
 
     def begin(self, plan: Plan) -> None:
         self.seen.clear()
@@ -46,6 +47,9 @@ class Spy:
 
     def lost(self, run_id: str, attempt: int) -> None:
         self.losses.append((run_id, attempt))
+
+    def noted(self, text: str) -> None:
+        self.notes.append(text)
 
     def finished(self, outcome: RunOutcome) -> None:
         self.seen.append(outcome)
@@ -138,11 +142,9 @@ def test_skipped_failures_are_still_failures(small_trial: SmallTrial, tmp_path: 
 def test_what_changed_is_replayed_again(small_trial: SmallTrial, tmp_path: Path) -> None:
     run, site, out = one_run(small_trial, tmp_path), tmp_path / "site", tmp_path / "out"
     shutil.copytree(small_trial.site, site)
-    trial = SmallTrial(site, tmp_path)
 
     def skipped(config: Configuration | None = None) -> int:
-        plan = plan_of(trial, out, [run])
-        return run_campaign(Plan(tuple(_with(plan, config)), plan.out, plan.config, plan.vehicle)).skipped
+        return run_campaign(make_plan([str(run)], site, out, config)).skipped
 
     assert skipped() == 0
     stat = (run / "odometer.parquet").stat()
@@ -154,12 +156,6 @@ def test_what_changed_is_replayed_again(small_trial: SmallTrial, tmp_path: Path)
     assert (out / "runs/run_id=run0/runs.parquet").exists()
     (site / "balises.parquet").unlink()
     assert [skipped(), skipped()] == [0, 1]
-
-
-def _with(plan: Plan, config: Configuration | None) -> list[worker.RunJob]:
-    from dataclasses import replace
-
-    return [replace(job, config=config or job.config) for job in plan.jobs]
 
 
 def test_clock_and_file_times_decide_nothing(
@@ -185,7 +181,7 @@ def test_log_that_changes_while_it_is_read(
         return log
 
     with monkeypatch.context() as patched:
-        patched.setattr(worker, "read_run", read_and_append)
+        patched.setattr(recorded_log, "read_run", read_and_append)
         changed = by_run(run_campaign(plan_of(small_trial, out, [run])))["run0"]
     assert changed.status is RunStatus.FAILED
     assert "changed while it was read" in (changed.error or "")
