@@ -131,9 +131,8 @@ def _fetched(store: Any, path: str, folder: Path, version: str | None) -> Path:
 
 
 def _copies(listing: Listing, path: str, target: Path) -> dict[str, Path]:
-    """Where the object goes, or each of those directly in the folder."""
+    """Where the object goes, or each of those in the folder."""
     if path in listing:
         return {path: target}
     target.mkdir()
-    names = {place: place.removeprefix(f"{path.rstrip('/')}/") for place in listing}
-    return {place: target / name for place, name in names.items() if name and "/" not in name and name != ".."}
+    return {place: target / name_of(f"x://{place}") for place in listing}

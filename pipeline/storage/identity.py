@@ -22,9 +22,8 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
     """
     if not is_url(folder):
         return _local_versions(str(folder), name)
-    infos = {
-        place.split("/")[-2]: info for place, info in on_store(folder, objects_at).items() if place.endswith(f"/{name}")
-    }
+    listed = on_store(folder, lambda store, path: store.find(path, detail=True))
+    infos = {place.split("/")[-2]: info for place, info in listed.items() if place.endswith(f"/{name}")}
     found = {part: version_of(info) for part, info in infos.items()}
     return None if None in found.values() else {part: str(version) for part, version in found.items()}
 

@@ -22,11 +22,16 @@ class AlteredError(Exception):
 
 
 def objects_at(store: Any, path: str) -> Listing:
-    """What a store tells of an object, or of each object in a folder and below, by its path."""
+    """What a store tells of an object, or of each object directly in a folder, by its path.
+
+    `find`, `exists` and `isdir` of fsspec say that nothing is there, too, where the store has only failed to answer.
+    """
     try:
-        return dict(store.find(path, detail=True))
+        info = store.info(path)
     except FileNotFoundError:
         return {}
+    found = entries_of(store, path) if info["type"] == "directory" else [info]
+    return {entry["name"]: entry for entry in found if entry["type"] != "directory"}
 
 
 def entries_of(store: Any, folder: str) -> list[dict[str, Any]]:
@@ -39,10 +44,7 @@ def entries_of(store: Any, folder: str) -> list[dict[str, Any]]:
 
 
 def kind_of(store: Any, path: str) -> str:
-    """`file` or `directory`; empty where there is neither.
-
-    `exists` and `isdir` of fsspec say no, too, where the store has only failed to answer.
-    """
+    """`file` or `directory`; empty where there is neither."""
     try:
         return str(store.info(path)["type"])
     except FileNotFoundError:

@@ -190,6 +190,27 @@ def test_log_that_changes_while_it_is_read(
     assert (again.status, again.skipped) == (RunStatus.OK, False)
 
 
+def test_a_panic_fails_its_run_only(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Libraries written in Rust raise what is no `Exception`; decoding, it is the log's fault, later our own."""
+    panics: dict[str, BaseException] = {
+        "run1": pl.exceptions.PanicException("range end index 7 out of range"),
+        "run2": BaseExceptionGroup("of many", [GeneratorExit()]),
+    }
+
+    def read(path: Path, config: IngestConfig) -> RunLog:
+        if path.name in panics:
+            raise panics[path.name]
+        return read_run(path, config)
+
+    monkeypatch.setattr(recorded_log, "read_run", read)
+    plans = [plan_of(small_trial, tmp_path, [path]) for path in small_trial.paths[:3]]
+    outcomes = [run_campaign(plan).outcomes[0] for plan in plans]
+    assert [outcome.status for outcome in outcomes] == [RunStatus.OK, RunStatus.FAILED, RunStatus.FAILED]
+    assert [outcome.defect for outcome in outcomes] == [False, False, True]
+    assert re.search("run1: cannot be decoded, it is damaged: range end", outcomes[1].error or "")
+    assert store.run_ids(tmp_path) == ["run0", "run1", "run2"]
+
+
 def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("division by zero")
