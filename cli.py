@@ -442,7 +442,7 @@ def _guarded(arguments: list[str], debug: bool) -> int:
         # The reader of our output has gone (`| head`): nothing more to say, not even on closing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except Exception as error:
+    except BaseException as error:  # panics of libraries are no `Exception`
         _complain(f"a defect of this program: {type(error).__name__}: {error}", debug)
         print("Please report it with the output of the same command and --debug.", file=sys.stderr)
         return DEFECT

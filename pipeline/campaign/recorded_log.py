@@ -57,12 +57,13 @@ class RecordedLog:
         """Decode the log."""
         try:
             run = read_run(path, self._job.config.ingest)
-        except (Exception, pl.exceptions.PanicException) as error:
+        except pl.exceptions.PanicException as error:
             self.digest_at(path)
-            if isinstance(error, Exception):
-                raise
             reason = str(error).partition("\n")[0]
             raise InputError(f"cannot be decoded, it is damaged: {reason}", place=str(path)) from None
+        except Exception:
+            self.digest_at(path)
+            raise
         self.digest_at(path, run.input_digest)
         return run
 

@@ -52,7 +52,8 @@ def run_campaign(
         finally:
             engine.close()
             _tidy(plan, loop)
-            keep(plan, loop.outcomes)
+            if left.jobs:
+                keep(plan, loop.outcomes)
         _finish(plan, loop, summary)
         return summary
 

@@ -21,6 +21,7 @@ from pipeline.storage.writing import (
     remove_folder,
     replace_files,
     stage,
+    unfinished_in,
     whole_file,
     write_bytes,
 )
@@ -45,6 +46,7 @@ __all__ = [
     "replace_files",
     "signature",
     "stage",
+    "unfinished_in",
     "version",
     "versions",
     "whole_file",

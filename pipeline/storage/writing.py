@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import IO, Any
 
@@ -142,6 +143,16 @@ def discard(staged: list[tuple[Address, Address]]) -> None:
     for temporary, final in staged:
         if temporary != final:
             Path(temporary).unlink(missing_ok=True)
+
+
+def unfinished_in(folder: Path | str) -> list[str]:
+    """Names of files in a folder that were being written; none where it does not exist."""
+    with as_output_error(folder):
+        try:
+            names = os.listdir(folder)  # noqa: PTH208 - of thousands of folders
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+    return [name for name in names if fnmatchcase(name, UNFINISHED)]
 
 
 def remove(address: Address) -> None:

@@ -284,6 +284,12 @@ def test_configuration_comes_back(tmp_path: Path) -> None:
     assert store.read_config(tmp_path) == config
 
 
+def test_configuration_of_another_build_is_one_message(tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text("[matching]\nbias_sigma_m = 2.0\n")
+    with pytest.raises(UsageError, match=r"config.toml: was not written by this build.*bias_sigma_m.*[Rr]eplay"):
+        store.read_config(tmp_path)
+
+
 @pytest.mark.parametrize(
     "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show tables", "", "-- x"]
 )
