@@ -44,6 +44,7 @@ _SLOW = (
     "matching/test_calibration.py",
     "matching/test_found_route.py",
     "plausibility",
+    "monitors/test_pseudorange.py",
     "replay/test_channels.py",
     "replay/test_evidence.py",
     "replay/test_moving.py",

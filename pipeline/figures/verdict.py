@@ -24,7 +24,7 @@ def verdict_reasons(run: Row, unknown_share_limit: float) -> str:
     unsafe, unproven = _reasons(run, unknown_share_limit)
     if not unsafe + unproven and run["verdict"] == RunVerdict.UNPROVEN:
         return "its streams do not fit each other, as the notes say"
-    return "; ".join(unsafe + unproven) or "every acceptance was right, and every position failure within the budget"
+    return "; ".join(unsafe + unproven) or "every acceptance right, every position failure within the time allowed"
 
 
 def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]]:
@@ -36,14 +36,14 @@ def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]
     share = run["share_unknown"]
     undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
     unsafe = {
-        "{} VBs accepted despite a wrong position": run["unsafe_accepted"],
-        "{} position failures in use beyond the budget": run["failures_beyond_budget"],
+        "VBs accepted despite a wrong position: {}": run["unsafe_accepted"],
+        "position failures in use for longer than allowed: {}": run["failures_beyond_budget"],
     }
     unproven = {
-        "{} VBs accepted of which nothing says whether the position was right": run["unproven_accepted"],
-        "{} position failures of which nothing says whether they were within the budget": undecided,
+        "VBs accepted that nothing can check: {}": run["unproven_accepted"],
+        "position failures of unknown length: {}": undecided,
         "no position was in use while the train moved": share is None,
-        f"{share or 0.0:.1%} of the moving time in use cannot be judged": share is not None
+        f"{share or 0.0:.1%} of the moving time in use could not be checked": share is not None
         and share > unknown_share_limit,
         "no VB was accepted": not run["balises_accepted"],
     }
