@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import Clock, flags
+from pipeline.epochs.clock import Clock, met
 from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import LdsMode
@@ -21,11 +21,11 @@ def availability_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration
 
     `epochs`: monitored and judged, in order of time. Each epoch counts for the first reason that applies.
     """
-    moving = flags(epochs, pl.col("moving").fill_null(value=True))
+    moving = met(epochs, pl.col("moving").fill_null(value=True))
     whole_s = float(clock.held_s[moving].sum())
-    if whole_s <= 0.0 or not flags(epochs, pl.col("moving")).any():
+    if whole_s <= 0.0 or not met(epochs, pl.col("moving")).any():
         return ()
-    lost = moving & ~flags(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
+    lost = moving & ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
     lost_s = float(clock.held_s[lost].sum())
     if lost_s <= (1.0 - _LOW) * whole_s:
         return ()
@@ -44,15 +44,15 @@ def _reasons(epochs: pl.DataFrame, config: Configuration) -> dict[str, Bools]:
     by = f", usually {aside_m:.0f} m beside it" if isinstance(aside_m, float) else ""
     limit_m, ambiguous = config.lds.ci_limit_m, config.matching.ambiguity_probability
     return {
-        "no fix": ~flags(epochs, pl.col("fix_valid")),
-        f"positions off the track{by}": ~flags(epochs, pl.col("on_track")),
-        f"a confidence interval over {limit_m:g} m": flags(epochs, pl.col("confidence_m") > limit_m),
-        "positions that fit two tracks": flags(epochs, pl.col("gate_probability") < ambiguous),
-        f"an alarm, or waiting for a return after one{_loudest(epochs)}": flags(
+        "no fix": ~met(epochs, pl.col("fix_valid")),
+        f"positions off the track{by}": ~met(epochs, pl.col("on_track")),
+        f"a confidence interval over {limit_m:g} m": met(epochs, pl.col("confidence_m") > limit_m),
+        "positions that fit two tracks": met(epochs, pl.col("gate_probability") < ambiguous),
+        f"an alarm, or waiting for a return after one{_loudest(epochs)}": met(
             epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value
         ),
-        "no odometer": flags(epochs, pl.col("odometer_reason").is_not_null()),
-        "initialisation": flags(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.INITIALISING.value),
+        "no odometer": met(epochs, pl.col("odometer_reason").is_not_null()),
+        "initialisation": met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.INITIALISING.value),
         "positions not validated": np.ones(epochs.height, dtype=np.bool_),
     }
 
