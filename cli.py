@@ -158,9 +158,12 @@ def demo(
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
     page = write_demo(result, out / "tables")
     if not quiet:
-        print(result.head)
-        show_table(result.checks, "What was injected, expected and found")
-        print(f"\nThe trial is in {out}, its tables in {out / 'tables'}, the report is {page}.")
+        differing = result.checks.filter(~result.checks["agrees"])
+        if differing.height:
+            show_table(differing.drop("title", "agrees"), "What was found differs from what was expected")
+        print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {page}\n")
+        show_table(result.lines)
+        print(result.sentence)
     raise typer.Exit(OK if result.agrees else RUNS_NOT_OK)
 
 
@@ -337,17 +340,30 @@ def experiment(
 @app.command()
 def sql(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    query: Annotated[str, typer.Argument(help="One SELECT.")],
+    query: Annotated[str, typer.Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
+    beside: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
+    ] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", callback=_here, help="Write CSV; `-` is standard output.")] = None,
+    parquet: Annotated[Path | None, typer.Option("--parquet", metavar="FILE", callback=_here, help="Write Parquet.")] = None,
+    xlsx: Annotated[Path | None, typer.Option("--xlsx", metavar="FILE", callback=_here, help="Write an Excel workbook (extra `excel`).")] = None,
     as_json: Json = False,
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
+    from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
     from pipeline.results.query import run_sql
     from pipeline.results.terminal import show_table
 
-    answer = run_sql(out, query)
+    answer = run_sql(out, query, _named_results(beside or []))
+    written = [(csv, write_csv), (parquet, write_parquet), (xlsx, write_xlsx)]
+    for file, write in written:
+        if file is not None:
+            write(answer, file)
+            _say(f"{answer.height} rows in {file}")
     if as_json:
         _print_json(answer)
-    else:
+    elif all(file is None for file, _ in written):
         show_table(answer)
 
 
@@ -489,6 +505,16 @@ def _assess(out: str, config: Path | None, as_json: bool) -> None:
     print("\n".join(found.statements[1:]))
 
 
+def _named_results(given: list[str]) -> dict[str, str]:
+    """`NAME=OUT` by name."""
+    from schemas.errors import UsageError
+
+    for text in given:
+        if not re.fullmatch(r"[A-Za-z]\w*=.+", text):
+            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
+    return dict(text.split("=", 1) for text in given)
+
+
 def _status_of(summary: Summary) -> int:
     from schemas.enums import RunStatus
 
@@ -498,28 +524,36 @@ def _status_of(summary: Summary) -> int:
 
 
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.tally import outcome_line, outcome_rows, summary_line
-    from pipeline.results.terminal import show_table
+    from pipeline.campaign.tally import outcome_line, outcome_rows
     from schemas.enums import RunStatus
 
-    rows = outcome_rows(summary)
     if as_json:
         told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
+        rows = outcome_rows(summary)
         _print_json({**told, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
     elif quiet:
         for outcome in summary.outcomes:
             if outcome.status is not RunStatus.OK:
                 print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
     else:
-        print(summary_line(summary))
-        remarkable = rows.filter((rows["verdict"] != "safe") | (rows["status"] != "ok"))
-        shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
-        if shown.height:
-            show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))
-        if (more := remarkable.height - shown.height) > 0:
-            print(f"{more} more that are not safe: see replay.log beside the tables.")
-        print(f"Tables are in {out}.")
+        _show_ending(summary, out)
+
+
+def _show_ending(summary: Summary, out: str) -> None:
+    """The verdicts, the worst first; of many runs those that are not safe."""
+    from pipeline.campaign.tally import ending_rows, summary_line
+    from pipeline.results.terminal import show_table
+
+    print(summary_line(summary))
+    rows = ending_rows(summary)
+    remarkable = rows.filter(rows["verdict"] != "safe")
+    shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
+    if shown.height:
+        show_table(shown)
+    if (more := remarkable.height - shown.height) > 0:
+        print(f"{more} more are not safe: `balise sql {out} \"SELECT verdict, run_id, error FROM runs\"` lists all.")
+    print(f"Tables are in {out}; `balise report {out}` makes pages of them.")
 
 
 if __name__ == "__main__":

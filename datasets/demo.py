@@ -13,7 +13,7 @@ from datasets.comparison import Check, checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign.finish import write_campaign
-from pipeline.figures.verdict import CampaignHead, head_of, worst_verdict
+from pipeline.figures.verdict import CampaignHead, head_of, word_of, worst_verdict
 from pipeline.ingest.run import read_run
 from pipeline.report import write_report
 from pipeline.results.store import write_config, write_run
@@ -44,6 +44,37 @@ class DemoResult:
     def agrees(self) -> bool:
         return bool(self.checks["agrees"].all())
 
+    @property
+    def lines(self) -> pl.DataFrame:
+        """One line per run, `run_id, injected, verdict, hazards, checks`, as short as a terminal is wide."""
+        of_runs = self.checks.group_by("run_id", maintain_order=True)
+        told = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
+        rows = [
+            (run_id, _in_short(injected), _verdict(one), _classes(one.hazards), f"{agreeing}/{of}")
+            for (run_id, injected, agreeing, of), one in zip(told, self.tables, strict=True)
+        ]
+        names = ("run_id", "injected", "verdict", "hazards", "checks")
+        return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
+
+    @property
+    def sentence(self) -> str:
+        """`all 87 checks agree`, or how many do not."""
+        wrong = int((~self.checks["agrees"]).sum())
+        return f"{wrong} of {self.checks.height} checks do not agree" if wrong else f"all {self.checks.height} checks agree"
+
+
+def _in_short(injected: str) -> str:
+    """Faults in words without how long they last."""
+    return ", ".join(fault.partition(" for ")[0] for fault in injected.split(", "))
+
+
+def _verdict(tables: RunTables) -> str:
+    return word_of(worst_verdict(tables.runs["verdict"].to_list()))
+
+
+def _classes(hazards: pl.DataFrame) -> str:
+    return " ".join(hazards["hazard"].cast(pl.String).unique(maintain_order=True)) or "none"
+
 
 def demo(
     out: Path, config: Configuration | None = None, seed: int | None = None, progress: Progress | None = None
@@ -54,7 +85,7 @@ def demo(
     `progress` is told of each run written and replayed.
     """
     scenario = demo_scenario(seed)
-    paths = write_trial(scenario, out, progress)
+    paths = write_trial(scenario, out, _ended(progress, "written"))
     return replay_trial(scenario, read_site(out / "site"), paths, config or Configuration(), progress)
 
 
@@ -71,14 +102,20 @@ def replay_trial(
     """Replay the runs of a trial that was written and compare each with what its scenario expects."""
     checks: list[Check] = []
     tables = []
+    done = _ended(progress, "replayed")
     for spec, path in zip(scenario.runs, paths, strict=True):
         run: RunLog = read_run(path, config.ingest)
         vehicle = scenario.vehicle if spec.vehicle and scenario.vehicle else Vehicle()
         tables.append(replay(run, site, vehicle, config))
         checks += compare(spec, run, tables[-1])
-        if progress is not None:
-            progress(spec.id)
+        if done is not None:
+            done(spec.id)
     return DemoResult(scenario, site, checks_table(checks), tuple(tables))
+
+
+def _ended(progress: Progress | None, what: str) -> Progress | None:
+    """Tells of a run what has been done to it."""
+    return None if progress is None else lambda run_id: progress(f"{run_id}: {what}")
 
 
 def write_demo(result: DemoResult, out: Path) -> Path:

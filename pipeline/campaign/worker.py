@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline import storage
 from pipeline.campaign import known_logs, lock
-from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, worst
+from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, with_faults, worst
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
 from pipeline.results import store
@@ -64,7 +64,8 @@ def replay_one(job: RunJob) -> RunOutcome:
         return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
     metadata = _metadata(job, files_digest, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
-    return outcome_of(job, tables.runs, sum(file.size_bytes for file in before), time.monotonic() - begun)
+    outcome = outcome_of(job, tables.runs, sum(file.size_bytes for file in before), time.monotonic() - begun)
+    return with_faults(outcome, tables.hazards)
 
 
 def fail_run(
@@ -175,7 +176,10 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 def _earlier(job: RunJob) -> RunOutcome:
     """The outcome of a run that is complete already."""
     runs = store.read_table(job.out, "runs", job.run_id).collect()
-    return replace(outcome_of(job, runs, 0, 0.0), skipped=True)
+    outcome = replace(outcome_of(job, runs, 0, 0.0), skipped=True)
+    if not outcome.hazards:
+        return outcome
+    return with_faults(outcome, store.read_table(job.out, "hazards", job.run_id).collect())
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:

@@ -8,31 +8,44 @@ are plain Hive-partitioned Parquet, so DuckDB reads them from outside all the sa
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import dataframely as dy
 import polars as pl
 
 from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.storage.address import Address, is_url, join
 from schemas.campaign import CAMPAIGN_TABLES
+from schemas.dictionary import dictionary_frame
 from schemas.errors import UsageError
+from schemas.near import did_you_mean
 from schemas.tables import TABLES
 
 # After comments and brackets, the words that a query begins with.
 _QUERY = re.compile(r"(\s|\(|--[^\n]*(\n|$)|/\*.*?\*/)*(select|with|explain|from|values)\b", re.IGNORECASE | re.DOTALL)
 
+_SHOW = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
+_DESCRIBE = re.compile(r"\s*(?:describe|desc)\s+(?:table\s+)?[\"`]?(\w+)[\"`]?\s*;?\s*", re.IGNORECASE)
+# What polars says of a name that it does not know.
+_UNKNOWN = re.compile(r"unable to find column \"(\w+)\"|relation '(\w+)' was not found|column (?:named )?\"?(\w+)\"? not")
+
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
-_REMEDY = "`balise dictionary` lists the columns of each table."
+_REMEDY = "SHOW TABLES and DESCRIBE table list what there is."
 
 
-def run_sql(out: Address, sql: str) -> pl.DataFrame:
-    """The answer to one SELECT over the complete runs of a result.
+def run_sql(out: Address, sql: str, others: Mapping[str, Address] | None = None) -> pl.DataFrame:
+    """The answer to one SELECT, SHOW TABLES or DESCRIBE over the complete runs of a result.
 
     Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, and those of the
     campaign where they are written. A condition on `run_id` reads the files of these runs only.
+    `others`: more results by name; `{"old": OUT}` adds the tables `old_runs`, `old_hazards` and so on.
     """
+    if _SHOW.fullmatch(sql):
+        return _tables_there_are(others or {})
+    if described := _DESCRIBE.fullmatch(sql):
+        return _columns_of(described[1], others or {})
     if not _QUERY.match(sql):
         raise UsageError(
             "is no query",
@@ -42,6 +55,8 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
             remedy=_REMEDY,
         )
     tables = _tables(out, sql)
+    for name, address in (others or {}).items():
+        tables |= _tables(address, sql, f"{name}_")
     try:
         with catalogue.patient():
             return pl.SQLContext(tables).execute(sql).collect()
@@ -49,21 +64,59 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
         if not is_url(out):
             store.check_tables(out, [name for name in TABLES if name in tables])
         raise UsageError(
-            f"cannot be answered: {_first_line(error)}",
+            f"cannot be answered: {_first_line(error)}{_meant(_first_line(error), tables, others or {})}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
         ) from None
 
 
-def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
+def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]:
     """What the query may name: ten thousand addresses take their time, remote tables their transfer."""
     runs = store.complete_runs(out)
 
     def named(names: Iterable[str]) -> list[str]:
-        return [name for name in names if re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
+        return [name for name in names if re.search(rf"\b{prefix}{name}\b", sql, re.IGNORECASE)]
 
-    return {name: _scan(out, name, runs) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    found = {name: _scan(out, name, runs) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    return {f"{prefix}{name}": frame for name, frame in found.items()}
+
+
+def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
+    """Every table that a query may name: the name in the dictionary, and its contract."""
+    tables = {**TABLES, **CAMPAIGN_TABLES}
+    return {f"{prefix}{name}": (name, kind) for prefix in ("", *(f"{o}_" for o in others)) for name, kind in tables.items()}
+
+
+def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
+    rows = [
+        (name, len(kind.columns()), " ".join((kind.__doc__ or "").split())) for name, (_, kind) in _contracts(others).items()
+    ]
+    return pl.DataFrame(rows, schema={"table": pl.String, "columns": pl.Int64, "meaning": pl.String}, orient="row")
+
+
+def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
+    known = _contracts(others)
+    found = known.get(table.lower())
+    if found is None:
+        near = did_you_mean(table, known)
+        raise UsageError(f"is no table{near and '; ' + near}", place=table, expected=", ".join(known), remedy=_REMEDY)
+    columns = dictionary_frame(found[0]).drop("group", "table")
+    if found[0] not in TABLES:
+        return columns
+    own = {"column": "run_id", "dtype": "String", "unit": "", "nullable": False, "meaning": "id of the run"}
+    return pl.concat([pl.DataFrame([own], schema=columns.schema), columns])
+
+
+def _meant(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
+    """What the name may have been that polars did not find."""
+    unknown = _UNKNOWN.search(said)
+    if unknown is None:
+        return ""
+    columns = {"run_id", *(column for name in tables for column in _contracts(others)[name][1].columns())}
+    name = next(part for part in unknown.groups() if part)
+    near = did_you_mean(name, _contracts(others) if unknown[2] else columns)
+    return f"; {near}" if near else ""
 
 
 def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:

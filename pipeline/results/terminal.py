@@ -26,12 +26,17 @@ _VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])"
 
 def show_table(frame: pl.DataFrame, title: str = "") -> None:
     """Print a frame to standard output, every row, no wider than the terminal."""
-    lines = fitted(_columns(frame), screen_width()) if frame.width else []
+    lines = table_lines(frame, screen_width())
     if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
         title, lines = f"{_BOLD}{title}{_PLAIN}" if title else "", [_coloured(line) for line in lines]
     print("\n".join([title, *lines] if title else lines))
     if frame.width and not frame.height:
         print("(no rows)")
+
+
+def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
+    """A frame as aligned text, two blanks between columns, in lines of at most `width` characters."""
+    return fitted(_columns(frame), width) if frame.width else []
 
 
 def screen_width() -> int | None:
