@@ -360,7 +360,8 @@ def sql(
     for file, write in written:
         if file is not None:
             write(answer, file)
-            _say(f"{answer.height} rows in {file}")
+            if str(file) != "-":
+                _say(f"{answer.height} rows in {file}")
     if as_json:
         _print_json(answer)
     elif all(file is None for file, _ in written):
@@ -418,6 +419,7 @@ def export(
 def diff(
     out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     out_b: Annotated[str, typer.Argument(help="Another one.")],
+    detail: Annotated[bool, typer.Option("--detail", help="Every value that changed, too.")] = False,
     as_json: Json = False,
 ) -> None:
     """What changed between two results; exit status 1 on a difference."""
@@ -427,7 +429,7 @@ def diff(
     if as_json:
         _print_json(found.as_dict())
     else:
-        print(found.text())
+        print(found.text(detail))
     raise typer.Exit(OK if found.same else RUNS_NOT_OK)
 
 

@@ -10,9 +10,9 @@ _SHOWN = 3
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`did you mean `antenna_height_m`?`; empty where nothing is alike. Case does not count."""
+    """` (did you mean `antenna_height_m`?)` to put behind a message, empty where nothing is alike; case does not count."""
     by_lower = {item.lower(): item for item in known}
     near = difflib.get_close_matches(name.lower(), list(by_lower), n=_SHOWN, cutoff=_ALIKE)
     if not near:
         near = [item for item in by_lower if len(name) > 2 and name.lower() in item][:_SHOWN]
-    return f"did you mean {' or '.join(f'`{by_lower[item]}`' for item in near)}?" if near else ""
+    return f" (did you mean {' or '.join(f'`{by_lower[item]}`' for item in near)}?)" if near else ""

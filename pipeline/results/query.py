@@ -29,7 +29,9 @@ _QUERY = re.compile(r"(\s|\(|--[^\n]*(\n|$)|/\*.*?\*/)*(select|with|explain|from
 _SHOW = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
 _DESCRIBE = re.compile(r"\s*(?:describe|desc)\s+(?:table\s+)?[\"`]?(\w+)[\"`]?\s*;?\s*", re.IGNORECASE)
 # What polars says of a name that it does not know.
-_UNKNOWN = re.compile(r"unable to find column \"(\w+)\"|relation '(\w+)' was not found|column (?:named )?\"?(\w+)\"? not")
+_NO_COLUMN = re.compile(r"(?:unable to find column|no column named) [\"'](\w+)[\"']")
+_NO_TABLE = re.compile(r"relation '(\w+)' was not found")
+_NO_VALUE = re.compile(r"to `enum` failed for value \"([^\"]*)\"")
 
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
 _REMEDY = "SHOW TABLES and DESCRIBE table list what there is."
@@ -64,7 +66,7 @@ def run_sql(out: Address, sql: str, others: Mapping[str, Address] | None = None)
         if not is_url(out):
             store.check_tables(out, [name for name in TABLES if name in tables])
         raise UsageError(
-            f"cannot be answered: {_first_line(error)}{_meant(_first_line(error), tables, others or {})}",
+            f"cannot be answered: {_told(_first_line(error), tables, others or {})}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
@@ -99,8 +101,9 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     known = _contracts(others)
     found = known.get(table.lower())
     if found is None:
-        near = did_you_mean(table, known)
-        raise UsageError(f"is no table{near and '; ' + near}", place=table, expected=", ".join(known), remedy=_REMEDY)
+        raise UsageError(
+            f"is no table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
+        )
     columns = dictionary_frame(found[0]).drop("group", "table")
     if found[0] not in TABLES:
         return columns
@@ -108,15 +111,18 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     return pl.concat([pl.DataFrame([own], schema=columns.schema), columns])
 
 
-def _meant(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
-    """What the name may have been that polars did not find."""
-    unknown = _UNKNOWN.search(said)
-    if unknown is None:
-        return ""
-    columns = {"run_id", *(column for name in tables for column in _contracts(others)[name][1].columns())}
-    name = next(part for part in unknown.groups() if part)
-    near = did_you_mean(name, _contracts(others) if unknown[2] else columns)
-    return f"; {near}" if near else ""
+def _told(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
+    """What polars says, of a name or a value that it does not know in our words, with the nearest that there is."""
+    contracts = _contracts(others)
+    columns = {"run_id": None} | {name: kind for table in tables for name, kind in contracts[table][1].columns().items()}
+    if column := _NO_COLUMN.search(said):
+        return f"no column is called `{column[1]}`{did_you_mean(column[1], columns)}"
+    if table := _NO_TABLE.search(said):
+        return f"no table is called `{table[1]}`{did_you_mean(table[1], contracts)}"
+    if value := _NO_VALUE.search(said):
+        values = {word for kind in columns.values() if isinstance(kind, dy.Enum) for word in kind.categories}
+        return f"no column has the value `{value[1]}`{did_you_mean(value[1], values)}"
+    return said
 
 
 def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
