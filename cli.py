@@ -96,9 +96,10 @@ def replay(
     """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
     from pipeline.campaign.progress import watches
+    from pipeline.results.manifest import settings_files
 
     settings, train = _configuration(config), _vehicle(vehicle)
-    plan = make_plan(runs, site, out, settings, train, route, write_route)
+    plan = make_plan(runs, site, out, settings, train, route, write_route, settings_files(config, vehicle))
     try:
         summary = run_campaign(
             plan,
@@ -345,9 +346,16 @@ def sql(
         list[str] | None,
         typer.Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", callback=_here, help="Write CSV; `-` is standard output.")] = None,
-    parquet: Annotated[Path | None, typer.Option("--parquet", metavar="FILE", callback=_here, help="Write Parquet.")] = None,
-    xlsx: Annotated[Path | None, typer.Option("--xlsx", metavar="FILE", callback=_here, help="Write an Excel workbook (extra `excel`).")] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", callback=_here, help="Write CSV; `-` is standard output.")
+    ] = None,
+    parquet: Annotated[
+        Path | None, typer.Option("--parquet", metavar="FILE", callback=_here, help="Write Parquet.")
+    ] = None,
+    xlsx: Annotated[
+        Path | None,
+        typer.Option("--xlsx", metavar="FILE", callback=_here, help="Write an Excel workbook (extra `excel`)."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
@@ -413,6 +421,47 @@ def export(
     print("Wrote " + " and ".join(str(path) for path in files))
     for text in missing:
         print(f"Without {text}")
+
+
+@app.command()
+def verify(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    logs: Annotated[
+        list[str] | None, typer.Option("--logs", help="Logs to replay again and compare: paths, folders, globs.")
+    ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    route: RouteFiles = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
+    from pipeline.campaign.plan import make_plan
+    from pipeline.campaign.verify import recompute
+    from pipeline.campaign.verify import verify as compare
+    from pipeline.results.store import read_config
+    from pipeline.results.terminal import how_far, show_table
+    from schemas.errors import UsageError
+
+    found = [compare(out, None if quiet else how_far("runs"))]
+    if logs:
+        if site is None:
+            raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+        settings = _configuration(config) if config else read_config(out)
+        train = _vehicle(vehicle)
+        found.append(
+            recompute(out, lambda to: make_plan(logs, site, to, settings, train, route), jobs or os.cpu_count() or 1)
+        )
+    if as_json:
+        _print_json([{"compared": one.compared, "problems": one.table} for one in found])
+    for one in found if not as_json else []:
+        if one.problems:
+            show_table(one.table)
+        if one.problems or not quiet:
+            print(one.sentence)
+    raise typer.Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
 
 
 @app.command()
@@ -554,7 +603,7 @@ def _show_ending(summary: Summary, out: str) -> None:
     if shown.height:
         show_table(shown)
     if (more := remarkable.height - shown.height) > 0:
-        print(f"{more} more are not safe: `balise sql {out} \"SELECT verdict, run_id, error FROM runs\"` lists all.")
+        print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
     print(f"Tables are in {out}; `balise report {out}` makes pages of them.")
 
 

@@ -13,12 +13,15 @@ from datasets.comparison import Check, checks_table, compare
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline.campaign.finish import write_campaign
+from pipeline.campaign.plan import software_digest
 from pipeline.figures.verdict import CampaignHead, head_of, word_of, worst_verdict
 from pipeline.ingest.run import read_run
 from pipeline.report import write_report
+from pipeline.results.manifest import listing
 from pipeline.results.store import write_config, write_run
 from pipeline.site.read import read_site
 from pipeline.stages import replay
+from pipeline.storage import file_digests
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
 from schemas.version import SOFTWARE
@@ -28,12 +31,16 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DemoResult:
-    """`checks`: one row per thing expected, as `comparison.checks_table`; `tables`: the replay of each run."""
+    """`checks`: one row per thing expected, as `comparison.checks_table`; `tables`: the replay of each run.
+
+    `paths`: its log.
+    """
 
     scenario: Scenario
     site: Site
     checks: pl.DataFrame
     tables: tuple[RunTables, ...]
+    paths: tuple[Path, ...] = ()
 
     @property
     def head(self) -> CampaignHead:
@@ -60,7 +67,11 @@ class DemoResult:
     def sentence(self) -> str:
         """`all 87 checks agree`, or how many do not."""
         wrong = int((~self.checks["agrees"]).sum())
-        return f"{wrong} of {self.checks.height} checks do not agree" if wrong else f"all {self.checks.height} checks agree"
+        return (
+            f"{wrong} of {self.checks.height} checks do not agree"
+            if wrong
+            else f"all {self.checks.height} checks agree"
+        )
 
 
 def _in_short(injected: str) -> str:
@@ -110,7 +121,7 @@ def replay_trial(
         checks += compare(spec, run, tables[-1])
         if done is not None:
             done(spec.id)
-    return DemoResult(scenario, site, checks_table(checks), tuple(tables))
+    return DemoResult(scenario, site, checks_table(checks), tuple(tables), tuple(paths))
 
 
 def _ended(progress: Progress | None, what: str) -> Progress | None:
@@ -121,10 +132,12 @@ def _ended(progress: Progress | None, what: str) -> Progress | None:
 def write_demo(result: DemoResult, out: Path) -> Path:
     """The demo's tables as a campaign would leave them, and the report; returns the report's first page."""
     config = Configuration()
-    for tables in result.tables:
+    made = {"software": SOFTWARE, "software_digest": software_digest(), "site_digest": result.site.digest}
+    for tables, path in zip(result.tables, result.paths, strict=True):
         row = tables.runs.row(0, named=True)
         digests = {name: row[name] for name in ("config_digest", "input_digest")}
-        write_run(tables, out, {"software": SOFTWARE, "site_digest": result.site.digest, **digests})
+        listed = {"log_files": listing(file_digests(path)), "site_files": listing(result.site.files)}
+        write_run(tables, out, {**made, **digests, **listed, "status": row["status"]})
     write_config(out, config)
     write_campaign(out, config)
     return write_report(out, result.site)[0]

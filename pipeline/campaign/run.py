@@ -17,7 +17,9 @@ from pipeline.campaign.processes import LocalEngine
 from pipeline.campaign.serial import SerialEngine
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
+from pipeline.results.manifest import note_settings
 from pipeline.storage.address import is_url
+from schemas.config import digest_of
 from schemas.errors import UsageError
 
 TIME_LIMIT_S = 3600.0
@@ -43,6 +45,7 @@ def run_campaign(
         store.sweep(plan.out)
         plan = held_by(plan if force else with_previous(plan), campaign)
         store.write_config(plan.out, plan.config)
+        note_settings(plan.out, digest_of(plan.config, plan.vehicle), plan.given)
         engine = _engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
         loop = CampaignLoop(plan.jobs, engine, time_limit_s, watches)
         try:

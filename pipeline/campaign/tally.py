@@ -124,7 +124,7 @@ def _few(faults: Sequence[str]) -> str:
 
 def outcome_rows(summary: Summary) -> pl.DataFrame:
     """A campaign as a table: one row per run that was reached, its verdict first."""
-    kinds = {
+    kinds: dict[str, type[pl.DataType] | pl.DataType] = {
         "verdict": pl.String,
         "run_id": pl.String,
         "status": pl.String,

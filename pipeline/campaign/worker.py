@@ -8,13 +8,23 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from pipeline import storage
 from pipeline.campaign import known_logs, lock
-from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, with_faults, worst
+from pipeline.campaign.outcome import (
+    Failure,
+    RunOutcome,
+    changed,
+    failed_tables,
+    failure_of,
+    outcome_of,
+    with_faults,
+    worst,
+)
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.ingest import read_run
-from pipeline.results import store
+from pipeline.results import manifest, store
 from pipeline.site.read import read_site
 from pipeline.site.route import with_route
 from pipeline.storage import files
@@ -25,6 +35,13 @@ from schemas.run import RunLog, RunTables, Site
 from schemas.version import SOFTWARE
 
 
+class LogContent(NamedTuple):
+    """What a log holds: one digest over it, and the list of its files; empty until it was read."""
+
+    digest: str = ""
+    files: str = ""
+
+
 def replay_one(job: RunJob) -> RunOutcome:
     """Replay a run unless its tables are there already, and write them.
 
@@ -32,7 +49,7 @@ def replay_one(job: RunJob) -> RunOutcome:
     be written, a changed site and an interruption leave this function as an exception.
     """
     begun = time.monotonic()
-    files_digest = ""
+    content = LogContent()
     try:
         _same_software(job)
         site = _site(job.site, job.site_digest)
@@ -42,15 +59,15 @@ def replay_one(job: RunJob) -> RunOutcome:
         with _fetched(job, version) as path:
             before = _signature(path)
             if job.previous is not None:
-                files_digest = _files_digest(job, path, version)
-                if _is_done(job, files_digest):
+                content = _content(job, path, version)
+                if _is_done(job, content.digest):
                     return _earlier(job)
             try:
                 run = read_run(path, job.config.ingest)
             except Exception:
-                files_digest = files_digest or _files_digest(job, path, version)
+                content = content if content.digest else _content(job, path, version)
                 raise
-            files_digest = files_digest or _files_digest(job, path, version, run.input_digest)
+            content = content if content.digest else _content(job, path, version, run.input_digest)
             site = with_route(site, job.route) if job.route else site
             tables = _replayed(job, run, site)
             if job.write_route:
@@ -60,22 +77,22 @@ def replay_one(job: RunJob) -> RunOutcome:
     except (OutputError, SiteError, UsageError):
         raise
     except Exception as error:
-        failure = failure_of(error, lasting=bool(files_digest))
-        return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
-    metadata = _metadata(job, files_digest, worst(tables.runs)) | {"log_digest": run.input_digest}
+        failure = failure_of(error, lasting=bool(content.digest))
+        return fail_run(job, failure.error, content, failure, time.monotonic() - begun)
+    metadata = _metadata(job, content, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
     outcome = outcome_of(job, tables.runs, sum(file.size_bytes for file in before), time.monotonic() - begun)
     return with_faults(outcome, tables.hazards)
 
 
 def fail_run(
-    job: RunJob, error: str, files_digest: str = "", failure: Failure | None = None, seconds: float = 0.0
+    job: RunJob, error: str, content: LogContent | None = None, failure: Failure | None = None, seconds: float = 0.0
 ) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
     Without `failure` (a worker was lost, a run took too long) the next campaign tries the run again.
     """
-    metadata = _metadata(job, files_digest, RunStatus.FAILED)
+    metadata = _metadata(job, content or LogContent(), RunStatus.FAILED)
     if failure is None or not failure.lasting:
         metadata["redo"] = "yes"
     _write(job, failed_tables(job, error), metadata)
@@ -138,12 +155,13 @@ def _signature(path: Path) -> tuple[storage.FileState, ...]:
         return storage.signature(path)
 
 
-def _files_digest(job: RunJob, path: Path, version: str | None, known: str = "") -> str:
+def _content(job: RunJob, path: Path, version: str | None, known: str = "") -> LogContent:
     """What the log holds, kept for the next campaign; `known`: the SHA-256 of a log of one file that was read."""
     with _as_input_error(path):
-        digest = storage.content_digest(path, known)
-    known_logs.remember(job, version, digest)
-    return digest
+        listed = storage.file_digests(path, known)
+    content = LogContent(storage.digest_of_files(listed), manifest.listing(listed))
+    known_logs.remember(job, version, content.digest)
+    return content
 
 
 @contextlib.contextmanager
@@ -197,5 +215,6 @@ def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 
-def _metadata(job: RunJob, files_digest: str, status: RunStatus) -> dict[str, str]:
-    return {**digests(job, files_digest), "status": status.value}
+def _metadata(job: RunJob, content: LogContent, status: RunStatus) -> dict[str, str]:
+    listed = {"log_files": content.files, "site_files": job.site_files}
+    return {**digests(job, content.digest), **listed, "status": status.value}

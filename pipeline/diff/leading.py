@@ -27,7 +27,7 @@ def verdict_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
 def balise_counts(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
     """`accepted 15 became 3`: counts of virtual balises that changed, from two `runs` tables of one run."""
     return tuple(
-        f"{_of(solution, a, b)}{words} {'unknown' if one is None else one} became {'unknown' if other is None else other}"
+        f"{_of(solution, a, b)}{words} {_told(one)} became {_told(other)}"
         for column, words in BALISE_COUNTS.items()
         for solution, one, other in _both(a, b, column)
         if one != other
@@ -46,6 +46,10 @@ def passage_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
         f"{_of(solution, a, b)}{' '.join(balises)}: {one} became {other}"
         for (solution, one, other), balises in moved.items()
     )
+
+
+def _told(count: object) -> object:
+    return "unknown" if count is None else count
 
 
 def _both(a: pl.DataFrame, b: pl.DataFrame, column: str) -> list[tuple[str, object, object]]:

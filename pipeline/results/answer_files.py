@@ -38,7 +38,7 @@ def write_xlsx(answer: pl.DataFrame, file: Path) -> None:
             "is too long for Excel", place=str(file), found=f"{answer.height} rows", expected=f"at most {_MOST_ROWS}"
         )
     times = [name for name, dtype in answer.schema.items() if isinstance(dtype, pl.Datetime)]
-    plain = _flat(answer).with_columns(pl.col(name).dt.replace_time_zone(None).dt.cast_time_unit("ms") for name in times)
+    plain = _flat(answer).with_columns(pl.col(times).dt.replace_time_zone(None).dt.cast_time_unit("ms"))
     buffer = io.BytesIO()
     try:
         plain.write_excel(buffer, dtype_formats={pl.Datetime: _TIMES}, freeze_panes=(1, 0), autofit=True)

@@ -87,12 +87,15 @@ def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]
 def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
     """Every table that a query may name: the name in the dictionary, and its contract."""
     tables = {**TABLES, **CAMPAIGN_TABLES}
-    return {f"{prefix}{name}": (name, kind) for prefix in ("", *(f"{o}_" for o in others)) for name, kind in tables.items()}
+    return {
+        f"{prefix}{name}": (name, kind) for prefix in ("", *(f"{o}_" for o in others)) for name, kind in tables.items()
+    }
 
 
 def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
     rows = [
-        (name, len(kind.columns()), " ".join((kind.__doc__ or "").split())) for name, (_, kind) in _contracts(others).items()
+        (name, len(kind.columns()), " ".join((kind.__doc__ or "").split()))
+        for name, (_, kind) in _contracts(others).items()
     ]
     return pl.DataFrame(rows, schema={"table": pl.String, "columns": pl.Int64, "meaning": pl.String}, orient="row")
 
@@ -114,11 +117,13 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
 def _told(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
     """What polars says, of a name or a value that it does not know in our words, with the nearest that there is."""
     contracts = _contracts(others)
-    columns = {"run_id": None} | {name: kind for table in tables for name, kind in contracts[table][1].columns().items()}
+    columns = {"run_id": None} | {
+        name: kind for table in tables for name, kind in contracts[table][1].columns().items()
+    }
     if column := _NO_COLUMN.search(said):
         return f"no column is called `{column[1]}`{did_you_mean(column[1], columns)}"
-    if table := _NO_TABLE.search(said):
-        return f"no table is called `{table[1]}`{did_you_mean(table[1], contracts)}"
+    if missing := _NO_TABLE.search(said):
+        return f"no table is called `{missing[1]}`{did_you_mean(missing[1], contracts)}"
     if value := _NO_VALUE.search(said):
         values = {word for kind in columns.values() if isinstance(kind, dy.Enum) for word in kind.categories}
         return f"no column has the value `{value[1]}`{did_you_mean(value[1], values)}"

@@ -57,6 +57,7 @@ def read_site(path: Path | str) -> Site:
         route=None if route is None else Route.validate(route, cast=True),
         findings=tuple(notes + found.findings),
         digest=_digest(files),
+        files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
 
 

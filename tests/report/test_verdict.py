@@ -64,7 +64,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("index.html", "unsafe", "1 unsafe, 0 unproven, 1 safe, 1 failed."),
         ("runs/good.html", "safe", "primary: safe, every acceptance right, every position failure within"),
-        ("runs/bad.html", "unsafe", "primary: unsafe, VBs accepted despite a wrong position: 1; position failures in use"),
+        ("runs/bad.html", "unsafe", "primary: unsafe, VBs accepted despite a wrong position: 1; position"),
         ("runs/lost.html", "failed", "run: failed."),
     ],
 )
