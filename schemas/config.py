@@ -11,10 +11,10 @@ from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
 
+from schemas.breaches import told
 from schemas.enums import Fix
-from schemas.errors import BaliseError, ConfigError
+from schemas.errors import BaliseError, ConfigError, listed
 from schemas.tables import MONITORS
 
 # Strict: neither text nor true or false is a number.
@@ -373,16 +373,7 @@ def settings_from(
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        breaches = [_told(breach) for breach in error.errors()]
-        raise ConfigError("; ".join(breaches), place=place, remedy=remedy) from None
-
-
-def _told(breach: ErrorDetails) -> str:
-    """One breach with its path, and what was found where that is a single value."""
-    key = ".".join(str(part) for part in breach["loc"]) or "(file)"
-    found, unknown = breach["input"], breach["type"] == "extra_forbidden"
-    single = isinstance(found, str | int | float) and not unknown
-    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {found!r}" if single else "")
+        raise ConfigError(listed(told(error, kind)), place=place, remedy=remedy) from None
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:

@@ -5,6 +5,8 @@ Ends at the command line, at the batch boundary that turns a failed run into a r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class BaliseError(Exception):
     """A condition the user can act on.
@@ -35,7 +37,7 @@ class BaliseError(Exception):
         if self.expected is not None:
             text += f"; expected {self.expected}"
         if self.remedy is not None:
-            text += f". {self.remedy}"
+            text += self.remedy if text.endswith("\n") else f". {self.remedy}"
         return text
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -53,6 +55,13 @@ def _rebuild(
     remedy: str | None,
 ) -> BaliseError:
     return kind(message, place=place, found=found, expected=expected, remedy=remedy)
+
+
+def listed(problems: Sequence[str]) -> str:
+    """Problems of one file as one message: a single one as it is, several one below the other."""
+    if len(problems) == 1:
+        return problems[0]
+    return "\n  ".join([f"{len(problems)} problems in this file", *problems]) + "\n"
 
 
 class UsageError(BaliseError):

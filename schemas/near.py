@@ -10,7 +10,7 @@ _SHOWN = 3
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """` (did you mean `antenna_height_m`?)` to put behind a message; empty where nothing is alike, whatever the case."""
+    """` (did you mean `antenna_height_m`?)` to put behind a message; empty where nothing is alike."""
     by_lower = {item.lower(): item for item in known}
     near = difflib.get_close_matches(name.lower(), list(by_lower), n=_SHOWN, cutoff=_ALIKE)
     if not near:

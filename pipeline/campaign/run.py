@@ -8,7 +8,6 @@ from pathlib import Path
 
 from pipeline.campaign.cluster import DaskEngine
 from pipeline.campaign.engines import Engine
-from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.interruption import Interrupted, listening
 from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
@@ -101,6 +100,8 @@ def _tidy(plan: Plan, loop: CampaignLoop, scheduler: str | None) -> None:
 
 def _finish(plan: Plan, loop: CampaignLoop, summary: Summary) -> None:
     """The tables over all runs; they too are given up when somebody asks to stop."""
+    from pipeline.campaign.finish import write_campaign  # statistics, which take long to load
+
     with listening(loop.stop, at_once=True):
         try:
             write_campaign(plan.out, plan.config)

@@ -15,7 +15,7 @@ from pipeline.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.track.survey import geometric_measures_m, track_of
-from schemas.errors import InputError, SiteError
+from schemas.errors import InputError, SiteError, listed
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site
 
@@ -94,9 +94,8 @@ def _digest(files: dict[str, bytes]) -> str:
 
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
-    listed = breaches[0] if len(breaches) == 1 else "\n  ".join([f"{len(breaches)} breaches", *breaches]) + "\n"
     remedy = "Mend what is named; `balise dictionary` lists the columns of a site."
-    return SiteError(listed, place=shown(path), remedy=remedy)
+    return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
