@@ -323,6 +323,7 @@ def experiment(
         Path | None,
         typer.Option("--config", callback=_here, help="The bank to judge: `rare`, `bank`, `catalogue`."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Run a published experiment again, at its own size."""
     from datasets.experiment import EXPERIMENTS
@@ -332,9 +333,18 @@ def experiment(
         print("\n".join(EXPERIMENTS))
         return
     if name not in EXPERIMENTS:
-        raise UsageError("is no experiment", place=name, expected=", ".join(EXPERIMENTS))
+        from schemas.near import did_you_mean
+
+        raise UsageError(
+            f"is no experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
+        )
+    from pipeline.campaign.workers import watched
+    from pipeline.results.terminal import how_far
+
     bank = None if config is None else _configuration(config)
-    for path in EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank):
+    with watched(None if quiet else how_far("pieces of work")):
+        written = EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank)
+    for path in written:
         print(path)
 
 

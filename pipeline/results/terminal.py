@@ -17,7 +17,7 @@ import polars as pl
 
 from pipeline.results.layout import Column, fitted
 
-_SAID_EVERY_S = 5.0
+_SAID_EVERY_S, _CHANGED_EVERY_S = 5.0, 0.2
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 # Right is green, wrong red, not known grey; the word itself says it where there are no colours.
 _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
@@ -116,13 +116,17 @@ def _plain(value: Any) -> Any:
 
 
 def how_far(things: str) -> Callable[[int, int], None]:
-    """Says on standard error every few seconds how many of how many things are done."""
-    said_s = time.monotonic()
+    """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s."""
+    on_terminal = sys.stderr.isatty()
+    said_s = time.monotonic() - (_SAID_EVERY_S if on_terminal else 0.0)
 
     def progress(done: int, total: int) -> None:
         nonlocal said_s
-        if time.monotonic() - said_s >= _SAID_EVERY_S:
+        last = on_terminal and done == total
+        if last or time.monotonic() - said_s >= (_CHANGED_EVERY_S if on_terminal else _SAID_EVERY_S):
             said_s = time.monotonic()
-            print(f"{done}/{total} {things}", file=sys.stderr, flush=True)
+            text = f"{done}/{total} {things}"
+            begin, end = ("\r", "\n" if last else "") if on_terminal else ("", "\n")
+            print(f"{begin}{text}", end=end, file=sys.stderr, flush=True)
 
     return progress
