@@ -15,10 +15,17 @@ import typer
 
 if TYPE_CHECKING:
     from pipeline.campaign import Summary
+    from pipeline.safety.sensitivity import Replay
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
 _SHOWN_RUNS = 25
+
+
+def _examples(*lines: str) -> str:
+    """What stands under the help of a command; an empty line keeps each on a line of its own."""
+    return "\n\n".join(["Examples:", *lines])
+
 
 app = typer.Typer(
     name="balise",
@@ -26,7 +33,7 @@ app = typer.Typer(
     epilog="Exit status: 0 all runs ok; 1 some run failed or partial; 2 bad usage, configuration or site; "
     "3 a defect of the program; 129, 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 
@@ -75,7 +82,12 @@ def _about(
         raise typer.Exit(OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
+        "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
+    )
+)
 def replay(
     runs: Annotated[list[str], typer.Argument(help="Logs, run folders, folders of runs, globs, addresses.")],
     site: Site,
@@ -120,7 +132,12 @@ def replay(
     raise typer.Exit(_status_of(summary))
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise dictionary --table hazards",
+        "balise dictionary --markdown > dictionary.md",
+    )
+)
 def dictionary(
     as_json: Json = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="As one Markdown page.")] = False,
@@ -145,7 +162,12 @@ def dictionary(
         show_table(settings_frame(), "Configuration and vehicle")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise demo",
+        "balise demo --out /tmp/demo --seed 7",
+    )
+)
 def demo(
     out: OutFolder = Path("demo-out"),
     seed: Annotated[int | None, typer.Option(help="Another trial than the usual one.")] = None,
@@ -168,7 +190,11 @@ def demo(
     raise typer.Exit(OK if result.agrees else RUNS_NOT_OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise synth scenario.toml --out trial",
+    )
+)
 def synth(
     scenario: Annotated[Path, typer.Argument(callback=_here, help="Scenario (TOML).")],
     out: OutFolder,
@@ -183,15 +209,32 @@ def synth(
         print(f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise safety",
+        "balise safety week12",
+        "balise safety week12 --config other_level.toml --json",
+    )
+)
 def safety(
     out: Annotated[str | None, typer.Argument(help="A result of `balise replay`, for what it measured.")] = None,
     config: ConfigFile = None,
+    logs: Annotated[
+        list[str] | None,
+        typer.Option("--logs", help="Logs to replay with other limits, for the sensitivity of the verdict."),
+    ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
+    vehicle: VehicleFile = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Safety budget with its errata; of a result, what it measured against it, each figure with its bounds."""
+    """Safety budget with its errata; of a result, what it was made from and what it measured, each figure with bounds.
+
+    The sensitivity to service levels comes from the tables. That to `failure_limit_m` and `evidence_factor` needs the
+    logs: with --logs and --site they are replayed once per value.
+    """
     if out is not None:
-        _assess(out, config, as_json)
+        _assess(out, config, _replay_again(logs or [], site, vehicle, jobs), as_json)
         return
     from pipeline.results.terminal import show_table
     from pipeline.safety import safety_tables
@@ -206,7 +249,13 @@ def safety(
         print()
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise inspect monday.mcap",
+        "balise inspect line9",
+        "balise inspect line9 --result week12",
+    )
+)
 def inspect(
     path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
     result: Annotated[
@@ -230,7 +279,11 @@ def inspect(
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise inject monday.mcap --fault ramp.toml --out monday_ramp.mcap",
+    )
+)
 def inject(
     run: Annotated[str, typer.Argument(help="A recorded run.")],
     fault: Annotated[Path, typer.Option("--fault", callback=_here, help="Fault file (TOML).")],
@@ -254,7 +307,12 @@ def inject(
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise convert receiver.ubx --to monday",
+        "balise convert positions.csv --config columns.toml --to monday.mcap",
+    )
+)
 def convert(
     logs: Annotated[
         list[Path],
@@ -278,7 +336,11 @@ def convert(
         print(f"not used: {count} x {reason}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise calibrate good/*.mcap --site line9 --out train7.toml",
+    )
+)
 def calibrate(
     runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, globs.")],
     site: Site,
@@ -312,7 +374,12 @@ def calibrate(
     print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise experiment list",
+        "balise experiment diagnostics --repetitions 50",
+    )
+)
 def experiment(
     name: Annotated[str, typer.Argument(help="`list` shows the names.")],
     out: OutFolder = Path("experiment-out"),
@@ -348,7 +415,14 @@ def experiment(
         print(path)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        'balise sql week12 "SHOW TABLES"',
+        'balise sql week12 "SELECT run_id, verdict FROM runs" --csv runs.csv',
+        'balise sql week12 "SELECT r.run_id, r.verdict, o.verdict FROM runs r JOIN old_runs o USING (run_id)"'
+        " --with old=week11",
+    )
+)
 def sql(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     query: Annotated[str, typer.Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
@@ -386,7 +460,11 @@ def sql(
         show_table(answer)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise report week12 --site line9",
+    )
+)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
@@ -407,7 +485,12 @@ def report(
         print(f"{len(pages)} files; begin with {pages[0]}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise export week12 monday --to monday.mcap --site line9",
+        "balise export week12 monday --to monday.geojson",
+    )
+)
 def export(
     out: ResultFolder,
     run: Annotated[str, typer.Argument(help="Id of the run.")],
@@ -433,7 +516,12 @@ def export(
         print(f"Without {text}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise verify week12",
+        "balise verify week12 --logs logs --site line9 --vehicle train7.toml",
+    )
+)
 def verify(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     logs: Annotated[
@@ -474,7 +562,12 @@ def verify(
     raise typer.Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise diff week11 week12",
+        "balise diff week11 week12 --detail",
+    )
+)
 def diff(
     out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     out_b: Annotated[str, typer.Argument(help="Another one.")],
@@ -550,12 +643,29 @@ def _print_json(value: Any) -> None:
     print(to_json(value))
 
 
-def _assess(out: str, config: Path | None, as_json: bool) -> None:
+def _replay_again(logs: list[str], site: str | None, vehicle: Path | None, jobs: int) -> Replay | None:
+    """How `safety` replays the logs with another configuration; none without logs."""
+    from pipeline.campaign import make_plan, run_campaign
+    from schemas.errors import UsageError
+
+    if not logs:
+        return None
+    if site is None:
+        raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+    ground, train = site, _vehicle(vehicle)
+
+    def replay_with(settings: Configuration, to: str) -> None:
+        run_campaign(make_plan(logs, ground, to, settings, train), jobs=jobs or os.cpu_count() or 1)
+
+    return replay_with
+
+
+def _assess(out: str, config: Path | None, replay_again: Replay | None, as_json: bool) -> None:
     from pipeline.results.terminal import show_table
     from pipeline.safety.assessment import assess, for_reading
 
     settings = None if config is None else _configuration(config)
-    found = assess(out, settings)
+    found = assess(out, settings, replay_again)
     if as_json:
         _print_json({"statements": found.statements, **found.tables})
         return
