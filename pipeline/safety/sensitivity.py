@@ -1,8 +1,8 @@
 """By how much the verdict hangs on what was chosen: failure limit, service level, width of the evidence.
 
-Service levels need no new replay: how long each failure was in use stands in the `runs` table. The failure limit and the
-width of the evidence decide what a failure is, and the limit also when a negated position may return, so that these need
-the logs again.
+Service levels need no new replay: how long each failure was in use stands in the `runs` table. The failure limit and
+the width of the evidence decide what a failure is, and the limit also when a blocked position may return, so that these
+need the logs again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ Replay = Callable[[Configuration, str], None]
 def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:
     """One row per key of `[hazards]` and value: runs by verdict, wrong acceptances, failures beyond the time allowed.
 
-    `how` says where a row comes from. `replay` replays the logs with a configuration into a folder; without it the rows that need it have no figures.
+    `how` says where a row comes from. `replay` replays the logs with a configuration into a folder; without it the rows
+    that need it have no figures.
     """
     used = config.hazards.service_level
     rows: list[Row] = []

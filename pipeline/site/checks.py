@@ -194,7 +194,7 @@ def _check_gaps(track: Track, found: Remarks) -> None:
 
 
 def _near_pairs(places: Floats, reach_m: float) -> Iterator[tuple[int, int]]:
-    """Numbers of points no farther apart than this, the lower one first; in order of one axis few have to be compared."""
+    """Numbers of points no farther apart than this, the lower one first; in order of one axis few are compared."""
     order = np.argsort(places[:, 0], kind="stable")
     ordered = places[order]
     ends = np.searchsorted(ordered[:, 0], ordered[:, 0] + reach_m, side="right")

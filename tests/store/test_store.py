@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import dataframely as dy
@@ -52,6 +54,10 @@ def test_layout_and_metadata(tmp_path: Path) -> None:
     assert sorted(files_in(tmp_path)) == sorted(f"{name}/run_id=r1/{name}.parquet" for name in TABLES)
     found = pq.read_metadata(tmp_path / "runs/run_id=r1/runs.parquet")
     metadata = {key.decode(): value.decode() for key, value in found.metadata.items() if key.startswith(b"balise.")}
+    others = [name for name in TABLES if name != "runs"]
+    files = {name: (tmp_path / f"{name}/run_id=r1/{name}.parquet").read_bytes() for name in others}
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    assert json.loads(metadata.pop("balise.tables")) == digests
     expected = {**METADATA, "table": "runs", "contract": CONTRACT_VERSION}
     assert metadata == {f"balise.{key}": value for key, value in expected.items()}
     assert found.row_group(0).column(0).compression == "ZSTD"
@@ -274,7 +280,7 @@ def test_configuration_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show tables", "", "-- x"]
+    "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show runs", "", "-- x"]
 )
 def test_results_are_only_read(tmp_path: Path, sql: str) -> None:
     store.write_run(tables_of("r1"), tmp_path, METADATA)
