@@ -21,7 +21,9 @@ def source_files(out: Address) -> pl.DataFrame:
     if manifest is None:
         return pl.DataFrame(schema=_SCHEMA)
     content = storage.content_of(join(out, NAME)) or b""
-    rows: list[tuple[str, str, str, int | None, str]] = [("manifest", "", NAME, len(content), hashlib.sha256(content).hexdigest())]
+    rows: list[tuple[str, str, str, int | None, str]] = [
+        ("manifest", "", NAME, len(content), hashlib.sha256(content).hexdigest())
+    ]
     made = {(run["software"], run["software_digest"]) for run in manifest["runs"].values()}
     rows += [("program", "", software or "", None, digest or "") for software, digest in sorted(made, key=str)]
     for entries in manifest["settings"].values():

@@ -135,8 +135,8 @@ def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
     """Three faults for `primary`, one of them missed; two failures in use, one within the budget."""
     text = text_of(out, "index.html")
     section = text[text.index('id="s1"') : text.index("table-levels-s1")]
-    assert "of 2 position failures in use, at a virtual balise or not, 1 were within the budget and 1 beyond" in section
-    assert "Of 3 faults with a failure that a truth judged 1 were missed detections" in section
+    assert "2 position failures in use, at a virtual balise or not: 1 in time, 1 too late" in section
+    assert "No monitor found 1 of 3 faults with a failure that a truth judged" in section
     assert "<dt>share of missed ones of these</dt><dd>0.333 (95 %: 0.0084 to 0.906)</dd>" in section
     assert "<dt>runs that were replayed</dt><dd>3</dd>" in section
     assert "<dt>runs that could not be, with this solution or before any was known</dt><dd>1</dd>" in section
