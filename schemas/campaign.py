@@ -186,7 +186,7 @@ def _figures_schema() -> type[dy.Schema]:
         "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
         "hours_needed": real(
             "h",
-            "fault-free hours needed to prove THR_VB by counting, 95 %, with so many failures not shown to be in time",
+            "hours that prove THR_VB by counting, 95 %",
             min=0,
         ),
         "hours_still_needed": real("h", "of these still needed", min=0),

@@ -38,9 +38,7 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     ]
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     if partial:
-        said.append(
-            f"{partial} of {runs['run_id'].n_unique()} runs are partial: only what could be read of them counts."
-        )
+        said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: only what was read of them counts.")
     return [*said, *_unjudged(runs, alarms)]
 
 

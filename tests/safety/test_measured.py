@@ -111,7 +111,7 @@ def test_rates_over_the_campaign() -> None:
     assert (
         "4 position failures in use, at a virtual balise or not: 1 in time, 2 too late, 1 unknown" in sentence
     )
-    assert "of 1 it cannot be said, in 3.75 h judged, 1.75 h of these by a truth" in sentence
+    assert "Hours judged: 3.75, of these 1.75 by a truth" in sentence
     assert "Of 18 accepted virtual balises judged by a truth 1 were accepted despite a wrong position" in sentence
     assert "and 2 more by the odometer alone; 14 accepted ones could not be checked" in sentence
 
