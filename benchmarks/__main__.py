@@ -12,7 +12,9 @@ import polars as pl
 from benchmarks.results import Figure
 from pipeline.results.terminal import show_table, to_json
 
-MODULES = ("end_to_end", "ingest", "matching", "calibration", "campaign", "interruptions", "experiment", "relink")
+MODULES = (
+    *("start", "end_to_end", "ingest", "matching", "calibration", "campaign", "interruptions", "experiment", "relink"),
+)
 
 
 def main() -> int:
