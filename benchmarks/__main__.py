@@ -13,7 +13,16 @@ from benchmarks.results import Figure
 from pipeline.results.terminal import show_table, to_json
 
 MODULES = (
-    *("start", "end_to_end", "ingest", "matching", "calibration", "campaign", "interruptions", "experiment", "relink"),
+    "start",
+    "end_to_end",
+    "ingest",
+    "matching",
+    "calibration",
+    "topologies",
+    "campaign",
+    "interruptions",
+    "experiment",
+    "relink",
 )
 
 

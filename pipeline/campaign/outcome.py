@@ -15,7 +15,6 @@ from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import verdict_reasons, worst_verdict
 from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
-from schemas.config import digest_of
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
@@ -29,7 +28,7 @@ class RunOutcome:
 
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
-    `faults`: each in words, the worst first.
+    `faults`: each in words, the worst first. `redo`: the next call tries it again; `proof`: that of `resume`.
     """
 
     run_id: str
@@ -47,6 +46,8 @@ class RunOutcome:
     attempts: int = 1
     why: str = ""
     faults: tuple[str, ...] = ()
+    redo: bool = False
+    proof: str = ""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def never_begun(workers: int) -> str:
     return f"{workers} workers died before they could begin it. Look at the workers' own logs."
 
 
-def failure_of(error: Exception, lasting: bool) -> Failure:
+def failure_of(error: BaseException, lasting: bool) -> Failure:
     """How a failure is told, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
         again = isinstance(error, InputError) and not isinstance(error, ChangedError)
@@ -149,7 +150,7 @@ def failed_tables(job: RunJob, error: str) -> RunTables:
     from pipeline.figures.summary import failed_row
 
     folder = job.address.rstrip("/").rpartition("/")[0]
-    made = Provenance(digest_of(job.config, job.vehicle), "", SOFTWARE)
+    made = Provenance(job.config_digest, "", SOFTWARE)
     row = failed_row(error.replace(f"{redacted(folder)}/", ""), made)
     empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
     return RunTables(run_id=job.run_id, runs=row, **empty)

@@ -16,12 +16,15 @@ from typing import Any
 import polars as pl
 
 from pipeline.results.layout import Column, fitted
+from schemas.errors import visible
 
 _SAID_EVERY_S, _CHANGED_EVERY_S = 5.0, 0.2
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 # Right is green, wrong red, not known grey; the word itself says it where there are no colours.
 _COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
 _VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])")
+# Control characters that JSON itself lets stand.
+_STEERING = re.compile("[\x7f-\x9f]")
 
 
 def show_table(frame: pl.DataFrame, title: str = "") -> None:
@@ -67,7 +70,8 @@ def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
 
 def to_json(value: Any) -> str:
     """JSON of frames, instants and plain values; what is not known is null."""
-    return json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)
+    text = json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)
+    return _STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def duration_text(seconds: float) -> str:
@@ -94,7 +98,7 @@ def _text(value: object) -> str:
         case list():
             return " ".join(map(_text, value))
         case _:
-            return str(value)
+            return visible(str(value)).replace("\n", r"\n")
 
 
 def _plain(value: Any) -> Any:

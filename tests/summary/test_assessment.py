@@ -134,7 +134,7 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     assert said[2].startswith(
         "primary: in 1 of 3 h the position could not be checked (1 of 3 runs have no evidence at all)"
     )
-    assert said[3].startswith("primary: 1 alarms in 1 runs could not be checked.")
+    assert said[3].startswith("primary: 1 alarms in 1 runs could not be checked")
 
 
 def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
