@@ -171,7 +171,7 @@ def test_shares_are_of_failures_that_a_truth_judged() -> None:
     assert (found["stanford_nominal"], found["stanford_hpl_nominal"]) == (5, None)
     (sentence,) = plain_statements(figures)
     assert (
-        "Of 2 faults with a failure that a truth judged 1 were not found in time; 1 more were seen by the" in sentence
+        "Of 2 faults with a failure that a truth judged 1 were not found in time; 1 more are known by the" in sentence
     )
     row = detection_by_level(catalogue, faults, CONFIG).row(1, named=True)  # LPV-200, 0.5025 s
     assert (row["failures"], row["within"], row["exceeded"]) == (4, 1, 2)

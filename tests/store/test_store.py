@@ -18,7 +18,7 @@ from pipeline import storage
 from pipeline.campaign import find_runs
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
-from pipeline.results.terminal import plain_table, to_json
+from pipeline.results.terminal import table_lines, to_json
 from pipeline.storage import files
 from pipeline.storage.address import Address, redacted, stem_of
 from schemas.config import Configuration
@@ -389,7 +389,7 @@ def test_any_query_has_an_answer_or_one_message(tmp_path: Path) -> None:
 def test_control_characters_are_shown_and_not_sent() -> None:
     title = "\x1b]0;owned\x07\x9b31m\u202e\n"
     frame = pl.DataFrame({"name": [title]})
-    for text in (plain_table(frame), to_json(frame), str(InputError("bad", place=title))):
+    for text in ("\n".join(table_lines(frame)), to_json(frame), str(InputError("bad", place=title))):
         assert not set(text) & {"\x1b", "\x07", "\x9b"}
-    assert plain_table(frame).splitlines()[-1] == r"\x1b]0;owned\x07\x9b31m\u202e\n"
+    assert table_lines(frame)[-1] == r"\x1b]0;owned\x07\x9b31m\u202e\n"
     assert json.loads(to_json(frame))[0]["name"] == title
