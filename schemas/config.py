@@ -60,6 +60,8 @@ class IngestConfig(Settings):
     balise_reads: tuple[StreamMapping, ...] = ()
     # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
+    # A receiver before its first fix, or a week that rolls over, touches some rows; more is another recording. Ours.
+    wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
 
     @model_validator(mode="before")
     @classmethod

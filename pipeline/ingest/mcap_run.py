@@ -192,7 +192,7 @@ def _frames(
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[Breach] = []
     remarks: list[str] = []
-    frames = stream_frames(decoded, breaches, remarks)
+    frames = stream_frames(decoded, breaches, config.wrong_dates_share, remarks)
     if "gnss" not in frames:
         breaches.append(_no_gnss(path, walk, left_over))
     refuse(breaches)
