@@ -21,6 +21,7 @@ from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
 from datasets.receiver import Journey, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
+from pipeline.storage.parquet import parquet_bytes
 from schemas.config import Vehicle, settings_from, to_toml
 from schemas.errors import OutputError
 from schemas.run import STREAMS, RunLog, Site
@@ -97,7 +98,7 @@ def write_site(site: Site, folder: Path) -> None:
     for name in ("track", "links", "balises", "route"):
         table: pl.DataFrame | None = getattr(site, name)
         if table is not None:
-            table.write_parquet(folder / f"{name}.parquet")
+            (folder / f"{name}.parquet").write_bytes(parquet_bytes(table))
 
 
 def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
@@ -125,7 +126,7 @@ def _write(run: RunLog, path: Path, log: LogKind) -> None:
     for name in STREAMS:
         file, table = path / f"{name}.parquet", run.stream(name)
         if table is not None:
-            table.write_parquet(file)
+            file.write_bytes(parquet_bytes(table))
         else:
             # What an earlier run left here would be taken for a stream of this one.
             file.unlink(missing_ok=True)

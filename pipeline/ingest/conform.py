@@ -43,12 +43,6 @@ def conform_to(
     return pl.DataFrame({name: series for name, series in conformed.items() if series is not None})
 
 
-def extra_columns(frame: pl.DataFrame, stream: Stream) -> list[str]:
-    """Recorded columns that the contract does not know."""
-    known = STREAM_SCHEMAS[stream].columns()
-    return [name for name in frame.columns if name not in known]
-
-
 def _may_be_absent(name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[Breach]) -> bool:
     if column.nullable:
         return True
