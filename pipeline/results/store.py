@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -14,7 +13,7 @@ from pipeline.results.source import conjuncts, source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.files import exists, read_bytes
-from schemas.config import Configuration, Settings, settings_from, to_toml
+from schemas.config import Configuration, Settings, settings_from, to_toml, toml_of
 from schemas.conform import conform, dtypes
 from schemas.errors import UsageError
 from schemas.run import RunTables, Site
@@ -226,7 +225,7 @@ def read_config(out: Address) -> Configuration | None:
     address = join(out, "config.toml")
     if not exists(address):
         return None
-    return settings_from(tomllib.loads(read_bytes(address).decode()), Configuration, str(address))
+    return settings_from(toml_of(read_bytes(address), shown(address)), Configuration, str(address))
 
 
 def write_config(out: Address, settings: Settings) -> None:

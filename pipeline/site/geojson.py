@@ -41,7 +41,7 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     try:
         document = json.loads(data)
         features, epsg = list(document["features"]), _epsg(document)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
     points: dict[str, list[Any]] = {name: [] for name in _TRACK_COLUMNS}
@@ -122,17 +122,20 @@ def _add_element(
         return
     try:
         triples = [(float(c[0]), float(c[1]), float(c[2]) if len(c) > 2 else None) for c in coordinates]
-    except (TypeError, ValueError, IndexError):
+    except (TypeError, ValueError, IndexError, KeyError, OverflowError):
         breaches.append(f"{place} ({name}): coordinates are not numbers [longitude, latitude(, height)]")
         return
     if str(name) in lengths:
         breaches.append(f"{place}: net element {name} stands in the file twice")
         return
     sigma_m = keys.get("sigmam")
+    declared = _first(keys, _LENGTH_KEYS)
+    if any(isinstance(value, int) and value.bit_length() > 1024 for value in (sigma_m, declared)):
+        breaches.append(f"{place} ({name}): sigma_m or length is no number of metres")
+        return
     if isinstance(sigma_m, bool) or not isinstance(sigma_m, int | float | None):
         breaches.append(f"{place} ({name}): sigma_m {sigma_m!r}; expected a number of metres")
         return
-    declared = _first(keys, _LENGTH_KEYS)
     lengths[str(name)] = float(declared) if isinstance(declared, int | float) else float("nan")
     points["netelement_id"] += [str(name)] * len(triples)
     points["sigma_m"] += [None if sigma_m is None else float(sigma_m)] * len(triples)
