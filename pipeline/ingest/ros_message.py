@@ -19,7 +19,7 @@ DEEPEST = 32  # messages inside each other
 _CODES = {"u1": "B", "i1": "b", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f4": "f", "f8": "d"}
 # One line at a time, and no two parts of the pattern that could take the same characters: the time is linear.
 _LINE = re.compile(
-    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?\d{0,9}\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?:<=)?\d{0,9}\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>(?:[\s=].*)?)"
 )
 
 
@@ -74,7 +74,7 @@ def short_name(full: str) -> str:
 def _member(line: str, package: str) -> Member | None:
     content = line.split("#", 1)[0].strip()
     match = _LINE.fullmatch(content)
-    if not content or (match and match["rest"].startswith("=")):
+    if not content or (match and match["rest"].lstrip().startswith("=")):
         return None
     if match is None:
         raise DefinitionError(f"the definition line {content[:80]!r} is not understood")
