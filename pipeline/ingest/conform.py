@@ -196,7 +196,7 @@ def _check_range(series: pl.Series, column: dy.Float64 | dy.Int64, where: str, b
     over = getattr(column, "min_exclusive", None)
     if low < least:  # type: ignore[operator]
         breaches.append(_out_of_range(where, low, series < least, f"at least {least:g}"))
-    if over is not None and low <= over:  # type: ignore[operator]
+    if over is not None and low <= over:
         breaches.append(_out_of_range(where, low, series <= over, f"more than {over:g}"))
     if high > most:  # type: ignore[operator]
         breaches.append(_out_of_range(where, high, series > most, f"at most {most:g}"))

@@ -78,12 +78,10 @@ def _check_sizes(messages: Messages, channel: Channel) -> None:
 
 def _pieces(messages: Messages) -> Iterator[Messages]:
     """The messages of an unusually large block in parts: decoding needs several times their size."""
-    total = messages.length.cumsum()
-    parts = total // _DECODED_TOGETHER
-    if parts[-1] == 0:
+    if messages.length.sum() < _DECODED_TOGETHER:
         yield messages
         return
-    cuts = np.flatnonzero(np.diff(parts)) + 1
+    cuts = np.flatnonzero(np.diff(messages.length.cumsum() // _DECODED_TOGETHER)) + 1
     yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
 
 

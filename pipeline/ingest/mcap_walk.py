@@ -76,8 +76,8 @@ class McapWalk:
         self._definitions: dict[int, mcap.records.Channel] = {}
         self._pending: list[Pending] = []
         self._pending_size = 0
-        self._unpacker = Decompressor()
         self._memory = np.empty(0, dtype=np.uint8)
+        self._unpacker = Decompressor()
         self._ordinal = 0
         self._allowance = Allowance(_FREE_RECORDS + window.size)
         self._known: set[bytes] = set()

@@ -40,6 +40,15 @@ def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str] | None = None
 
 
 Schema = dict[str, pl.DataType]
+# A panic of polars is a BaseException: it has one for metadata of a column that is not UTF-8.
+_ERRORS = (
+    pa.ArrowException,
+    pl.exceptions.PolarsError,
+    pl.exceptions.PanicException,
+    OSError,
+    ValueError,
+    OverflowError,
+)
 
 
 @contextmanager
@@ -47,7 +56,7 @@ def _reading() -> Iterator[None]:
     """Turns what pyarrow and polars raise into one error of one line."""
     try:
         yield
-    except (pa.ArrowException, pl.exceptions.PolarsError, OSError, ValueError, OverflowError) as error:
+    except _ERRORS as error:
         raise ParquetError((str(error).strip().splitlines() or [type(error).__name__])[0]) from None
 
 
