@@ -60,6 +60,8 @@ class IngestConfig(Settings):
     balise_reads: tuple[StreamMapping, ...] = ()
     # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
+    # A receiver before its first fix, or a week that rolls over, touches some rows; more is another recording. Ours.
+    wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
 
     @model_validator(mode="before")
     @classmethod
@@ -452,17 +454,29 @@ def _told(breach: ErrorDetails) -> str:
     key = ".".join(str(part) for part in breach["loc"]) or "(file)"
     found, unknown = breach["input"], breach["type"] == "extra_forbidden"
     single = isinstance(found, str | int | float) and not unknown
-    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {found!r}" if single else "")
+    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {_shown(found)}" if single else "")
+
+
+def _shown(value: str | int | float) -> str:
+    """The value, shortened (Python does not even write integers of 4,300 digits)."""
+    long = isinstance(value, int) and value.bit_length() > 1024
+    return "a very large integer" if long else repr(value)[:100]
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """A TOML file as a mapping, or one error."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return toml_of(path.read_bytes(), str(path), kind)
     except OSError as error:
         raise kind(f"cannot be read: {error.strerror}", place=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise kind(f"is not TOML: {error}", place=str(path)) from None
+
+
+def toml_of(content: bytes, place: str, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
+    """TOML as a mapping, or one error."""
+    try:
+        return tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:  # also: not UTF-8, an integer of thousands of digits
+        raise kind(f"is not TOML: {error}", place=place) from None
 
 
 def load_settings(path: Path | None, kind: type[S]) -> S:
