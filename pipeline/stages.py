@@ -72,7 +72,7 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
 
 def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> _Context:
     """The run in order, its odometer, and what is known of where the train was."""
-    cleaned, counts = clean(run)
+    cleaned, counts = clean(run, config.ingest)
     odometry = odometry_of(cleaned.odometer, vehicle, config)
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)

@@ -50,7 +50,13 @@ def _wrong(breach: ErrorDetails) -> str:
     text = _WORDS.get(breach["type"], breach["msg"].removeprefix("Value error, "))
     found = breach["input"]
     single = isinstance(found, str | int | float) and breach["type"] != "missing"
-    return f"{key}: {_filled(text, breach.get('ctx') or {})}" + (f", found {found!r}" if single else "")
+    return f"{key}: {_filled(text, breach.get('ctx') or {})}" + (f", found {_shown(found)}" if single else "")
+
+
+def _shown(value: object) -> str:
+    """The value as TOML was read; an integer of more digits than Python writes has no text."""
+    long = isinstance(value, int) and value.bit_length() > 1024
+    return "a very large integer" if long else repr(value)[:100]
 
 
 def _filled(text: str, context: Mapping[str, Any]) -> str:

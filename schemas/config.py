@@ -60,6 +60,8 @@ class IngestConfig(Settings):
     balise_reads: tuple[StreamMapping, ...] = ()
     # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
+    # A receiver before its first fix, or a week that rolls over, touches some rows; more is another recording. Ours.
+    wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
 
     @model_validator(mode="before")
     @classmethod
@@ -449,11 +451,17 @@ def settings_from(
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """A TOML file as a mapping, or one error."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return toml_of(path.read_bytes(), str(path), kind)
     except OSError as error:
         raise kind(f"cannot be read: {error.strerror}", place=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise kind(f"is not TOML: {error}", place=str(path)) from None
+
+
+def toml_of(content: bytes, place: str, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
+    """TOML as a mapping, or one error."""
+    try:
+        return tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:  # also: not UTF-8, an integer of thousands of digits
+        raise kind(f"is not TOML: {error}", place=place) from None
 
 
 def load_settings(path: Path | None, kind: type[S]) -> S:

@@ -29,6 +29,7 @@ class IngestNotes:
     damage: str | None = None
     slow_path_messages: int = 0
     chunks_without_crc: int = 0
+    files_without_crc: tuple[str, ...] = ()
     skipped_topics: tuple[str, ...] = ()
 
 

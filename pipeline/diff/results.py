@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from dataclasses import asdict, dataclass
 
@@ -14,6 +13,7 @@ from pipeline.diff.leading import BALISE_COUNTS, balise_counts, passage_changes,
 from pipeline.diff.tables import Difference, compare_tables
 from pipeline.results import store
 from pipeline.storage.address import Address, redacted
+from pipeline.storage.parquet import ParquetError, read_parquet
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
@@ -153,7 +153,7 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> R
         a, b = (_content(out, table, run_id) for out in (out_a, out_b))
         if a == b:
             continue
-        frame_a, frame_b = (pl.read_parquet(io.BytesIO(content)) for content in (a, b))
+        frame_a, frame_b = (_frame(out, table, run_id, content) for out, content in ((out_a, a), (out_b, b)))
         if table == "hazards":
             found, hazards = compare_hazards(frame_a, frame_b, window_s)
         else:
@@ -166,6 +166,14 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> R
     made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]
     changed = [item for item in differences if item not in made]
     return RunDiff(run_id, verdicts, balises, tuple(hazards), tuple(changed), tuple(item.column for item in made))
+
+
+def _frame(out: Address, table: str, run_id: str, content: bytes) -> pl.DataFrame:
+    try:
+        return read_parquet(content)
+    except ParquetError as error:
+        place = redacted(str(store.table_address(out, table, run_id)))
+        raise UsageError(f"cannot be read: {error}", place=place, remedy="Replay the run again with --force.") from None
 
 
 def _content(out: Address, table: str, run_id: str) -> bytes:

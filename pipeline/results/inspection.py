@@ -63,6 +63,7 @@ def inspect_log(path: Address, config: IngestConfig) -> dict[str, pl.DataFrame]:
         "left_over": found.left_over,
         "damage": found.notes.damage,
         "chunks_without_crc": found.notes.chunks_without_crc,
+        "files_without_crc": list(found.notes.files_without_crc),
     }
     tables = {"Log": _figures(figures)}
     tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in found.streams])

@@ -16,6 +16,8 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.results import catalogue, store
+from pipeline.results.source import source_of
+from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.dictionary import dictionary_frame
@@ -59,11 +61,8 @@ def run_sql(
     for name, address in (others or {}).items():
         tables |= _tables(address, sql, f"{name}_")
     try:
-        with catalogue.patient():
-            return pl.SQLContext(tables).execute(sql).collect()
+        return pl.SQLContext(tables).execute(sql).collect()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
-        if not is_url(out):
-            store.check_tables(out, [name for name in TABLES if name in tables])
         raise UsageError(
             f"cannot be answered: {_told(_first_line(error), tables, others or {})}",
             place="SQL",
@@ -155,18 +154,28 @@ def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
     kept = catalogue.fresh(out, table)
     if kept is not None:
         return kept
-    return store.read_table(out, table) if is_url(out) else catalogue.scan(out, table, runs)
+    return store.scan_runs(out, table, runs)
 
 
 def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFrame]:
     """`campaign/runs.parquet` as `campaign_runs`, and so on; those that are not there are left out."""
     addresses = {name: join(join(out, "campaign"), f"{name.removeprefix('campaign_')}.parquet") for name in names}
-    if not is_url(out):
-        found = {name: Path(address) for name, address in addresses.items() if Path(address).exists()}
-        return {name: pl.scan_parquet(file, glob=False) for name, file in found.items()}
-    contents = storage.read_many([str(address) for address in addresses.values()])
-    there = {name: contents.get(str(address)) for name, address in addresses.items()}
-    return {name: pl.read_parquet(content).lazy() for name, content in there.items() if content is not None}
+    contents: Mapping[str, bytes | Path]
+    if is_url(out):
+        contents = storage.read_many([str(address) for address in addresses.values()])
+    else:
+        contents = {str(address): Path(address) for address in addresses.values() if Path(address).exists()}
+    there = {name: str(address) for name, address in addresses.items() if str(address) in contents}
+    return {name: _campaign_table(name, contents[place]) for name, place in there.items()}
+
+
+def _campaign_table(name: str, source: bytes | Path) -> pl.LazyFrame:
+    try:
+        frame = parquet.read_parquet(source)
+    except parquet.ParquetError as error:
+        remedy = "`balise replay` with the same --out writes it again."
+        raise UsageError(f"cannot be read: {error}", place=f"table `{name}`", remedy=remedy) from None
+    return source_of(frame.schema, lambda columns, _: iter([frame.select(columns)]))
 
 
 def _first_line(error: BaseException) -> str:

@@ -65,7 +65,7 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
         if open_cases.height:
             said.append(
                 f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs could not be"
-                " checked: the rate of false alarms leaves these runs out."
+                " checked. The rate of false alarms leaves these runs out."
             )
     return said
 
@@ -117,29 +117,29 @@ def _statement(row: dict[str, Any]) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
     head = " ".join([_failures(row), _missed(row), _acceptances(row)])
     if row["share_p1"]:
-        head += f" Wrong and not blocked: {row['share_p1']:.3%} of the time in runs with a truth."
+        head += f" Position wrong and not blocked: {row['share_p1']:.3%} of the time in runs with a truth."
     if row["hours_still_needed"] == 0.0:
-        return f"{head} By counting, this proves a {claim}."
+        return f"{head} This proves a {claim} by counting."
     return (
-        f"{head} Fault-free hours still needed to prove a {claim} by counting: {row['hours_still_needed']:.3g} of"
-        f" {row['hours_needed']:.3g} h with a truth. The claim has to rest on the time to detect."
+        f"{head} Fault-free hours still needed to prove a {claim} by counting: {row['hours_still_needed']:.3g} h of"
+        f" {row['hours_needed']:.3g} h. No trial reaches that: the claim has to rest on the time to detect."
     )
 
 
 def _failures(row: dict[str, Any]) -> str:
     within, beyond = row["failures_within_budget"], row["failures_beyond_budget"]
     unknown = row["failures"] - within - beyond
-    beside = f", {unknown} could not be checked" if unknown else ""
+    beside = f", {unknown} unknown" if unknown else ""
     return (
-        f"{row['solution']}: of {row['failures']} position failures in use, at a virtual balise or not, {within} were"
-        f" in time and {beyond} too late{beside}, in {row['hours_with_evidence']:.6g} h judged,"
-        f" {row['hours_with_truth']:.6g} h of these by a truth (reference or balise reads)."
+        f"{row['solution']}: {row['failures']} position failures in use, at a virtual balise or not: {within} in time,"
+        f" {beyond} too late{beside}. Hours judged: {row['hours_with_evidence']:.6g}, of these"
+        f" {row['hours_with_truth']:.6g} by a truth (reference or balise reads)."
     )
 
 
 def _missed(row: dict[str, Any]) -> str:
     known, missed = row["missed_known"], row["missed_judged"]
-    said = f"Of {known} faults with a failure that a truth judged {missed} were not found in time"
+    said = f"No monitor found {missed} of {known} faults with a failure that a truth judged"
     if row["missed"] > missed:
         said += f"; {row['missed'] - missed} more are known by the odometer alone, and shares leave them out"
     return f"{said}."
@@ -151,5 +151,5 @@ def _acceptances(row: dict[str, Any]) -> str:
     if seen > unsafe:
         said += f", and {seen - unsafe} more by the odometer alone"
     if row["unproven_accepted"]:
-        said += f"; of {row['unproven_accepted']} accepted ones the position could not be checked"
+        said += f"; {row['unproven_accepted']} accepted ones could not be checked"
     return f"{said}."

@@ -14,6 +14,7 @@ from pipeline.site.route import route_table
 from pipeline.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
+from pipeline.storage.parquet import without_checksums
 from pipeline.track.survey import geometric_measures_m, track_of
 from schemas.errors import InputError, SiteError, listed
 from schemas.inputs import Balises, Links, Route, Track
@@ -55,7 +56,7 @@ def read_site(path: Path | str) -> Site:
         links=Links.validate(found.links, cast=True),
         balises=None if balises is None else Balises.validate(balises, cast=True),
         route=None if route is None else Route.validate(route, cast=True),
-        findings=tuple(notes + found.findings),
+        findings=tuple(notes + _without_checksums(files) + found.findings),
         digest=_digest(files),
         files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
@@ -85,6 +86,12 @@ def _files(folder: Path | str) -> dict[str, bytes]:
 def is_geojson(address: Path | str) -> bool:
     """By its name: a network as registers of infrastructure export it, net elements and net relations in one file."""
     return name_of(address).lower().endswith(".geojson")
+
+
+def _without_checksums(files: dict[str, bytes]) -> list[Finding]:
+    text = "has no checksums of its pages: damage to it may stay unseen"
+    names = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
+    return [Finding("note", name, text) for name in names]
 
 
 def _digest(files: dict[str, bytes]) -> str:

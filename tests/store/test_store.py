@@ -218,7 +218,7 @@ def test_a_table_that_is_gone_from_a_complete_run_is_missed_and_not_left_out(tmp
             store.write_run(tables_of(run_id), out, METADATA)
         storage.remove(store.table_address(out, "hazards", "a"))
         with pytest.raises(UsageError, match="run a, table `hazards`: cannot be read"):
-            store.read_table(out, "hazards")
+            store.read_table(out, "hazards").collect()
 
 
 def test_config_is_written_resolved(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_results_of_another_build_are_named(tmp_path: Path, remote: bool) -> Non
     as_of_another_build(out, "b")
     message = "run b, table `runs`: was written by another build .* no notes; outages as Int32.*[Rr]eplay"
     with pytest.raises(UsageError, match=message):
-        store.read_table(out, "runs")
+        store.read_table(out, "runs").collect()
     assert store.read_table(out, "runs", "a").collect().height == 1
     assert store.read_table(out, "hazards").collect().height == 0
 
