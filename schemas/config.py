@@ -112,15 +112,26 @@ class MatchingConfig(Settings):
     heading_sigma_deg: Positive = 10.0
     # Slower, the noise of the velocity decides its heading.
     heading_min_speed_mps: Positive = 2.0
-    # Newson & Krumm 2009, eq. 2, for ways by odometer.
+    # Heights tell tracks apart that lie over each other by so much: a train needs a clearance of 4.5 m and more.
+    # The bias is that of datum and antenna: one that the vehicle file does not know stands some 4 m over the rail.
+    clearance_m: Positive = 3.0
+    height_bias_sigma_m: Positive = 2.0
+    # So much at most: no single direction or height decides (3,000 to 1).
+    direct_limit: Positive = 8.0
+    # Newson & Krumm 2009, eq. 2, for ways by odometer, whose scale is wrong by some percent.
     transition_scale_m: Positive = 5.0
+    transition_share: NonNegative = 0.01
+    # Limited, since a position that jumps along the track must not send the path on a detour.
+    mismatch_limit: Positive = 12.0
+    # Log-probability that each relation costs which is passed against its navigability.
+    barred_cost: NonNegative = 20.0
     # DOMAIN section 2: the noise of a standing train is no turn; the first 20 m of net movement orient the path.
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
     # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
     # A survey error is constant in place, not white (DOMAIN section 3); the length is ours.
-    survey_correlation_m: Positive = 200.0
+    survey_correlation_m: Positive = 1000.0
     # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
     estimated_drift: NonNegative = 0.1
     # Reflections follow no error model: one of them must not decide on the track.
@@ -129,8 +140,25 @@ class MatchingConfig(Settings):
     # Positions closer together tell the same of the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
+    # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
+    offset_floor_m: Positive = 0.02
+    table_floor_m: Positive = 0.1
+    # Off an element by what no error explains costs by the time, or a run elsewhere for a minute, which is paid for
+    # twice, would be put on a track far aside. A lost position drifts by this share of its distance to the nearest.
+    off_track_s: Positive = 8.0
+    off_track_wander: NonNegative = 0.03
     # A jump that no train makes decides on no track; after half a minute the odometer may be the wrong one.
     jump_hold_s: Positive = 30.0
+    # Farther than the odometer (or without one speed and its change; no train brakes or turns by 5 m/s²) by this share,
+    # so many standard deviations and this margin.
+    jump_odometer_share: NonNegative = 0.05
+    jump_sigmas: Positive = 5.0
+    jump_margin_m: NonNegative = 10.0
+    jump_speed_mps: Positive = 100.0
+    jump_acceleration_mps2: Positive = 5.0
+    # For so long before and after a jump the train may be on a track as far aside as that, and as it was long.
+    jump_aside_s: NonNegative = 120.0
+    jump_aside_m: NonNegative = 500.0
 
 
 class AlignConfig(Settings):
