@@ -11,10 +11,10 @@ from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
 
+from schemas.breaches import told
 from schemas.enums import Fix
-from schemas.errors import BaliseError, ConfigError
+from schemas.errors import BaliseError, ConfigError, listed
 from schemas.tables import MONITORS
 
 # Strict: neither text nor true or false is a number.
@@ -445,22 +445,7 @@ def settings_from(
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        breaches = [_told(breach) for breach in error.errors()]
-        raise ConfigError("; ".join(breaches), place=place, remedy=remedy) from None
-
-
-def _told(breach: ErrorDetails) -> str:
-    """One breach with its path, and what was found where that is a single value."""
-    key = ".".join(str(part) for part in breach["loc"]) or "(file)"
-    found, unknown = breach["input"], breach["type"] == "extra_forbidden"
-    single = isinstance(found, str | int | float) and not unknown
-    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {_shown(found)}" if single else "")
-
-
-def _shown(value: str | int | float) -> str:
-    """The value, shortened (Python does not even write integers of 4,300 digits)."""
-    long = isinstance(value, int) and value.bit_length() > 1024
-    return "a very large integer" if long else repr(value)[:100]
+        raise ConfigError(listed(told(error, kind)), place=place, remedy=remedy) from None
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:

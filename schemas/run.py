@@ -71,7 +71,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Site:
-    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`."""
+    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`.
+
+    `files`: name, size [bytes] and SHA-256 of each file that it was read from; `digest` is over names and contents.
+    """
 
     track: pl.DataFrame
     links: pl.DataFrame
@@ -79,6 +82,7 @@ class Site:
     route: pl.DataFrame | None = None
     findings: tuple[Finding, ...] = ()
     digest: str = ""
+    files: tuple[tuple[str, int, str], ...] = ()
 
 
 @dataclass(frozen=True)

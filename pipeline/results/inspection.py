@@ -12,11 +12,7 @@ from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.results import store
-from pipeline.site.describe import describe_site
-from pipeline.site.parallels import parallel_findings
 from pipeline.site.read import is_geojson, read_site
-from pipeline.site.survey_findings import survey_findings
-from pipeline.site.windows import window_findings
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
 from schemas.config import IngestConfig, MatchingConfig
@@ -105,6 +101,12 @@ def inspect_site(
 
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
+    # What they need takes long to load, and a log needs none of it.
+    from pipeline.site.describe import describe_site
+    from pipeline.site.parallels import parallel_findings
+    from pipeline.site.survey_findings import survey_findings
+    from pipeline.site.windows import window_findings
+
     site = read_site(path)
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
