@@ -11,10 +11,10 @@ from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
 
+from schemas.breaches import told
 from schemas.enums import Fix
-from schemas.errors import BaliseError, ConfigError
+from schemas.errors import BaliseError, ConfigError, listed
 from schemas.tables import MONITORS
 
 # Strict: neither text nor true or false is a number.
@@ -77,6 +77,8 @@ class IngestConfig(Settings):
     balise_reads: tuple[StreamMapping, ...] = ()
     # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
+    # A receiver before its first fix, or a week that rolls over, touches some rows; more is another recording. Ours.
+    wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
     correct: tuple[StreamCorrection, ...] = ()
     # What no train can have and a known cause explains fails a run (`fail`), or is told and leaves it unproven.
     plausibility: Literal["fail", "warn"] = "fail"
@@ -474,26 +476,23 @@ def settings_from(
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        breaches = [_told(breach) for breach in error.errors()]
-        raise ConfigError("; ".join(breaches), place=place, remedy=remedy) from None
-
-
-def _told(breach: ErrorDetails) -> str:
-    """One breach with its path, and what was found where that is a single value."""
-    key = ".".join(str(part) for part in breach["loc"]) or "(file)"
-    found, unknown = breach["input"], breach["type"] == "extra_forbidden"
-    single = isinstance(found, str | int | float) and not unknown
-    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {found!r}" if single else "")
+        raise ConfigError(listed(told(error, kind)), place=place, remedy=remedy) from None
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """A TOML file as a mapping, or one error."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return toml_of(path.read_bytes(), str(path), kind)
     except OSError as error:
         raise kind(f"cannot be read: {error.strerror}", place=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise kind(f"is not TOML: {error}", place=str(path)) from None
+
+
+def toml_of(content: bytes, place: str, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
+    """TOML as a mapping, or one error."""
+    try:
+        return tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:  # also: not UTF-8, an integer of thousands of digits
+        raise kind(f"is not TOML: {error}", place=place) from None
 
 
 def load_settings(path: Path | None, kind: type[S]) -> S:

@@ -30,6 +30,7 @@ class IngestNotes:
     damage: str | None = None
     slow_path_messages: int = 0
     chunks_without_crc: int = 0
+    files_without_crc: tuple[str, ...] = ()
     skipped_topics: tuple[str, ...] = ()
     corrections: tuple[str, ...] = ()
 
@@ -72,7 +73,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Site:
-    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`."""
+    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`.
+
+    `files`: name, size [bytes] and SHA-256 of each file that it was read from; `digest` is over names and contents.
+    """
 
     track: pl.DataFrame
     links: pl.DataFrame
@@ -80,6 +84,7 @@ class Site:
     route: pl.DataFrame | None = None
     findings: tuple[Finding, ...] = ()
     digest: str = ""
+    files: tuple[tuple[str, int, str], ...] = ()
 
 
 @dataclass(frozen=True)

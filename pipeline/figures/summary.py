@@ -132,6 +132,8 @@ def _ingest_remarks(ingest: IngestNotes) -> list[str]:
     remarks = list(ingest.corrections)
     if ingest.chunks_without_crc:
         remarks.append(f"{ingest.chunks_without_crc} chunks without a checksum")
+    if ingest.files_without_crc:
+        remarks.append(f"without checksums: {', '.join(ingest.files_without_crc)}")
     if ingest.skipped_topics:
         remarks.append("topics not used: " + ", ".join(ingest.skipped_topics))
     return remarks

@@ -13,11 +13,7 @@ from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.results import store
 from pipeline.results.fit_report import FitReport, fit_report
-from pipeline.site.describe import describe_site
-from pipeline.site.parallels import parallel_findings
 from pipeline.site.read import is_geojson, read_site
-from pipeline.site.survey_findings import survey_findings
-from pipeline.site.windows import window_findings
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
 from schemas.config import IngestConfig, MatchingConfig, Vehicle
@@ -75,6 +71,7 @@ def inspect_log(
         "left_over": found.left_over,
         "damage": found.notes.damage,
         "chunks_without_crc": found.notes.chunks_without_crc,
+        "files_without_crc": list(found.notes.files_without_crc),
     }
     tables = {"Log": _figures(figures)}
     tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in found.streams])
@@ -114,6 +111,12 @@ def inspect_site(
 
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
+    # What they need takes long to load, and a log needs none of it.
+    from pipeline.site.describe import describe_site
+    from pipeline.site.parallels import parallel_findings
+    from pipeline.site.survey_findings import survey_findings
+    from pipeline.site.windows import window_findings
+
     site = read_site(path)
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
