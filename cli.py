@@ -261,6 +261,8 @@ def inspect(
     result: Annotated[
         str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
     ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site to hold a log against.")] = None,
+    vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -269,7 +271,7 @@ def inspect(
     from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result, settings.matching)
+    tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
     if as_json:
         _print_json(tables)
     else:
@@ -325,6 +327,7 @@ def convert(
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
     from pipeline.receivers import convert as convert_logs
+    from pipeline.results.fit_report import fit_report
     from schemas.errors import visible
 
     settings = _configuration(config)
@@ -335,6 +338,8 @@ def convert(
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
         print(f"not used: {count} x {visible(reason)}")
+    for line in fit_report(converted.run, settings.ingest).lines():
+        print(line)
 
 
 @app.command(

@@ -22,7 +22,8 @@ STREAMS: tuple[Stream, ...] = (
 class IngestNotes:
     """What reading found out about the log beside its data.
 
-    `partial_until_ns` is set when the log is damaged at its end and read up to there.
+    `partial_until_ns` is set when the log is damaged at its end and read up to there; `corrections`: what the
+    configuration changed in it.
     """
 
     partial_until_ns: int | None = None
@@ -31,6 +32,7 @@ class IngestNotes:
     chunks_without_crc: int = 0
     files_without_crc: tuple[str, ...] = ()
     skipped_topics: tuple[str, ...] = ()
+    corrections: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
