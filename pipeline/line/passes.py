@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from pipeline.export.places import Stretches, ground_of, stretches_of
 from pipeline.line.pieces import Pieces, plane_of
-from pipeline.line.spans import FIRST_LOSS, State, spans_of, states_of
+from pipeline.line.spans import FIRST_LOSS, State, directions_of, spans_of, states_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration
-from schemas.enums import BaliseKind, Judgement, PassageStatus
+from schemas.enums import BaliseKind, Direction, Judgement, PassageStatus
 from schemas.line import LineCause, LineCriteria
 from schemas.run import Site
 
@@ -154,48 +154,51 @@ def _unsafe(passages: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataF
         (pl.col("status") == PassageStatus.ACCEPTED.value)
         & (pl.col("judgement") == Judgement.WRONG.value)
         & (pl.col("kind") == BaliseKind.VIRTUAL.value)
-        & pl.col("netelement_id").is_in(list(pieces.track.index))
-    )
-    places = zip(unsafe["netelement_id"].to_list(), floats(unsafe, "measure_m").tolist(), strict=True)
-    piece = [int(pieces.at(pieces.track.index[name], np.array([at]))[0]) for name, at in places]
-    rows = unsafe.select(t=pl.coalesce("t_offered", "t_true"), state=pl.lit(int(State.WRONG_IN_USE)))
-    rows = rows.with_columns(piece=pl.Series(piece, dtype=pl.Int64))
-    return _rows(_both_ways(rows), LineCause.UNSAFE_ACCEPTANCE)
+    ).with_columns(t=pl.coalesce("t_offered", "t_true"))
+    forward = unsafe["direction"].cast(pl.String) == Direction.GROWING.value
+    ahead = forward.replace_strict({True: 1.0, False: -1.0}, return_dtype=pl.Float64)
+    return _rows(_named(unsafe.with_columns(ahead=ahead), legs, pieces), LineCause.UNSAFE_ACCEPTANCE)
 
 
 def _misleading(
     epochs: pl.DataFrame, states: Ints, legs: Stretches, ground: Ground, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
     """Pieces that wrong positions in use claimed, and those beside a position on a wrong track."""
-    wrong = (states == State.WRONG_IN_USE) | (states == State.WRONG_TRACK)
-    track = ~np.isfinite(floats(epochs, "error_low_m"))
-    named = epochs["netelement_id"].is_not_null().to_numpy()
-    parts = []
-    for rows, reach_m, cause in (
-        (wrong & ~track & named & (states == State.WRONG_IN_USE), None, LineCause.CLAIMED_WRONGLY),
-        (wrong & track & named, criteria.beside_m, LineCause.WRONG_TRACK),
-    ):
-        for state in np.unique(states[rows]):
-            told = epochs.filter(pl.Series(rows & (states == state)))
-            piece = _claimed(told, ground.pieces) if reach_m is None else ground.beside(told, reach_m)
-            frame = pl.DataFrame({"piece": piece}).with_columns(state=pl.lit(int(state)), t=pl.lit(told["t"][0]))
-            parts.append(_rows(_both_ways(frame), cause))
+    told = epochs.with_columns(state=pl.Series(states), ahead=pl.Series(directions_of(epochs)))
+    told = told.filter(pl.col("netelement_id").is_not_null())
+    track = pl.col("error_low_m").is_null()
+    in_use = pl.col("state") == int(State.WRONG_IN_USE)
+    claims = _named(told.filter(in_use & ~track), legs, ground.pieces)
+    parts = [_rows(claims, LineCause.CLAIMED_WRONGLY)]
+    for state in (State.WRONG_TRACK, State.WRONG_IN_USE):
+        rows = told.filter(track & (pl.col("state") == int(state)))
+        if rows.height:
+            # On which of these tracks it was, and so which way over each, nobody knows.
+            piece = pl.DataFrame({"piece": ground.beside(rows, criteria.beside_m)})
+            both = piece.join(pl.DataFrame({"growing": [True, False]}), how="cross")
+            lone = both.with_columns(state=pl.lit(int(state)), t=pl.lit(rows["t"][0]))
+            parts.append(_rows(lone, LineCause.WRONG_TRACK))
     return parts
 
 
-def _claimed(epochs: pl.DataFrame, pieces: Pieces) -> Ints:
-    """The pieces that positions name."""
-    found = [
-        pieces.at(pieces.track.index[str(name)], floats(rows, "measure_m"))
-        for (name,), rows in epochs.group_by("netelement_id")
-        if name in pieces.track.index
-    ]
-    return np.unique(np.concatenate(found)) if found else np.empty(0, dtype=np.int64)
+def _named(rows: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
+    """`piece, growing, state, t` of the places that rows name; `ahead`: their direction on growing path.
 
-
-def _both_ways(frame: pl.DataFrame) -> pl.DataFrame:
-    """What misleads condemns a place for both directions."""
-    return pl.concat([frame.with_columns(growing=pl.lit(True)), frame.with_columns(growing=pl.lit(False))])
+    Both directions where that is not known.
+    """
+    signs: dict[str, set[int]] = {}
+    for name, sign in zip(legs.elements, legs.sign.tolist(), strict=True):
+        signs.setdefault(name, set()).add(sign)
+    found: dict[tuple[int, bool], object] = {}
+    for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():
+        if (element := pieces.track.index.get(name)) is None or at is None:
+            continue
+        ways = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1.0, -1.0) else set()
+        for growing in ways or {True, False}:
+            found.setdefault((int(pieces.at(element, np.array([at]))[0]), growing), t)
+    schema = {name: _PASSES[name] for name in ("piece", "growing", "state", "t")}
+    table = [(piece, growing, int(State.WRONG_IN_USE), t) for (piece, growing), t in found.items()]
+    return pl.DataFrame(table, schema=schema, orient="row")
 
 
 def _merged(rows: pl.DataFrame) -> pl.DataFrame:

@@ -244,7 +244,7 @@ def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
             largest_undetected_m=pl.Series([errors.get(one.piece) for one in placed], dtype=pl.Float64),
             proved=pl.Series([bool(proved[one.piece]) and one.virtual for one in placed], dtype=pl.Boolean),
         )
-        .select(LineBalises.columns())
+        .select(*LineBalises.columns())
     )
 
 
