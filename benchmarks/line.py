@@ -16,7 +16,7 @@ from pipeline.line.pieces import middles, pieces_of
 from pipeline.line.write import passes_of_runs, write_line
 from pipeline.results.store import read_table
 from pipeline.site.read import read_site
-from schemas.config import Configuration, Vehicle, settings_from
+from schemas.config import Configuration, settings_from
 from schemas.line import LineCriteria
 
 RUNS = 50
@@ -78,18 +78,13 @@ def measure(out: Path, runs: int = RUNS) -> list[Figure]:
     """Replay the trial once and hold the classes against the places."""
     if not (out / "trial" / "site").exists():
         write_trial(scenario(runs), out / "trial")
-    vehicle = Vehicle.model_validate(scenario(runs).vehicle.model_dump() if scenario(runs).vehicle else {})
+    vehicle = scenario(runs).vehicle
     plan = make_plan(
         [str(out / "trial" / "runs")], str(out / "trial" / "site"), str(out / "tables"), Configuration(), vehicle
     )
     run_campaign(plan, jobs=2)
     found = write_line(out / "tables", read_site(out / "trial" / "site"), LineCriteria(loss_limit=0.15))
     table = found.pieces.filter(pl.col("passes") > 0).with_columns(chainage=_chainage())
-    print(
-        table.filter(pl.col("piece_class") == "unsuitable").select(
-            "chainage", "direction", "cause", "monitors", "passes", "lost", "wrong_in_use", "claimed_wrongly"
-        )
-    )
     return [*_found(table), _invented(table), _predicted(out)]
 
 

@@ -98,7 +98,7 @@ def _strips(pieces: pl.DataFrame, balises: pl.DataFrame) -> list[str]:
     for (name,), own in shown.group_by("netelement_id", maintain_order=True):
         start = int(own["piece"].min() or 0)  # type: ignore[arg-type]
         for (row,), part in own.group_by((pl.col("piece") - start) // _ROW_PIECES, maintain_order=True):
-            drawings.append(_strip(str(name), part, first.filter(pl.col("netelement_id") == name), int(row)))  # type: ignore[call-overload]
+            drawings.append(_strip(str(name), part, first.filter(pl.col("netelement_id") == name), int(row)))
     return drawings
 
 

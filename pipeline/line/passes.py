@@ -28,7 +28,7 @@ CAUSES = {
     State.WRONG_TRACK: LineCause.WRONG_TRACK,
     State.WRONG_IN_USE: LineCause.WRONG,
 }
-_PASSES = {
+_PASSES: dict[str, pl.DataType | type[pl.DataType]] = {
     "piece": pl.Int64,
     "growing": pl.Boolean,
     "state": pl.Int64,

@@ -34,7 +34,7 @@ def _evidence(runs: pl.DataFrame) -> Iterator[str]:
 
 
 def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
-    needed, most = passes_needed(0, 0, criteria), int(table["passes"].max() or 0)
+    needed, most = passes_needed(0, 0, criteria), max(table["passes"].to_list(), default=0)
     if needed is not None and most < needed:
         yield (
             f"Too few passes: a piece has {most} at most, and {needed} without a loss are needed to show that no more "
