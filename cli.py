@@ -88,6 +88,9 @@ def replay(
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
+    undetected: Annotated[
+        bool, typer.Option("--undetected", help="Also the largest error that no monitor would have noticed.")
+    ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
@@ -98,6 +101,9 @@ def replay(
     from pipeline.campaign.progress import watches
 
     settings, train = _configuration(config), _vehicle(vehicle)
+    if undetected:
+        asked = settings.undetected.model_copy(update={"compute": True})
+        settings = settings.model_copy(update={"undetected": asked})
     plan = make_plan(runs, site, out, settings, train, route, write_route)
     try:
         summary = run_campaign(

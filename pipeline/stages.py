@@ -14,6 +14,7 @@ from pipeline.figures.bounds import threshold_factor
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
+from pipeline.figures.undetected import Spacing
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
@@ -30,6 +31,8 @@ from pipeline.odometry.polarity import polarity
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network
 from pipeline.track.route import site_network
+from pipeline.undetected.columns import Diagnosis, Undetected, not_computed, undetected_of
+from pipeline.undetected.windows import fixes_ns
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
@@ -173,6 +176,7 @@ class _Ride:
     aligned: pl.DataFrame
     lds: LdsResult
     odometry: Odometry | None
+    spacing: Spacing | None
 
 
 def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
@@ -181,12 +185,41 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     fixes = run.gnss.filter(pl.col("solution") == solution)
     odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, odometry, context.vehicle, config)
-    bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config, context.factor)
+    singles = _single_monitors(context, solution, aligned, matches)
+    bank = MonitorBank(aligned, singles, config, context.factor)
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
     lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
-    monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
-    return _Ride(seen, found, aligned, lds, odometry)
+    seen = pl.concat([aligned, lds.epochs.drop("t")], how="horizontal")
+    unnoticed = _undetected(context, solution, seen, bank, singles["channel"], lds, matches)
+    monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
+    passages = lds.passages.with_columns(unnoticed.passages)
+    taken = Solution(solution, fixes, monitored, lds.crossings, passages, balises, found.path)
+    return _Ride(taken, found, aligned, lds, odometry, unnoticed.spacing)
+
+
+def _undetected(
+    context: _Context,
+    solution: str,
+    epochs: pl.DataFrame,
+    bank: MonitorBank,
+    channel: pl.DataFrame,
+    lds: LdsResult,
+    matches: dict[str, Match],
+) -> Undetected:
+    """The largest error that no monitor would have noticed; nulls where nobody asked."""
+    config = context.config
+    if not config.undetected.compute:
+        return not_computed(epochs, lds.passages)
+    diagnosis = Diagnosis(
+        epochs=epochs,
+        bank=bank.along(),
+        held=lds.held,
+        channel=channel,
+        other=_compared(context, solution, epochs, matches),
+        satellites=_ranges(context, solution),
+        fixes_ns=fixes_ns(context.run, lds.crossings, config),
+    )
+    return undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
 
 
 def _reads_on_odometer(
@@ -228,6 +261,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
+        spacing=ride.spacing,
     )
 
 
@@ -253,16 +287,28 @@ def _single_monitors(
     context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
-    satellites = context.run.satellites
-    ranges = None if satellites is None else satellites.filter(pl.col("solution") == solution)
-    named = other in matches and other != solution
-    compared = on_path_of(aligned, matches[other].epochs) if other is not None and named else None
+    ranges, compared = _ranges(context, solution), _compared(context, solution, aligned, matches)
     absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
         "along_doppler": doppler_monitor(aligned, context.config, context.factor),
         "channel": channel_monitor(aligned, compared, context.factor, absent),
         "pseudorange": pseudorange_monitor(aligned, ranges, context.config),
     }
+
+
+def _compared(
+    context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
+) -> pl.DataFrame | None:
+    """The solution to compare with, on this one's path; none where none is named or the run has it not."""
+    other = context.config.monitors.channel_reference
+    if other is None or other == solution or other not in matches:
+        return None
+    return on_path_of(aligned, matches[other].epochs)
+
+
+def _ranges(context: _Context, solution: str) -> pl.DataFrame | None:
+    satellites = context.run.satellites
+    return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
 
 def _tables(run_id: str, parts: list[_Part]) -> RunTables:

@@ -11,6 +11,7 @@ import polars as pl
 from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
 from pipeline.figures.evidence_notes import evidence_notes, motion_notes, undiagnosed_notes
+from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
 from pipeline.results.provenance import Provenance
@@ -38,7 +39,7 @@ class SolutionResults:
     """All that the stages found out about one solution; tables as in `schemas.tables`, failures as in `schemas.stages`.
 
     `distance_m`: way driven, None where nobody knows; `odometer_contradicted`: gaps between anchors that the odometer
-    does not close (DOMAIN section 5.1).
+    does not close (DOMAIN section 5.1); `spacing`: of physical balises, None where not computed.
     """
 
     solution: str
@@ -56,6 +57,7 @@ class SolutionResults:
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
     notes: tuple[str, ...] = ()
+    spacing: Spacing | None = None
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
@@ -77,6 +79,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | figures.state_shares(epochs, clock)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
+        | undetected_figures(epochs, results.spacing, config.hazards.failure_limit_m)
         | _provenance(provenance)
     )
     return _frame(row | {"verdict": verdict_of(row, config.hazards.unknown_share_limit)})
