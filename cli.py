@@ -257,6 +257,36 @@ def inject(
 
 
 @app.command()
+def undetected(
+    run: Annotated[str, typer.Argument(help="A recorded run.")],
+    site: Site,
+    out: Annotated[Path, typer.Option("--out", callback=_here, help="Folder for the fault file and its profile.")],
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
+    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
+    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+) -> None:
+    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    from datasets.undetected import largest_fault, write_fault
+    from pipeline.ingest import read_run
+    from pipeline.site.read import read_site
+
+    settings, train = _configuration(config), _vehicle(vehicle)
+    log = read_run(run, settings.ingest, with_digest=False)
+    found = largest_fault(log, read_site(site), train, settings, solution, balise, at_s, behind)
+    one = settings.undetected.solutions_at_fault == "one"
+    file = write_fault(found, solution if one else None, out)
+    began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
+    print(
+        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most."
+    )
+    print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
+    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+
+
+@app.command()
 def convert(
     logs: Annotated[
         list[Path],

@@ -31,7 +31,7 @@ from pipeline.odometry.polarity import polarity
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network
 from pipeline.track.route import site_network
-from pipeline.undetected.columns import Diagnosis, Undetected, not_computed, undetected_of
+from pipeline.undetected.columns import Diagnosis, undetected_of
 from pipeline.undetected.windows import fixes_ns
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
@@ -76,6 +76,17 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
         for name in context.run.solutions()
     ]
     return _tables(run.run_id, parts)
+
+
+def diagnosed(
+    run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str
+) -> tuple[Diagnosis, pl.DataFrame, pl.DataFrame]:
+    """What watched one solution of a run, with its passages and crossings as the LDS made them."""
+    if solution not in run.solutions():
+        raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
+    context = _context(run, site, vehicle, config)
+    ride = _ride(context, solution, _matches(context)[0])
+    return ride.diagnosis, ride.lds.passages, ride.lds.crossings
 
 
 def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> _Context:
@@ -176,6 +187,7 @@ class _Ride:
     aligned: pl.DataFrame
     lds: LdsResult
     odometry: Odometry | None
+    diagnosis: Diagnosis
     spacing: Spacing | None
 
 
@@ -185,41 +197,26 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     fixes = run.gnss.filter(pl.col("solution") == solution)
     odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, odometry, context.vehicle, config)
-    singles = _single_monitors(context, solution, aligned, matches)
+    compared = _compared(context, solution, aligned, matches)
+    singles = _single_monitors(context, solution, aligned, compared)
     bank = MonitorBank(aligned, singles, config, context.factor)
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
     lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
     seen = pl.concat([aligned, lds.epochs.drop("t")], how="horizontal")
-    unnoticed = _undetected(context, solution, seen, bank, singles["channel"], lds, matches)
+    diagnosis = Diagnosis(
+        epochs=seen,
+        bank=bank.along(),
+        held=lds.held,
+        channel=singles["channel"],
+        other=compared,
+        satellites=_ranges(context, solution),
+        fixes_ns=fixes_ns(run, lds.crossings, config.lds.starts_of_mission, config.undetected),
+    )
+    unnoticed = undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
     monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
     passages = lds.passages.with_columns(unnoticed.passages)
     taken = Solution(solution, fixes, monitored, lds.crossings, passages, balises, found.path)
-    return _Ride(taken, found, aligned, lds, odometry, unnoticed.spacing)
-
-
-def _undetected(
-    context: _Context,
-    solution: str,
-    epochs: pl.DataFrame,
-    bank: MonitorBank,
-    channel: pl.DataFrame,
-    lds: LdsResult,
-    matches: dict[str, Match],
-) -> Undetected:
-    """The largest error that no monitor would have noticed; nulls where nobody asked."""
-    config = context.config
-    if not config.undetected.compute:
-        return not_computed(epochs, lds.passages)
-    diagnosis = Diagnosis(
-        epochs=epochs,
-        bank=bank.along(),
-        held=lds.held,
-        channel=channel,
-        other=_compared(context, solution, epochs, matches),
-        satellites=_ranges(context, solution),
-        fixes_ns=fixes_ns(context.run, lds.crossings, config),
-    )
-    return undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
+    return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
 
 
 def _reads_on_odometer(
@@ -284,10 +281,10 @@ def _alignment(aligned: pl.DataFrame) -> Alignment:
 
 
 def _single_monitors(
-    context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
+    context: _Context, solution: str, aligned: pl.DataFrame, compared: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
-    ranges, compared = _ranges(context, solution), _compared(context, solution, aligned, matches)
+    ranges = _ranges(context, solution)
     absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
         "along_doppler": doppler_monitor(aligned, context.config, context.factor),

@@ -70,11 +70,6 @@ class _Both:
     outright: Bools
 
 
-def not_computed(epochs: pl.DataFrame, passages: pl.DataFrame) -> Undetected:
-    """Nulls: nobody asked."""
-    return Undetected(_nothing(Epochs, epochs.height), _nothing(Passages, passages.height))
-
-
 def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith("undetected_")}
     return pl.DataFrame({name: [None] * rows for name in kinds}, schema=kinds)
@@ -83,27 +78,34 @@ def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
 def undetected_of(
     diagnosis: Diagnosis, passages: pl.DataFrame, crossings: pl.DataFrame, vehicle: Vehicle, config: Configuration
 ) -> Undetected:
-    """The largest error that no monitor would have noticed at each epoch and passage (DOMAIN section 5.6).
+    """The largest error that no monitor would have noticed at each epoch and passage; nulls where nobody asked.
 
     `passages`, `crossings`: of the LDS. Never smaller than what any fault of the definition reaches.
     """
     epochs = diagnosis.epochs
-    rows = watched(epochs, diagnosis.bank, diagnosis.held, vehicle, config)
-    if config.undetected.solutions_at_fault == "one":
-        rows = with_channel(rows, epochs, diagnosis.channel, diagnosis.other)
-    t_ns = times_ns(epochs)
+    if not config.undetected.compute:
+        return Undetected(_nothing(Epochs, epochs.height), _nothing(Passages, passages.height))
+    rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(epochs)
     parts = windows(rows, t_ns, diagnosis.fixes_ns)
     found = _both(rows, parts)
     ranges = diagnosis.satellites
     of_range = None if ranges is None else _both(_with_ranges(rows, epochs, ranges, config), parts)
     spacing = largest_spacing(rows, _way_m(rows, epochs), config)
-    at = _rows_of_passages(passages, crossings, rows, t_ns, config)
+    at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
     return Undetected(
         _at_epochs(rows, found, facing),
         _at_passages(at, rows, found, of_range, facing, t_ns, _names(diagnosis.bank, config)),
         spacing,
     )
+
+
+def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Watched:
+    """What the monitors watched, the comparison with another solution where the fault is in one alone."""
+    rows = watched(diagnosis.epochs, diagnosis.bank, diagnosis.held, vehicle, config)
+    if config.undetected.solutions_at_fault == "all":
+        return rows
+    return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other)
 
 
 def _both(rows: Watched, parts: list[tuple[int, int]]) -> _Both:
@@ -152,7 +154,7 @@ def _faced(found: _Both, facing: Ints) -> Floats:
     return np.where(facing > 0, [found.up_m, found.down_m], [found.down_m, found.up_m])
 
 
-def _rows_of_passages(
+def rows_of_passages(
     passages: pl.DataFrame, crossings: pl.DataFrame, rows: Watched, t_ns: Ints, config: Configuration
 ) -> Ints:
     """The row that each passage looks at, -1 where there is none.

@@ -12,7 +12,7 @@ from pipeline.undetected.stretch import Stretch, paid_m
 from schemas.arrays import Floats
 
 # The best split up to one row is good up to the rows around it too; the next one is sought so much farther on.
-_FARTHER = 1.2
+_FARTHER = 1.3
 
 
 @dataclass(frozen=True)

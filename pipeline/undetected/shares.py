@@ -15,6 +15,8 @@ from scipy.optimize import linprog
 from pipeline.undetected.stretch import Stretch
 from schemas.arrays import Floats, Ints
 
+# Entries of a matrix: rows, columns, values.
+Entries = tuple[Ints, Ints, Floats]
 # Blocks are so much longer than the stretch before them.
 _BLOCK_GROWTH = 0.25
 # Nothing is infinite in a program: a monitor that is not evaluated costs so many times the dearest that is.
@@ -47,15 +49,12 @@ def best_shares(stretch: Stretch) -> Floats:
     blocks, monitors = _Blocks.over(stretch.rows), 1 + stretch.weight.shape[1]
     ends = 2 * blocks.first.size
     terms, costs, linear = _program(stretch, blocks)
-    size = terms.shape[0]
     gauge = max(float(costs.max()), 1e-12)
-    absolute = sparse.hstack([terms, -sparse.identity(size), sparse.identity(size)])
-    whole = sparse.hstack([sparse.hstack([sparse.identity(ends)] * monitors), sparse.csr_matrix((ends, 2 * size))])
     found = linprog(
         np.concatenate([linear, costs, costs]) / gauge,
-        A_eq=sparse.vstack([absolute, whole]).tocsr(),
-        b_eq=np.concatenate([np.zeros(size), np.ones(ends)]),
-        bounds=[(None, None)] * (monitors * ends) + [(0.0, None)] * (2 * size),
+        A_eq=_equations(terms, costs.size, ends, monitors),
+        b_eq=np.concatenate([np.zeros(costs.size), np.ones(ends)]),
+        bounds=np.array([(-np.inf, np.inf)] * (monitors * ends) + [(0.0, np.inf)] * (2 * costs.size)),
         method="highs-ds",
     )
     knots = np.zeros((monitors, blocks.first.size, 2))
@@ -68,8 +67,18 @@ def best_shares(stretch: Stretch) -> Floats:
     return shares
 
 
-def _program(stretch: Stretch, blocks: _Blocks) -> tuple[sparse.csr_matrix, Floats, Floats]:
-    """What is paid for, as rows over the shares at both ends of the blocks; what each costs; what the start gives."""
+def _equations(terms: list[Entries], size: int, ends: int, monitors: int) -> sparse.csr_matrix:
+    """Each term is what it has above zero less what it has below; shares add up to one at both ends of each block."""
+    shares, each = monitors * ends, np.arange(size)
+    ones = np.ones(size)
+    whole = size + np.tile(np.arange(ends), monitors), np.arange(shares), np.ones(shares)
+    entries = [*terms, (each, shares + each, -ones), (each, shares + size + each, ones), whole]
+    row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
+    return sparse.csr_matrix((value, (row, column)), shape=(size + ends, shares + 2 * size))
+
+
+def _program(stretch: Stretch, blocks: _Blocks) -> tuple[list[Entries], Floats, Floats]:
+    """What is paid for, as terms over the shares at both ends of the blocks; what each costs; what the start gives."""
     ends = 2 * blocks.first.size
     pieces, costs, linear = [], [], np.zeros((1 + stretch.weight.shape[1]) * ends)
     raw_mps = np.maximum(np.abs(stretch.most_mps), np.abs(stretch.least_mps))
@@ -93,9 +102,7 @@ def _program(stretch: Stretch, blocks: _Blocks) -> tuple[sparse.csr_matrix, Floa
             pieces.append((np.array([begin + at.size]), np.array([offset]), np.array([before[0]])))
             costs.append(np.array([free]))
         linear[offset] -= before[0] * stretch.start_mps[average]
-    row, column, value = (np.concatenate(part) for part in zip(*pieces, strict=True))
-    cost = np.concatenate(costs)
-    return sparse.csr_matrix((value, (row, column)), shape=(cost.size, linear.size)), cost, linear
+    return pieces, np.concatenate(costs), linear
 
 
 def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
@@ -109,7 +116,7 @@ def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
     return np.concatenate([first, last - 1, blocks.last]), np.concatenate([half, half, threshold[blocks.last]])
 
 
-def _shares_at(blocks: _Blocks, at: Ints, row: Ints, value: Floats, offset: int) -> list[tuple[Ints, Ints, Floats]]:
+def _shares_at(blocks: _Blocks, at: Ints, row: Ints, value: Floats, offset: int) -> list[Entries]:
     """The share at these rows of the stretch, times `value`, as entries of the program's rows."""
     block, along = blocks.lines(at)
     return [(row, offset + 2 * block, value * (1.0 - along)), (row, offset + 2 * block + 1, value * along)]

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+from datetime import datetime
+
 import numpy as np
 import polars as pl
 
 from pipeline.undetected.watched import Watched
 from schemas.arrays import Ints, times_ns
-from schemas.config import Configuration
+from schemas.config import UndetectedConfig
 from schemas.enums import BaliseKind
 from schemas.run import RunLog
 
 
-def fixes_ns(run: RunLog, crossings: pl.DataFrame, config: Configuration) -> Ints:
+def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:
     """Instants at which something else than GNSS said where the train was, in order [ns].
 
     Physical balises read on the path, the reference by configuration, and configured starts of mission. The run's
     first row is a start of mission in any case.
     """
-    found: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in config.lds.starts_of_mission], dtype=np.int64)]
-    if "read" in config.undetected.fixes:
+    found: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in missions], dtype=np.int64)]
+    if "read" in config.fixes:
         found.append(times_ns(crossings.filter(kind=BaliseKind.PHYSICAL.value)))
-    if "reference" in config.undetected.fixes and run.reference is not None:
+    if "reference" in config.fixes and run.reference is not None:
         found.append(times_ns(run.reference))
     return np.unique(np.concatenate(found))
 
