@@ -10,8 +10,8 @@ import polars as pl
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
 from pipeline.odometry import odometry_of
-from pipeline.track.geodesy import curvature_radii_m, distances_m
-from schemas.arrays import Floats, Ints
+from pipeline.track.geodesy import curvature_radii_m, distances_m, moved_deg
+from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -25,12 +25,13 @@ _OUTER_CELLS = 3
 class _Way:
     """Where positions were along their own way and left of it at some instants, and the way by the distance along it.
 
-    `course_m`: over so much of it, to both sides, its course is taken.
+    `own_height_m`: of the positions. `course_m`: over so much of it, to both sides, its course is taken.
     """
 
     t_ns: Ints
     s_m: Floats
     left_m: Floats
+    own_height_m: Floats
     course_m: float
     axis_m: Floats
     latitude_deg: Floats
@@ -54,14 +55,15 @@ def displacement_m(
     """
     way = _own_way(run, solution) if site is None else _site_way(run, solution, site)
     now, known = t_ns.astype(np.float64), way.t_ns.astype(np.float64)
-    s_m, beside_m = np.interp(now, known, way.s_m), np.interp(now, known, way.left_m)
+    s_m, beside_m, own_m = (np.interp(now, known, at) for at in (way.s_m, way.left_m, way.own_height_m))
     here, there = way.places(s_m), way.places(s_m + ahead_m)
-    east, north, up = _local_m(here, there)
-    (east_here, north_here), (east_there, north_there) = (_left_of(way, at) for at in (s_m, s_m + ahead_m))
+    east_here, north_here = _left_of(way, s_m)
     # A position beside the track stays as far beside it where the track has turned.
-    turned_e = beside_m * (east_there - east_here) + left_m * east_here
-    turned_n = beside_m * (north_there - north_here) + left_m * north_here
-    return np.column_stack([east + turned_e, north + turned_n, up])
+    begin = moved_deg(*here, beside_m * east_here, beside_m * north_here)
+    east_there, north_there = _left_of(way, s_m + ahead_m)
+    end = moved_deg(*there, beside_m * east_there, beside_m * north_there)
+    east, north, _ = _local_m((*begin, own_m), (*end, own_m))
+    return np.column_stack([east + left_m * east_here, north + left_m * north_here, there[2] - here[2]])
 
 
 def _left_of(way: _Way, s_m: Floats) -> tuple[Floats, Floats]:
@@ -86,7 +88,7 @@ def _own_way(run: RunLog, solution: str) -> _Way:
         raise InputError("the train moves too little to know its track", place=run.run_id, expected="30 m or more")
     count = np.bincount(of_epoch)
     means = [np.bincount(of_epoch, weights=values) / count for values in (s_m, *places)]
-    return _Way(t_ns, s_m, np.zeros_like(s_m), _BIN_M, *means)
+    return _Way(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
 
 
 def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
@@ -105,7 +107,9 @@ def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
     elements, measures = found.path.locate(leg, axis)
     places = _on_track(site.track, elements.tolist(), measures)
     left_m = epochs["cross_track_m"].to_numpy()
-    return _Way(epochs["t"].to_physical().to_numpy(), s_m, left_m, _AT_POINT_M, axis, *places)
+    own = fixes.join(epochs.select("t"), on="t", how="right", maintain_order="right")
+    own_m = np.nan_to_num(floats(own, "height_m"))
+    return _Way(epochs["t"].to_physical().to_numpy(), s_m, left_m, own_m, _AT_POINT_M, axis, *places)
 
 
 # The survey is straight from point to point, so its course at a place is that of the segment there.
