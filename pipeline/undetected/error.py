@@ -113,7 +113,7 @@ def _splits_after(window: Watched) -> list[tuple[int, Floats]]:
 def _growth_at(window: Watched, begins: Ints, lag: int, shares: Floats) -> Floats:
     """Growth from each of these rows over `lag` rows, its averages at the start not known, with one split for all."""
     total = np.zeros(begins.size)
-    threshold = window.threshold_mps[begins]
+    threshold = np.where(window.fresh[begins, None], 0.0, window.threshold_mps[begins])
     carried = np.zeros_like(threshold)  # part of the row after, as it falls to the averages here
     for row in range(lag, 0, -1):
         at = begins + row

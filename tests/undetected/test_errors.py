@@ -14,8 +14,6 @@ from tests.undetected.oracle import Rows, beyond, optimum, recursions, rows, wat
 
 SIZES = [(2, 0), (3, 0), (9, 0), (30, 0), (60, 0)]
 CASES = [(seed, *SIZES[seed % len(SIZES)]) for seed in range(15)]
-    (seed, int(size), resets) for seed, (size, resets) in enumerate([(2, 0), (3, 0), (9, 0), (30, 0), (60, 0)] * 3)
-]
 RESETS = [(seed, 40, 2) for seed in range(100, 104)]
 
 
