@@ -12,7 +12,10 @@ import polars as pl
 from benchmarks.results import Figure
 from pipeline.results.terminal import show_table, to_json
 
-MODULES = ("end_to_end", "ingest", "matching", "calibration", "campaign", "interruptions", "experiment", "relink", "undetected")
+MODULES = (
+    *("end_to_end", "ingest", "matching", "calibration", "campaign", "interruptions", "experiment", "relink"),
+    "undetected",
+)
 
 
 def main() -> int:
