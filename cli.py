@@ -299,6 +299,7 @@ def convert(
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
     from pipeline.receivers import convert as convert_logs
+    from schemas.errors import visible
 
     settings = _configuration(config)
     converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
@@ -307,7 +308,7 @@ def convert(
     write_run_as(converted.run, to)
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
-        print(f"not used: {count} x {reason}")
+        print(f"not used: {count} x {visible(reason)}")
 
 
 @app.command()
@@ -375,12 +376,15 @@ def sql(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     query: Annotated[str, typer.Argument(help="One SELECT.")],
     as_json: Json = False,
+    allow_files: Annotated[
+        bool, typer.Option("--allow-files", help="The query may read files beside the result (`read_csv`).")
+    ] = False,
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
     from pipeline.results.query import run_sql
     from pipeline.results.terminal import show_table
 
-    answer = run_sql(out, query)
+    answer = run_sql(out, query, allow_files)
     if as_json:
         _print_json(answer)
     else:
@@ -474,7 +478,7 @@ def _guarded(arguments: list[str], debug: bool) -> int:
         # The reader of our output has gone (`| head`): nothing more to say, not even on closing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except Exception as error:
+    except BaseException as error:  # panics of libraries are no `Exception`
         _complain(f"a defect of this program: {type(error).__name__}: {error}", debug)
         print("Please report it with the output of the same command and --debug.", file=sys.stderr)
         return DEFECT
@@ -484,7 +488,9 @@ def _guarded(arguments: list[str], debug: bool) -> int:
 def _complain(text: str, debug: bool) -> None:
     if debug:
         traceback.print_exc()
-    print(f"balise: {text}", file=sys.stderr)
+    from schemas.errors import visible
+
+    print(f"balise: {visible(text)}", file=sys.stderr)
 
 
 def _configuration(file: Path | None) -> Configuration:

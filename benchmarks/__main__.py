@@ -13,7 +13,15 @@ from benchmarks.results import Figure
 from pipeline.results.terminal import show_table, to_json
 
 MODULES = (
-    *("end_to_end", "ingest", "matching", "calibration", "campaign", "interruptions", "experiment", "relink"),
+    "end_to_end",
+    "ingest",
+    "matching",
+    "calibration",
+    "topologies",
+    "campaign",
+    "interruptions",
+    "experiment",
+    "relink",
     "undetected",
 )
 

@@ -22,7 +22,8 @@ SPEED_UP = 1.7
 HELP_S = 0.3
 QUERY_S = 2.0
 MEMORY_MB = 600.0
-FORTY, THOUSAND, TEN_THOUSAND = 40, 1000, 10_000
+RESUME_S = 10.0
+FORTY, THOUSAND, FIVE_THOUSAND, TEN_THOUSAND = 40, 1000, 5000, 10_000
 _HAZARDS = "SELECT hazard, COUNT(*) AS n FROM hazards GROUP BY hazard"
 _JOINED = (
     "SELECT hazard, COUNT(*) AS n, SUM(duration_s) AS seconds FROM hazards "
@@ -37,6 +38,7 @@ def measure(folder: Path) -> list[Figure]:
         *_speed_up(folder / "forty"),
         *_thousand(folder / "thousand"),
         *_questions(folder / "ten-thousand"),
+        *_resumed(folder / "five-thousand"),
     ]
 
 
@@ -111,6 +113,32 @@ def _questions(folder: Path) -> list[Figure]:
         ),
         Figure("hazard query without the catalogue", bare_s, "s"),
         Figure("tables over ten thousand runs, nothing catalogued", watch.seconds, "s"),
+    ]
+
+
+def _resumed(folder: Path) -> list[Figure]:
+    """A complete campaign of five thousand runs, called again: one run under as many names."""
+    shutil.rmtree(folder, ignore_errors=True)
+    spec = demo_scenario().runs[0]
+    log = write_run_log(build_run(demo_scenario(), spec), folder / "one")
+    write_site(build_site(demo_scenario()), folder / "site")
+    run_campaign(make_plan([str(log)], folder / "site", folder / "few"))
+    _multiply(folder / "few", folder / "out", FIVE_THOUSAND)
+    for number in range(FIVE_THOUSAND):
+        target = folder / "logs" / f"r{number:05}"
+        target.mkdir(parents=True)
+        for file in log.iterdir():
+            (target / file.name).hardlink_to(file)
+    plan = make_plan([str(folder / "logs")], folder / "site", folder / "out")
+    seconds = []
+    for _ in range(2):
+        with stopwatch() as watch:
+            resumed = run_campaign(plan, jobs=2)
+        seconds.append(watch.seconds)
+    return [
+        Figure("five thousand complete runs, looked into", seconds[0], "s"),
+        Figure("five thousand complete runs, known", seconds[1], "s", RESUME_S),
+        Figure("of these replayed again", FIVE_THOUSAND - resumed.skipped, "runs", 0),
     ]
 
 

@@ -16,7 +16,7 @@ import polars as pl
 
 from benchmarks.results import Figure
 from pipeline.alignment.align import align
-from pipeline.lds import LdsLimits, LdsResult, run_lds
+from pipeline.lds import LdsResult, run_lds
 from pipeline.matching import match
 from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry import odometry_of
@@ -102,9 +102,9 @@ def lds_of(made: Journey, config: Configuration, vehicle: Vehicle | None = None)
     found = match(run.gnss, odometry, site, vehicle, config.matching, config.fix_sigma, None)
     along = None if odometry is None else odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, along, vehicle, config)
-    limits = LdsLimits.of(config, vehicle)
-    bank = MonitorBank(aligned, {}, config, limits.threshold_factor)
-    return aligned, run_lds(aligned, bank, found.path.balises(site.balises), None, config.lds, limits)
+    bank = MonitorBank(aligned, {}, config)
+    scale_sigma = None if odometry is None else odometry.scale_sigma
+    return aligned, run_lds(aligned, bank, found.path.balises(site.balises), None, scale_sigma, config)
 
 
 def outcome(made: Journey, config: Configuration) -> Outcome:

@@ -6,6 +6,7 @@ one run written alone has the bytes that it has in the whole trial.
 
 from __future__ import annotations
 
+import io
 import zlib
 from collections.abc import Callable
 from datetime import timedelta
@@ -21,6 +22,7 @@ from datasets.motion import Motion, build_motion
 from datasets.odometer import odometer_stream
 from datasets.receiver import Journey, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
+from pipeline.storage import replace_files
 from schemas.config import Vehicle, settings_from, to_toml
 from schemas.errors import OutputError
 from schemas.run import STREAMS, RunLog, Site
@@ -110,25 +112,20 @@ def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
 def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
     """One run at a path: `*.mcap` (JSON unless said otherwise, which keeps everything), else a folder of Parquet."""
     log = log or ("json" if path.suffix == ".mcap" else "parquet")
-    try:
-        _write(run, path, log)
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error.strerror}", place=str(error.filename or path)) from None
-
-
-def _write(run: RunLog, path: Path, log: LogKind) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     if log != "parquet":
         write_mcap(run, path, encoding=log)
         return
-    path.mkdir(exist_ok=True)
-    for name in STREAMS:
-        file, table = path / f"{name}.parquet", run.stream(name)
-        if table is not None:
-            table.write_parquet(file)
-        else:
-            # What an earlier run left here would be taken for a stream of this one.
-            file.unlink(missing_ok=True)
+    # No stream that an earlier run left here may be taken for one of this run, and without GNSS none is a run.
+    contents = {f"{name}.parquet": _parquet(run.stream(name)) for name in STREAMS}
+    replace_files(path, contents, marker="gnss.parquet")
+
+
+def _parquet(table: pl.DataFrame | None) -> bytes | None:
+    if table is None:
+        return None
+    buffer = io.BytesIO()
+    table.write_parquet(buffer)
+    return buffer.getvalue()
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

@@ -10,15 +10,13 @@ import polars as pl
 from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
-from pipeline.figures.bounds import threshold_factor
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
 from pipeline.figures.run_notes import run_notes
-from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
+from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
-from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
 from pipeline.matching.reference import match_reference
@@ -53,14 +51,11 @@ class _Context:
     counts: CleanCounts
     odometry: Odometry | None
     evidence: Evidence
-    factor: float
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Tables of one solution."""
-
-    tables: dict[str, pl.DataFrame]
+_AT_THE_END = ("latency_s", "latency_sigma_s", "odometer_scale")
+Tables = dict[str, pl.DataFrame]
+"""Those of one solution, by name."""
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
@@ -96,8 +91,7 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
     evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
-    factor = threshold_factor(config.monitors.false_alarm_probability)
-    return _Context(cleaned, site, vehicle, config, counts, odometry, evidence, factor)
+    return _Context(cleaned, site, vehicle, config, counts, odometry, evidence)
 
 
 def _reference_places(
@@ -119,7 +113,9 @@ def _reference_places(
     path_m, distance_m = floats(found.epochs, "path_m"), config.matching.orientation_distance_m
     facing = 1 if odometry is None else polarity(odometry, times_ns(found.epochs), path_m, distance_m)
     ahead_m = facing * vehicle.gnss_antenna_ahead_m
-    return ReferencePlaces.of(found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track)
+    return ReferencePlaces.of(
+        found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track, config.align
+    )
 
 
 def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:
@@ -153,29 +149,22 @@ def _match(context: _Context, solution: str) -> Match:
     )
 
 
-def _failed(context: _Context, solution: str, error: InputError) -> _Part:
+def _failed(context: _Context, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     made = provenance(context.run, context.site, context.vehicle, context.config)
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return _Part(nothing | {"runs": failed_row(str(error), made, solution)})
+    return nothing | {"runs": failed_row(str(error), made, solution)}
 
 
-def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> _Part:
+def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> Tables:
     """One solution: what the train made of it, then what the judge says of that."""
     ride = _ride(context, solution, matches)
     bench = Bench(ride.solution, context.evidence, ride.odometry, context.vehicle, context.config)
     judged = judge(bench, context.run.reference, context.run.faults)
     epochs = pl.concat([ride.solution.epochs, judged.epochs_columns], how="horizontal")
     row = summarise(_results(context, ride, judged, epochs), context.config, _made(context))
-    return _Part(
-        {
-            "hazards": judged.hazards,
-            "passages": judged.passages,
-            "alarms": judged.alarms,
-            "epochs": epochs,
-            "runs": row,
-        }
-    )
+    found = {"hazards": judged.hazards, "passages": judged.passages, "alarms": judged.alarms}
+    return {**found, "epochs": epochs, "runs": row}
 
 
 @dataclass(frozen=True)
@@ -199,9 +188,10 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     aligned = align(found.epochs, odometry, context.vehicle, config)
     compared = _compared(context, solution, aligned, matches)
     singles = _single_monitors(context, solution, aligned, compared)
-    bank = MonitorBank(aligned, singles, config, context.factor)
+    bank = MonitorBank(aligned, singles, config)
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
-    lds = run_lds(aligned, bank, balises, reads, config.lds, LdsLimits.of(config, context.vehicle), solution)
+    scale_sigma = None if odometry is None else odometry.scale_sigma
+    lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
     seen = pl.concat([aligned, lds.epochs.drop("t")], how="horizontal")
     diagnosis = Diagnosis(
         epochs=seen,
@@ -253,7 +243,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         evidence=judged.evidence,
         vehicle=_figures_from(context),
         odometer_contradicted=context.evidence.contradicted,
-        alignment=_alignment(ride.aligned),
+        alignment=ride.aligned.select(*_AT_THE_END, odometer_scale_sigma="scale_sigma").row(-1, named=True),
         counts=counts,
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
@@ -274,12 +264,6 @@ def _figures_from(context: _Context) -> VehicleFigures:
     return VehicleFigures.FILE if given else VehicleFigures.LEARNED
 
 
-def _alignment(aligned: pl.DataFrame) -> Alignment:
-    """Scale and latency as they stand at the end of the run."""
-    names = ("latency_s", "latency_sigma_s", "odometer_scale", "scale_sigma")
-    return Alignment(*(aligned[name][-1] for name in names))
-
-
 def _single_monitors(
     context: _Context, solution: str, aligned: pl.DataFrame, compared: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
@@ -287,8 +271,8 @@ def _single_monitors(
     ranges = _ranges(context, solution)
     absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
-        "along_doppler": doppler_monitor(aligned, context.config, context.factor),
-        "channel": channel_monitor(aligned, compared, context.factor, absent),
+        "along_doppler": doppler_monitor(aligned, context.config),
+        "channel": channel_monitor(aligned, compared, context.config, absent),
         "pseudorange": pseudorange_monitor(aligned, ranges, context.config),
     }
 
@@ -308,10 +292,9 @@ def _ranges(context: _Context, solution: str) -> pl.DataFrame | None:
     return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
 
-def _tables(run_id: str, parts: list[_Part]) -> RunTables:
+def _tables(run_id: str, parts: list[Tables]) -> RunTables:
     """Rows of all solutions, by the contract."""
     whole = {
-        name: conform(pl.concat([shaped(part.tables[name], table) for part in parts]), table)
-        for name, table in TABLES.items()
+        name: conform(pl.concat([shaped(part[name], table) for part in parts]), table) for name, table in TABLES.items()
     }
     return RunTables(run_id=run_id, **whole)

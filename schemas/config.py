@@ -112,15 +112,26 @@ class MatchingConfig(Settings):
     heading_sigma_deg: Positive = 10.0
     # Slower, the noise of the velocity decides its heading.
     heading_min_speed_mps: Positive = 2.0
-    # Newson & Krumm 2009, eq. 2, for ways by odometer.
+    # Heights tell tracks apart that lie over each other by so much: a train needs a clearance of 4.5 m and more.
+    # The bias is that of datum and antenna: one that the vehicle file does not know stands some 4 m over the rail.
+    clearance_m: Positive = 3.0
+    height_bias_sigma_m: Positive = 2.0
+    # So much at most: no single direction or height decides (3,000 to 1).
+    direct_limit: Positive = 8.0
+    # Newson & Krumm 2009, eq. 2, for ways by odometer, whose scale is wrong by some percent.
     transition_scale_m: Positive = 5.0
+    transition_share: NonNegative = 0.01
+    # Limited, since a position that jumps along the track must not send the path on a detour.
+    mismatch_limit: Positive = 12.0
+    # Log-probability that each relation costs which is passed against its navigability.
+    barred_cost: NonNegative = 20.0
     # DOMAIN section 2: the noise of a standing train is no turn; the first 20 m of net movement orient the path.
     deadband_mps: Positive = 0.3
     orientation_distance_m: Positive = 20.0
     # The rest of a position's error: DIAG Table 1, user.
     noise_tau_s: Positive = 100.0
     # A survey error is constant in place, not white (DOMAIN section 3); the length is ours.
-    survey_correlation_m: Positive = 200.0
+    survey_correlation_m: Positive = 1000.0
     # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
     estimated_drift: NonNegative = 0.1
     # Reflections follow no error model: one of them must not decide on the track.
@@ -129,8 +140,25 @@ class MatchingConfig(Settings):
     # Positions closer together tell the same of the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
+    # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
+    offset_floor_m: Positive = 0.02
+    table_floor_m: Positive = 0.1
+    # Off an element by what no error explains costs by the time, or a run elsewhere for a minute, which is paid for
+    # twice, would be put on a track far aside. A lost position drifts by this share of its distance to the nearest.
+    off_track_s: Positive = 8.0
+    off_track_wander: NonNegative = 0.03
     # A jump that no train makes decides on no track; after half a minute the odometer may be the wrong one.
     jump_hold_s: Positive = 30.0
+    # Farther than the odometer (or without one speed and its change; no train brakes or turns by 5 m/s²) by this share,
+    # so many standard deviations and this margin.
+    jump_odometer_share: NonNegative = 0.05
+    jump_sigmas: Positive = 5.0
+    jump_margin_m: NonNegative = 10.0
+    jump_speed_mps: Positive = 100.0
+    jump_acceleration_mps2: Positive = 5.0
+    # For so long before and after a jump the train may be on a track as far aside as that, and as it was long.
+    jump_aside_s: NonNegative = 120.0
+    jump_aside_m: NonNegative = 500.0
 
 
 class AlignConfig(Settings):
@@ -173,6 +201,25 @@ class AlignConfig(Settings):
     # Variance that has still to settle fades with this time constant: positions that settle over 10 to 60 s are
     # followed; longer, and a drift that begins meanwhile would be learned as scale the sooner.
     settling_tau_s: Positive = 25.0
+    # Beyond so many standard deviations it is no noise of odometer or reference: two-sided Gaussian 1e-7, as the
+    # monitors' k_T by default, which it does not follow: how easily they alarm tells nothing of the odometer.
+    sure_sigmas: Positive = 5.3267
+    # A speed is a mean over this time: the noise of single rows is no speed (DOMAIN section 2).
+    speed_window_s: Positive = 1.0
+    # Changes of speed tell the latency. A speed over less time before and after has noise that would pass for such
+    # changes: at constant speed the filter would grow sure of any latency.
+    latency_span_s: Positive = 2.0
+    # Receivers show a little noise without memory beside the modelled one: this share of the variance.
+    white_share: Probability = 0.01
+    # Over more periods a step of the stamps tells nothing of the receiver's clock: it may have started anew.
+    clock_periods: Positive = 3.0
+
+
+def threshold_factor(false_alarm_probability: float) -> float:
+    """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
+    from scipy.special import ndtri  # most commands that read a configuration test nothing
+
+    return float(-ndtri(false_alarm_probability / 2.0))
 
 
 class MonitorConfig(Settings):
@@ -195,6 +242,10 @@ class MonitorConfig(Settings):
     odometer_sigma_mps: Positive = 0.05
     # Of plain receivers; `balise calibrate` measures it.
     doppler_sigma_mps: Positive = 0.1
+    # Velocities farther apart do not tell the way between them: one missing epoch of a log at 1 Hz is bridged.
+    doppler_gap_s: Positive = 2.5
+    # Stamps of positions and of satellites that belong together may differ by rounding.
+    satellite_stamp_s: NonNegative = 0.001
     # A drawn line is no survey: 2-D surveys that state no sigma wander across the track.
     survey_wander_m: NonNegative = 0.3
     survey_wander_length_m: Positive = 100.0
@@ -206,6 +257,11 @@ class MonitorConfig(Settings):
     # The second receiver of composite fail-safety (LOC Fig. 3).
     channel_reference: str | None = None
     disabled: tuple[str, ...] = ()
+
+    @property
+    def threshold_factor(self) -> float:
+        """k_T of every monitor."""
+        return threshold_factor(self.false_alarm_probability)
 
     @field_validator("ewma_alphas")
     @classmethod
@@ -234,6 +290,7 @@ class LdsConfig(Settings):
     recovery_s: Positive = 30.0
     init_s: Positive = 10.0
     rearm_m: Positive = 10.0
+    rearm_sigmas: NonNegative = 3.0
     # SUBSET-041 5.3.1.1: 5 m + 5 % of the distance.
     odometer_fixed_m: NonNegative = 5.0
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
@@ -258,6 +315,9 @@ class HazardConfig(Settings):
     jump_limit_m: Positive = 20.0
     # So that the class does not depend on the rate of the log (DOMAIN section 5.3).
     jump_window_s: Positive = 1.0
+    # A jump over several epochs reaches from its first to its last step of at least this share of the largest one: two
+    # halves belong together, noise does not.
+    jump_share: Probability = 0.3
     # Noise at the limit is neither a failure nor its end (DOMAIN section 5.3).
     failure_hold_s: NonNegative = 1.0
     episode_end_s: NonNegative = 10.0
@@ -275,6 +335,16 @@ class HazardConfig(Settings):
     reference_aside_m: NonNegative = 0.5
     # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
+    # Two known places that the odometer's confidence does not join are joined by a way that differs from it by no more:
+    # so much may be lost in slip. A search bound: beyond it nothing is said of place or track.
+    slip_m: NonNegative = 200.0
+    slip_share: Annotated[Number, Field(ge=0, lt=1)] = 0.5
+    # More chains of net elements between two places are not weighed: nothing is said of place or track there.
+    routes_limit: Annotated[int, Field(strict=True, gt=0)] = 64
+    # Without an odometer the train's way over this time, by the evidence, says which way it goes.
+    turn_s: Positive = 2.0
+    # How long before alarm or hazard the opinion on who was at fault looks.
+    suspect_lookback_s: NonNegative = 60.0
     # A net element less probable than one in a thousand is no place of the reference (DOMAIN section 5.1).
     rival_probability: Probability = 0.001
     # Of the read itself; Q of the site is the announcement's (DOMAIN section 5.1).

@@ -39,6 +39,11 @@ class Hazard(StrEnum):
     VB_SHIFT = "VB_SHIFT"
     VB_WRONG_TRACK = "VB_WRONG_TRACK"
 
+    @property
+    def counted_as(self) -> str:
+        """The column of `runs` that counts the rows of this class: `hazards_1a`, `hazards_shift`."""
+        return "hazards_" + self.value.removeprefix("VB_").removeprefix("JUMP_").lower()
+
 
 class FailureMode(StrEnum):
     INSERTION = "insertion"

@@ -5,6 +5,16 @@ Ends at the command line, at the batch boundary that turns a failed run into a r
 
 from __future__ import annotations
 
+import re
+
+# C0 and C1 control characters but the line feed, and what turns the direction of writing.
+_HIDDEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
+def visible(text: str) -> str:
+    """The text with control characters escaped: what a log or a file name holds must not steer a terminal."""
+    return _HIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
 
 class BaliseError(Exception):
     """A condition the user can act on.
@@ -36,7 +46,7 @@ class BaliseError(Exception):
             text += f"; expected {self.expected}"
         if self.remedy is not None:
             text += f". {self.remedy}"
-        return text
+        return visible(text)
 
     def __reduce__(self) -> tuple[object, ...]:
         # Exceptions with keyword-only arguments do not survive the way between processes otherwise.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataframely as dy
+import polars as pl
 
 from schemas.columns import flag, instant, one_of, real, text
 from schemas.enums import BaliseKind, PassageStatus, SigmaSource
@@ -11,7 +12,8 @@ from schemas.enums import BaliseKind, PassageStatus, SigmaSource
 class Positions(dy.Schema):
     """One row per GNSS epoch of a solution, in order of time: the position on the track network, by matching.
 
-    Positions are those of the balise antenna. Null where the epoch has no position.
+    Positions are those of the balise antenna. What is null says the rest: only a valid fix has a path position, only a
+    path position is near or on the track, and only on the track the path has a probability (`placed`).
     """
 
     t = instant("stamp of the epoch")
@@ -41,6 +43,14 @@ class Positions(dy.Schema):
     digits_along_m = real("m", "deviation by the step in which positions are written down, along", min=0)
     digits_cross_m = real("m", "the same across the track", min=0)
     digits_up_m = real("m", "the same of the height", min=0)
+
+    @dy.rule()
+    def placed(cls):  # type: ignore[no-untyped-def]  # noqa: N805
+        """What later stages rest on, and do not ask again."""
+        has_place = pl.col("path_m").is_not_null()
+        near = pl.col("near_track") | ~pl.col("on_track")
+        sure = pl.col("gate_probability").is_null() | pl.col("on_track")
+        return (~has_place | pl.col("fix_valid")) & (~pl.col("near_track") | has_place) & near & sure
 
 
 class Aligned(Positions):

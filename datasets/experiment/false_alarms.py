@@ -25,9 +25,9 @@ from datasets.experiment.thresholds import (
 )
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
-from pipeline.figures.bounds import clopper_pearson, poisson_rate, threshold_factor
+from pipeline.figures.bounds import clopper_pearson, poisson_rate
 from schemas.arrays import Floats, Ints
-from schemas.config import Configuration, LdsConfig
+from schemas.config import Configuration, LdsConfig, threshold_factor
 
 PROBABILITIES: tuple[float, ...] = (1e-3, 1e-4, 1e-5)
 REPETITIONS = 1_000_000

@@ -16,9 +16,8 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
 from datasets.experiment.plan import BANKS, Reading, Sensors
-from pipeline.figures.bounds import threshold_factor
 from schemas.arrays import Floats
-from schemas.config import MonitorConfig
+from schemas.config import MonitorConfig, threshold_factor
 
 AXES: tuple[str, ...] = ("along", "cross", "up")
 

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from datasets.experiment.geometry import TAUS_S, Geometry
 from datasets.experiment.sigmas import bank_sigmas
-from pipeline.figures.bounds import threshold_factor
 from schemas.arrays import Floats
+from schemas.config import threshold_factor
 
 Reading = Literal["increments", "position"]
 Sensors = Literal["odometer", "odometer_and_track"]

@@ -23,8 +23,8 @@ from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Readin
 from datasets.experiment.sigmas import limit_sigmas
 from datasets.experiment.workers import generator
 from pipeline.calibration.sigmas import overall_ratio
-from pipeline.figures.bounds import threshold_factor
 from schemas.arrays import Floats
+from schemas.config import threshold_factor
 
 EXTRAPOLATED = 1e-7
 _PER_PLACE = 20

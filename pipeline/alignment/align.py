@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.estimates import EpochArrays, Learned, stamp_jitter_s
+from pipeline.alignment.estimates import Estimates, stamp_jitter_s
 from pipeline.alignment.learning import learn
 from pipeline.monitors.along import most_scatter_m
 from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
-from schemas.arrays import Bools, Floats, floats, times_ns
+from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 
 NO_ODOMETER = "no odometer"
@@ -31,18 +31,12 @@ def align(positions: pl.DataFrame, odometry: Odometry | None, vehicle: Vehicle, 
     positions = positions.with_columns(*_sigmas(config.monitors), _confidence(config.lds))
     if odometry is None:
         return _without_odometer(positions, vehicle, config)
-    path_m = floats(positions, "path_m")
-    matched = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy() & np.isfinite(path_m)
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
-    near = positions["fix_valid"].to_numpy() & positions["near_track"].to_numpy() & np.isfinite(path_m)
-    along_m, t_ns = unrolled(positions, near), times_ns(positions)
-    sigma_m, digits_m = floats(positions, "calibrated_along_m"), floats(positions, "digits_along_m")
-    jitter_s = stamp_jitter_s(odometry.seconds(t_ns))
-    arrays = EpochArrays(t_ns, along_m, sigma_m, digits_m, matched, jitter_s)
-    learned = learn(arrays, odometry, vehicle, config)
-    return positions.with_columns(
-        *_columns(arrays, odometry, learned, config), pl.Series("along_m", along_m, nan_to_null=True)
-    )
+    along_m = unrolled(positions, flags(positions, "near_track"))
+    positions = positions.with_columns(pl.Series("along_m", along_m, nan_to_null=True))
+    jitter_s = stamp_jitter_s(odometry.seconds(times_ns(positions)), config.align.clock_periods)
+    in_use = learn(positions, flags(positions, "on_track"), jitter_s, odometry, vehicle, config)
+    return positions.with_columns(_columns(times_ns(positions), jitter_s, odometry, in_use, config))
 
 
 def _sigmas(config: MonitorConfig) -> list[pl.Expr]:
@@ -61,14 +55,14 @@ def _confidence(lds: LdsConfig) -> pl.Expr:
     return half_width.alias("confidence_m")
 
 
-def unrolled(epochs: pl.DataFrame, matched: Bools) -> Floats:
+def unrolled(epochs: pl.DataFrame, near: Bools) -> Floats:
     """Path position with the way taken out that a curve adds to a position beside the track [m]; NaN elsewhere.
 
     A point y left of a track that turns left by its curvature k moves dx / (1 - k y) along it while the train moves
     dx, whether y is an error of the position or of the survey. Both are known, so this is no noise of the monitor.
     """
-    along = np.full(matched.size, np.nan)
-    rows = np.flatnonzero(matched)
+    along = np.full(near.size, np.nan)
+    rows = np.flatnonzero(near)
     path_m = floats(epochs, "path_m")[rows]
     beside = np.nan_to_num(floats(epochs, "curvature_per_m")[rows] * floats(epochs, "cross_track_m")[rows])
     along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
@@ -94,16 +88,21 @@ def odometer_at(times: pl.Series, aligned: pl.DataFrame, odometry: Odometry) -> 
     return pl.Series("odometer_m", known, nan_to_null=True)
 
 
-def _columns(arrays: EpochArrays, odometry: Odometry, learned: Learned, config: Configuration) -> list[pl.Series]:
-    at = odometry.seconds(arrays.t_ns) - learned.latency_s
+def _columns(
+    t_ns: Ints, jitter_s: float, odometry: Odometry, in_use: Estimates, config: Configuration
+) -> list[pl.Series]:
+    at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
     rows = np.flatnonzero(known)
     step = np.zeros(known.size)
-    step[rows] = odometry.increments(arrays.t_ns[rows], learned.scale[rows], learned.latency_s[rows]).distance_m
+    step[rows] = odometry.increments(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows]).distance_m
     total = np.where(known, np.cumsum(step), np.nan)
-    speed = np.where(known, learned.scale * odometry.speed_at_s(at), np.nan)
+    speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
     rows_m = np.minimum(odometry.row_sigma_m(at), most_scatter_m(config))
-    turning = speed_of_positions(at, with_hysteresis(total, hysteresis_m(rows_m))) if rows_m.any() else speed
+    turning = speed
+    if rows_m.any():
+        held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
+        turning = speed_of_positions(at, held, config.align.speed_window_s)
     reason = (
         pl.when(pl.Series(known))
         .then(None)
@@ -115,16 +114,16 @@ def _columns(arrays: EpochArrays, odometry: Odometry, learned: Learned, config: 
         pl.Series("odometer_m", total, nan_to_null=True),
         pl.select(reason.alias("odometer_reason")).to_series(),
         pl.Series("odometer_segment", odometry.segment_at_s(at)),
-        pl.Series("stamp_jitter_s", np.full(known.size, arrays.jitter_s)),
+        pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, odometry.noise.white_m2_per_s)),
         pl.Series("odometer_rows_m", rows_m),
         pl.Series("odometer_period_s", np.full(known.size, odometry.period_s)),
         pl.Series("speed_mps", speed, nan_to_null=True),
         pl.Series("direction", _direction(turning, config.matching.deadband_mps)),
-        pl.Series("odometer_scale", learned.scale),
-        pl.Series("scale_sigma", learned.scale_sigma),
-        pl.Series("latency_s", learned.latency_s),
-        pl.Series("latency_sigma_s", learned.latency_sigma_s),
+        pl.Series("odometer_scale", in_use.scale),
+        pl.Series("scale_sigma", in_use.scale_sigma),
+        pl.Series("latency_s", in_use.latency_s),
+        pl.Series("latency_sigma_s", in_use.latency_sigma_s),
     ]
 
 
@@ -139,8 +138,8 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     """No odometer: speed and direction from GNSS (velocity, else positions over the second before)."""
     nothing = pl.lit(None, pl.Float64)
     t_s = times_ns(positions) * 1e-9
-    valid = positions["fix_valid"].to_numpy() & positions["on_track"].to_numpy()
-    by_position = speed_of_positions(t_s - t_s[0], np.where(valid, floats(positions, "path_m"), np.nan))
+    path_m = np.where(flags(positions, "on_track"), floats(positions, "path_m"), np.nan)
+    by_position = speed_of_positions(t_s - t_s[0], path_m, config.align.speed_window_s)
     by_doppler = floats(positions, "velocity_along_mps")
     speed = np.where(np.isfinite(by_doppler), by_doppler, by_position)
     latency = vehicle.gnss_latency_s
@@ -155,7 +154,7 @@ def _without_odometer(positions: pl.DataFrame, vehicle: Vehicle, config: Configu
     )
 
 
-def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float = 1.0) -> Floats:
+def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
     """Speed [m/s] from positions at least `window_s` apart, causal; NaN where there are none."""
     speed = np.full(t_s.size, np.nan)
     valid = np.flatnonzero(np.isfinite(path_m))

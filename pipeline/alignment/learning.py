@@ -6,30 +6,36 @@ from bisect import bisect_left
 from itertools import pairwise
 
 import numpy as np
+import polars as pl
 
-from pipeline.alignment.estimates import EpochArrays, Estimate, Learned
-from pipeline.alignment.odometer_filter import SPEED_SPAN_S, FilterState, ScaleLatencyFilter, estimates_of, prior_of
+from pipeline.alignment.estimates import Estimates
+from pipeline.alignment.odometer_filter import FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.epochs.timeline import gap_limit_s
-from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
 from pipeline.monitors.axis import AxisSeries, error_model, run_axis
 from pipeline.monitors.recursion import AxisState
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from pipeline.odometry.odometry import Odometry
-from schemas.arrays import Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
 
 # Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
 _FIRST_BLOCK, _BLOCK = 2048, 8192
 
 
-def learn(arrays: EpochArrays, odometry: Odometry, vehicle: Vehicle, config: Configuration) -> Learned:
-    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only."""
+def learn(
+    positions: pl.DataFrame, usable: Bools, jitter_s: float, odometry: Odometry, vehicle: Vehicle, config: Configuration
+) -> Estimates:
+    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
+
+    `positions`: `t, along_m, calibrated_along_m, digits_along_m`; `usable`: those on the track; `jitter_s`: see
+    `stamp_jitter_s`.
+    """
     prior = prior_of(vehicle, config.align)
-    learned = Learned.constant(prior, arrays.t_ns.size)
+    learned = prior.over(positions.height)
     if vehicle.odometer_scale is not None and vehicle.gnss_latency_s is not None:
         return learned
-    _Learner(arrays, odometry, vehicle, config, learned).run(prior)
+    _Learner(positions, usable, jitter_s, odometry, vehicle, config, learned).run(prior)
     if vehicle.odometer_scale is not None:
         learned.scale_sigma[:] = prior.scale_sigma
     if vehicle.gnss_latency_s is not None:
@@ -47,48 +53,51 @@ class _Learner:
     """
 
     def __init__(
-        self, arrays: EpochArrays, odometry: Odometry, vehicle: Vehicle, config: Configuration, learned: Learned
+        self,
+        positions: pl.DataFrame,
+        usable: Bools,
+        jitter_s: float,
+        odometry: Odometry,
+        vehicle: Vehicle,
+        config: Configuration,
+        learned: Estimates,
     ) -> None:
-        self._config = config
-        self._odometry = odometry
-        self._learned = learned
-        self._arrays = arrays
+        self._config, self._odometry, self._vehicle, self._learned = config, odometry, vehicle, learned
+        self._jitter_s = jitter_s
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
         self._alphas = np.array(config.monitors.ewma_alphas)
-        self._factor = threshold_factor(config.monitors.false_alarm_probability)
+        self._factor, self._limit_m = config.monitors.threshold_factor, config.hazards.failure_limit_m
         # Latencies of five sigmas have to find a known distance too.
-        margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
-        known = odometry.known_at(arrays.t_ns) & odometry.known_at(arrays.t_ns - margin_ns)
-        self._rows = np.flatnonzero(arrays.usable & known)
-        t_s = odometry.seconds(arrays.t_ns)
-        self._t_s, self._path_m, self._sigma_m = (
-            values[self._rows] for values in (t_s, arrays.path_m, np.hypot(arrays.sigma_m, arrays.digits_m))
+        margin_ns, t_ns = round(5e9 * config.align.latency_prior_sigma_s), times_ns(positions)
+        self._rows = np.flatnonzero(usable & odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns))
+        self._path_m, self._own_m, self._digits_m = (
+            floats(positions, name)[self._rows] for name in ("along_m", "calibrated_along_m", "digits_along_m")
         )
+        self._sigma_m = np.hypot(self._own_m, self._digits_m)
+        t_s = odometry.seconds(t_ns)
+        self._t_ns, self._t_s = t_ns[self._rows], t_s[self._rows]
         self._segment = odometry.segment_at_s(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
-        self._limit_m = config.hazards.failure_limit_m
         period_s = float(np.median(np.diff(t_s)))
-        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + config.align.scattered_gap_sigmas * arrays.jitter_s
+        gap_s = gap_limit_s(period_s, config.align.gap_reset_s) + config.align.scattered_gap_sigmas * jitter_s
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s)
-        self._outages = _gaps_before(self._t_s, t_s[arrays.usable], gap_s)
-        self._vehicle = vehicle
+        self._outages = _gaps_before(self._t_s, t_s[usable], gap_s)
 
-    def run(self, prior: Estimate) -> None:
+    def run(self, prior: Estimates) -> None:
         if self._rows.size == 0:
             return
-        prior = Estimate(
-            prior.scale,
-            prior.scale_sigma if self._vehicle.odometer_scale is None else 0.0,
-            prior.latency_s,
-            prior.latency_sigma_s if self._vehicle.gnss_latency_s is None else 0.0,
-        )
+        # What the file gives is not learned.
+        if self._vehicle.odometer_scale is not None:
+            prior = prior._replace(scale_sigma=np.zeros(()))
+        if self._vehicle.gnss_latency_s is not None:
+            prior = prior._replace(latency_sigma_s=np.zeros(()))
         state, position = self._filter.start(prior, *self._observation(0)), 0
         while position < self._rows.size:
             state, alarm = self._learn_until_alarm(state, position)
             if alarm >= self._rows.size:
                 break
-            position, unsettled_m2 = self._hold(state.estimate(), alarm)
+            position, unsettled_m2 = self._hold(float(estimates_of(state.joint).scale_sigma), alarm)
             if position < self._rows.size:
                 state = self._filter.restart(state, *self._observation(position), unsettled_m2)
 
@@ -134,15 +143,16 @@ class _Learner:
                 state = self._beyond_break(state, int(before[first]), int(due[first]))
             part = due[first:last]
             observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
-            joints[first:last] = self._filter.run(state, *observed, self._arrays.jitter_s)
+            joints[first:last] = self._filter.run(state, *observed, self._jitter_s)
             state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
-        use_from = np.searchsorted(self._t_s, self._t_s[due] + SPEED_SPAN_S)
+        # An update reads the odometer so long after its epoch, so its result may be used only after that.
+        use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
         return state, np.maximum(use_from, due + 1), joints
 
     def _beyond_break(self, state: FilterState, before: int, position: int) -> FilterState:
         """The state at the first position after a break; where the odometer lost its way, nothing tells of a move."""
         if self._segment[before] == self._segment[position]:
-            observed = *self._observation(position), float(self._sigma_m[position]), self._arrays.jitter_s
+            observed = *self._observation(position), float(self._sigma_m[position]), self._jitter_s
             return self._filter.resume(state, *observed, self._limit_m)
         away = self._outages[before] != self._outages[position]
         return self._filter.restart(state, *self._observation(position), self._limit_m**2 if away else 0.0)
@@ -168,28 +178,33 @@ class _Learner:
 
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
         """Along-track increments of these positions; the one at `restart` has none before it."""
-        first = max(begin - 1, restart)
-        rows, arrays = self._rows[first:end], self._arrays
-        scale, scale_sigma, latency_s, latency_sigma_s = self._learned.at(rows)
-        at_s = self._t_s[first:end] - latency_s
+        part = slice(max(begin - 1, restart), end)
+        in_use = self._learned.at(self._rows[part])
+        at_s = self._t_s[part] - in_use.latency_s
         epochs = AlongEpochs(
-            epoch=rows,
-            t_s=self._t_s[first:end],
-            along_m=self._path_m[first:end],
+            epoch=self._rows[part],
+            t_s=self._t_s[part],
+            along_m=self._path_m[part],
             segment=self._odometry.segment_at_s(at_s),
-            sigma_m=arrays.sigma_m[rows],
-            digits_m=arrays.digits_m[rows],
-            jitter_s=arrays.jitter_s,
-            scale_sigma=scale_sigma,
-            latency_sigma_s=latency_sigma_s,
+            sigma_m=self._own_m[part],
+            digits_m=self._digits_m[part],
+            jitter_s=self._jitter_s,
+            scale_sigma=in_use.scale_sigma,
+            latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=self._odometry.noise.white_m2_per_s,
-            rows_m=np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config)),
+            rows_m=self._rows_m(at_s),
             period_s=self._odometry.period_s,
         )
-        odometer = self._odometry.increments(arrays.t_ns[rows], scale, latency_s)
-        return along_series(epochs, odometer, self._config).between(begin - first, rows.size)
+        odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)
+        return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
 
-    def _hold(self, estimate: Estimate, alarm: int) -> tuple[int, float]:
+    def _rows_m(self, at_s: Floats) -> Floats | None:
+        """Quantisation noise of the odometer's rows; none at a stand may be some under way."""
+        if not self._odometry.noise.quantisation:
+            return None
+        return np.minimum(self._odometry.row_sigma_m(at_s), most_scatter_m(self._config))
+
+    def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
         """Position from which learning goes on after the alarm at `alarm`, and what it has still to settle [m2].
 
         The number of positions if it never goes on. What may settle is how far the position is from its place then.
@@ -205,7 +220,7 @@ class _Learner:
             failing |= np.arange(position, end) <= begin + 1
             failed_s = np.maximum.accumulate(np.where(failing, t_s, failed_s[-1]))
             away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
-            variance_m2 = self._drift_m2(begin, position, end, estimate)
+            variance_m2 = self._drift_m2(begin, position, end, scale_sigma)
             near = np.abs(away_m) <= relink_bound_m(variance_m2, self._factor, self._limit_m)
             back = np.flatnonzero(near & (t_s - failed_s >= self._config.lds.recovery_s))
             if back.size:
@@ -214,16 +229,16 @@ class _Learner:
             position, block = end, min(2 * block, _BLOCK)
         return self._rows.size, 0.0
 
-    def _drift_m2(self, anchor: int, begin: int, end: int, estimate: Estimate) -> Floats:
+    def _drift_m2(self, anchor: int, begin: int, end: int, scale_sigma: float) -> Floats:
         """By how much GNSS minus odometer moves from the anchor to these positions without a fault [m^2]."""
-        sigma_m, t_ns = self._sigma_m, self._arrays.t_ns[self._rows]
+        sigma_m, t_ns = self._sigma_m, self._t_ns
         way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
         return drift_m2(
             sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2,
             self._t_s[begin:end] - self._t_s[anchor],
             np.cumsum(way_m),
             self._config.monitors.odometer_sigma_mps,
-            max(estimate.scale_sigma, self._vehicle.odometer_scale_sigma or 0.0),
+            max(scale_sigma, self._vehicle.odometer_scale_sigma or 0.0),
         )
 
 

@@ -21,19 +21,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.alignment.estimates import Estimate
+from pipeline.alignment.estimates import Estimates
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Floats
 from schemas.config import AlignConfig, Vehicle
 
 _OFFSET, _SCALE, _LATENCY, _ERRORS = 0, 1, 2, 3
 _OFFSET_PRIOR_M2 = 1e6
-# Receivers show a little noise without memory beside the modelled one; it also keeps the update well conditioned.
-_WHITE_SHARE = 0.01
-# An update reads the odometer so long before and after its epoch, so its result may be used only after that. Changes of
-# speed tell the latency. A speed over less time has noise that would pass for such changes: at constant speed the
-# filter would grow sure of any latency.
-SPEED_SPAN_S = 2.0
 # Half the square of so many sigmas that no doubt is left; beyond it the exponential would overflow.
 _CERTAIN = 100.0
 
@@ -50,15 +44,11 @@ class FilterState(NamedTuple):
     origin_m: float
     unsettled_m2: float = 0.0
 
-    def estimate(self) -> Estimate:
-        ((scale, scale_sigma, latency_s, latency_sigma_s),) = estimates_of(self.joint[None]).tolist()
-        return Estimate(scale, scale_sigma, latency_s, latency_sigma_s)
 
-
-def estimates_of(joints: Floats) -> Floats:
-    """Scale, its deviation, latency and its deviation [s] of joint states (k, states, states + 1); shape (k, 4)."""
-    means, deviations = joints[:, :, -1], np.sqrt(np.diagonal(joints, axis1=1, axis2=2))
-    return np.column_stack([1.0 + means[:, _SCALE], deviations[:, _SCALE], means[:, _LATENCY], deviations[:, _LATENCY]])
+def estimates_of(joints: Floats) -> Estimates:
+    """Scale and latency of joint states, shape (..., states, states + 1)."""
+    means, deviations = joints[..., -1], np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
+    return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
 
 
 @dataclass(frozen=True)
@@ -70,7 +60,7 @@ class ScaleLatencyFilter:
     odometry: Odometry
     config: AlignConfig
 
-    def start(self, prior: Estimate, t_s: float, path_m: float) -> FilterState:
+    def start(self, prior: Estimates, t_s: float, path_m: float) -> FilterState:
         """A new state at this epoch: offset and GNSS errors unknown, scale and latency as in `prior`."""
         errors = self.shares.size
         origin_m = float(self.odometry.distance_at_s(np.array([t_s - prior.latency_s]))[0])
@@ -81,7 +71,7 @@ class ScaleLatencyFilter:
 
     def restart(self, state: FilterState, t_s: float, path_m: float, unsettled_m2: float = 0.0) -> FilterState:
         """Offset and GNSS errors unknown again; what was learned of scale and latency stays."""
-        fresh = self.start(state.estimate(), t_s, path_m)
+        fresh = self.start(estimates_of(state.joint), t_s, path_m)
         kept = slice(_SCALE, _ERRORS)
         fresh.joint[kept, kept] = state.joint[kept, kept]
         return fresh._replace(unsettled_m2=max(unsettled_m2, self._unsettled_m2(state, t_s)))
@@ -98,7 +88,9 @@ class ScaleLatencyFilter:
         left_m2 = self._unsettled_m2(state, t_s)
         self._predict(state.joint, _nanoseconds(t_s - state.t_s), state.unsettled_m2 - left_m2, joint)
         seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
-        variance_m2 = row.dot(seen[:-1]).item() + _WHITE_SHARE * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
+        variance_m2 = (
+            row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2 + self._scatter_m2(jitter_s, speed_mps)
+        )
         probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
         # More than the offset's own prior would say no more, and leave no digits for the position's noise.
         brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
@@ -119,7 +111,7 @@ class ScaleLatencyFilter:
         steps_ns = [_nanoseconds(step_s) for step_s in np.diff(t_s, prepend=state.t_s).tolist()]
         unsettled_m2 = state.unsettled_m2 * np.exp((state.t_s - t_s) / self.config.settling_tau_s)
         settled_m2 = (-np.diff(unsettled_m2, prepend=state.unsettled_m2)).tolist()
-        white_m2 = (_WHITE_SHARE * sigma_m**2).tolist()
+        white_m2 = (self.config.white_share * sigma_m**2).tolist()
         before = state.joint
         epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, steps_ns, settled_m2, strict=True)
         for joint, row, now_s, place_m, own_m2, step_ns, walked_m2 in epochs:
@@ -172,8 +164,8 @@ class ScaleLatencyFilter:
         The speed is centred, but at the ends of the odometer: one from the same odometer noise as the innovation would
         bias the latency upwards.
         """
-        times_s = self.odometry.t_s
-        begin_s, end_s = max(at_s - SPEED_SPAN_S, times_s.item(0)), min(at_s + SPEED_SPAN_S, times_s.item(-1))
+        times_s, span_s = self.odometry.t_s, self.config.latency_span_s
+        begin_s, end_s = max(at_s - span_s, times_s.item(0)), min(at_s + span_s, times_s.item(-1))
         before, distance, after = np.interp((begin_s, at_s, end_s), times_s, self.odometry.distance_m).tolist()
         return distance - origin_m, (after - before) / (end_s - begin_s)
 
@@ -206,11 +198,11 @@ def _nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
-def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimate:
+def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
     """Scale and latency as the vehicle file gives them, else the configured prior around 1 and 0."""
     scale_known = vehicle.odometer_scale is not None
     latency_known = vehicle.gnss_latency_s is not None
-    return Estimate(
+    return Estimates.of(
         scale=vehicle.odometer_scale if vehicle.odometer_scale is not None else 1.0,
         scale_sigma=(vehicle.odometer_scale_sigma or 0.0) if scale_known else config.scale_prior_sigma,
         latency_s=vehicle.gnss_latency_s if vehicle.gnss_latency_s is not None else 0.0,

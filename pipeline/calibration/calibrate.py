@@ -11,7 +11,6 @@ import tomli_w
 
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, velocity_sigma_mps, worst_fit
 from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run, pooled
-from pipeline.figures.bounds import threshold_factor
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
 from pipeline.monitors.axis import error_model
@@ -76,7 +75,7 @@ def calibrate(
         )
     fitted = _vehicle(base, found, config.align.latency_prior_sigma_s)
     epochs = [replay(log, site, fitted, config).epochs.filter(pl.col("solution") == solution) for log in logs]
-    factor = threshold_factor(config.monitors.false_alarm_probability)
+    factor = config.monitors.threshold_factor
     fits = regress_sigmas(epochs, factor)
     worst = worst_fit(fits)
     return Calibration(

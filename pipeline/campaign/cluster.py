@@ -24,7 +24,6 @@ from schemas.errors import UsageError
 
 _CONNECT_S = 10.0
 _COUNT_EVERY_S = 2.0
-_PATIENCE_S = 300.0
 _ANSWER_S = 5.0
 _KILL_S = 15.0
 _GRACE_S = 15.0
@@ -45,28 +44,22 @@ class DaskEngine(Engine):
         self._threads = 0
         self._counted = -_COUNT_EVERY_S
         self._seen_s = time.monotonic()
-        self._scheduler = scheduler
+        self.name = self._scheduler = scheduler
         self._marks: dict[Result, str] = {}
         self._workers: dict[str, str] = {}
         self._client.subscribe_topic(_BEGUN, self._note)
 
     def capacity(self) -> int:
-        """Twice the cluster's threads, so that no worker waits for the next run.
-
-        Raises `UsageError` where no worker has been there for minutes: nobody would notice in the night.
-        """
+        """Twice the cluster's threads, so that no worker waits for the next run."""
         if time.monotonic() - self._counted > _COUNT_EVERY_S:
             self._threads = sum(self._count().values())
             self._counted = time.monotonic()
             if self._threads:
                 self._seen_s = self._counted
-            elif self._counted - self._seen_s > _PATIENCE_S:
-                raise UsageError(
-                    f"has had no worker for {_PATIENCE_S:g} s",
-                    place=self._scheduler,
-                    remedy="Start workers and repeat the command: complete runs are skipped.",
-                )
         return max(1, 2 * self._threads)
+
+    def lonely_s(self) -> float:
+        return 0.0 if self._threads else time.monotonic() - self._seen_s
 
     def submit(self, job: RunJob) -> Result:
         mark = f"balise-{secrets.token_hex(8)}"

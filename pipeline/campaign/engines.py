@@ -13,6 +13,7 @@ class Engine:
     """What the campaign loop needs to know of where runs are replayed."""
 
     in_process = False
+    name = "this machine"
 
     def capacity(self) -> int:
         """How many runs may be under way at once."""
@@ -31,6 +32,10 @@ class Engine:
     def is_lost_worker(self, error: BaseException) -> bool:
         """Whether the error means that the worker died, not that the run failed."""
         return False
+
+    def lonely_s(self) -> float:
+        """For how long there has been no worker to hand runs to [s]."""
+        return 0.0
 
     def collected(self, result: Result) -> None:
         """The campaign has seen the result and is done with it."""

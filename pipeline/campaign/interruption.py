@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from asyncio import CancelledError
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -13,7 +14,15 @@ from pipeline.campaign.watch import Summary
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Interrupted(BaseException):
+class StopRun(BaseException):
+    """Whatever is under way is to end: nothing on the way may take it for a failure of a run."""
+
+
+# What passes through the boundary that turns all else that a run raises into a failed run.
+ENDING = (StopRun, KeyboardInterrupt, SystemExit, GeneratorExit, CancelledError)
+
+
+class Interrupted(StopRun):
     """The user or the system asked to stop; `summary` tells what is complete."""
 
     def __init__(self, signum: int, summary: Summary | None = None) -> None:

@@ -57,7 +57,7 @@ def _locked_local(out: Path, own: str) -> Iterator[None]:
         try:
             yield
         finally:
-            (out / _NAME).unlink(missing_ok=True)
+            storage.remove(out / _NAME)
     finally:
         os.close(folder)
 

@@ -9,16 +9,20 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from dataclasses import dataclass, replace
 
 from pipeline.campaign.engines import Engine
-from pipeline.campaign.interruption import Interrupted
-from pipeline.campaign.outcome import Result, RunOutcome, lost, never_begun, overdue
+from pipeline.campaign.interruption import ENDING, Interrupted
+from pipeline.campaign.outcome import Failure, Result, RunOutcome, failure_of, lost, never_begun, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.watch import Watch
 from pipeline.campaign.worker import fail_run
-from schemas.errors import UsageError
+from schemas.errors import BaliseError, UsageError
 
 _LOOK_S = 0.2
 _ATTEMPTS = 2
 _STARTS = 10
+# A cluster without a worker: after how long that is said, and after how long the campaign gives up, since in the
+# night nobody would notice [s].
+_SAY_S = 4.0
+_PATIENCE_S = 300.0
 
 
 @dataclass(frozen=True)
@@ -40,27 +44,40 @@ class _UnderWay:
 class CampaignLoop:
     """Takes all jobs through an engine; `outcomes` in order of their ends.
 
-    `limit_s`: how long a run may take before it is given up [s].
+    `limit_s`: how long a run may take before it is given up [s]; `known`: the outcomes of runs that are complete.
     """
 
-    def __init__(self, jobs: Sequence[RunJob], engine: Engine, limit_s: float, watches: Sequence[Watch]) -> None:
+    def __init__(
+        self,
+        jobs: Sequence[RunJob],
+        engine: Engine,
+        limit_s: float,
+        watches: Sequence[Watch],
+        known: Sequence[RunOutcome] = (),
+    ) -> None:
         self.outcomes: list[RunOutcome] = []
         self._engine, self._limit_s, self._watches = engine, limit_s, watches
         self._waiting = deque(map(_Attempt, jobs))
         self._under_way: dict[Result, _UnderWay] = {}
+        self._known = known
+        self._planned = len(jobs) + len(known)
         self._stop: int | None = None
+        self._said = False
+        self._disturbed: set[str] = set()
 
     def stop(self, signum: int) -> None:
         """End at the next look, because of this signal."""
         self._stop = signum
 
     @property
-    def under_way(self) -> list[str]:
-        """Ids of the runs that were handed out and have not ended."""
-        return [item.attempt.job.run_id for item in self._under_way.values()]
+    def disturbed(self) -> set[str]:
+        """Ids of the runs whose worker may have left something half written: lost, ended, or under way still."""
+        return self._disturbed | {item.attempt.job.run_id for item in self._under_way.values()}
 
     def run(self) -> None:
         """Go on until every run has its outcome. Raises `Interrupted` when asked to stop."""
+        for outcome in self._known:
+            self._note(outcome)
         while self._waiting or self._under_way:
             self._hand_out()
             done, _ = wait(self._under_way, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
@@ -69,6 +86,7 @@ class CampaignLoop:
             for result in done:
                 self._note(self._collect(result))
             self._end_overdue()
+            self._look_for_workers()
             now = time.monotonic()
             ages = [(item.attempt.job.run_id, now - item.since_s) for item in self._under_way.values()]
             for watch in self._watches:
@@ -95,14 +113,17 @@ class CampaignLoop:
             if error is None:
                 return replace(result.result(), attempts=attempt.number)
             if item.overdue:
-                return _failed(attempt, overdue(self._limit_s))
+                return _failed(attempt, Failure(overdue(self._limit_s), lasting=False))
             if isinstance(error, CancelledError):
                 raise UsageError(
                     "the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped."
                 )
-            if not self._engine.is_lost_worker(error):
+            if self._engine.is_lost_worker(error):
+                return self._after_loss(attempt, self._engine.has_begun(result))
+            if isinstance(error, (BaliseError, *ENDING)):
                 raise error
-            return self._after_loss(attempt, self._engine.has_begun(result))
+            # The worker could not even tell what became of the run.
+            return _failed(attempt, failure_of(error, lasting=False))
         finally:
             self._engine.collected(result)
 
@@ -112,11 +133,12 @@ class CampaignLoop:
             self._waiting.appendleft(replace(attempt, starts=attempt.starts + 1))
             return None
         if begun and attempt.number < _ATTEMPTS:
+            self._disturbed.add(attempt.job.run_id)
             for watch in self._watches:
                 watch.lost(attempt.job.run_id, attempt.number)
             self._waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
             return None
-        return _failed(attempt, lost(attempt.number) if begun else never_begun(attempt.starts))
+        return _failed(attempt, Failure(lost(attempt.number) if begun else never_begun(attempt.starts), lasting=False))
 
     def _end_overdue(self) -> None:
         now = time.monotonic()
@@ -125,8 +147,26 @@ class CampaignLoop:
                 item.since_s = now
             if now - item.since_s > self._limit_s and not item.overdue:
                 item.overdue = True
+                self._disturbed.add(item.attempt.job.run_id)
                 self._engine.kill(result)
 
+    def _look_for_workers(self) -> None:
+        """Say soon that no worker is left, with what is done and what to do; raises `UsageError` in the end."""
+        lonely_s = self._engine.lonely_s()
+        done = f"{len(self.outcomes)} of {self._planned} runs are done"
+        if lonely_s > _PATIENCE_S:
+            raise UsageError(
+                f"{self._engine.name} has had no worker for {_PATIENCE_S:g} s; {done}",
+                remedy="Start workers and repeat the command: complete runs are skipped.",
+            )
+        if lonely_s > _SAY_S and not self._said:
+            for watch in self._watches:
+                watch.noted(
+                    f"{self._engine.name} has no worker left; {done}. Start workers, and the campaign goes on by "
+                    f"itself; it ends after {_PATIENCE_S:g} s without, and the same command then does the rest"
+                )
+        self._said = lonely_s > _SAY_S
 
-def _failed(attempt: _Attempt, reason: str) -> RunOutcome:
-    return replace(fail_run(attempt.job, reason), attempts=attempt.number)
+
+def _failed(attempt: _Attempt, failure: Failure) -> RunOutcome:
+    return replace(fail_run(attempt.job, failure), attempts=attempt.number)

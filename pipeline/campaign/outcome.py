@@ -14,7 +14,6 @@ from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import worst_verdict
 from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
-from schemas.config import digest_of
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
@@ -27,7 +26,8 @@ class RunOutcome:
     """What became of one run. `defect` is ours, with its `trace`; everything else is the input's.
 
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
-    over it; `hazards` and `missed_detections` are None where nothing could be judged.
+    over it; `hazards` and `missed_detections` are None where nothing could be judged. `redo`: the next call tries it
+    again; `proof`: that of `resume`.
     """
 
     run_id: str
@@ -43,6 +43,8 @@ class RunOutcome:
     missed_detections: int | None = None
     peak_memory_bytes: int = 0
     attempts: int = 1
+    redo: bool = False
+    proof: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def never_begun(workers: int) -> str:
     return f"{workers} workers died before they could begin it. Look at the workers' own logs."
 
 
-def failure_of(error: Exception, lasting: bool) -> Failure:
+def failure_of(error: BaseException, lasting: bool) -> Failure:
     """How a failure is told, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
         again = isinstance(error, InputError) and not isinstance(error, ChangedError)
@@ -126,7 +128,7 @@ def failed_tables(job: RunJob, error: str) -> RunTables:
     from pipeline.figures.summary import failed_row
 
     folder = job.address.rstrip("/").rpartition("/")[0]
-    made = Provenance(digest_of(job.config, job.vehicle), "", SOFTWARE)
+    made = Provenance(job.config_digest, "", SOFTWARE)
     row = failed_row(error.replace(f"{redacted(folder)}/", ""), made)
     empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
     return RunTables(run_id=job.run_id, runs=row, **empty)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
@@ -14,7 +14,7 @@ from pipeline import storage
 from pipeline.results import store
 from pipeline.site.read import read_site
 from pipeline.storage import files
-from pipeline.storage.address import Address, is_url, join, name_of, redacted, stem_of
+from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
 from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
@@ -41,6 +41,7 @@ class RunJob:
     vehicle: Vehicle
     out: str
     software_digest: str
+    config_digest: str = ""
     previous: Mapping[str, str] | None = None
     campaign: str = ""
     route: str = ""
@@ -72,7 +73,11 @@ def make_plan(
     `routes`: a route file for all runs, or a folder with one per run id. `write_routes`: a folder for those found.
     """
     config, vehicle = config or Configuration(), vehicle or Vehicle()
-    addresses = find_runs(runs)
+    try:
+        addresses = find_runs(runs)
+    except InputError as error:
+        # Nobody knows which runs there are: no run failed, the command cannot be met.
+        raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
     site_digest = read_site(site).digest
     base = RunJob(
         run_id="",
@@ -83,6 +88,7 @@ def make_plan(
         vehicle=vehicle,
         out=storage.absolute(out),
         software_digest=software_digest(),
+        config_digest=digest_of(config, vehicle),
     )
     jobs = [replace(base, run_id=run_id, address=address) for run_id, address in addresses.items()]
     jobs = [_with_routes(job, routes, write_routes) for job in jobs]
@@ -107,10 +113,11 @@ def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | No
     return replace(job, route=storage.absolute(found), route_digest=digest)
 
 
-def with_previous(plan: Plan) -> Plan:
-    """The plan with what earlier campaigns completed in the same output."""
-    complete = store.completed_runs(plan.out)
-    return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in plan.jobs))
+def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
+    """What is left to do of a plan without the known runs: its jobs with what earlier campaigns completed."""
+    left = [job for job in plan.jobs if job.run_id not in known]
+    complete = store.completed_runs(plan.out) if left else {}
+    return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 
 def held_by(plan: Plan, campaign: str) -> Plan:
@@ -121,7 +128,7 @@ def held_by(plan: Plan, campaign: str) -> Plan:
 def digests(job: RunJob, files_digest: str) -> dict[str, str]:
     """What decides a run's tables; equal digests mean equal tables, so that the run is skipped."""
     return {
-        "config_digest": digest_of(job.config, job.vehicle),
+        "config_digest": job.config_digest,
         "files_digest": files_digest,
         "site_digest": f"{job.site_digest} {job.route_digest}".strip(),
         "software": SOFTWARE,
@@ -135,12 +142,7 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
     for name in named:
         for address in _expand(name):
             run_id = stem_of(address)
-            if run_id == _NULL_OF_HIVE:
-                raise UsageError(
-                    f"a run cannot be called {run_id!r}: readers of Hive partitions take it for null",
-                    place=redacted(str(address)),
-                    remedy="Rename it: results are filed by run id.",
-                )
+            _check_name(run_id, address)
             other = found.setdefault(run_id, storage.absolute(address))
             if other != storage.absolute(address):
                 raise UsageError(
@@ -149,6 +151,20 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
                     remedy="Rename one of them: results are filed by run id.",
                 )
     return dict(sorted(found.items()))
+
+
+def _check_name(run_id: str, address: Address) -> None:
+    """Refuse what results cannot be filed under, before any work is done."""
+    reason = ""
+    if run_id == _NULL_OF_HIVE:
+        reason = f"a run cannot be called {run_id!r}: readers of Hive partitions take it for null"
+    elif (length := len(store.file_name(run_id))) > store.LONGEST_NAME:
+        reason = (
+            f"its name is too long to file results under: {length} characters where those beyond ASCII count "
+            f"three per byte, and {store.LONGEST_NAME} are possible"
+        )
+    if reason:
+        raise UsageError(reason, place=redacted(str(address)), remedy="Rename it: results are filed by run id.")
 
 
 def _expand(name: str) -> list[Address]:
@@ -165,7 +181,9 @@ def _expand(name: str) -> list[Address]:
 
 def _matches(name: str) -> list[Address]:
     if is_url(name):
-        return storage.glob_remote(name) if glob.has_magic(name) else [name]
+        check_public(name)
+        # A question mark in a web address begins its query.
+        return storage.glob_remote(name) if glob.has_magic(name) and not name.startswith("http") else [name]
     if Path(name).exists():
         return [Path(name)]
     return sorted(Path(match) for match in glob.glob(name, recursive=True))

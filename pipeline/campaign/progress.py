@@ -66,6 +66,9 @@ class LineWatch(_Spoken):
     def lost(self, run_id: str, attempt: int) -> None:
         self._print(loss_line(run_id, attempt))
 
+    def noted(self, text: str) -> None:
+        self._print(text)
+
     def _say_progress(self, under_way: Sequence[tuple[str, float]]) -> None:
         self._print(self._tally.line(under_way))
 
@@ -93,6 +96,9 @@ class JsonWatch(_Spoken):
 
     def lost(self, run_id: str, attempt: int) -> None:
         self._say("lost", {"run_id": run_id, "attempt": attempt})
+
+    def noted(self, text: str) -> None:
+        self._say("note", {"text": text})
 
     def _say_progress(self, under_way: Sequence[tuple[str, float]]) -> None:
         self._say("progress", self._tally.figures(under_way))
@@ -126,7 +132,10 @@ class BarWatch:
             self._progress.console.print(outcome_line(outcome), markup=False, highlight=False)
 
     def lost(self, run_id: str, attempt: int) -> None:
-        self._progress.console.print(loss_line(run_id, attempt), markup=False, highlight=False)
+        self.noted(loss_line(run_id, attempt))
+
+    def noted(self, text: str) -> None:
+        self._progress.console.print(text, markup=False, highlight=False)
 
     def end(self, summary: Summary) -> None:
         # The terminal may be closed.
@@ -155,7 +164,10 @@ class LogWatch:
             self._write(redacted(outcome.trace))
 
     def lost(self, run_id: str, attempt: int) -> None:
-        self._write(loss_line(run_id, attempt))
+        self.noted(loss_line(run_id, attempt))
+
+    def noted(self, text: str) -> None:
+        self._write(text)
 
     def end(self, summary: Summary) -> None:
         self._write(summary_line(summary))

@@ -14,6 +14,7 @@ from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
 from pipeline.campaign.plan import Plan, held_by, with_previous
 from pipeline.campaign.processes import LocalEngine
+from pipeline.campaign.resume import keep, unchanged
 from pipeline.campaign.serial import SerialEngine
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
@@ -41,23 +42,26 @@ def run_campaign(
     _check_shared(plan, scheduler)
     with locked(plan.out) as campaign:
         store.sweep(plan.out)
-        plan = held_by(plan if force else with_previous(plan), campaign)
+        known = [] if force else unchanged(plan)
+        left = with_previous(plan, {outcome.run_id for outcome in known}) if not force else plan
         store.write_config(plan.out, plan.config)
-        engine = _engine_for(jobs, len(plan.jobs), scheduler, time_limit_s)
-        loop = CampaignLoop(plan.jobs, engine, time_limit_s, watches)
+        engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
+        loop = CampaignLoop(held_by(left, campaign).jobs, engine, time_limit_s, watches, known)
         try:
             summary = _watched(plan, loop, watches, at_once=engine.in_process)
         finally:
             engine.close()
-            _tidy(plan, loop, scheduler)
+            _tidy(plan, loop)
+            if left.jobs:
+                keep(plan, loop.outcomes)
         _finish(plan, loop, summary)
         return summary
 
 
 def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> Engine:
-    if scheduler is not None:
+    if scheduler is not None and runs:
         return DaskEngine(scheduler, limit_s)
-    return SerialEngine(limit_s) if runs == 1 else LocalEngine(min(jobs, runs))
+    return SerialEngine(limit_s) if runs <= 1 else LocalEngine(min(jobs, runs))
 
 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:
@@ -89,10 +93,10 @@ def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Watch], at_once: 
     return summary
 
 
-def _tidy(plan: Plan, loop: CampaignLoop, scheduler: str | None) -> None:
-    """Remove what ended workers left half done; those of a cluster may be at it still."""
-    if scheduler is None and not is_url(plan.out):
-        for run_id in loop.under_way:
+def _tidy(plan: Plan, loop: CampaignLoop) -> None:
+    """Remove what ended workers left half done; one of a cluster that is at it still writes its run again."""
+    if not is_url(plan.out):
+        for run_id in loop.disturbed:
             store.sweep_run(Path(plan.out), run_id)
 
 

@@ -10,7 +10,8 @@ from concurrent.futures import Future
 from types import FrameType
 
 from pipeline.campaign.engines import Engine
-from pipeline.campaign.outcome import Result, overdue
+from pipeline.campaign.interruption import StopRun
+from pipeline.campaign.outcome import Failure, Result, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import fail_run, replay_one
 
@@ -29,14 +30,14 @@ class SerialEngine(Engine):
             with _alarm(self._limit_s):
                 result.set_result(replay_one(job))
         except _Overdue:
-            result.set_result(fail_run(job, overdue(self._limit_s)))
+            result.set_result(fail_run(job, Failure(overdue(self._limit_s), lasting=False)))
         except Exception as error:
             result.set_exception(error)
         return result
 
 
-class _Overdue(BaseException):
-    """Not an `Exception`, so that nothing on the way takes it for a failure of its own."""
+class _Overdue(StopRun):
+    """The run has had its time."""
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from pipeline.campaign.watch import Summary
 from pipeline.figures.verdict import word_of
 from pipeline.results.terminal import duration_text
 from schemas.enums import RunStatus
+from schemas.errors import visible
 
 _SLOW_SHOWN = 2
 
@@ -49,7 +50,7 @@ class Tally:
         if self.rate_per_s is not None and self.left_s is not None:
             parts += [f"{self.rate_per_s:.2f} runs/s", f"{duration_text(self.left_s)} left"]
         if slow := slowest(under_way):
-            parts.append("longest now: " + ", ".join(f"{run} ({duration_text(age_s)})" for run, age_s in slow))
+            parts.append("longest now: " + ", ".join(f"{visible(run)} ({duration_text(age_s)})" for run, age_s in slow))
         return ", ".join(parts)
 
     def figures(self, under_way: Sequence[tuple[str, float]] = ()) -> dict[str, object]:
@@ -81,12 +82,12 @@ def outcome_line(outcome: RunOutcome) -> str:
         text += f" in {duration_text(outcome.seconds)}"
     if outcome.attempts > 1:
         text += f" (attempt {outcome.attempts})"
-    return text
+    return visible(text).replace("\n", r"\n")
 
 
 def loss_line(run_id: str, attempt: int) -> str:
     """A lost worker in one line."""
-    return f"{run_id}: its worker died at attempt {attempt}; tried again"
+    return visible(f"{run_id}: its worker died at attempt {attempt}; tried again")
 
 
 def summary_line(summary: Summary) -> str:

@@ -53,6 +53,9 @@ class Watch(Protocol):
     def lost(self, run_id: str, attempt: int) -> None:
         """The worker died that was at this attempt of a run; it is tried again."""
 
+    def noted(self, text: str) -> None:
+        """Something that somebody should see to."""
+
     def finished(self, outcome: RunOutcome) -> None: ...
 
     def end(self, summary: Summary) -> None: ...

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 from pipeline import storage
-from pipeline.campaign import known_logs, lock
-from pipeline.campaign.outcome import Failure, RunOutcome, changed, failed_tables, failure_of, outcome_of, worst
+from pipeline.campaign import lock
+from pipeline.campaign.interruption import ENDING
+from pipeline.campaign.outcome import Failure, RunOutcome, failed_tables, failure_of, outcome_of, worst
 from pipeline.campaign.plan import RunJob, digests, software_digest
-from pipeline.ingest import read_run
+from pipeline.campaign.recorded_log import RecordedLog
+from pipeline.campaign.resume import proof_of
 from pipeline.results import store
 from pipeline.site.read import read_site
 from pipeline.site.route import with_route
 from pipeline.storage import files
-from pipeline.storage.address import is_url, redacted
+from pipeline.storage.address import redacted
 from schemas.enums import RunStatus
-from schemas.errors import BaliseError, InputError, OutputError, SiteError, UsageError
+from schemas.errors import OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
 from schemas.version import SOFTWARE
 
@@ -28,72 +28,56 @@ from schemas.version import SOFTWARE
 def replay_one(job: RunJob) -> RunOutcome:
     """Replay a run unless its tables are there already, and write them.
 
-    Whatever is wrong with the run becomes a `runs` row of status `failed`; only an output that cannot
-    be written, a changed site and an interruption leave this function as an exception.
+    Whatever is wrong with the run, a panic of a decoder included, becomes a `runs` row of status `failed`; only an
+    output that cannot be written, a changed site and an interruption leave this function as an exception.
     """
+    log = RecordedLog(job)
+    outcome = _replay_one(job, log)
+    return replace(outcome, proof=proof_of(job, log.state) if log.digest and not outcome.redo else "")
+
+
+def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     begun = time.monotonic()
-    files_digest = ""
     try:
         _same_software(job)
         site = _site(job.site, job.site_digest)
-        version = _version(job)
-        if (known := known_logs.known_digest(job, version)) and _is_done(job, known):
+        if (known := log.known_digest()) and _is_done(job, known):
             return _earlier(job)
-        with _fetched(job, version) as path:
-            before = _signature(path)
-            if job.previous is not None:
-                files_digest = _files_digest(job, path, version)
-                if _is_done(job, files_digest):
-                    return _earlier(job)
-            try:
-                run = read_run(path, job.config.ingest)
-            except Exception:
-                files_digest = files_digest or _files_digest(job, path, version)
-                raise
-            files_digest = files_digest or _files_digest(job, path, version, run.input_digest)
+        with log.here() as path:
+            if job.previous is not None and _is_done(job, log.digest_at(path)):
+                return _earlier(job)
+            run = log.read(path)
             site = with_route(site, job.route) if job.route else site
             tables = _replayed(job, run, site)
             if job.write_route:
                 _write_found_route(job, run, site)
-            if storage.signature(path) != before:
-                raise changed(path)
-    except (OutputError, SiteError, UsageError):
+    except (OutputError, SiteError, UsageError, *ENDING):
         raise
-    except Exception as error:
-        failure = failure_of(error, lasting=bool(files_digest))
-        return fail_run(job, failure.error, files_digest, failure, time.monotonic() - begun)
-    metadata = _metadata(job, files_digest, worst(tables.runs)) | {"log_digest": run.input_digest}
+    except BaseException as error:
+        failure = failure_of(error, lasting=bool(log.digest))
+        return fail_run(job, failure, log.digest, time.monotonic() - begun)
+    metadata = _metadata(job, log.digest, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
-    return outcome_of(job, tables.runs, sum(file.size_bytes for file in before), time.monotonic() - begun)
+    return outcome_of(job, tables.runs, log.size_bytes, time.monotonic() - begun)
 
 
-def fail_run(
-    job: RunJob, error: str, files_digest: str = "", failure: Failure | None = None, seconds: float = 0.0
-) -> RunOutcome:
+def fail_run(job: RunJob, failure: Failure, files_digest: str = "", seconds: float = 0.0) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
-    Without `failure` (a worker was lost, a run took too long) the next campaign tries the run again.
+    Unless the reason is lasting (a worker was lost, a run took too long) the next campaign tries the run again.
     """
-    metadata = _metadata(job, files_digest, RunStatus.FAILED)
-    if failure is None or not failure.lasting:
-        metadata["redo"] = "yes"
-    _write(job, failed_tables(job, error), metadata)
-    trace = failure.trace if failure else None
-    return RunOutcome(job.run_id, RunStatus.FAILED, error, defect=trace is not None, trace=trace, seconds=seconds)
-
-
-def _version(job: RunJob) -> str | None:
-    """What a store says of the log, before it is fetched."""
-    return storage.version(job.address) if is_url(job.address) else None
-
-
-@contextlib.contextmanager
-def _fetched(job: RunJob, version: str | None) -> Iterator[Path]:
-    """The log on this machine; errors name it by its own address."""
-    with storage.local_copy(job.address) as path, _told_of(job, path):
-        if _version(job) != version:
-            raise changed(redacted(job.address))
-        yield path
+    metadata = _metadata(job, files_digest, RunStatus.FAILED) | ({} if failure.lasting else {"redo": "yes"})
+    _write(job, failed_tables(job, failure.error), metadata)
+    defect = failure.trace is not None
+    return RunOutcome(
+        job.run_id,
+        RunStatus.FAILED,
+        failure.error,
+        defect=defect,
+        trace=failure.trace,
+        seconds=seconds,
+        redo=not failure.lasting,
+    )
 
 
 def _write(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
@@ -130,38 +114,6 @@ def _same_software(job: RunJob) -> None:
             found=SOFTWARE,
             remedy="Install the same version on all workers, and restart them.",
         )
-
-
-def _signature(path: Path) -> tuple[storage.FileState, ...]:
-    with _as_input_error(path):
-        return storage.signature(path)
-
-
-def _files_digest(job: RunJob, path: Path, version: str | None, known: str = "") -> str:
-    """What the log holds, kept for the next campaign; `known`: the SHA-256 of a log of one file that was read."""
-    with _as_input_error(path):
-        digest = storage.content_digest(path, known)
-    known_logs.remember(job, version, digest)
-    return digest
-
-
-@contextlib.contextmanager
-def _as_input_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", place=str(path)) from None
-
-
-@contextlib.contextmanager
-def _told_of(job: RunJob, path: Path) -> Iterator[None]:
-    """Errors name the log by its own address, not by that of a temporary copy."""
-    try:
-        yield
-    except BaliseError as error:
-        if error.place and str(path) != job.address:
-            error.place = error.place.replace(str(path), redacted(job.address))
-        raise
 
 
 def _is_done(job: RunJob, files_digest: str) -> bool:

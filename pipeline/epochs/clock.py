@@ -32,8 +32,8 @@ class Clock:
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
 
 
-def flags(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
-    """A condition with false for null."""
+def met(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
+    """Where a condition holds; null is false."""
     return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
 
 

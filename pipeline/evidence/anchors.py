@@ -11,17 +11,10 @@ import polars as pl
 from pipeline.evidence.carrying import Anchor, Odometer
 from pipeline.evidence.routes import Place, Route, routes_of_path
 from pipeline.track.path import TravelledPath
-from pipeline.track.survey import Track
+from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
-from schemas.config import HazardConfig
+from schemas.config import AlignConfig, HazardConfig
 from schemas.enums import BaliseKind, Evidence
-
-# A balise this far beyond its element's end is still on it: surveys and balise lists round [m].
-_ON_ELEMENT_M = 0.5
-# So much way together says which way the odometer counts (DOMAIN section 2) [m].
-_TURNED_M = 20.0
-# No train is faster, and no noise of a sample larger: what comes farther is no place of this train.
-_FASTEST_MPS, _SIGMAS = 150.0, 6.0
 
 Pairs = tuple[Ints, Ints]
 
@@ -45,14 +38,21 @@ class ReferencePlaces:
 
     @classmethod
     def of(
-        cls, epochs: pl.DataFrame, path: TravelledPath, rivals: Pairs, sigma_m: Floats, ahead_m: float, track: Track
+        cls,
+        epochs: pl.DataFrame,
+        path: TravelledPath,
+        rivals: Pairs,
+        sigma_m: Floats,
+        ahead_m: float,
+        track: Track,
+        config: AlignConfig,
     ) -> Self:
         """Matched samples (`t, leg, path_m, on_track`) and their path; `ahead_m`: the reference's place ahead of the
         balise antenna, along growing path. `rivals`: samples and net elements (numbers of the survey).
         """
         all_ns, all_m = times_ns(epochs), floats(epochs, "path_m")
         placed = np.flatnonzero(flags(epochs, "on_track") & np.isfinite(all_m))
-        kept = placed[_reachable(all_ns[placed], all_m[placed], sigma_m[placed])]
+        kept = placed[_reachable(all_ns[placed], all_m[placed], sigma_m[placed], config)]
         leg, path_m = ints(epochs["leg"])[kept], floats(epochs, "path_m")[kept]
         legs = tuple(routes_of_path(path, track.index))
         number = np.full(epochs.height, -1)
@@ -69,28 +69,26 @@ class ReferencePlaces:
         return Anchor(int(self.t_ns[sample]), place, float(self.sigma_m[sample]), Evidence.REFERENCE)
 
 
-def _reachable(t_ns: Ints, path_m: Floats, sigma_m: Floats) -> Ints:
+def _reachable(t_ns: Ints, path_m: Floats, sigma_m: Floats, config: AlignConfig) -> Ints:
     """Samples that a train can have come to from one another: outward from the longest piece without a leap."""
-    leaps = np.flatnonzero(_leaps(t_ns[:-1], t_ns[1:], path_m[:-1], path_m[1:], sigma_m[:-1] + sigma_m[1:])) + 1
-    pieces = np.split(np.arange(t_ns.size), leaps)
+
+    def leaps(a: Ints, b: Ints) -> Bools:
+        """Steps that no train can drive and no noise explains."""
+        most_m = config.fastest_mps * (t_ns[b] - t_ns[a]) / NS_PER_S + config.sure_sigmas * (sigma_m[a] + sigma_m[b])
+        beyond: Bools = np.abs(path_m[b] - path_m[a]) > most_m
+        return beyond
+
+    samples = np.arange(t_ns.size)
+    pieces = np.split(samples, np.flatnonzero(leaps(samples[:-1], samples[1:])) + 1)
     longest = int(np.argmax([piece.size for piece in pieces]))
     kept = [pieces[longest]]
     for ahead in pieces[longest + 1 :]:
-        a, b = kept[-1][-1:], ahead[:1]
-        if not _leaps(t_ns[a], t_ns[b], path_m[a], path_m[b], sigma_m[a] + sigma_m[b]).any():
+        if not leaps(kept[-1][-1:], ahead[:1]).any():
             kept.append(ahead)
     for before in pieces[:longest][::-1]:
-        a, b = before[-1:], kept[0][:1]
-        if not _leaps(t_ns[a], t_ns[b], path_m[a], path_m[b], sigma_m[a] + sigma_m[b]).any():
+        if not leaps(before[-1:], kept[0][:1]).any():
             kept.insert(0, before)
     return np.concatenate(kept)
-
-
-def _leaps(begin_ns: Ints, end_ns: Ints, begin_m: Floats, end_m: Floats, sigma_m: Floats) -> Bools:
-    """Steps that no train can drive."""
-    most_m = _FASTEST_MPS * (end_ns - begin_ns) / NS_PER_S + _SIGMAS * sigma_m
-    leaps: Bools = np.abs(end_m - begin_m) > most_m
-    return leaps
 
 
 def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints) -> Bools:
@@ -163,8 +161,13 @@ def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], 
     return count
 
 
-def facing_of(reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometer | None) -> set[int]:
-    """Oriented net elements over which the train ran as the odometer counted up, by the reference."""
+def facing_of(
+    reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometer | None, least_m: float
+) -> set[int]:
+    """Oriented net elements over which the train ran as the odometer counted up, by the reference.
+
+    `least_m`: so much way together says which way the odometer counts (DOMAIN section 2).
+    """
     if reference is None or odometer is None:
         return set()
     found: set[int] = set()
@@ -173,7 +176,7 @@ def facing_of(reference: ReferencePlaces | None, covered: list[Coverage], odomet
         t_ns, path_m, leg = reference.t_ns[part], reference.path_m[part], reference.leg[part]
         counted_m = odometer.between(t_ns[:-1], t_ns[1:]).distance_m
         together = np.where(np.diff(leg) == 0, np.sign(np.diff(path_m)) * counted_m, 0.0)
-        if abs(float(np.nansum(together))) >= _TURNED_M:
+        if abs(float(np.nansum(together))) >= least_m:
             element, _, sense = reference.legs[int(leg[0])].locate(path_m[:1])
             found.add(2 * int(element[0]) + int(sense[0] * np.nansum(together) < 0.0))
     return found
@@ -207,6 +210,6 @@ def _physical_places(balises: pl.DataFrame, track: Track) -> dict[str, Place]:
         if number is None:
             continue
         own = track.measure_m[track.vertices(number)]
-        if own[0] - _ON_ELEMENT_M <= measure_m <= own[-1] + _ON_ELEMENT_M:
+        if own[0] - MEASURE_TOLERANCE_M <= measure_m <= own[-1] + MEASURE_TOLERANCE_M:
             places[name] = Place(number, measure_m)
     return places

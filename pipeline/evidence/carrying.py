@@ -38,15 +38,24 @@ class Odometer(Protocol):
 
 @dataclass(frozen=True)
 class Trust:
-    """How far evidence goes: k sigma, and 5 m + 5 % of the way on one side of an anchor (SUBSET-041 5.3.1.1)."""
+    """How far evidence goes: k sigma, and 5 m + 5 % of the way on one side of an anchor (SUBSET-041 5.3.1.1).
+
+    `slip_m`, `slip_share`: how far a way between two anchors may differ from the odometer's; `routes`: how many chains
+    between them are weighed.
+    """
 
     factor: float
     fixed_m: float
     share: float
+    slip_m: float
+    slip_share: float
+    routes: int
 
     @classmethod
     def of(cls, config: Configuration) -> Trust:
-        return cls(config.hazards.evidence_factor, config.lds.odometer_fixed_m, config.lds.odometer_share)
+        hazards, lds = config.hazards, config.lds
+        beside = hazards.evidence_factor, lds.odometer_fixed_m, lds.odometer_share
+        return cls(*beside, hazards.slip_m, hazards.slip_share, hazards.routes_limit)
 
     def beside_m(self, driven_m: Floats, sigma_m: float) -> Floats:
         """Half the interval on one side of an anchor of this sigma."""

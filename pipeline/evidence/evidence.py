@@ -192,7 +192,13 @@ def evidence_of(
     borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
     gaps: list[Gap] = []
     if odometer is not None and borders:
-        gaps = gaps_of(borders, facing_of(reference, covered, odometer), odometer, network, trust)
+        gaps = gaps_of(
+            borders,
+            facing_of(reference, covered, odometer, config.matching.orientation_distance_m),
+            odometer,
+            network,
+            trust,
+        )
     contradicted = sum(_contradicts(gap, odometer, trust) for gap in gaps)
     return Evidence(
         reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted, tuple(unknown), disputed

@@ -14,10 +14,8 @@ from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
 
 # How finely the odometer is looked at for how far the train went beyond an anchor before it turned.
-_LOOK_S = 1.0
+LOOK_S = 1.0
 _SAME_M = 0.01
-# A search bound, no limit of trust: an odometer that slipped by more leaves the gap without a chain, so unknown.
-_SLIPPED_M, _SLIPPED_SHARE = 200.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -72,19 +70,21 @@ def _between(a: Anchor, b: Anchor, odometer: Odometer, network: Network, trust: 
         return [Gap(a.t_ns, b.t_ns, a, None, []), Gap(a.t_ns, b.t_ns, None, b, [])]
     way_m = float(driven_m(odometer, a.t_ns, np.array([b.t_ns]))[0])
     slack_m = float(trust.beside_m(np.array(way_m), 0.0)) + trust.factor * (a.sigma_m + b.sigma_m)
-    ways = _ways_of_length(a, b, length_m, slack_m, network)
+    ways = _ways_of_length(a, b, length_m, slack_m, network, trust.routes)
     if ways == []:
-        ways = _ways_of_length(a, b, length_m, _SLIPPED_M + _SLIPPED_SHARE * way_m, network)
+        ways = _ways_of_length(a, b, length_m, trust.slip_m + trust.slip_share * way_m, network, trust.routes)
     return [Gap(a.t_ns, b.t_ns, a, b, ways)]
 
 
-def _ways_of_length(a: Anchor, b: Anchor, length_m: float, slack_m: float, network: Network) -> list[Way] | None:
+def _ways_of_length(
+    a: Anchor, b: Anchor, length_m: float, slack_m: float, network: Network, most: int
+) -> list[Way] | None:
     """Chains from anchor to anchor whose length is that of the odometer but for the slack, either way round."""
     ways: list[Way] = []
     for begin, goal, way_m, back in ((a, b, length_m, False), (b, a, -length_m, True)):
         lengths = (max(way_m - slack_m, 0.0), way_m + slack_m)
         for start in (2 * begin.place.element, 2 * begin.place.element + 1):
-            found = chains_between(network, start, begin.place, goal.place, lengths, back)
+            found = chains_between(network, start, begin.place, goal.place, lengths, back, most)
             if found is None:
                 return None
             ends = [(0.0, _goal_m(network, chain, goal.place)) for chain in found]
@@ -141,7 +141,7 @@ def _reaching(gap: Gap, sheets: set[bool], odometer: Odometer, network: Network,
     for way in ways:
         if network.usable[way.chain.oriented[0]] not in sheets:
             continue
-        chains = extended(network, way.chain, *_reach_m(gap, way, odometer, trust))
+        chains = extended(network, way.chain, *_reach_m(gap, way, odometer, trust), trust.routes)
         if chains is None or (turned and any(_branches(chain, network) for chain in chains)):
             return replace(gap, ways=None)
         reached += [replace(way, chain=chain) for chain in chains]
@@ -166,7 +166,7 @@ def _branches(chain: Chain, network: Network) -> bool:
 
 
 def _looks(gap: Gap) -> Ints:
-    count = int((gap.end_ns - gap.begin_ns) / (_LOOK_S * NS_PER_S)) + 2
+    count = int((gap.end_ns - gap.begin_ns) / (LOOK_S * NS_PER_S)) + 2
     return np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
 
 

@@ -12,8 +12,6 @@ from pipeline.track.network import Edge, Network
 from pipeline.track.path import TravelledPath
 from schemas.arrays import Bools, Floats, Ints
 
-# A yard has more chains than anybody can weigh: beyond so many nothing is said of the track.
-MOST_ROUTES = 64
 # Of two visits of one element the one that holds the measure comes first, however near the other is.
 _OUTSIDE_COUNTS = 1e3
 
@@ -125,11 +123,11 @@ def along_m(network: Network, oriented: int, measure_m: float) -> float:
 
 
 def chains_between(
-    network: Network, start: int, begin: Place, goal: Place, lengths_m: tuple[float, float], back: bool
+    network: Network, start: int, begin: Place, goal: Place, lengths_m: tuple[float, float], back: bool, most: int
 ) -> list[Chain] | None:
     """Chains from `begin` on the oriented element `start` to `goal`, of a length between the two; `begin` is at 0.
 
-    `back`: the train runs them from the goal to the begin. None where there are more than can be weighed.
+    `back`: the train runs them from the goal to the begin. None where there are more than `most`.
     """
     shortest_m, longest_m = lengths_m
     found: list[Chain] = []
@@ -144,7 +142,7 @@ def chains_between(
                 found.append(chain)
         exit_m = entry_m + network.length_m(last)
         steps += 1
-        if len(found) > MOST_ROUTES or steps > MOST_ROUTES**2:
+        if len(found) > most or steps > most**2:
             return None
         open_chains += [
             Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m))
@@ -154,19 +152,19 @@ def chains_between(
     return found
 
 
-def extended(network: Network, chain: Chain, least_m: float, most_m: float) -> list[Chain] | None:
+def extended(network: Network, chain: Chain, least_m: float, most_m: float, most: int) -> list[Chain] | None:
     """The chain carried on over every branch until it covers the coordinates from `least_m` to `most_m`.
 
-    Where the track ends before, it ends. None where there are more chains than can be weighed.
+    Where the track ends before, it ends. None where there are more than `most` chains.
     """
-    ahead = _grown(network, [chain], most_m, _onward)
-    return None if ahead is None else _grown(network, ahead, least_m, _before)
+    ahead = _grown(network, [chain], most_m, _onward, most)
+    return None if ahead is None else _grown(network, ahead, least_m, _before, most)
 
 
 _Step = Callable[[Network, Chain, float], Iterator[Chain]]
 
 
-def _grown(network: Network, chains: list[Chain], until_m: float, step: _Step) -> list[Chain] | None:
+def _grown(network: Network, chains: list[Chain], until_m: float, step: _Step, most: int) -> list[Chain] | None:
     done: list[Chain] = []
     growing = list(chains)
     while growing:
@@ -176,7 +174,7 @@ def _grown(network: Network, chains: list[Chain], until_m: float, step: _Step) -
             growing += further
         else:
             done.append(chain)
-        if len(done) + len(growing) > MOST_ROUTES:
+        if len(done) + len(growing) > most:
             return None
     return done
 

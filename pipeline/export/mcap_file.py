@@ -17,7 +17,7 @@ from pipeline.export.gis import balises_geojson, track_geojson
 from pipeline.export.messages import Encoding, Topic, geojson_topic, log_topic, rows_topic
 from pipeline.export.position_messages import location_fix_topic, navsatfix_topic
 from pipeline.export.positions import as_gnss, positions_of
-from schemas.errors import OutputError
+from pipeline.storage import whole_file
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import MONITORS
 
@@ -69,30 +69,27 @@ def write_topics(
     from mcap.writer import CompressionType, Writer
 
     kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-    try:
-        with path.open("wb") if isinstance(path, Path) else nullcontext(path) as stream:
-            writer = Writer(
-                stream,
-                compression=kinds[compression],
-                chunk_size=chunk_size or 1024 * 1024,
-                use_chunking=chunk_size is not None,
-                enable_crcs=checksums,
+    with whole_file(path) if isinstance(path, Path) else nullcontext(path) as stream:
+        writer = Writer(
+            stream,
+            compression=kinds[compression],
+            chunk_size=chunk_size or 1024 * 1024,
+            use_chunking=chunk_size is not None,
+            enable_crcs=checksums,
+        )
+        writer.start(profile=profile, library="balise")
+        channels = [
+            writer.register_channel(
+                topic.topic,
+                topic.encoding,
+                writer.register_schema(topic.schema_name, topic.schema_encoding, topic.schema),
             )
-            writer.start(profile=profile, library="balise")
-            channels = [
-                writer.register_channel(
-                    topic.topic,
-                    topic.encoding,
-                    writer.register_schema(topic.schema_name, topic.schema_encoding, topic.schema),
-                )
-                for topic in topics
-            ]
-            for _, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
-                t_ns, data = topics[number].times_ns[row], next(topics[number].messages)
-                writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
-            writer.finish()  # type: ignore[no-untyped-call]
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
+            for topic in topics
+        ]
+        for _, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
+            t_ns, data = topics[number].times_ns[row], next(topics[number].messages)
+            writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:

@@ -9,7 +9,8 @@ from pipeline.export.layout import layout_json
 from pipeline.export.mcap_file import PositionMessage, run_topics, write_topics
 from pipeline.results.provenance import input_digest
 from pipeline.results.store import check_site, metadata_of, read_run, table_address
-from schemas.errors import OutputError, UsageError
+from pipeline.storage import write_bytes
+from schemas.errors import UsageError
 from schemas.run import RunLog, RunTables, Site
 
 SUFFIXES = (".mcap", ".geojson", ".gpx")
@@ -33,7 +34,6 @@ def export_run(
         raise UsageError("cannot be told by its suffix", place=str(to), expected=" or ".join(SUFFIXES))
     tables = read_run(out, run_id)
     _check(out, tables, site, log)
-    to.parent.mkdir(parents=True, exist_ok=True)
     if to.suffix.lower() == ".mcap":
         return _write_mcap(tables, to, site, log, positions)
     if site is None:
@@ -68,8 +68,5 @@ def _write_mcap(
 
 
 def _write_text(path: Path, text: str) -> Path:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
+    write_bytes(path, text.encode())
     return path

@@ -1,4 +1,4 @@
-"""How certain a figure from few events is: exact bounds on rates and shares; and the factor of a threshold.
+"""How certain a figure from few events is: exact bounds on rates and shares.
 
 Rates are of a Poisson process; shares are of independent trials (events, passages, runs), never of
 epochs, whose errors are correlated. The bounds are exact in the sense of Garwood and of Clopper and
@@ -12,17 +12,9 @@ from dataclasses import dataclass
 
 # The incomplete gamma and beta functions give what chi-square and beta quantiles of scipy.stats
 # give, without the second that importing scipy.stats costs every worker.
-from scipy.special import betaincinv, gammaincinv, ndtri
+from scipy.special import betaincinv, gammaincinv
 
 CONFIDENCE = 0.95
-# Beyond chance: two-sided Gaussian 1e-7, as the monitors' k_T by default (DOMAIN section 3). Evidence does not follow
-# their configuration: how easily they alarm tells nothing of the odometer.
-SURE_SIGMAS = 5.3267
-
-
-def threshold_factor(false_alarm_probability: float) -> float:
-    """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
-    return float(-ndtri(false_alarm_probability / 2.0))
 
 
 @dataclass(frozen=True)

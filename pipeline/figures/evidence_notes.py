@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
-from pipeline.epochs.clock import Clock, flags
+from pipeline.epochs.clock import Clock, met
 from pipeline.monitors.along import most_scatter_m
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures
@@ -117,5 +117,5 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> tuple[str
 
 def motion_notes(epochs: pl.DataFrame, clock: Clock) -> tuple[str, ...]:
     """For how long nobody knows whether the train moved."""
-    untold_s = float(clock.held_s[flags(epochs, pl.col("moving").is_null())].sum())
+    untold_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
     return (_UNTOLD.format(s=untold_s),) if untold_s > 0.0 else ()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import polars as pl
 
 from schemas.campaign import STANFORD
-from schemas.enums import RunStatus
+from schemas.enums import Hazard, RunStatus
 
-HAZARD_COUNTS = ("hazards_1a", "hazards_1b", "hazards_shift", "hazards_wrong_track")
+HAZARD_COUNTS = tuple(kind.counted_as for kind in Hazard)
 """Rows of the hazard table by class."""
 
 JUDGED_COUNTS = (

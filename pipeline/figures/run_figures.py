@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import Clock, flags, trusted, usable
+from pipeline.epochs.clock import Clock, met, trusted, usable
 from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
@@ -35,13 +35,13 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
 
     Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not (DOMAIN section 5.5).
     """
-    lost = outages_s(clock.t_ns, flags(epochs, usable()), clock.limit_s)
-    valid = flags(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
-    share = availability(clock.t_ns, valid, flags(epochs, _may_move()), clock.limit_s)
-    trust = uptime(clock.t_ns, flags(epochs, trusted(config)), clock.limit_s)
+    lost = outages_s(clock.t_ns, met(epochs, usable()), clock.limit_s)
+    valid = met(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
+    share = availability(clock.t_ns, valid, met(epochs, _may_move()), clock.limit_s)
+    trust = uptime(clock.t_ns, met(epochs, trusted(config)), clock.limit_s)
     mtbf_h = trust.mean_time_between_losses_h
     return {
-        "availability": share if flags(epochs, pl.col("moving"))[:-1].any() else None,
+        "availability": share if met(epochs, pl.col("moving"))[:-1].any() else None,
         "outages": len(lost),
         "longest_outage_s": float(lost.max()) if len(lost) else 0.0 if epochs.height else None,
         "cross_bias_m": epochs["cross_track_m"].filter(epochs["on_track"]).median(),
@@ -63,8 +63,8 @@ def judged() -> pl.Expr:
 
 def share_unknown(epochs: pl.DataFrame, clock: Clock) -> float | None:
     """Share of the moving time in use that the evidence cannot judge; None without any such time."""
-    used = flags(epochs, pl.col("in_use") & _may_move())
-    return share_of_time(clock.held_s[used], ~flags(epochs, judged())[used])
+    used = met(epochs, pl.col("in_use") & _may_move())
+    return share_of_time(clock.held_s[used], ~met(epochs, judged())[used])
 
 
 def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
@@ -133,14 +133,7 @@ def is_passage() -> pl.Expr:
 
 
 def hazard_counts(hazards: pl.DataFrame) -> Row:
-    classes = {
-        Hazard.VB_JUMP_1A: "hazards_1a",
-        Hazard.VB_JUMP_1B: "hazards_1b",
-        Hazard.VB_SHIFT: "hazards_shift",
-        Hazard.VB_WRONG_TRACK: "hazards_wrong_track",
-    }
-    counts = {column: pl.col("hazard") == kind for kind, column in classes.items()}
-    counts |= {
+    counts = {kind.counted_as: pl.col("hazard") == kind for kind in Hazard} | {
         "hazards_detected": pl.col("detected"),
         "hazards_within_budget": pl.col("within_budget"),
         "missed_detections": missed_detection(),
@@ -179,7 +172,7 @@ def alarm_counts(alarms: pl.DataFrame, epochs: pl.DataFrame, evidence: Evidence 
     The rate counts the time in which the along-track bank judged and the position was judged.
     """
     false = alarms.filter(pl.col("verdict") == Verdict.FALSE).height
-    monitored, seen = flags(epochs, _along_evaluated()), flags(epochs, judged())
+    monitored, seen = met(epochs, _along_evaluated()), met(epochs, judged())
     truth = evidence in TRUTH and bool(seen.any())
     complete = truth and not (alarms["verdict"] == Verdict.UNKNOWN).any()
     judged_s = float(clock.held_s[monitored & seen].sum())

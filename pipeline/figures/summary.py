@@ -25,21 +25,12 @@ Row = dict[str, object]
 
 
 @dataclass(frozen=True)
-class Alignment:
-    """Latency and odometer scale at the end of the run; None where nothing is known of them."""
-
-    latency_s: float | None = None
-    latency_sigma_s: float | None = None
-    odometer_scale: float | None = None
-    odometer_scale_sigma: float | None = None
-
-
-@dataclass(frozen=True)
 class SolutionResults:
     """All that the stages found out about one solution; tables as in `schemas.tables`, failures as in `schemas.stages`.
 
     `distance_m`: way driven, None where nobody knows; `odometer_contradicted`: gaps between anchors that the odometer
-    does not close (DOMAIN section 5.1); `spacing`: of physical balises, None where not computed.
+    does not close (DOMAIN section 5.1). `alignment`: latency and odometer scale at the end of the run. `spacing`: of
+    physical balises, None where not computed.
     """
 
     solution: str
@@ -52,7 +43,7 @@ class SolutionResults:
     evidence: Evidence | None = None
     vehicle: VehicleFigures = VehicleFigures.NONE
     odometer_contradicted: int = 0
-    alignment: Alignment = field(default_factory=Alignment)
+    alignment: Row = field(default_factory=dict)
     counts: StreamCounts = field(default_factory=StreamCounts)
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
@@ -118,10 +109,7 @@ def _identity(results: SolutionResults) -> Row:
         "vehicle": results.vehicle,
         "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
-        "latency_s": results.alignment.latency_s,
-        "latency_sigma_s": results.alignment.latency_sigma_s,
-        "odometer_scale": results.alignment.odometer_scale,
-        "odometer_scale_sigma": results.alignment.odometer_scale_sigma,
+        **results.alignment,
     }
 
 

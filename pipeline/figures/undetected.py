@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
+# One-sided, as of claims (DOMAIN section 6).
+_DOUBT = 0.05
+
 
 @dataclass(frozen=True)
 class Spacing:
@@ -43,4 +46,32 @@ def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: f
         "undetected_share_beyond": beyond.height / known.height,
         "t_undetected_beyond": None if beyond.is_empty() else beyond["t"].dt.timestamp("ns")[0],
         "undetected_beyond_path_m": None if beyond.is_empty() else beyond["path_m"][0],
+    }
+
+
+def undetected_spread() -> dict[str, pl.Expr]:
+    """Of the passages of one balise: the larger of both directions, over those where it is known."""
+    larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
+    return {
+        "undetected_count": larger.count().cast(pl.Int64),
+        "undetected_median_m": larger.median(),
+        "undetected_p95_m": larger.quantile(0.95, interpolation="higher"),
+        "undetected_max_m": larger.max(),
+    }
+
+
+def spacing_of_runs() -> dict[str, pl.Expr]:
+    """Of the runs of one solution: the shortest spacing, and the share of all runs that keep it, from below.
+
+    None of n runs fell short of their own shortest: with 95 % confidence a share of 0.05^(1/n) does not (Clopper and
+    Pearson, n of n).
+    """
+    runs = pl.col("physical_spacing_starts").count()
+    share = pl.when(runs > 0).then(pl.lit(_DOUBT).pow(1.0 / runs))
+    return {
+        "undetected_max_m": pl.col("undetected_max_m").max(),
+        "physical_spacing_runs": runs.cast(pl.Int64),
+        "physical_spacing_m": pl.col("physical_spacing_m").min(),
+        "physical_spacing_median_m": pl.col("physical_spacing_m").median(),
+        "physical_spacing_share_low": share,
     }

@@ -22,7 +22,7 @@ def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
 def verdict_reasons(run: Row, unknown_share_limit: float) -> str:
     """Why the verdict is what it is."""
     unsafe, unproven = _reasons(run, unknown_share_limit)
-    return "; ".join(unsafe + unproven) or "every acceptance was right, and every position failure within the budget"
+    return "; ".join(unsafe + unproven) or "every acceptance right, every position failure within the time allowed"
 
 
 def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]]:
@@ -34,14 +34,14 @@ def _reasons(run: Row, unknown_share_limit: float) -> tuple[list[str], list[str]
     share = run["share_unknown"]
     undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
     unsafe = {
-        "{} VBs accepted despite a wrong position": run["unsafe_accepted"],
-        "{} position failures in use beyond the budget": run["failures_beyond_budget"],
+        "VBs accepted despite a wrong position: {}": run["unsafe_accepted"],
+        "position failures in use for longer than allowed: {}": run["failures_beyond_budget"],
     }
     unproven = {
-        "{} VBs accepted of which nothing says whether the position was right": run["unproven_accepted"],
-        "{} position failures of which nothing says whether they were within the budget": undecided,
+        "VBs accepted that nothing can check: {}": run["unproven_accepted"],
+        "position failures of unknown length: {}": undecided,
         "no position was in use while the train moved": share is None,
-        f"{share or 0.0:.1%} of the moving time in use cannot be judged": share is not None
+        f"{share or 0.0:.1%} of the moving time in use could not be checked": share is not None
         and share > unknown_share_limit,
         "no VB was accepted": not run["balises_accepted"],
     }

@@ -8,20 +8,20 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.evidence import Evidence
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.evidence import Evidence as AllEvidence
 from pipeline.evidence.accused import carried_forward
+from pipeline.evidence.evidence import KINDS
 from pipeline.evidence.routes import Route, routes_of_path
 from pipeline.judge.in_use import unambiguous
-from pipeline.judge.judgement import Judgements, Positions, judge_positions, with_own_anchors
+from pipeline.judge.judgement import Judgements, Positions, judge_positions, margins_m, with_own_anchors
 from pipeline.judge.moving import stood_spans
+from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
-from schemas.enums import BaliseKind, PassageStatus
-
-# Without an odometer the train's way over this time says which way it goes.
-_TURN_S = 2.0
+from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Bench:
     """One solution before the judge; `odometry` grows with its path."""
 
     solution: Solution
-    evidence: Evidence
+    evidence: AllEvidence
     odometry: Odometry | None
     vehicle: Vehicle
     config: Configuration
@@ -73,8 +73,8 @@ class Bench:
 
     @cached_property
     def path_m(self) -> Floats:
-        """Path positions of valid fixes, NaN elsewhere."""
-        return np.where(flags(self.epochs, "fix_valid"), floats(self.epochs, "path_m"), np.nan)
+        """Path positions, NaN without a valid fix."""
+        return floats(self.epochs, "path_m")
 
     @cached_property
     def odometer_moves(self) -> Bools:
@@ -109,7 +109,9 @@ class Bench:
             return told
         found = judge_positions(told, self.evidence.at(self.at_ns), self.legs, self.config.hazards)
         train_m = self.path_m - found.known_m(self.config.hazards.known_error_m) * told.direction
-        ahead = np.searchsorted(self.t_ns, self.t_ns + round(_TURN_S * NS_PER_S)).clip(0, self.t_ns.size - 1)
+        ahead = np.searchsorted(self.t_ns, self.t_ns + round(self.config.hazards.turn_s * NS_PER_S)).clip(
+            0, self.t_ns.size - 1
+        )
         with np.errstate(invalid="ignore"):
             came_m = train_m[ahead] - train_m
             sure = np.flatnonzero(np.abs(came_m) > found.half_m + found.half_m[ahead])
@@ -137,14 +139,25 @@ class Bench:
 
     @cached_property
     def offers(self) -> pl.DataFrame:
-        """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them."""
-        return self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
+        """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them.
+
+        `virtual`, and `accepted` (of a virtual one by the LDS), stand beside the columns of the LDS.
+        """
+        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+        virtual = kind == BaliseKind.VIRTUAL.value
+        accepted = (virtual & (status == PassageStatus.ACCEPTED.value)).fill_null(value=False)
+        crossings = self.solution.crossings.filter(pl.col("offered") | pl.col("status").is_null())
+        return crossings.with_columns(virtual=virtual, accepted=accepted)
+
+    @cached_property
+    def accepted(self) -> pl.DataFrame:
+        """The virtual balises that the LDS accepted, in order of time."""
+        return self.offers.filter("accepted").sort("t")
 
     @cached_property
     def offers_judged(self) -> Judgements:
         """What the evidence says of every offer: the balise against where the train was."""
         offers = self.offers
-        telegram = (offers["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
         index = self.evidence.network.track.index
         sure = self.positions.unambiguous
         positions = Positions(
@@ -156,17 +169,14 @@ class Bench:
             unambiguous=sure[ints(offers["before"])] & sure[ints(offers["epoch"])],
         )
         t_ns = times_ns(offers)
-        return self._judge(positions, np.where(telegram, t_ns, self.instants(t_ns)))
+        return self._judge(positions, np.where(flags(offers, "virtual"), self.instants(t_ns), t_ns))
 
     def _judge(self, positions: Positions, at_ns: Ints) -> Judgements:
         hazards = self.config.hazards
         found = judge_positions(positions, self.evidence.at(at_ns, self.stood), self.legs, hazards)
         if self.odometry is None:
             return found
-        status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
-        accepted = (kind == BaliseKind.VIRTUAL.value) & (status == PassageStatus.ACCEPTED.value)
-        virtual = self.offers.filter(accepted).sort("t")
-        since_ns, path_m = self.instants(times_ns(virtual)), floats(virtual, "path_m")
+        since_ns, path_m = self.instants(times_ns(self.accepted)), floats(self.accepted, "path_m")
         trust, limit_m = self.evidence.trust, hazards.failure_limit_m
         carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, trust, limit_m)
         return with_own_anchors(found, positions, carried, hazards)
@@ -176,3 +186,34 @@ class Bench:
         """Path position of the train where reference or reads tell it closely enough [m], NaN elsewhere."""
         known = self.judged.known_m(self.config.hazards.known_error_m)
         return self.path_m - known * self.positions.direction
+
+    @cached_property
+    def by_reference_m(self) -> Floats:
+        """The same where the reference tells it."""
+        return np.where(self.judged.kind == KINDS.index(Evidence.REFERENCE), self.train_m, np.nan)
+
+    @cached_property
+    def margin_m(self) -> Floats:
+        """Errors below it are those of a healthy position."""
+        return margins_m(floats(self.epochs, "sigma_along_m"), self.config.hazards)
+
+    @cached_property
+    def odometer_wrong(self) -> Bools:
+        """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
+        half = np.where(np.isfinite(self.train_m), self.judged.half_m, np.nan)
+        odometer_m, since_ns = floats(self.epochs, "odometer_m"), times_ns(self.accepted)
+        return odometer_beyond_confidence(self.t_ns, odometer_m, self.train_m, half, since_ns, self.config.lds)
+
+    def speed_at(self, t_ns: Ints) -> Floats:
+        """Speed [m/s] by the epochs around each instant; NaN where no epoch knows it."""
+        speed = np.abs(floats(self.epochs, "speed_mps"))
+        known = np.isfinite(speed)
+        if not known.any():
+            return np.full(t_ns.size, np.nan)
+        at_s, stamps_s = ((values - self.t_ns[0]) / NS_PER_S for values in (t_ns, self.t_ns[known]))
+        return np.interp(at_s, stamps_s, speed[known])
+
+    @cached_property
+    def gap_ns(self) -> int:
+        """Longest time between epochs over which a movement is interpolated."""
+        return round(linking_gap_s(nominal_period_s(self.t_ns), self.config.lds.crossing_gap_s) * NS_PER_S)

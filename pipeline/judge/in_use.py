@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.clock import met, trusted
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, runs_of, times_ns
 from schemas.config import Configuration
-
-_LEAST_HELD_S = 1.0
 
 
 def reaction_s(t_ns: Ints, config: Configuration) -> float:
@@ -22,7 +21,7 @@ def reaction_s(t_ns: Ints, config: Configuration) -> float:
 def unambiguous(epochs: pl.DataFrame, config: Configuration) -> Bools:
     """The track of the position is not in doubt by what the train knew then."""
     sure: Bools = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
-    return sure & flags(epochs, "on_track")
+    return sure
 
 
 def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
@@ -32,11 +31,10 @@ def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
     reaction.
     """
     t_ns = times_ns(epochs)
-    usable = flags(epochs, "fix_valid") & np.isfinite(floats(epochs, "path_m")) & unambiguous(epochs, config)
-    usable &= floats(epochs, "confidence_m") <= config.lds.ci_limit_m
+    usable = met(epochs, trusted(config))
     period_s = nominal_period_s(t_ns) or 0.0
     end_s = (t_ns - t_ns[:1]) / NS_PER_S
-    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), linking_gap_s(period_s, _LEAST_HELD_S))
+    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), linking_gap_s(period_s))
     blocked = np.zeros(t_ns.size)
     for from_s, until_s in _negated_spans(end_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
         blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)

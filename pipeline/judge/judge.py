@@ -8,29 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.failure_log import FailureLog, failure_log
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.epochs.failure_log import failure_log
 from pipeline.evidence.evidence import KINDS, NOTHING
+from pipeline.evidence.gaps import LOOK_S
 from pipeline.evidence.routes import Place
 from pipeline.judge.across import errors_across, healthy_across
-from pipeline.judge.alarms import alarms_table, margins_m
+from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series, find_episodes
 from pipeline.judge.hazards import Draft, drafts_of
 from pipeline.judge.in_use import in_use_s
 from pipeline.judge.judgement import WRONG, judgement_words
 from pipeline.judge.jumps import find_jumps, steps_of
-from pipeline.judge.moving import moving_by_evidence
+from pipeline.judge.moving import moving_by_evidence, within_spans
 from pipeline.judge.offers import Offers
-from pipeline.judge.passages import Found, passages_table, position_stamps, with_unoffered, within_spans
+from pipeline.judge.passages import Found, passages_table
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.rows import failures_table, hazards_table
-from pipeline.judge.states import lds_states, odometer_beyond_confidence
-from pipeline.judge.suspect import Witnesses
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
-from schemas.enums import BaliseKind, Evidence, PassageStatus
-
-_LOOK_S = 1.0
+from pipeline.judge.states import lds_states
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from schemas.enums import Evidence
 
 
 @dataclass(frozen=True)
@@ -57,21 +54,20 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
     offers = Offers.of(bench, series.row)
     episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)
     drafts = drafts_of(episodes, series, offers, bench.config.hazards)
-    witnesses, across = _witnesses(bench), _across(bench, reference)
-    spans = [_undetected_ns(one, series) for one in episodes]
-    passages = _passages(bench, drafts, offers, spans)
+    across = _across(bench, reference)
+    spans = [undetected_ns(one, series) for one in episodes]
     return Judged(
-        hazards=hazards_table(drafts, series, offers, witnesses, bench),
-        alarms=_alarms(bench, log, witnesses, across, drafts),
-        passages=passages,
+        hazards=hazards_table(drafts, series, offers, bench),
+        alarms=alarms_table(bench, log, _healthy(bench, across), drafts),
+        passages=passages_table(bench, offers, _found(bench, drafts, offers), *_train_passings(bench), spans),
         failures=failures_table(episodes, drafts, series, offers, bench),
-        epochs_columns=_epochs(bench, used_s, _odometer_wrong(bench), spans, across),
+        epochs_columns=_epochs(bench, used_s, spans, across),
         distance_m=_distance_m(bench),
         evidence=_evidence(bench),
     )
 
 
-def _undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
+def undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
     """From onset to detection, or to the end; what a step offers on its way lies before its first position."""
     begin_ns = episode.onset_ns
     if episode.step is not None:
@@ -82,15 +78,12 @@ def _undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
 def _series(bench: Bench, used_s: Floats) -> Series:
     """Valid positions with their jumps."""
     row = np.flatnonzero(bench.positions.known)
-    by_reference = bench.judged.kind == KINDS.index(Evidence.REFERENCE)
-    train_m = np.where(by_reference, bench.train_m, np.nan)[row]
     at_ns, odometry = bench.at_ns[row], bench.odometry
     counted_m = np.full(max(row.size - 1, 0), np.nan)
     if odometry is not None:
         counted_m = odometry.between(at_ns[:-1], at_ns[1:]).distance_m
-    gap_s = linking_gap_s(nominal_period_s(bench.t_ns), bench.config.lds.crossing_gap_s)
     t_ns, path_m = bench.t_ns[row], bench.path_m[row]
-    steps = steps_of(t_ns, path_m, train_m, counted_m, gap_s)
+    steps = steps_of(t_ns, path_m, bench.by_reference_m[row], counted_m, bench.gap_ns)
     jumps = find_jumps(steps, bench.positions.direction[row], bench.config.hazards)
     sigma_m = floats(bench.epochs, "sigma_along_m")[row]
     direction = bench.positions.direction[row]
@@ -111,42 +104,6 @@ def _across(bench: Bench, reference: pl.DataFrame | None) -> tuple[Floats, Float
     heading, hazards = floats(bench.epochs, "heading_deg"), bench.config.hazards
     limits = hazards.reference_gap_s, hazards.failure_limit_m
     return errors_across(bench.solution.fixes, heading, bench.at_ns, reference, *limits)
-
-
-def _witnesses(bench: Bench) -> Witnesses:
-    epochs = bench.epochs
-    stood = within_spans(bench.at_ns, bench.stood)
-    return Witnesses(
-        t_ns=bench.t_ns,
-        judged=bench.judged,
-        margin_m=margins_m(floats(epochs, "sigma_along_m"), bench.config.hazards),
-        path_m=bench.path_m,
-        odometer_m=floats(epochs, "odometer_m"),
-        velocity_mps=floats(epochs, "velocity_along_mps"),
-        contradicted=stood | _odometer_wrong(bench),
-        ambiguous=np.isfinite(bench.path_m) & ~bench.positions.unambiguous,
-    )
-
-
-def _odometer_wrong(bench: Bench) -> Bools:
-    """Epochs at which the distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""
-    known = np.isfinite(bench.train_m)
-    half = np.where(known, bench.judged.half_m, np.nan)
-    status, kind = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
-    accepted = bench.offers.filter((status == PassageStatus.ACCEPTED.value) & (kind == BaliseKind.VIRTUAL.value))
-    odometer_m = floats(bench.epochs, "odometer_m")
-    at_ns = times_ns(accepted.sort("t"))
-    return odometer_beyond_confidence(bench.t_ns, odometer_m, bench.train_m, half, at_ns, bench.config.lds)
-
-
-def _passages(bench: Bench, drafts: Sequence[Draft], offers: Offers, spans: Sequence[tuple[int, int]]) -> pl.DataFrame:
-    period_s = nominal_period_s(bench.t_ns)
-    gap_ns = round(linking_gap_s(period_s, bench.config.lds.crossing_gap_s) * NS_PER_S)
-    passings, forward = _train_passings(bench)
-    stamps = position_stamps(bench.epochs)
-    solution = bench.solution
-    passages = with_unoffered(solution.passages, passings, solution.balises, forward, stamps, gap_ns, solution.name)
-    return passages_table(passages, offers, _found(bench, drafts, offers), passings, bench.epochs, spans, gap_ns)
 
 
 def _found(bench: Bench, drafts: Sequence[Draft], offers: Offers) -> Found:
@@ -180,41 +137,36 @@ def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, i
 def _look_at(bench: Bench) -> Ints:
     """The instants of the positions, and others between those that are far apart."""
     at_ns = bench.at_ns
-    long = np.flatnonzero(np.diff(at_ns) > 1.5 * _LOOK_S * NS_PER_S)
+    long = np.flatnonzero(np.diff(at_ns) > 1.5 * LOOK_S * NS_PER_S)
     between = [
-        np.arange(begin, end, round(_LOOK_S * NS_PER_S), dtype=np.int64)[1:]
+        np.arange(begin, end, round(LOOK_S * NS_PER_S), dtype=np.int64)[1:]
         for begin, end in zip(at_ns[long].tolist(), at_ns[long + 1].tolist(), strict=True)
     ]
     return np.unique(np.concatenate([at_ns, *between]))
 
 
-def _alarms(
-    bench: Bench, log: FailureLog, witnesses: Witnesses, across: tuple[Floats, Floats], drafts: Sequence[Draft]
-) -> pl.DataFrame:
-    hazards, epochs = bench.config.hazards, bench.epochs
-    sigmas = floats(epochs, "sigma_cross_m"), floats(epochs, "sigma_up_m")
-    healthy = healthy_across(across, sigmas, bench.judged.half_m / hazards.evidence_factor, hazards.evidence_factor)
-    places = epochs.select("netelement_id", "measure_m")
-    return alarms_table(bench.solution.name, log, witnesses, bench.positions.known, healthy, places, drafts, hazards)
+def _healthy(bench: Bench, across: tuple[Floats, Floats]) -> dict[str, Bools]:
+    factor = bench.config.hazards.evidence_factor
+    sigmas = floats(bench.epochs, "sigma_cross_m"), floats(bench.epochs, "sigma_up_m")
+    return healthy_across(across, sigmas, bench.judged.half_m / factor, factor)
 
 
 def _epochs(
     bench: Bench,
     used_s: Floats,
-    odometer_wrong: Bools,
     spans: Sequence[tuple[int, int]],
     across: tuple[Floats, Floats],
 ) -> pl.DataFrame:
     config, judged = bench.config, bench.judged
-    by_reference = np.where(judged.kind == KINDS.index(Evidence.REFERENCE), bench.train_m, np.nan)
     moving, sure = moving_by_evidence(
         bench.at_ns,
-        by_reference,
+        bench.by_reference_m,
         judged.half_m,
         bench.odometer_moves,
         bench.odometer_told,
         bench.stood,
         config.matching.deadband_mps,
+        config.align.speed_window_s,
     )
     suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
     known = np.isfinite(bench.path_m)
@@ -227,7 +179,7 @@ def _epochs(
             pl.Series("error_up_m", across[1], nan_to_null=True),
             judgement_words(judged.code),
             pl.Series("in_use", used_s > 0.0),
-            lds_states(bench.epochs, judged, odometer_wrong),
+            lds_states(bench.epochs, judged, bench.odometer_wrong),
             pl.Series("suspect_after_the_fact", suspect),
             pl.select(pl.when(pl.Series(sure)).then(pl.Series(moving)).alias("moving")).to_series(),
         ]

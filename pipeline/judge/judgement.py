@@ -87,6 +87,12 @@ class Judgements:
         return np.where(self.by_truth & (self.half_m <= known_to_m), self.middle_m, np.nan)
 
 
+def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
+    """Errors of a healthy position: max(5 m, min(3 sigma, failure limit))."""
+    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), config.failure_limit_m)
+    return np.maximum(config.false_alarm_margin_m, noise)
+
+
 def judgement_words(code: Ints) -> pl.Series:
     kinds = [one.value for one in JUDGEMENTS]
     return pl.Series("judgement", kinds, dtype=pl.Enum(kinds)).gather(code)

@@ -9,9 +9,6 @@ import numpy as np
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import HazardConfig
 
-# A jump spread over several epochs reaches from its first to its last increment of at least this share of the largest.
-_SHARE_OF_LARGEST = 0.3
-
 
 @dataclass(frozen=True)
 class Steps:
@@ -35,11 +32,11 @@ class Jump:
     step_m: float
 
 
-def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_s: float) -> Steps:
+def steps_of(t_ns: Ints, path_m: Floats, train_m: Floats, counted_m: Floats, gap_ns: int) -> Steps:
     """`train_m`: path position by the reference, NaN elsewhere; there `counted_m`, the odometer's steps, serves."""
     by_reference, by_odometer = np.diff(path_m - train_m), np.diff(path_m) - counted_m
     change = np.where(np.isfinite(by_reference), by_reference, by_odometer)
-    linked = np.isfinite(change) & (np.diff(t_ns) <= gap_s * NS_PER_S)
+    linked = np.isfinite(change) & (np.diff(t_ns) <= gap_ns)
     excess = np.concatenate([[0.0], np.cumsum(np.where(linked, change, 0.0))])
     return Steps(t_ns, excess[: t_ns.size], np.concatenate([[False], linked])[: t_ns.size])
 
@@ -86,5 +83,5 @@ def _extent(steps: Steps, begin: int, end: int, sign: float, config: HazardConfi
     start = max(min(earliest + 1, begin), 1)
     increments = np.diff(steps.excess_m[start - 1 : end + 1]) * sign
     increments[~steps.linked[start : end + 1]] = 0.0
-    part = np.flatnonzero(increments >= _SHARE_OF_LARGEST * increments.max())
+    part = np.flatnonzero(increments >= config.jump_share * increments.max())
     return start + int(part[0]), start + int(part[-1])

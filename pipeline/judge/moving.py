@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
-
-_WINDOW_S = 1.0
 
 
 def stood_spans(
@@ -34,13 +34,14 @@ def moving_by_evidence(
     known: Bools,
     stood: list[tuple[int, int]],
     deadband_mps: float,
+    window_s: float,
 ) -> tuple[Bools, Bools]:
     """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
 
-    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over a second it moved where it came
+    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over `window_s` it moved where it came
     farther than the dead band and that noise allow. It also tells where the odometer stands or is silent.
     """
-    ahead = np.searchsorted(t_ns, t_ns + round(_WINDOW_S * NS_PER_S)).clip(0, t_ns.size - 1)
+    ahead = np.searchsorted(t_ns, t_ns + round(window_s * NS_PER_S)).clip(0, t_ns.size - 1)
     with np.errstate(invalid="ignore"):
         came_m = np.abs(train_m[ahead] - train_m)
         by_reference = came_m > deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S + noise_m + noise_m[ahead]
@@ -55,3 +56,11 @@ def _held(steps: Bools, size: int) -> Bools:
     """Nothing follows upon the last epoch, which stays as it was before."""
     last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
     return np.concatenate([steps, last])[:size]
+
+
+def within_spans(t_ns: Ints, spans: Sequence[tuple[int, int]]) -> Bools:
+    """Instants of the spans, their ends left out."""
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
+    for begin_ns, end_ns in spans:
+        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
+    return inside

@@ -10,8 +10,7 @@ import polars as pl
 
 from pipeline.judge.bench import Bench
 from pipeline.judge.judgement import Judgements
-from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
-from schemas.enums import BaliseKind, PassageStatus
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,6 @@ class Offers:
         """`row`: the epochs of the valid positions."""
         offers, passages = bench.offers, bench.solution.passages
         late = passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
-        virtual = (offers["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
-        accepted = (offers["status"].cast(pl.String) == PassageStatus.ACCEPTED.value).fill_null(value=False)
         return cls(
             crossing_id=ints(offers["crossing_id"]),
             balise_id=offers["balise_id"].to_list(),
@@ -48,8 +45,8 @@ class Offers:
             number=np.searchsorted(row, ints(offers["epoch"])).clip(0, max(row.size - 1, 0)),
             path_m=floats(offers, "path_m"),
             judged=bench.offers_judged,
-            virtual=virtual,
-            offered=virtual & offers["offered"].to_numpy(),
-            accepted=virtual & accepted.to_numpy(),
+            virtual=flags(offers, "virtual"),
+            offered=flags(offers, "virtual") & flags(offers, "offered"),
+            accepted=flags(offers, "accepted"),
             beyond_window=offers["crossing_id"].is_in(late.drop_nulls().implode()).to_numpy(),
         )

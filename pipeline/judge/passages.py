@@ -8,10 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from pipeline.judge.bench import Bench
 from pipeline.judge.judgement import judgement_words
+from pipeline.judge.moving import within_spans
 from pipeline.judge.offers import Offers
 from pipeline.judge.passings import Passing
-from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.arrays import Bools, Floats, Ints, floats, ints
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
@@ -25,32 +27,31 @@ class Found(NamedTuple):
 
 
 def passages_table(
-    passages: pl.DataFrame,
+    bench: Bench,
     offers: Offers,
     found: Found,
     passings: dict[str, list[Passing]],
-    epochs: pl.DataFrame,
+    forward: dict[str, int],
     spans: Sequence[tuple[int, int]],
-    gap_ns: int,
 ) -> pl.DataFrame:
-    """Passages of the LDS with the columns of the evidence; `spans`: from each fault's onset to its detection."""
+    """Passages of the LDS, and those that it knows nothing of, with the columns of the evidence.
+
+    `forward`: +1 where the path grows with the measure of the balise's net element; `spans`: from each fault's onset to
+    its detection.
+    """
+    stamps = bench.t_ns[np.isfinite(bench.path_m)]
+    passages = _with_unoffered(bench, passings, forward, stamps)
     offered = _of_crossings(passages, offers, found)
     t_true = _assigned(passages, passings)
-    stamps = position_stamps(epochs)
-    positioned = _within_gap(stamps, ints(t_true), gap_ns) & t_true.is_not_null().to_numpy()
+    positioned = _within_gap(stamps, ints(t_true), bench.gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
         t_true.cast(pl.Datetime("ns", "UTC")).alias("t_true"),
         *offered,
         pl.Series("_positioned", positioned),
         pl.Series("_suspect", _inside(passages, spans)),
-        _speeds(passages, t_true, epochs, gap_ns),
+        _speeds(passages, t_true, bench),
     )
     return _with_failures(frame).select(Passages.column_names())
-
-
-def position_stamps(epochs: pl.DataFrame) -> Ints:
-    """Times of the epochs with a position [ns]."""
-    return times_ns(epochs)[flags(epochs, "fix_valid") & np.isfinite(floats(epochs, "path_m"))]
 
 
 def _of_crossings(passages: pl.DataFrame, offers: Offers, found: Found) -> list[pl.Series]:
@@ -118,24 +119,12 @@ def _inside(passages: pl.DataFrame, spans: Sequence[tuple[int, int]]) -> Bools:
     return accepted & within_spans(t_ns, spans)
 
 
-def within_spans(t_ns: Ints, spans: Sequence[tuple[int, int]]) -> Bools:
-    inside = np.zeros(t_ns.size, dtype=np.bool_)
-    for begin_ns, end_ns in spans:
-        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
-    return inside
-
-
-def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, gap_ns: int) -> pl.Series:
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, bench: Bench) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
-    stamps, speed = times_ns(epochs), np.abs(floats(epochs, "speed_mps"))
-    known = np.isfinite(speed)
-    if not known.any():
-        return pl.Series("speed_mps", [None] * passages.height, dtype=pl.Float64)
-    offset = int(stamps[0])
-    values = np.interp((ints(at) - offset) / 1e9, (stamps[known] - offset) / 1e9, speed[known])
-    told = at.is_not_null() & pl.Series(_within_gap(stamps[known], ints(at), gap_ns))
-    return pl.select(pl.when(told).then(pl.Series(values)).alias("speed_mps")).to_series()
+    known = np.isfinite(floats(bench.epochs, "speed_mps"))
+    told = at.is_not_null().to_numpy() & _within_gap(bench.t_ns[known], ints(at), bench.gap_ns)
+    return pl.Series("speed_mps", np.where(told, bench.speed_at(ints(at)), np.nan), nan_to_null=True)
 
 
 def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
@@ -162,26 +151,22 @@ def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def with_unoffered(
-    passages: pl.DataFrame,
-    passings: dict[str, list[Passing]],
-    balises: pl.DataFrame,
-    forward: dict[str, int],
-    stamps: Ints,
-    gap_ns: int,
-    solution: str,
+def _with_unoffered(
+    bench: Bench, passings: dict[str, list[Passing]], forward: dict[str, int], stamps: Ints
 ) -> pl.DataFrame:
     """One more passage for each virtual balise that the train passed and the LDS knows nothing of.
 
     The LDS follows the position: before the first one, or where it is wrong at an end of the run, no window has closed
-    yet. `forward`: +1 where the path grows with the measure of the balise's net element; `stamps`: of valid positions.
+    yet. `stamps`: of valid positions.
     """
+    passages, solution = bench.solution.passages, bench.solution.name
     given = set(zip(passages["balise_id"].to_list(), _assigned(passages, passings).to_list(), strict=True))
-    virtual = balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
+    virtual = bench.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     rows = [
-        _unoffered(balise, instant, sense * forward[balise["balise_id"]], _was_seen(stamps, instant, gap_ns), solution)
+        _unoffered(balise, instant, sense * forward[balise["balise_id"]], seen, solution)
         for balise in virtual.unique("balise_id", keep="first", maintain_order=True).iter_rows(named=True)
         for instant, sense, clear in passings.get(balise["balise_id"], ())
+        for seen in _within_gap(stamps, np.array([instant]), bench.gap_ns).tolist()
         if clear and (balise["balise_id"], instant) not in given
     ]
     if not rows:
@@ -192,10 +177,6 @@ def with_unoffered(
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
     return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
-
-
-def _was_seen(stamps: Ints, instant: int, gap_ns: int) -> bool:
-    return bool(_within_gap(stamps, np.array([instant]), gap_ns)[0])
 
 
 def _unoffered(balise: dict[str, object], instant: int, direction: int, seen: bool, solution: str) -> dict[str, object]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.evidence.evidence import Alternative, EvidenceSet
 from pipeline.evidence.routes import Place, Route
+from pipeline.track.survey import MEASURE_TOLERANCE_M
 from schemas.arrays import Bools, Floats, Ints
 
 
@@ -85,8 +86,8 @@ def _on_route(alternative: Alternative, elements: Ints, measures: Floats, at_m: 
     if at_m.size == 0:
         return []
     for visit in range(route.element.size):
-        inside = (elements == route.element[visit]) & (measures >= route.low_m[visit] - 0.5)
-        inside &= measures <= route.high_m[visit] + 0.5
+        inside = (elements == route.element[visit]) & (measures >= route.low_m[visit] - MEASURE_TOLERANCE_M)
+        inside &= measures <= route.high_m[visit] + MEASURE_TOLERANCE_M
         for balise in np.flatnonzero(inside).tolist():
             since = measures[balise] - route.low_m[visit]
             forward = bool(route.forward[visit])

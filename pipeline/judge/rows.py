@@ -15,8 +15,8 @@ from pipeline.judge.hazards import Draft, rate_mps, size_m
 from pipeline.judge.in_use import reaction_s
 from pipeline.judge.judgement import UNKNOWN, WRONG
 from pipeline.judge.offers import Offers
-from pipeline.judge.suspect import Witnesses, suspect_of
-from schemas.arrays import NS_PER_S, floats
+from pipeline.judge.suspect import suspect_of
+from schemas.arrays import NS_PER_S
 from schemas.conform import dtypes
 from schemas.enums import Evidence, FailureMode, Hazard, Timing
 from schemas.stages import Failures
@@ -59,7 +59,6 @@ def hazards_table(
     drafts: Sequence[Draft],
     series: Series,
     offers: Offers,
-    witnesses: Witnesses,
     bench: Bench,
 ) -> pl.DataFrame:
     """Rows in order of time; `hazard_id` is the place in `drafts`."""
@@ -69,7 +68,7 @@ def hazards_table(
             "solution": bench.solution.name,
             "hazard_id": number,
             "caused_by": None if draft.caused_by is None else ids[id(draft.caused_by)],
-            "suspect": suspect_of(witnesses, draft.episode.onset_ns, draft.episode.end_ns).value,
+            "suspect": suspect_of(bench, draft.episode.onset_ns, draft.episode.end_ns).value,
             "size_m": size_m(draft, series, offers, bench.config.hazards.known_error_m),
             "rate_mps": rate_mps(draft, series, bench.config.hazards.known_error_m),
             "evidence": _evidence(draft, series, offers).value,
@@ -143,14 +142,11 @@ def _place(row: int, t_ns: int, bench: Bench) -> dict[str, Any]:
     direction, middle_m = int(bench.positions.direction[row]), float(bench.judged.middle_m[row])
     path_m = float(bench.path_m[row]) - direction * middle_m
     names, measures = bench.solution.path.locate(max(int(bench.positions.leg[row]), 0), path_m)
-    speed = np.abs(floats(bench.epochs, "speed_mps"))
-    known = np.isfinite(speed)
-    at_s, stamps_s = (t_ns - bench.t_ns[0]) / NS_PER_S, (bench.t_ns - bench.t_ns[0]) / NS_PER_S
     return {
         "netelement_id": names[0],
         "measure_m": _known(float(measures[0])),
         "path_m": _known(path_m),
-        "speed_mps": float(np.interp(at_s, stamps_s[known], speed[known])) if known.any() else None,
+        "speed_mps": _known(float(bench.speed_at(np.array([t_ns]))[0])),
     }
 
 

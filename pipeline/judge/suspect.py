@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.evidence.evidence import KINDS
-from pipeline.judge.judgement import Judgements
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from pipeline.judge.bench import Bench
+from pipeline.judge.moving import within_spans
+from schemas.arrays import NS_PER_S, Ints, floats
 from schemas.enums import Evidence, Suspect
 
-_LOOKBACK_S = 60.0
-_LONGEST_STEP_S = 2.0
 
-
-@dataclass(frozen=True)
-class Witnesses:
-    """All epochs of a solution; NaN where a witness says nothing.
-
-    `margin_m`: errors below it are those of a healthy position. `contradicted`: the odometer is, by reference, reads
-    or its own standing.
-    """
-
-    t_ns: Ints
-    judged: Judgements
-    margin_m: Floats
-    path_m: Floats
-    odometer_m: Floats
-    velocity_mps: Floats
-    contradicted: Bools
-    ambiguous: Bools
-
-
-def suspect_of(w: Witnesses, begin_ns: int, end_ns: int) -> Suspect:
-    """The decision table, from 60 s before the alarm or hazard to its end; the first row that applies.
+def suspect_of(bench: Bench, begin_ns: int, end_ns: int) -> Suspect:
+    """The decision table, from `suspect_lookback_s` before the alarm or hazard to its end; the first row that applies.
 
     | row | evidence | suspect |
     |---|---|---|
@@ -46,29 +24,34 @@ def suspect_of(w: Witnesses, begin_ns: int, end_ns: int) -> Suspect:
 
     The map is found over several runs (`pipeline/figures/map_errors.py`).
     """
-    first = int(np.searchsorted(w.t_ns, begin_ns - round(_LOOKBACK_S * NS_PER_S)))
-    rows = np.arange(first, max(first, int(np.searchsorted(w.t_ns, end_ns, side="right"))))
+    first = int(np.searchsorted(bench.t_ns, begin_ns - round(bench.config.hazards.suspect_lookback_s * NS_PER_S)))
+    rows = np.arange(first, max(first, int(np.searchsorted(bench.t_ns, end_ns, side="right"))))
+    judged = bench.judged.take(rows)
     with np.errstate(invalid="ignore"):
-        left = (w.judged.least_m[rows] > w.margin_m[rows]) | w.judged.wrong_track[rows]
-    by_odometer = w.judged.kind[rows] == KINDS.index(Evidence.ODOMETER)
-    if (left & ~by_odometer).any():
+        left = (judged.least_m > bench.margin_m[rows]) | judged.wrong_track
+    if (left & (judged.kind != KINDS.index(Evidence.ODOMETER))).any():
         return Suspect.GNSS
-    if w.contradicted[rows].any() or _parted_together(w, rows):
+    stood = within_spans(bench.at_ns[rows], bench.stood)
+    if (stood | bench.odometer_wrong[rows]).any() or _parted_together(bench, rows):
         return Suspect.ODOMETER
     if left.any():
         return Suspect.GNSS
-    return Suspect.TRACK if w.ambiguous[rows].any() else Suspect.UNKNOWN
+    ambiguous = np.isfinite(bench.path_m) & ~bench.positions.unambiguous
+    return Suspect.TRACK if ambiguous[rows].any() else Suspect.UNKNOWN
 
 
-def _parted_together(w: Witnesses, rows: Ints) -> bool:
+def _parted_together(bench: Bench, rows: Ints) -> bool:
     """Position and Doppler agree with each other where both left the odometer, by half the margin of the position."""
-    known = rows[np.isfinite(w.path_m[rows]) & np.isfinite(w.odometer_m[rows]) & np.isfinite(w.velocity_mps[rows])]
+    path_m, odometer_m = bench.path_m[rows], floats(bench.epochs, "odometer_m")[rows]
+    velocity_mps = floats(bench.epochs, "velocity_along_mps")[rows]
+    known = np.flatnonzero(np.isfinite(path_m) & np.isfinite(odometer_m) & np.isfinite(velocity_mps))
     if known.size < 2:
         return False
-    dt_s = np.diff(w.t_ns[known]) / NS_PER_S
-    mean_mps = 0.5 * (w.velocity_mps[known][1:] + w.velocity_mps[known][:-1])
-    doppler_m = np.concatenate([[0.0], np.cumsum(np.where(dt_s <= _LONGEST_STEP_S, mean_mps * dt_s, 0.0))])
-    position_m, odometer_m = w.path_m[known] - w.path_m[known[0]], w.odometer_m[known] - w.odometer_m[known[0]]
-    margin = 0.5 * w.margin_m[known]
+    dt_s = np.diff(bench.t_ns[rows][known]) / NS_PER_S
+    mean_mps = 0.5 * (velocity_mps[known][1:] + velocity_mps[known][:-1])
+    near = dt_s <= bench.config.monitors.doppler_gap_s
+    doppler_m = np.concatenate([[0.0], np.cumsum(np.where(near, mean_mps * dt_s, 0.0))])
+    position_m, odometer_m = path_m[known] - path_m[known[0]], odometer_m[known] - odometer_m[known[0]]
+    margin = 0.5 * bench.margin_m[rows][known]
     both = (np.abs(position_m - odometer_m) > margin) & (np.abs(doppler_m - odometer_m) > margin)
     return bool((both & (np.abs(position_m - doppler_m) <= margin)).any())

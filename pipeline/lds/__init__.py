@@ -37,7 +37,7 @@ Where the sources leave a choice, this package reads them so:
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """
 
-from pipeline.lds.bank_protocol import Bank, LdsLimits
+from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.run import LdsResult, run_lds
 
-__all__ = ["Bank", "LdsLimits", "LdsResult", "run_lds"]
+__all__ = ["Bank", "LdsResult", "run_lds"]

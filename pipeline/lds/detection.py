@@ -7,12 +7,11 @@ from math import isnan
 
 import numpy as np
 
-from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.crossings import Balise, Crossing, Seen
 from pipeline.lds.journey import Journey, turning_epochs
 from pipeline.lds.link_monitors import LinkOrder, disorder
 from pipeline.lds.linking import LinkingChain
-from schemas.config import LdsConfig
+from schemas.config import Configuration, LdsConfig
 from schemas.enums import BaliseKind, PassageStatus
 
 
@@ -27,20 +26,19 @@ class BaliseDetection:
         journey: Journey,
         balises: dict[BaliseKind, list[Balise]],
         crossings: Sequence[Crossing],
-        config: LdsConfig,
-        limits: LdsLimits,
+        config: Configuration,
     ) -> None:
-        self._journey, self._config, self._limits = journey, config, limits
+        self._journey, self._config = journey, config
         self._at: dict[BaliseKind, dict[int, list[Crossing]]] = {kind: {} for kind in BaliseKind}
         for crossing in crossings:
             self._at[crossing.balise.kind].setdefault(crossing.epoch, []).append(crossing)
         self._turns = turning_epochs(journey)
-        self._disarmed = Disarmed(journey, config)
+        self._disarmed = Disarmed(journey, config.lds)
         self._along_m: list[float] = (journey.odometer_m * journey.direction).tolist()
-        self.virtual = LinkingChain(balises[BaliseKind.VIRTUAL], config)
+        self.virtual = LinkingChain(balises[BaliseKind.VIRTUAL], config.lds)
         # A run without telegrams has no reader, so its physical balises have no passages.
-        self.physical = LinkingChain(balises[BaliseKind.PHYSICAL] if self._at[BaliseKind.PHYSICAL] else [], config)
-        self.order = LinkOrder(journey, limits)
+        self.physical = LinkingChain(balises[BaliseKind.PHYSICAL] if self._at[BaliseKind.PHYSICAL] else [], config.lds)
+        self.order = LinkOrder(journey, config)
         self.events = sorted({*self._turns, *(crossing.epoch for crossing in crossings)})
 
     @property
@@ -128,7 +126,7 @@ class BaliseDetection:
         if self._journey.refusal[crossing.before] is PassageStatus.REJECTED_AMBIGUOUS:
             return PassageStatus.REJECTED_AMBIGUOUS
         refusal = self._journey.refusal[crossing.epoch]
-        if refusal is None and entering and self._config.entry_from_unfitted_area and self._journey.has_odometer:
+        if refusal is None and entering and self._config.lds.entry_from_unfitted_area and self._journey.has_odometer:
             # Insertion is what endangers an entry: the diagnosis must stand behind the first VB too.
             return PassageStatus.REJECTED_MONITOR
         return refusal
@@ -143,13 +141,13 @@ class BaliseDetection:
     def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:
         if not self.order.is_evaluated(k):
             return False
-        out_of_order = disorder(offered, overdue, self._journey, self._config, self._limits)
+        out_of_order = disorder(offered, overdue, self._journey, self._config)
         self.order.note(k, out_of_order)
         return out_of_order > 0
 
 
 class Disarmed:
-    """Balises just detected, re-armed once the odometer has moved max(`rearm_m`, 3 sigma) away (DOMAIN section 4).
+    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away by the odometer (DOMAIN section 4).
 
     Where the run has no odometer, the position's distance from the balise has to serve.
     """
@@ -171,7 +169,7 @@ class Disarmed:
 
     def rearm(self, k: int) -> None:
         """Re-arm what the train has left behind at epoch `k`."""
-        away_m = max(self._config.rearm_m, 3.0 * float(self._journey.sigma_m[k]))
+        away_m = max(self._config.rearm_m, self._config.rearm_sigmas * float(self._journey.sigma_m[k]))
         for name, (balise, at_m) in list(self._at.items()):
             if abs(self._moved_m(k, balise, at_m)) >= away_m:
                 del self._at[name]

@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
-from pipeline.lds.bank_protocol import LdsLimits
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
-from schemas.config import LdsConfig
+from pipeline.odometry.driven import turns_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from schemas.config import Configuration, LdsConfig
 from schemas.enums import PassageStatus
 
 
@@ -19,11 +19,12 @@ from schemas.enums import PassageStatus
 class Journey:
     """Epochs in order of time; a NaN is a value that is not known.
 
-    `positioned`: fix valid and placed on the path. `refusal`: why a detection at this epoch would not
+    `positioned`: placed on the path. `refusal`: why a detection at this epoch would not
     count, `None` where it would. `direction`: direction of travel (+1/-1 along growing path) as known at that epoch;
     `travel`: that of the step from this epoch to the next, put back to where the train turned (for
     labels only). `travelled_m`: way run, turns included. `segment`: continuity segment of the odometer, between
-    segments its distance was lost. `blind`: no position for longer than a crossing is interpolated over (`gap_ns`).
+    segments its distance was lost; `scale_sigma`: of its scale, None unless a vehicle file gives both. `blind`: no
+    position for longer than a crossing is interpolated over (`gap_ns`).
     """
 
     t_ns: Ints
@@ -36,6 +37,7 @@ class Journey:
     confidence_m: Floats
     odometer_m: Floats
     segment: Ints
+    scale_sigma: float | None
     direction: Ints
     travel: Ints
     travelled_m: Floats
@@ -69,26 +71,26 @@ class Journey:
         return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
 
 
-def journey_of(epochs: pl.DataFrame, config: LdsConfig, limits: LdsLimits) -> Journey:
+def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configuration) -> Journey:
     """Take the columns of matched and aligned epochs: the only place where the LDS reads them (see `run_lds`)."""
-    t_ns = epochs["t"].dt.epoch("ns").to_numpy().astype(np.int64)
+    t_ns = times_ns(epochs)
     path_m = floats(epochs, "path_m")
-    fix_valid = epochs["fix_valid"].fill_null(False).to_numpy()
-    positioned = fix_valid & np.isfinite(path_m)
+    positioned = np.isfinite(path_m)
     odometer_m = floats(epochs, "odometer_m")
-    direction, travel = _directions(odometer_m, epochs["direction"], config.odometer_fixed_m)
-    gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.crossing_gap_s) * NS_PER_S)
+    direction, travel = _directions(odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
+    gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.lds.crossing_gap_s) * NS_PER_S)
     return Journey(
         t_ns=t_ns,
         leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
         path_m=path_m,
         positioned=positioned,
-        placed_nowhere=fix_valid & ~positioned,
-        refusal=_refusals(epochs, positioned, config, limits),
+        placed_nowhere=flags(epochs, "fix_valid") & ~positioned,
+        refusal=_refusals(epochs, positioned, config),
         sigma_m=floats(epochs.select(pl.col("position_sigma_m").forward_fill()), "position_sigma_m"),
         confidence_m=floats(epochs, "confidence_m"),
         odometer_m=odometer_m,
         segment=epochs["odometer_segment"].to_numpy().astype(np.int64),
+        scale_sigma=scale_sigma,
         direction=direction,
         travel=travel,
         travelled_m=_travelled_m(odometer_m, travel),
@@ -105,18 +107,15 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
     return blind
 
 
-def _refusals(
-    epochs: pl.DataFrame, positioned: Bools, config: LdsConfig, limits: LdsLimits
-) -> list[PassageStatus | None]:
+def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
     """Ambiguity before confidence; what is not known (null) is never taken as good."""
-    on_track = epochs["on_track"].fill_null(False).to_numpy()
-    probable = floats(epochs, "gate_probability") >= limits.ambiguity_probability
-    confident = floats(epochs, "confidence_m") <= config.ci_limit_m
+    sure = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
+    confident = floats(epochs, "confidence_m") <= config.lds.ci_limit_m
     refusals: list[PassageStatus | None] = [None] * len(positioned)
-    for k in np.flatnonzero(~(positioned & on_track & probable & confident)).tolist():
+    for k in np.flatnonzero(~(positioned & sure & confident)).tolist():
         if not positioned[k]:
             refusals[k] = PassageStatus.NOT_AVAILABLE
-        elif on_track[k] and probable[k]:
+        elif sure[k]:
             refusals[k] = PassageStatus.REJECTED_CONFIDENCE
         else:
             refusals[k] = PassageStatus.REJECTED_AMBIGUOUS
@@ -134,32 +133,15 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
         direction = held.to_numpy().astype(np.int64)
         return direction, direction
     known = np.flatnonzero(np.isfinite(odometer_m))
-    direction = np.ones(odometer_m.size, dtype=np.int64)
-    travel = direction.copy()
-    for turned_at, confirmed_at, sign in _turns(odometer_m[known], turn_m):
-        direction[known[confirmed_at] :] = sign
-        travel[known[turned_at] :] = sign
+    direction, travel = np.ones((2, odometer_m.size), dtype=np.int64)
+    for turned_at, seen_at, sense in zip(*turns_of(odometer_m[known], turn_m), strict=True):
+        direction[known[seen_at] :] = sense
+        travel[known[turned_at] :] = sense
     return direction, travel
 
 
-def _turns(odometer_m: Floats, turn_m: float) -> list[tuple[int, int, int]]:
-    """Turning points: index of the extreme, index where it is confirmed, new direction."""
-    turns: list[tuple[int, int, int]] = []
-    start, sign = 0, 1
-    while True:
-        way_m = sign * odometer_m[start:]
-        back_m = np.maximum.accumulate(way_m) - way_m
-        confirmed = int(np.argmax(back_m >= turn_m))
-        if back_m[confirmed] < turn_m:
-            return turns
-        extreme = int(np.argmax(way_m[: confirmed + 1]))
-        sign = -sign
-        turns.append((start + extreme, start + confirmed, sign))
-        start += confirmed
-
-
 def _travelled_m(odometer_m: Floats, travel: Ints) -> Floats:
-    """Way run since the first epoch; signed sums, so that jitter at standstill adds up to nothing."""
+    """Way run since the first epoch, on the scale in use; signed sums: jitter at a stand adds up to nothing."""
     travelled_m = np.full(odometer_m.size, np.nan)
     known = np.flatnonzero(np.isfinite(odometer_m))
     if known.size:

@@ -8,12 +8,11 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds import relink
-from pipeline.lds.bank_protocol import LdsLimits
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
 from pipeline.lds.relink import Anchor, Comparison
 from schemas.arrays import Bools, Floats, Ints
-from schemas.config import LdsConfig
+from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import Epochs
 
@@ -35,7 +34,7 @@ _NO_REASON = -1  # a reason is held as its place in the list above
 _STATES = tuple(state.value for state in MonitorState)
 
 
-def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: LdsConfig, limits: LdsLimits) -> int:
+def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
     """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
 
     Two or more at once, or one against the direction of travel, are out of order where the
@@ -44,8 +43,8 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Ld
     i, j = offered[0].before, offered[0].epoch
     odometer_step_m = journey.odometer_m[j] - journey.odometer_m[i]
     excess_m = abs(journey.path_m[j] - journey.path_m[i] - odometer_step_m)
-    noise_m = limits.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)
-    unexplained = excess_m > noise_m + config.odometer_share * abs(odometer_step_m)
+    noise_m = config.monitors.threshold_factor * sqrt(journey.sigma_m[i] ** 2 + journey.sigma_m[j] ** 2)
+    unexplained = excess_m > noise_m + config.lds.odometer_share * abs(odometer_step_m)
     backwards = offered[0].sense != journey.direction[j]
     return len(offered) if unexplained and (len(offered) > 1 or backwards) else overdue
 
@@ -53,8 +52,8 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Ld
 class LinkOrder:
     """Order of balise identities, step by step."""
 
-    def __init__(self, journey: Journey, limits: LdsLimits) -> None:
-        self._reason = _order_reasons(journey, "link_order" in limits.disabled)
+    def __init__(self, journey: Journey, config: Configuration) -> None:
+        self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled)
         self._value = np.where(self._reason == _NO_REASON, 0.0, np.nan)
 
     def is_evaluated(self, k: int) -> bool:
@@ -76,9 +75,10 @@ class LinkDistance:
     position after an outage it is the distance since the re-link anchor, within the bound of a re-link (`relink`).
     """
 
-    def __init__(self, journey: Journey, config: LdsConfig, limits: LdsLimits) -> None:
-        self._journey, self._config, self._limits = journey, config, limits
-        self._reason = _distance_reasons(journey, "link_distance" in limits.disabled)
+    def __init__(self, journey: Journey, config: Configuration) -> None:
+        self._journey, self._config = journey, config.lds
+        self._factor = config.monitors.threshold_factor
+        self._reason = _distance_reasons(journey, "link_distance" in config.monitors.disabled)
         self._possible: Bools = self._reason == _NO_REASON
         self._offset_m = journey.path_m - journey.odometer_m
         self._value = np.full(journey.t_ns.size, np.nan)
@@ -121,7 +121,7 @@ class LinkDistance:
         self._done = min(k + _BLOCK, self._fails.size)
         ahead = slice(k, self._done)
         way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
-        noise_m = self._limits.threshold_factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
+        noise_m = self._factor * np.hypot(self._journey.sigma_m[ahead], anchor.sigma_m)
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
         lost = self._possible[ahead] & (self._journey.segment[ahead] != anchor.segment)
         known = self._possible[ahead] & ~lost

@@ -9,7 +9,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 
-from pipeline.lds.bank_protocol import Bank, LdsLimits
+from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.crossings import Balise, Crossing
 from pipeline.lds.detection import BaliseDetection
 from pipeline.lds.journey import Journey, mission_epochs, segment_epochs
@@ -17,7 +17,7 @@ from pipeline.lds.link_monitors import LinkDistance
 from pipeline.lds.linking import LrvbChange
 from pipeline.lds.relink import Anchor, Held, Recovery, Relink, breaks
 from schemas.arrays import NS_PER_S
-from schemas.config import LdsConfig
+from schemas.config import Configuration
 from schemas.enums import BaliseKind
 
 
@@ -33,22 +33,21 @@ class LocationSystem:
         bank: Bank,
         balises: dict[BaliseKind, list[Balise]],
         crossings: Sequence[Crossing],
-        config: LdsConfig,
-        limits: LdsLimits,
+        config: Configuration,
     ) -> None:
-        self._journey, self._bank, self._config = journey, bank, config
-        self.balises = BaliseDetection(journey, balises, crossings, config, limits)
-        self.distance = LinkDistance(journey, config, limits)
+        self._journey, self._bank, self._config = journey, bank, config.lds
+        self.balises = BaliseDetection(journey, balises, crossings, config)
+        self.distance = LinkDistance(journey, config)
         self.lrvb_changes = [LrvbChange(0, None, chain_begun=False)]
         self.accepted_at_ns: dict[int, int] = {}
         self.tvb, self.alarm, self.negated, self.evaluated = ([False] * journey.t_ns.size for _ in range(4))
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
         self._way_m = journey.odometer_m * journey.direction
-        self._breaks = breaks(journey, limits)
-        self._missions = mission_epochs(journey, config)
+        self._breaks = breaks(journey, config.align)
+        self._missions = mission_epochs(journey, config.lds)
         self._events = sorted({*self.balises.events, *self._breaks, *self._missions, *segment_epochs(journey)})
-        self._relink = Relink(journey, self.tvb, config, limits)
+        self._relink = Relink(journey, self.tvb, config)
         self._recovery: Recovery | None = None  # while negated
         self._validated = False  # a VB or a TVB
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs

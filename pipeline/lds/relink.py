@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.lds.bank_protocol import Bank, LdsLimits
+from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from schemas.arrays import NS_PER_S
-from schemas.config import LdsConfig
+from schemas.config import AlignConfig, Configuration, LdsConfig
 from schemas.enums import BaliseKind
 
 UNLINKED = "no re-link: "
@@ -88,8 +88,9 @@ class Held(NamedTuple):
 class Relink:
     """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs, as far as they are known."""
 
-    def __init__(self, journey: Journey, tvb: list[bool], config: LdsConfig, limits: LdsLimits) -> None:
-        self._journey, self._tvb, self._config, self._limits = journey, tvb, config, limits
+    def __init__(self, journey: Journey, tvb: list[bool], config: Configuration) -> None:
+        self._journey, self._tvb, self._config = journey, tvb, config
+        self._factor = config.monitors.threshold_factor
         self._anchor: Anchor | None = None
         self._alarmed = False
         self._mission_from = 0
@@ -101,7 +102,7 @@ class Relink:
 
     def note_read(self, read: Crossing) -> None:
         """A telegram says where the train is."""
-        self._anchor = Anchor.at_crossing(self._journey, read, self._limits.balise_read_sigma_m) or self._anchor
+        self._anchor = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m) or self._anchor
 
     def note_alarm(self, k: int) -> None:
         """The first alarm with an anchor before it fixes that; only a telegram moves it from there."""
@@ -112,7 +113,7 @@ class Relink:
         """Before the first alarm: the last TVB `anchor_lag_s` before epoch `k`, else the first TVB, or a later read."""
         if self._alarmed:
             return self._anchor
-        old_ns = int(self._journey.t_ns[k]) - round(self._config.anchor_lag_s * NS_PER_S)
+        old_ns = int(self._journey.t_ns[k]) - round(self._config.lds.anchor_lag_s * NS_PER_S)
         tvbs = self._mission_from + np.flatnonzero(self._tvb[self._mission_from : k])
         if not tvbs.size:
             return self._anchor
@@ -123,13 +124,13 @@ class Relink:
     def compare(self, k: int) -> Comparison:
         """Hold the position at epoch `k` against the anchor."""
         anchor = self.anchor_at(k)
-        if not self._config.relink:
+        if not self._config.lds.relink:
             return Comparison(reason=SWITCHED_OFF)
         if anchor is None:
             return Comparison(reason=NO_ANCHOR)
         if anchor.segment != self._journey.segment[k]:
             return Comparison(reason=LOST)
-        if self._limits.odometer_scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
+        if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
             return Comparison(reason=NO_VEHICLE)
         offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
         found = Comparison(offset_m - anchor.offset_m, self._bound_m(anchor, k))
@@ -145,10 +146,9 @@ class Relink:
         waited_s = (int(self._journey.t_ns[k]) - anchor.t_ns) / NS_PER_S
         way_m = float(self._journey.travelled_m[k]) - anchor.travelled_m
         positions_m2 = anchor.sigma_m**2 + float(self._journey.sigma_m[k]) ** 2
-        limits = self._limits
-        scale_sigma = limits.odometer_scale_sigma or 0.0
-        variance_m2 = drift_m2(positions_m2, waited_s, way_m, limits.odometer_sigma_mps, scale_sigma)
-        return float(relink_bound_m(variance_m2, limits.threshold_factor, limits.failure_limit_m))
+        monitors, scale_sigma = self._config.monitors, self._journey.scale_sigma or 0.0
+        variance_m2 = drift_m2(positions_m2, waited_s, way_m, monitors.odometer_sigma_mps, scale_sigma)
+        return float(relink_bound_m(variance_m2, self._factor, self._config.hazards.failure_limit_m))
 
 
 class Recovery:
@@ -175,10 +175,10 @@ class Recovery:
         return seen and bool(self._journey.usable[k]) and t_ns - self._failed_at_ns >= self._recovery_ns
 
 
-def breaks(journey: Journey, limits: LdsLimits) -> frozenset[int]:
+def breaks(journey: Journey, config: AlignConfig) -> frozenset[int]:
     """The first usable epochs after outages of position or odometer over which the bank began anew."""
     known = np.flatnonzero(journey.comparable)
     usable = np.flatnonzero(journey.comparable & journey.usable)
-    after = known[1:][np.diff(journey.t_ns[known]) > limits.gap_reset_s * NS_PER_S]
+    after = known[1:][np.diff(journey.t_ns[known]) > config.gap_reset_s * NS_PER_S]
     rows = np.searchsorted(usable, after)
     return frozenset(usable[rows[rows < usable.size]].tolist())

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.lds.bank_protocol import Bank, LdsLimits
+from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.columns import epoch_columns
 from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time
 from pipeline.lds.journey import journey_of
@@ -14,7 +14,7 @@ from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
 from pipeline.lds.reads import reads_of
 from pipeline.lds.relink import Held
-from schemas.config import LdsConfig
+from schemas.config import Configuration
 from schemas.enums import BaliseKind
 
 
@@ -40,8 +40,8 @@ def run_lds(
     bank: Bank,
     balises: pl.DataFrame,
     balise_reads: pl.DataFrame | None,
-    config: LdsConfig,
-    limits: LdsLimits,
+    scale_sigma: float | None,
+    config: Configuration,
     solution: str = "primary",
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
@@ -49,20 +49,20 @@ def run_lds(
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
     where unknown)`, odometer_segment, direction` (+1/-1, used where there is no odometer).
-    `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the
-    read where the run has an odometer. A run without that stream has no reader, so its physical balises have no
-    passages.
+    `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has
+    an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of
+    the odometer, None unless a vehicle file gives it with the scale.
     """
-    journey = journey_of(epochs, config, limits)
+    journey = journey_of(epochs, scale_sigma, config)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
     reads, unknown = reads_of(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
     found = [*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads]
-    system = LocationSystem(journey, bank, on_path, found, config, limits)
+    system = LocationSystem(journey, bank, on_path, found, config)
     system.run()
     crossings = in_order_of_time(found)
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
-        epochs=epoch_columns(epochs["t"], system, journey, config),
+        epochs=epoch_columns(epochs["t"], system, journey, config.lds),
         crossings=crossing_rows(crossings, journey),
         passages=passage_rows(passages, crossings, journey, solution),
         unknown_reads=unknown,

@@ -25,6 +25,8 @@ class Segments(Polyline):
     first: Ints
     measure_start_m: Floats
     measure_end_m: Floats
+    height_start_m: Floats
+    height_end_m: Floats
     heading_rad: Floats
     sigma_m: Floats
     tree: cKDTree
@@ -36,8 +38,8 @@ class Candidates:
     """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
 
     `along_m` from the element's start and `left_m` to its end, `beyond_m` how far the position lies past the
-    end that `past` names (-1 start, 1 end, 0 neither), `offset_m` left of the element's own sense;
-    `linked_start`, `linked_end`: whether a relation leads on there.
+    end that `past` names (-1 start, 1 end, 0 neither), `offset_m` left of the element's own sense; `height_m` of the
+    track there (NaN on a 2-D survey); `linked_start`, `linked_end`: whether a relation leads on there.
     """
 
     first: Ints
@@ -48,6 +50,7 @@ class Candidates:
     beyond_m: Floats
     offset_m: Floats
     distance_m: Floats
+    height_m: Floats
     heading_rad: Floats
     survey_sigma_m: Floats
     past: Ints
@@ -69,7 +72,7 @@ class Candidates:
 
 _COLUMNS = (
     *("step", "element", "along_m", "left_m", "beyond_m", "offset_m"),
-    *("distance_m", "heading_rad", "survey_sigma_m", "past"),
+    *("distance_m", "height_m", "heading_rad", "survey_sigma_m", "past"),
     *("linked_start", "linked_end"),
 )
 
@@ -91,6 +94,8 @@ def segments_of(track: Track) -> Segments:
         first=np.searchsorted(owner[head], np.arange(len(track.ids) + 1)),
         measure_start_m=track.measure_m[head],
         measure_end_m=track.measure_m[head + 1],
+        height_start_m=track.height_m[head],
+        height_end_m=track.height_m[head + 1],
         heading_rad=np.arctan2(east, north),
         sigma_m=np.fmax(track.sigma_m[head], track.sigma_m[head + 1]),
         tree=cKDTree(probes, balanced_tree=False, compact_nodes=False),
@@ -146,6 +151,7 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
         beyond_m=np.abs(feet.fraction - held) * span * (past != 0),
         offset_m=np.where(corner, side * feet.distance_m, feet.offset_m),
         distance_m=feet.distance_m,
+        height_m=(1.0 - held) * segments.height_start_m[segment] + held * segments.height_end_m[segment],
         heading_rad=segments.heading_rad[segment],
         survey_sigma_m=segments.sigma_m[segment],
         past=past,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.matching.moves import Move, best_move
+from pipeline.matching.moves import Move, best_moves
 from pipeline.matching.trellis import Trellis
 from pipeline.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.track.network import Network
@@ -65,14 +65,13 @@ def decode(trellis: Trellis, best: Ints) -> Decoded:
     leg = np.zeros(len(best), dtype=np.int64)
     number = np.zeros(len(best), dtype=np.int64)
     at = 0
-    loops = [one for one in set(oriented.tolist()) if trellis.network.linked(one, one)]
-    moving = (oriented[1:] != oriented[:-1]) | np.isin(oriented[1:], loops)
     before = 0
-    for step in (np.flatnonzero(moving) + 1).tolist():
+    steps = np.flatnonzero(oriented[1:] != oriented[:-1]) + 1
+    places = oriented[steps - 1], place[steps - 1], oriented[steps], place[steps]
+    moves = best_moves(trellis.network, *places, trellis.ways.take(steps), trellis.config)
+    for step, move in zip(steps.tolist(), moves, strict=True):
         leg[before:step], number[before:step], before = len(chains) - 1, at, step
-        one, other = int(oriented[step - 1]), int(oriented[step])
-        move = _move(trellis, step, one, float(place[step - 1]), other, float(place[step]))
-        at = _follow(chains, at, move, other)
+        at = _follow(chains, at, move, int(oriented[step]))
     leg[before:], number[before:] = len(chains) - 1, at
     return Decoded(tuple(chains), leg, number, place)
 
@@ -115,11 +114,6 @@ def aligned(trellis: Trellis, decoded: Decoded) -> Decoded:
             if np.cos(np.radians(turn)) < 0:
                 decoded = decoded.turned(trellis.network, range(index, _next_break(decoded, index)))
     return decoded
-
-
-def _move(trellis: Trellis, step: int, one: int, one_m: float, other: int, other_m: float) -> Move | None:
-    way = trellis.ways.take(np.array([step]))
-    return best_move(trellis.network, one, one_m, other, other_m, way, trellis.config)
 
 
 def _follow(chains: list[Chain], at: int, move: Move | None, other: int) -> int:

@@ -81,7 +81,7 @@ def epoch_frame(
         "measure_m": measure_m,
         "path_m": path_m,
         "cross_track_m": places.cross_m,
-        "vertical_m": places.vertical_m - vehicle.antenna_height_m,
+        "vertical_m": places.vertical_m,
         "on_track": on_track,
         "near_track": fixes.valid & (distance_m <= config.reach_m),
         "path_probability": np.where(on_track, found.path_probability, np.nan),

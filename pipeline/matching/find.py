@@ -87,7 +87,7 @@ def _trellis(
     kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
     candidates = wide.take(np.flatnonzero(kept), len(steps)).renumbered(judged)
     steps = resumed(fixes, steps.epoch[judged], way)
-    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config.reach_m)
+    candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config)
     like = likelihood_of(fixes, steps, candidates, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, like, config)
@@ -96,8 +96,6 @@ def _trellis(
 def _thinned(fixes: Fixes, steps: Steps, network: Network, way: Travelled, config: MatchingConfig) -> Steps:
     """Fewer steps where no link is near, since nothing can be decided there that a later step does not show."""
     ends = end_places(network.track)[network.linked_ends()]
-    if len(ends) == 0 or len(steps) == 0:
-        return steps
     apart, _ = cKDTree(ends).query(fixes.points.surface[steps.epoch], distance_upper_bound=_CLEAR_M)
     moved = np.cumsum(np.nan_to_num(steps.chord_m)) / (_THINNING * config.step_distance_m)
     kept = np.isfinite(apart) | (np.nan_to_num(steps.elapsed_s) >= 0.5 * config.step_time_s)

@@ -8,6 +8,7 @@ import polars as pl
 from pipeline.matching.match import Match
 from pipeline.matching.rivals import Posterior
 from pipeline.track.leg import Leg, segments_at
+from pipeline.track.survey import Track
 from schemas.arrays import Bools, Ints, floats
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
@@ -17,6 +18,7 @@ ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "doubtful": pl.Boolean,
     "probability": pl.Float64,
     "rivals": pl.String,
+    "cross_bias_m": pl.Float64,
     "t_start": pl.Datetime("ns", "UTC"),
     "t_end": pl.Datetime("ns", "UTC"),
 }
@@ -26,31 +28,82 @@ def found_route(found: Match, sure: float) -> pl.DataFrame:
     """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
 
     `doubtful`: its least probability is below `sure`, or no position tells of it. `rivals`: other elements possible
-    meanwhile, the most probable first, each with its highest probability, in words.
+    meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
+    positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
     """
     leg = found.epochs["leg"].fill_null(-1).to_numpy()
     rows = [
-        _row(found, number, one, visit, leg == number, sure)
+        _row(found, number, one, visits, leg == number, sure)
         for number, one in enumerate(found.path.legs)
-        for visit in range(len(one.visits))
+        for visits in _passages(found.path.track, one)
     ]
     return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
 
 
-def _row(found: Match, number: int, leg: Leg, visit: int, on_leg: Bools, sure: float) -> tuple[object, ...]:
+def route_of_epochs(epochs: pl.DataFrame, sure: float) -> pl.DataFrame:
+    """The same of one solution's `epochs` in a result, without rivals: net elements with positions, by growing path.
+
+    Where the way turned over a switch, the rows of both legs stand beside each other and have to be put in order.
+    """
+    placed = epochs.filter(pl.col("on_track") & pl.col("netelement_id").is_not_null())
+    visit = pl.col("netelement_id").rle_id()
+    grows = (
+        (pl.col("path_m") - pl.col("path_m").mean()) * (pl.col("measure_m") - pl.col("measure_m").mean())
+    ).sum() >= 0
+    placed = placed.with_columns(forward=grows.over(visit))
+    # Where the element begins on the path tells laps apart, and is the same however often the train turns on it.
+    origin = pl.col("path_m") - pl.when("forward").then(1.0).otherwise(-1.0) * pl.col("measure_m")
+    least = pl.col("path_probability").min()
+    return (
+        placed.group_by("netelement_id", "forward", origin.round(0).alias("origin"))
+        .agg(
+            pl.col("path_m").min(),
+            (least < sure).fill_null(value=True).alias("doubtful"),
+            least.alias("probability"),
+            pl.col("cross_track_m").median().alias("cross_bias_m"),
+            pl.col("t").min().alias("t_start"),
+            pl.col("t").max().alias("t_end"),
+        )
+        .sort("path_m", "t_start")
+        .with_columns(
+            pl.when("forward").then(pl.lit("AB")).otherwise(pl.lit("BA")).alias("direction"),
+            pl.lit(None, dtype=pl.Int64).alias("leg"),
+            pl.lit("").alias("rivals"),
+        )
+        .select(pl.col(name).cast(kind) for name, kind in ROUTE_COLUMNS.items())
+    )
+
+
+def _passages(track: Track, leg: Leg) -> list[list[int]]:
+    """Visits that are one passage of an element: its pieces, one after the other. Each lap of a ring is another."""
+    passages: list[list[int]] = []
+    ended: object = None
+    for number, visit in enumerate(leg.visits):
+        measure = track.measure_m[track.vertices(visit.element)]
+        begin, end = (measure[0], measure[-1]) if visit.forward else (measure[-1], measure[0])
+        if passages and ended == (track.ids[visit.element], visit.forward, begin):
+            passages[-1].append(number)
+        else:
+            passages.append([number])
+        ended = (track.ids[visit.element], visit.forward, end)
+    return passages
+
+
+def _row(found: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, sure: float) -> tuple[object, ...]:
     path_m, probability = floats(found.epochs, "path_m"), floats(found.epochs, "path_probability")
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
-    inside = np.flatnonzero(on_leg & (leg.visit[segment] == visit) & np.isfinite(probability))
+    inside = np.flatnonzero(on_leg & np.isin(leg.visit[segment], visits) & np.isfinite(probability))
     least = float(probability[inside].min()) if len(inside) else None
-    name = found.path.track.ids[leg.visits[visit].element]
+    one = leg.visits[visits[0]]
     times = found.epochs["t"]
     return (
-        name,
-        "AB" if leg.visits[visit].forward else "BA",
+        found.path.track.ids[one.element],
+        "AB" if one.forward else "BA",
         number,
         least is None or least < sure,
         least,
         _rivals(found, inside, 1.0 - sure),
+        float(np.median(floats(found.epochs, "cross_track_m")[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,
         times[int(inside[-1])] if len(inside) else None,
     )

@@ -45,7 +45,8 @@ def hypotheses_of(cross_m2: float, survey_m2: float, doubt: float, config: Match
     `doubt`: the truth may be that many times the stated sigma. That it may be less is left out: errors that hardly
     change, as of dead reckoning, would look small and prove too much.
     """
-    scales = np.array([1.0, doubt]) if doubt > 1.0 else np.ones(1)
+    # Each sigma at most twice the one before: between two of them it would be taken for the smaller one.
+    scales = np.geomspace(1.0, doubt, 1 + int(np.ceil(np.log2(doubt))))
     lasting_m2 = config.cross_bias_sigma_m**2 + config.slow_share * cross_m2 * scales**2
     sigma_m = np.sqrt(lasting_m2 + survey_m2)
     count = len(_GRID_SIGMAS)
@@ -59,7 +60,7 @@ def hypotheses_of(cross_m2: float, survey_m2: float, doubt: float, config: Match
         bias_m=(kept * sigma_m[:, None] * _GRID_SIGMAS).ravel(),
         scale=np.repeat(scales, count),
         within_m=np.repeat(_WITHIN_SIGMAS * sigma_m, count),
-        log_prior=np.log(np.tile(prior / prior.sum(), len(scales)) / len(scales)),
+        log_prior=np.log(np.outer(scales / scales.sum(), prior / prior.sum()).ravel()),
         renewal=renewal,
     )
 

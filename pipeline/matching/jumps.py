@@ -14,38 +14,41 @@ from pipeline.matching.fixes import Fixes
 from pipeline.matching.steps import Steps
 from pipeline.track.network import Network
 from schemas.arrays import Floats, Ints
-
-# Positions are looked for on tracks further off for this long before and after a jump [s], and up to this far [m].
-_WITHIN_S = 120.0
-_FURTHEST_M = 500.0
+from schemas.config import MatchingConfig
 
 
 def with_tracks_aside(
-    found: Candidates, fixes: Fixes, believed: Ints, steps: Steps, network: Network, segments: Segments, reach_m: float
+    found: Candidates,
+    fixes: Fixes,
+    believed: Ints,
+    steps: Steps,
+    network: Network,
+    segments: Segments,
+    config: MatchingConfig,
 ) -> Candidates:
     """About jumps, also candidates as far off as the jump was long, on elements that are candidates elsewhere."""
-    aside_m = _aside_m(fixes, believed, steps)
+    aside_m = _aside_m(fixes, believed, steps, config)
     wider = np.flatnonzero(aside_m > 0)
     if len(wider) == 0:
         return found
-    far = candidates_of(fixes.points.take(steps.epoch[wider]), network, segments, float(aside_m.max()) + reach_m)
+    far = candidates_of(fixes.points.take(steps.epoch[wider]), network, segments, float(aside_m.max()) + config.reach_m)
     known = found.step * network.count + found.element
     step = wider[far.step]
-    kept = (far.distance_m <= aside_m[step] + reach_m) & np.isin(far.element, np.unique(found.element))
+    kept = (far.distance_m <= aside_m[step] + config.reach_m) & np.isin(far.element, np.unique(found.element))
     kept &= ~np.isin(step * network.count + far.element, known)
     kept &= (far.past == 0) | ~np.where(far.past < 0, far.linked_start, far.linked_end)
     return merged(found, far.take(np.flatnonzero(kept), len(wider)), wider)
 
 
-def _aside_m(fixes: Fixes, believed: Ints, steps: Steps) -> Floats:
+def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig) -> Floats:
     """Per step the length of the longest jump about it [m], 0 where there is none."""
     usable = np.cumsum(fixes.valid)
     after = np.flatnonzero(np.diff(usable[believed]) > 1) + 1
     size = np.linalg.norm(fixes.points.surface[believed[after]] - fixes.points.surface[believed[after - 1]], axis=1)
     t_s, begin_s, end_s = fixes.t_s[steps.epoch], fixes.t_s[believed[after - 1]], fixes.t_s[believed[after]]
-    first = np.searchsorted(t_s, begin_s - _WITHIN_S)
-    last = np.searchsorted(t_s, end_s + _WITHIN_S, side="right")
+    first = np.searchsorted(t_s, begin_s - config.jump_aside_s)
+    last = np.searchsorted(t_s, end_s + config.jump_aside_s, side="right")
     aside_m = np.zeros(len(steps))
     for one, (low, high) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
-        aside_m[low:high] = np.maximum(aside_m[low:high], min(float(size[one]), _FURTHEST_M))
+        aside_m[low:high] = np.maximum(aside_m[low:high], min(float(size[one]), config.jump_aside_m))
     return aside_m

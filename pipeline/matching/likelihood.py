@@ -20,16 +20,9 @@ from pipeline.matching.steps import Steps
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
-# Floor of what the offset changes from step to step [m]: rounding of surveys and fixes; more where the sigma is a
-# table's, which knows nothing of this receiver's noise.
-_FLOOR_M = 0.02
-_TABLE_FLOOR_M = 0.1
-# A position that an element does not explain stays so for this long [s]: being off costs by the time.
-# Where a position is off every element, its offsets change by this share of the least from step to step.
-_OFF_S = 8.0
-_OFF_WANDER = 0.03
-_HEADING_LIMIT = 8.0
+# Two surveys never end at the same place [m].
 _ENDS_SIGMA_M = 1.0
+# Log-likelihood that leaves next to nothing.
 _RULED_OUT = -50.0
 
 
@@ -39,8 +32,8 @@ class Likelihood:
     step before, and which part of the offset is expected to stay.
 
     `renewed_m2`: what a change of element adds. `fixed` is the log-likelihood that does not depend on the step before
-    (place past an element's end, reads of balises, heading as far as it is new, time off the track); `heading` is the
-    whole of it, for a first step.
+    (place past an element's end, reads of balises, heading and height as far as they are new, time off the track);
+    `direct` is the whole of heading and height, for a first step.
     """
 
     hypotheses: Hypotheses
@@ -49,7 +42,7 @@ class Likelihood:
     keep: Floats
     renewed_m2: Floats
     fixed: Floats
-    heading: Floats
+    direct: Floats
     outlier: float
     outlier_scale_m: float
 
@@ -72,24 +65,24 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
     wander_m2 += np.where(fixes.estimated[row], (config.estimated_drift * np.nan_to_num(way)) ** 2, 0.0)
     fast_m2 = ((1.0 - config.slow_share) * gnss_m2)[:, None] * hypotheses.scale**2
     variance = fast_m2 + hypotheses.within_m**2 + np.maximum(survey_m2 - common_m2, 0.0)[:, None]
-    floor_m2 = np.where(fixes.from_receiver[row], _FLOOR_M, _TABLE_FLOOR_M) ** 2
+    floor_m2 = np.where(fixes.from_receiver[row], config.offset_floor_m, config.table_floor_m) ** 2
     fresh = np.maximum(fast_m2 * renewed[:, None] + wander_m2[:, None], floor_m2[:, None])
     whole_m2 = gnss_m2 + survey_m2 + config.on_track_bias_m**2
     unexplained = candidates.distance_m > config.on_track_sigmas * np.sqrt(whole_m2)
     off = unexplained & (candidates.distance_m > config.outlier_scale_m)
-    heading = _heading(steps, candidates, config)
+    direct = _heading(steps, candidates, config) + _height(fixes, row, candidates, survey_m2, config)
     share_new = np.clip(gnss_m2 * renewed + wander_m2, np.minimum(floor_m2, whole_m2), whole_m2) / whole_m2
     return Likelihood(
         hypotheses=hypotheses,
         variance_m2=variance,
-        fresh_m2=fresh + _wander_m2(candidates, unexplained)[:, None],
+        fresh_m2=fresh + _wander_m2(candidates, unexplained, config)[:, None],
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
         keep=np.sqrt(1.0 - fast_m2 * renewed[:, None] / (variance + survey_m2[:, None])),
         renewed_m2=2.0 * (config.sigma_doubt**2) * survey_m2,
         fixed=_ends(candidates, gnss_m2 + survey_m2 + _ENDS_SIGMA_M**2, config)
-        + heading * share_new
+        + direct * share_new
         - _time_off(steps, candidates, off, config),
-        heading=heading,
+        direct=direct,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
     )
@@ -99,7 +92,7 @@ def initial_score(offset_m: Floats, candidate: Ints, like: Likelihood) -> Floats
     """Log-likelihood of states without a step before them, per hypothesis: `[state, hypothesis]`."""
     off_m = offset_m[:, None] - like.hypotheses.bias_m
     density = log_density(off_m, np.zeros(1), like.variance_m2[candidate], like)
-    return np.asarray(density + (like.fixed + like.heading)[candidate][:, None])
+    return np.asarray(density + (like.fixed + like.direct)[candidate][:, None])
 
 
 def step_score(before_m: Floats, offset_m: Floats, candidate: Ints, changes: Bools, like: Likelihood) -> Floats:
@@ -135,7 +128,7 @@ def _wide(off_m: Floats, scale_m: float) -> Floats:
     return np.asarray(-np.log(np.pi * scale_m * (1.0 + (off_m / scale_m) ** 2)))
 
 
-def _wander_m2(candidates: Candidates, off: Bools) -> Floats:
+def _wander_m2(candidates: Candidates, off: Bools, config: MatchingConfig) -> Floats:
     """What the offset changes besides where a position is off every element: that much of the distance to the nearest.
 
     A lost position drifts by metres in seconds, whatever it says of itself; how it moves is weak evidence. It is the
@@ -144,17 +137,13 @@ def _wander_m2(candidates: Candidates, off: Bools) -> Floats:
     begin = candidates.first[:-1]
     nearest_m = np.minimum.reduceat(candidates.distance_m, begin)[candidates.step]
     lost = np.logical_and.reduceat(off, begin)[candidates.step]
-    return np.where(lost, (_OFF_WANDER * nearest_m) ** 2, 0.0)
+    return np.where(lost, (config.off_track_wander * nearest_m) ** 2, 0.0)
 
 
 def _time_off(steps: Steps, candidates: Candidates, off: Bools, config: MatchingConfig) -> Floats:
-    """Cost of a position that lies off the element by what no error explains, by how long it does.
-
-    Otherwise a constant offset is paid for once, and a run whose positions are elsewhere for a minute, which is paid
-    for twice, would be put on a track far beside for all of it.
-    """
+    """Cost of a position that lies off the element by what no error explains, by how long it does."""
     elapsed_s = np.minimum(np.nan_to_num(steps.elapsed_s[candidates.step]), config.step_time_s)
-    return np.where(off, elapsed_s / _OFF_S, 0.0)
+    return np.where(off, elapsed_s / config.off_track_s, 0.0)
 
 
 def _cross_m2(fixes: Fixes, row: Ints, heading_rad: Floats) -> Floats:
@@ -187,6 +176,19 @@ def _heading(steps: Steps, candidates: Candidates, config: MatchingConfig) -> Fl
     """Log-likelihood of the direction of travel, either way along the element; nothing at standstill."""
     difference = steps.heading_rad[candidates.step] - candidates.heading_rad
     folded = (np.degrees(difference) + 90.0) % 180.0 - 90.0
-    value = np.maximum(-0.5 * (folded / config.heading_sigma_deg) ** 2, -_HEADING_LIMIT)
+    value = np.maximum(-0.5 * (folded / config.heading_sigma_deg) ** 2, -config.direct_limit)
     moving = steps.speed_mps[candidates.step] >= config.heading_min_speed_mps
     return np.where(moving & np.isfinite(value), value, 0.0)
+
+
+def _height(fixes: Fixes, row: Ints, candidates: Candidates, survey_m2: Floats, config: MatchingConfig) -> Floats:
+    """Log-likelihood of the height over the track, where tracks lie over each other; nothing without heights.
+
+    Tracks at one level differ by superelevation and errors of the survey, which say nothing of the train.
+    """
+    begin, track_m = candidates.first[:-1], candidates.height_m
+    apart_m = np.maximum.reduceat(track_m, begin) - np.minimum.reduceat(track_m, begin)
+    above_m = fixes.height_m[row] - track_m
+    variance = config.sigma_doubt**2 * fixes.cov_uu_m2[row] + survey_m2 + config.height_bias_sigma_m**2
+    value = np.maximum(-0.5 * above_m**2 / variance, -config.direct_limit)
+    return np.where((apart_m[candidates.step] >= config.clearance_m) & np.isfinite(value), value, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
@@ -19,6 +19,7 @@ from pipeline.odometry.polarity import polarity
 from pipeline.track.leg import leg_of
 from pipeline.track.network import network_of
 from pipeline.track.path import TravelledPath
+from pipeline.track.pieces import in_pieces
 from pipeline.track.route import network_along, visits_of
 from pipeline.track.survey import Track, track_of
 from schemas.arrays import Ints, floats, times_ns
@@ -63,6 +64,7 @@ def match(
     epoch comes near any track.
     """
     arrays = fixes_of(fixes, fix_sigma)
+    arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     path, found, ambiguous, posterior = _path(arrays, odometry, site, config, balise_reads)
@@ -100,7 +102,7 @@ def _path(
         leg = leg_of(track, visits)
         if not leg.returns:
             return *path_on_chain(fixes, odometry, track, leg, config), no_doubt(), None
-    network = network_of(track, site.links) if visits is None else network_along(track, visits)
+    network = network_of(in_pieces(track), site.links) if visits is None else network_along(track, visits)
     pinned = pins_of(fixes, site, network.track, balise_reads)
     return find_path(fixes, odometry, network, pinned, config)
 

@@ -11,13 +11,6 @@ from pipeline.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
-# Log-probabilities: mismatch between network and travelled distance counts at most the first (a GNSS that
-# jumps along the track must not send the path on a detour); each relation passed in a direction that is not
-# navigable costs the second.
-_MISMATCH_LIMIT = 12.0
-_BARRED = 20.0
-_ODOMETER_SHARE = 0.01
-
 
 @dataclass(frozen=True)
 class Ways:
@@ -36,12 +29,11 @@ class Ways:
 
 
 class Move(NamedTuple):
-    """Displacement [m] along the path, the elements between, and how the element is left.
+    """The elements between two places, and how the first is left.
 
-    `sense`: +1 ahead, -1 behind, 0 not at all; between places at one joint the displacement is 0 either way.
+    `sense`: +1 ahead, -1 behind, 0 not at all.
     """
 
-    displacement_m: float
     between: tuple[int, ...]
     sense: int
 
@@ -49,47 +41,45 @@ class Move(NamedTuple):
 def move_scores(
     network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, ways: Ways, config: MatchingConfig
 ) -> Floats:
-    """Log-probability of the most plausible move of each pair of places, -inf where there is none.
+    """Log-probability of each move between pairs of places, -inf where there is none: `[sense, pair]`.
 
-    Places are oriented elements and metres from their entries.
+    Rows: on the element, ahead, behind. Places are oriented elements and metres from their entries.
     """
     ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, ways.limit_m)
     length = network.track.length_m
     left_m, other_left_m = length[one // 2] - one_m, length[other // 2] - other_m
     stay = np.where(one == other, distance_scores(other_m - one_m, ways, config), -np.inf)
-    ahead = distance_scores(left_m + ahead_m + other_m, ways, config) - _BARRED * ahead_barred
-    behind = distance_scores(-(one_m + behind_m + other_left_m), ways, config) - _BARRED * behind_barred
+    ahead = distance_scores(left_m + ahead_m + other_m, ways, config) - config.barred_cost * ahead_barred
+    behind = distance_scores(-(one_m + behind_m + other_left_m), ways, config) - config.barred_cost * behind_barred
     ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
-    return np.maximum(stay, np.maximum(ahead, behind))
+    return np.stack([stay, ahead, behind])
 
 
 def distance_scores(displacement_m: Floats, ways: Ways, config: MatchingConfig) -> Floats:
     """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
     plain = np.abs(np.abs(displacement_m) - np.abs(ways.distance_m))
     mismatch = np.where(ways.signed, np.abs(displacement_m - ways.distance_m), plain)
-    scale = config.transition_scale_m + _ODOMETER_SHARE * np.abs(ways.distance_m)
-    return np.asarray(-np.minimum(mismatch / scale, _MISMATCH_LIMIT))
+    scale = config.transition_scale_m + config.transition_share * np.abs(ways.distance_m)
+    return np.asarray(-np.minimum(mismatch / scale, config.mismatch_limit))
 
 
-def best_move(
-    network: Network, one: int, one_m: float, other: int, other_m: float, way: Ways, config: MatchingConfig
-) -> Move | None:
-    """The most plausible move between two places and what lies between, none where the network has none."""
-    limit_m = float(way.limit_m[0])
-    moves = [(0, Move(other_m - one_m, (), 0))] if one == other else []
-    ahead = network.reach(one, limit_m).get(other)
-    if ahead is not None:
-        displacement = network.length_m(one) - one_m + ahead.distance_m + other_m
-        moves.append((ahead.barred_forward, Move(displacement, ahead.between, 1)))
-    behind = network.reach(other, limit_m).get(one)
-    if behind is not None:
-        displacement = -(one_m + behind.distance_m + network.length_m(other) - other_m)
-        moves.append((behind.barred_backward, Move(displacement, behind.between[::-1], -1)))
-    if not moves:
-        return None
-    distances = np.array([move.displacement_m for _, move in moves])
-    scores = distance_scores(distances, way, config) - _BARRED * np.array([barred for barred, _ in moves])
-    return moves[int(np.argmax(scores))][1]
+def best_moves(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, ways: Ways, config: MatchingConfig
+) -> list[Move | None]:
+    """The most plausible move of each pair of places, none where the network has none."""
+    scores = move_scores(network, one, one_m, other, other_m, ways, config)
+    chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
+    rows = zip(chosen.tolist(), one.tolist(), other.tolist(), ways.limit_m.tolist(), strict=True)
+    return [_move(network, *row) for row in rows]
+
+
+def _move(network: Network, chosen: int, one: int, other: int, limit_m: float) -> Move | None:
+    """The move of a row of `move_scores`, -1 for none."""
+    if chosen <= 0:
+        return None if chosen else Move((), 0)
+    if chosen == 1:
+        return Move(network.reach(one, limit_m)[other].between, 1)
+    return Move(network.reach(other, limit_m)[one].between[::-1], -1)
 
 
 def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:

@@ -15,15 +15,8 @@ from pipeline.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
-# No train is faster (the speed record on rails is 160 m/s; scheduled trains stay below 100 m/s), none speeds up, brakes
-# or turns faster (3 m/s² is much), and how fast it was is told by the positions of these last seconds.
-_TOP_SPEED_MPS = 100.0
-_MOST_CHANGE_MPS2 = 5.0
+# How fast the train was is told by positions this far apart, at least and at most [s].
 _SPEED_SPAN_S = (1.0, 5.0)
-# How far odometer and GNSS may differ over a step before it counts as a jump: share, and standard deviations.
-_ODOMETER_SHARE = 0.05
-_JUMP_SIGMAS = 5.0
-_JUMP_MARGIN_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -66,8 +59,6 @@ def travelled(fixes: Fixes, odometry: Odometry | None) -> Travelled:
 
 def steps_of(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Steps:
     """Steps every `step_distance_m` of movement and `step_time_s` of time among the given epochs."""
-    if len(rows) == 0:
-        return resumed(fixes, rows, way)
     moved = np.linalg.norm(np.diff(fixes.points.surface[rows], axis=0), axis=1)
     far = np.floor(np.concatenate([[0.0], np.cumsum(moved)]) / config.step_distance_m)
     late = np.floor((fixes.t_s[rows] - fixes.t_s[rows[0]]) / config.step_time_s)
@@ -89,7 +80,7 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
 
     def reachable(before: Ints, after: Ints) -> Bools:
         velocity = _velocity_mps(fixes, rows, since[before], before)
-        return _reachable(fixes, rows[before], rows[after], velocity, way) | (
+        return _reachable(fixes, rows[before], rows[after], velocity, way, config) | (
             t_s[after] - t_s[before] > config.jump_hold_s
         )
 
@@ -125,7 +116,9 @@ def _velocity_mps(fixes: Fixes, rows: Ints, since: Ints, until: Ints) -> Floats:
     return np.asarray((fixes.points.surface[end] - fixes.points.surface[begin]) / elapsed[:, None])
 
 
-def _reachable(fixes: Fixes, rows: Ints, others: Ints, velocity_mps: Floats, way: Travelled) -> Bools:
+def _reachable(
+    fixes: Fixes, rows: Ints, others: Ints, velocity_mps: Floats, way: Travelled, config: MatchingConfig
+) -> Bools:
     """Whether the train can have been at the positions of both epochs, by odometer or else by its velocity.
 
     Without an odometer a position that falls back is as far from where the train was heading as one that runs ahead.
@@ -136,15 +129,16 @@ def _reachable(fixes: Fixes, rows: Ints, others: Ints, velocity_mps: Floats, way
     aside = np.linalg.norm(moved - velocity_mps * elapsed[:, None], axis=1)
     by_odometer = np.abs(way.between(rows, others))
     variance = 0.5 * (fixes.cov_ee_m2 + fixes.cov_nn_m2)
-    margin = _JUMP_MARGIN_M + _JUMP_SIGMAS * (np.sqrt(variance[rows]) + np.sqrt(variance[others]))
-    heading_there = (apart <= elapsed * _TOP_SPEED_MPS + margin) & ~(aside > _MOST_CHANGE_MPS2 * elapsed**2 + margin)
-    counted = apart <= by_odometer * (1 + _ODOMETER_SHARE) + margin
+    margin = config.jump_margin_m + config.jump_sigmas * (np.sqrt(variance[rows]) + np.sqrt(variance[others]))
+    turned = aside > config.jump_acceleration_mps2 * elapsed**2 + margin
+    heading_there = (apart <= elapsed * config.jump_speed_mps + margin) & ~turned
+    counted = apart <= by_odometer * (1 + config.jump_odometer_share) + margin
     return np.asarray(np.where(np.isfinite(by_odometer), counted, heading_there))
 
 
 def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
     """Given epochs as steps, each with what happened since the one before."""
-    unknown = np.full(min(1, len(rows)), np.nan)
+    unknown = np.full(1, np.nan)
     elapsed = np.concatenate([unknown, np.diff(fixes.t_s[rows])])
     moved = np.diff(fixes.points.surface[rows], axis=0, prepend=np.nan)
     chord = np.linalg.norm(moved, axis=1)

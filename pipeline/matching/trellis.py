@@ -135,7 +135,7 @@ def _pair_moves(trellis: Trellis, steps: Ints) -> tuple[Ints, Floats]:
     )
     first = np.zeros(len(trellis), dtype=np.int64)
     first[steps] = begin[:-1]
-    return first, moves
+    return first, moves.max(axis=0)
 
 
 def _unchanged(trellis: Trellis) -> Bools:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.figures.bounds import threshold_factor
-from pipeline.monitors.axis import AxisSeries, decorrelation_of, error_model, with_memory
+from pipeline.monitors.axis import AxisSeries, errors_of, time_steps
 from pipeline.odometry.odometry import Increments
 from schemas.arrays import Floats, Ints
 from schemas.config import Configuration, MonitorConfig
@@ -20,7 +19,8 @@ class AlongEpochs:
     `epoch`: row among all epochs; `segment`: the odometer's continuity segment; `sigma_m`: of the Gauss-Markov errors;
     `digits_m`: how coarsely positions are written down; `jitter_s`: how the stamps scatter about the receiver's clock;
     `scale_sigma`, `latency_sigma_s`: of the estimates in use; `white_m2_per_s`: what the odometer's distance gathers in
-    a second; `rows_m`: quantisation noise of its rows, `period_s` apart.
+    a second; `rows_m`: quantisation noise of its rows, `period_s` apart, None where the odometer has none at
+    all: the same over a whole run, for the recursions carry each source on.
     """
 
     epoch: Ints
@@ -33,30 +33,25 @@ class AlongEpochs:
     scale_sigma: Floats
     latency_sigma_s: Floats
     white_m2_per_s: Floats | float
-    rows_m: Floats
-    period_s: float
+    rows_m: Floats | None
+    period_s: Floats | float
 
 
 def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuration) -> AxisSeries:
     """Increments from each epoch to the next, with what scale and latency leave uncertain."""
-    dt = np.diff(epochs.t_s, prepend=epochs.t_s[0] - 1.0)
-    fresh = (dt > config.align.gap_reset_s) | (np.diff(epochs.segment, prepend=epochs.segment[0]) != 0)
-    fresh[0] = True
+    dt, fresh = time_steps(epochs.t_s, config.align.gap_reset_s)
     zero = np.zeros(dt.size)
-    shares, taus_s = error_model(config.monitors)
     memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
-    sigmas = [np.outer(np.sqrt(shares), epochs.sigma_m), np.abs(memoryless_m)]
-    decorrelations = [decorrelation_of(dt, taus_s), np.ones(dt.size)]
-    if epochs.rows_m.any():
-        sigmas.append(epochs.rows_m)
-        decorrelations.append(_rows_decorrelation(dt, epochs.period_s, config.monitors))
+    beside = [(np.abs(memoryless_m), np.ones(dt.size))]
+    if epochs.rows_m is not None:
+        beside.append((epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)))
     return AxisSeries(
         epoch=epochs.epoch,
-        fresh=fresh,
+        fresh=fresh | (np.diff(epochs.segment, prepend=epochs.segment[:1]) != 0),
         border=np.zeros(dt.size, dtype=np.bool_),
         dt_s=dt,
-        rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[0]) - odometer.distance_m) / dt,
-        **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T, config.monitors),
+        rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[:1]) - odometer.distance_m) / dt,
+        **errors_of(epochs.sigma_m, dt, beside, config.monitors),
         white_m2=epochs.white_m2_per_s * dt,
         border_m2=zero,
         steady_mps=epochs.scale_sigma * odometer.distance_m / dt,
@@ -64,14 +59,14 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
     )
 
 
-def _rows_decorrelation(dt_s: Floats, period_s: float, config: MonitorConfig) -> Floats:
+def _rows_decorrelation(dt_s: Floats, period_s: Floats | float, config: MonitorConfig) -> Floats:
     """1 - phi of the rows' noise over these steps: none is left from row to row; between them little changes.
 
     The square is what a step changes on a straight line between two rows. Errors that change so little and at random
     would last for `period_s`^2 / dt, and averages would follow them: they have none that lasts longer than half of
     the fastest average's memory. So the variance of all averages is that of rows up to so far apart, or above it.
     """
-    changed = np.minimum(dt_s / max(period_s, 1e-9), 1.0) ** 2
+    changed = np.minimum(dt_s / np.maximum(period_s, 1e-9), 1.0) ** 2
     lasts_s = 0.5 / config.ewma_alphas[0]
     lost: Floats = np.maximum(changed, np.minimum(dt_s / lasts_s, 1.0))
     return lost
@@ -83,5 +78,5 @@ def most_scatter_m(config: Configuration) -> float:
     With more, a position that leaves its place by the failure limit would be no more than rows of the odometer, or the
     digits, make of it. Alarms of a record that scatters by more are its own, but no failure passes.
     """
-    factor = threshold_factor(config.monitors.false_alarm_probability)
+    factor = config.monitors.threshold_factor
     return config.hazards.failure_limit_m / (factor * float(np.sqrt(2.0)))

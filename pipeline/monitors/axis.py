@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -49,13 +50,20 @@ class AxisSeries:
         return AxisSeries(**{item.name: getattr(self, item.name)[low:high] for item in fields(self)})
 
 
-def with_memory(sigma_m: Floats, decorrelation: Floats, config: MonitorConfig) -> dict[str, Floats]:
-    """The error fields of a series from sqrt R_j (m, sources) and 1 - phi_j, best in Fortran order.
+Source = tuple[Floats, Floats]
+"""An error that positions share from row to row: its deviation [m], and 1 - phi over the step to each row."""
 
-    The recursions go along the rows, one source after the other.
+
+def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: MonitorConfig) -> dict[str, Floats]:
+    """The error fields of a series: Gauss-Markov errors of positions of this sigma, and what stands beside them.
+
+    In Fortran order, for the recursions go along the rows, one source after the other.
     """
-    before = before_steps(sigma_m, decorrelation, config.sigma_step_factor)
-    return {"sigma_m": sigma_m, "sigma_before_m": before, "decorrelation": decorrelation}
+    shares, taus_s = error_model(config)
+    model = [(np.sqrt(share) * sigma_m, -np.expm1(-dt_s / tau_s)) for share, tau_s in zip(shares, taus_s, strict=True)]
+    sigmas, decorrelations = (np.vstack(parts).T for parts in zip(*model, *beside, strict=True))
+    before = before_steps(sigmas, decorrelations, config.sigma_step_factor)
+    return {"sigma_m": sigmas, "sigma_before_m": before, "decorrelation": decorrelations}
 
 
 def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
@@ -65,9 +73,12 @@ def error_model(config: MonitorConfig) -> tuple[Floats, Floats]:
     return np.array(shares), np.array(taus)
 
 
-def decorrelation_of(dt_s: Floats, taus_s: Floats) -> Floats:
-    """1 - phi of first-order Gauss-Markov errors over these steps; shape (sources, steps)."""
-    return -np.expm1(-dt_s / taus_s[:, None])
+def time_steps(t_s: Floats, gap_reset_s: float) -> tuple[Floats, Bools]:
+    """Time since the row before [s] (1 s stands in where there is none), and rows that nothing leads to."""
+    dt_s = np.diff(t_s, prepend=t_s[:1] - 1.0)
+    fresh = dt_s > gap_reset_s
+    fresh[:1] = True
+    return dt_s, fresh
 
 
 def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None) -> tuple[Floats, Floats, AxisState]:

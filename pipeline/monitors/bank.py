@@ -117,9 +117,9 @@ class MonitorBank:
     reason` by monitor name. A fail of any monitor at an epoch is an alarm.
     """
 
-    def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration, factor: float):
+    def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
         count = epochs.height
-        alphas = np.array(config.monitors.ewma_alphas)
+        alphas, factor = np.array(config.monitors.ewma_alphas), config.monitors.threshold_factor
         disabled = config.monitors.disabled
         self._axes = tuple(
             _AxisBank(axis, count, alphas, factor, [f"{axis.name}_{scale}" not in disabled for scale in SCALES])

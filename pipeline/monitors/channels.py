@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.epochs.timeline import nominal_period_s
-from schemas.arrays import NS_PER_S
+from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from schemas.arrays import NS_PER_S, times_ns
 
 _PLACE = ("netelement_id", "measure_m", "path_m")
-_LEAST_GAP_S = 1.0
-_GAP_IN_PERIODS = 1.5
 
 
 def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
@@ -66,8 +64,7 @@ def _stamp() -> pl.Expr:
 
 def _gap_ns(epochs: pl.DataFrame) -> int:
     """Longest distance of epochs [ns] over which a position is carried."""
-    period_s = nominal_period_s(epochs["t"].to_physical().to_numpy()) or 0.0
-    return round(max(_GAP_IN_PERIODS * period_s, _LEAST_GAP_S) * NS_PER_S)
+    return round(linking_gap_s(nominal_period_s(times_ns(epochs))) * NS_PER_S)
 
 
 def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:

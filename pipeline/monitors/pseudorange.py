@@ -19,14 +19,12 @@ from scipy.special import chdtri
 from pipeline.monitors.series import NO_POSITION
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
 from pipeline.monitors.single import NO_RANGES, blind_monitor, judged
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
 
 NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
 TOO_FEW = "too few satellites to test the ranges"
 AMBIGUOUS = "the track is ambiguous"
-# Stamps of positions and of satellites that belong together may differ by rounding.
-_TOLERANCE_NS = 1_000_000
 _LEAST_SURVEY_SIGMA_M = 1e-3
 _RIDGE = 1e-13
 _CHUNK = 8192
@@ -40,14 +38,15 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
     """
     if satellites is None or satellites.is_empty():
         return blind_monitor(epochs.height, NO_RANGES)
-    ranges, track = _ranges_by_epoch(epochs, satellites), _track_of(epochs, config)
+    ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
+    track = _track_of(epochs, config)
     value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
     for part in _chunks(ranges, track):
         value[part.epoch], freedom[part.epoch] = _left_over(part), part.freedom
     tested = freedom > 0
     threshold = np.full(epochs.height, np.nan)
     threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
-    return judged(value, threshold, _reasons(epochs, track, ranges, tested, config))
+    return judged(value, threshold, _reasons(epochs, track, ranges, tested))
 
 
 @dataclass(frozen=True)
@@ -78,51 +77,37 @@ class _Track:
     matched: Bools
 
 
-def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame) -> _Ranges:
+def _ranges_by_epoch(epochs: pl.DataFrame, satellites: pl.DataFrame, apart_s: float) -> _Ranges:
     at = epochs.select(t_ns=pl.col("t").to_physical()).with_row_index("epoch")
     kept = (
         satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
         .unique(["t", "sv"], keep="first", maintain_order=True)
         .sort("t", maintain_order=True)
         .with_columns(t_ns=pl.col("t").to_physical())
-        .join_asof(at, on="t_ns", strategy="nearest", tolerance=_TOLERANCE_NS)
+        .join_asof(at, on="t_ns", strategy="nearest", tolerance=round(apart_s * NS_PER_S))
         .drop_nulls("epoch")
     )
-    azimuth, elevation = kept["azimuth_deg"].to_numpy(), kept["elevation_deg"].to_numpy()
-    stated = kept["sigma_m"].cast(pl.Float64).to_numpy().astype(np.float64) ** 2
+    azimuth, elevation, stated = (floats(kept, name) for name in ("azimuth_deg", "elevation_deg", "sigma_m"))
     _, system = np.unique(kept["sv"].str.slice(0, 1).to_numpy(), return_inverse=True)
     return _Ranges(
         kept["epoch"].to_numpy().astype(np.int64),
         system,
         line_of_sight_rows(azimuth, elevation),
         kept["residual_m"].to_numpy(),
-        np.where(np.isfinite(stated), stated, range_variances_m2(elevation).sum(axis=-1)),
+        np.where(np.isfinite(stated), stated**2, range_variances_m2(elevation).sum(axis=-1)),
     )
 
 
 def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
-    heading, slope, cross_m, vertical_m, survey_m, chord_m = (
-        epochs[name].cast(pl.Float64).to_numpy().astype(np.float64)
-        for name in (
-            "heading_deg",
-            "slope",
-            "cross_track_m",
-            "vertical_m",
-            "survey_sigma_m",
-            "interpolation_error_m",
-        )
-    )
+    names = ("heading_deg", "slope", "cross_track_m", "vertical_m", "survey_sigma_m", "interpolation_error_m")
+    heading, slope, cross_m, vertical_m, survey_m, chord_m = (floats(epochs, name) for name in names)
     angle, rise = np.radians(heading), np.arctan(np.nan_to_num(slope))
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
     survey_m = np.hypot(np.maximum(survey_m, _LEAST_SURVEY_SIGMA_M), np.nan_to_num(chord_m))
-    matched = (
-        epochs["fix_valid"].fill_null(False).to_numpy()
-        & epochs["on_track"].fill_null(False).to_numpy()
-        & np.isfinite(cross_m)
-        & np.isfinite(heading)
-    )
+    matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
+    sure = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
@@ -132,15 +117,9 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
         offset_m=offset,
         sigma_m=survey_m,
         height_known=known,
-        usable=matched & _unambiguous(epochs, config),
+        usable=matched & sure,
         matched=matched,
     )
-
-
-def _unambiguous(epochs: pl.DataFrame, config: Configuration) -> Bools:
-    """The causal probability of the path is good enough to hold the position on it."""
-    sure = epochs["gate_probability"] >= config.matching.ambiguity_probability
-    return sure.fill_null(False).to_numpy()
 
 
 @dataclass(frozen=True)
@@ -165,7 +144,8 @@ class Equations:
 
 def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Iterator[Equations]:
     """The equations that the monitor tests, some thousand epochs at once; arguments as of `pseudorange_monitor`."""
-    return _chunks(_ranges_by_epoch(epochs, satellites), _track_of(epochs, config))
+    ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
+    return _chunks(ranges, _track_of(epochs, config))
 
 
 def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
@@ -225,7 +205,7 @@ def normal_of(design: Floats, weight: Floats, prior: Floats) -> Floats:
     return np.asarray(normal)
 
 
-def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Bools, config: Configuration) -> pl.Series:
+def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Bools) -> pl.Series:
     seen = np.isin(np.arange(epochs.height), ranges.epoch)
     return pl.select(
         pl.when(pl.Series(tested))

@@ -9,9 +9,9 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.monitors.along import AlongEpochs, along_series
-from pipeline.monitors.axis import AxisSeries, decorrelation_of, error_model, with_memory
+from pipeline.monitors.axis import AxisSeries, Source, errors_of, time_steps
 from pipeline.odometry.odometry import Increments
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
 
 NO_POSITION = "no position"
@@ -34,7 +34,7 @@ class Axis:
 
 def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Axis]:
     """Along, cross and up (DIAG eq. 1-3 and 10-15) from aligned epochs of one solution."""
-    t_ns = epochs["t"].dt.timestamp("ns").to_numpy()
+    t_ns = times_ns(epochs)
     t_s = (t_ns - t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
     along_reasons = _first_of(matched, epochs["odometer_reason"])
@@ -62,7 +62,6 @@ def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
     return _first_of(
         _where(~epochs["fix_valid"], NO_POSITION),
         _where(~epochs["near_track"], OFF_TRACK),
-        _where(epochs["path_m"].is_null(), NO_POSITION),
         _where(no_sigma, NO_SIGMA),
     )
 
@@ -73,20 +72,14 @@ class _Builder:
     def __init__(self, epochs: pl.DataFrame, t_s: Floats, config: Configuration) -> None:
         self._epochs = epochs
         self._t_s = t_s
-        self._gap_reset_s = config.align.gap_reset_s
-        self._survey_default_m = config.matching.survey_sigma_default_m
-        self._wander_m, self._wander_length_m = config.monitors.survey_wander_m, config.monitors.survey_wander_length_m
-        self._shares, self._taus_s = error_model(config.monitors)
         self._config = config
 
     def _column(self, name: str, rows: Ints) -> Floats:
-        values: Floats = self._epochs[name].to_numpy().astype(np.float64)[rows]
-        return values
+        return floats(self._epochs, name)[rows]
 
     def along(self, reasons: pl.Series) -> AxisSeries:
         rows = np.flatnonzero(reasons.is_null().to_numpy())
-        if rows.size == 0:
-            return _empty(self._shares.size + 1)
+        rows_m = self._column("odometer_rows_m", rows)
         odometer = Increments(_steps(self._column("odometer_m", rows)), _steps(self._column("speed_mps", rows)))
         epochs = AlongEpochs(
             epoch=rows,
@@ -99,26 +92,20 @@ class _Builder:
             scale_sigma=self._column("scale_sigma", rows),
             latency_sigma_s=self._column("latency_sigma_s", rows),
             white_m2_per_s=self._column("odometer_white_m2_per_s", rows),
-            rows_m=self._column("odometer_rows_m", rows),
-            period_s=float(self._epochs["odometer_period_s"][0]),
+            rows_m=rows_m if rows_m.any() else None,
+            period_s=self._column("odometer_period_s", rows),
         )
         return along_series(epochs, odometer, self._config)
 
     def across(self, reasons: pl.Series, position: str, sigma: str, digits: str) -> AxisSeries:
         """Cross-track or vertical; the chord error of a coarse survey counts as one more correlated source."""
         rows = np.flatnonzero(reasons.is_null().to_numpy())
-        if rows.size == 0:
-            return _empty(self._shares.size)
-        dt, fresh = self._time_steps(rows)
+        dt, fresh = time_steps(self._t_s[rows], self._config.align.gap_reset_s)
         border = _changes(self._epochs["netelement_id"].rle_id().to_numpy()[rows])
-        survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._survey_default_m)
-        sigmas = [*np.outer(np.sqrt(self._shares), self._column(sigma, rows))]
-        decorrelations = [*decorrelation_of(dt, self._taus_s)]
+        survey = np.nan_to_num(self._column("survey_sigma_m", rows), nan=self._config.matching.survey_sigma_default_m)
         coarse = self._column(digits, rows), np.ones(rows.size)
-        for error, decorrelation in (self._chord_error(rows), self._wander(rows), coarse):
-            if error.any():  # mostly there is at most one of them
-                sigmas.append(error)
-                decorrelations.append(decorrelation)
+        # Mostly there is at most one of them.
+        beside = [source for source in (self._chord_error(rows), self._wander(rows), coarse) if source[0].any()]
         zero = np.zeros(rows.size)
         return AxisSeries(
             epoch=rows,
@@ -126,7 +113,7 @@ class _Builder:
             border=border,
             dt_s=dt,
             rate_mps=_steps(self._column(position, rows)) / dt,
-            **with_memory(np.vstack(sigmas).T, np.vstack(decorrelations).T, self._config.monitors),
+            **errors_of(self._column(sigma, rows), dt, beside, self._config.monitors),
             white_m2=zero,
             border_m2=2.0 * survey**2,
             steady_mps=self._turned_mps(rows) if position == "cross_track_m" else zero,
@@ -138,13 +125,14 @@ class _Builder:
         turning = self._column("curvature_per_m", rows) * self._column("speed_mps", rows)
         return np.nan_to_num(turning) * self._column("calibrated_along_m", rows)
 
-    def _wander(self, rows: Ints) -> tuple[Floats, Floats]:
+    def _wander(self, rows: Ints) -> Source:
         """How a 2-D survey of no stated accuracy wanders along its elements [m], and its decorrelation."""
+        config = self._config.monitors
         unstated = np.isnan(self._column("survey_sigma_m", rows)) & np.isnan(self._column("vertical_m", rows))
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
-        return np.where(unstated, self._wander_m, 0.0), -np.expm1(-way / self._wander_length_m)
+        return np.where(unstated, config.survey_wander_m, 0.0), -np.expm1(-way / config.survey_wander_length_m)
 
-    def _chord_error(self, rows: Ints) -> tuple[Floats, Floats]:
+    def _chord_error(self, rows: Ints) -> Source:
         """The polyline's chord error [m] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
         curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))
@@ -152,25 +140,12 @@ class _Builder:
         way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
         return error, -np.expm1(-way / np.maximum(length, 1.0))
 
-    def _time_steps(self, rows: Ints) -> tuple[Floats, Bools]:
-        """Time since the row before [s] (1 s stands in where there is none) and rows that nothing leads to."""
-        dt = np.diff(self._t_s[rows], prepend=self._t_s[rows[0]] - 1.0)
-        fresh = dt > self._gap_reset_s
-        fresh[0] = True
-        return dt, fresh
-
 
 def _steps(values: Floats) -> Floats:
-    return np.diff(values, prepend=values[0])
+    return np.diff(values, prepend=values[:1])
 
 
 def _changes(values: npt.NDArray[np.generic]) -> Bools:
     changed = np.zeros(values.size, dtype=np.bool_)
     changed[1:] = values[1:] != values[:-1]
     return changed
-
-
-def _empty(sources: int) -> AxisSeries:
-    none, many = np.zeros(0), np.zeros((0, sources))
-    no, index = np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.int64)
-    return AxisSeries(index, no, no, none, none, many, many, many, none, none, none, none)

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.monitors.channels import paired
 from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
-from schemas.arrays import Floats, floats
+from schemas.arrays import Floats, floats, times_ns
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 
@@ -20,7 +20,6 @@ NO_VALUE = "nothing to compute it from"
 NO_RANGES = "no satellites stream"
 NO_OTHER_SOLUTION = "no other solution configured to compare with"
 NO_OTHER_EPOCH = "the other solution has no position at this epoch"
-_WINDOW_S = 1.0
 _STATES = pl.Enum([state.value for state in MonitorState])
 
 
@@ -60,15 +59,16 @@ def blind_monitor(epochs: int, reason: str) -> pl.DataFrame:
     return judged(nothing, nothing, pl.Series([reason] * epochs, dtype=pl.String))
 
 
-def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) -> pl.DataFrame:
+def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """GNSS velocity along track against odometer speed, both over the second before [m/s].
 
     Tells an odometer fault (slip, slide, radar on wet ground) from a fault of GNSS positions (DOMAIN section 3).
     """
-    t_s = (epochs["t"].dt.timestamp("ns") - epochs["t"].dt.timestamp("ns")[0]).to_numpy() * 1e-9
+    t_ns = times_ns(epochs)
+    t_s = (t_ns - t_ns[0]) * 1e-9
     velocity = floats(epochs, "velocity_along_mps")
     usable = np.isfinite(velocity) & epochs["odometer_reason"].is_null().to_numpy() & epochs["fix_valid"].to_numpy()
-    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy())
+    first, span = _window(t_s, usable, epochs["odometer_segment"].to_numpy(), config)
     total = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity, np.nan)))])[:-1]
     by_doppler = (total - total[first]) / span
     odometer = floats(epochs, "odometer_m")
@@ -93,11 +93,11 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration, factor: float) 
         .then(pl.lit(NO_POSITION))
         .otherwise(pl.lit(FIRST_EPOCH))
     ).to_series()
-    return judged(by_doppler - by_odometer, factor * np.sqrt(variance), reasons)
+    return judged(by_doppler - by_odometer, config.monitors.threshold_factor * np.sqrt(variance), reasons)
 
 
 def channel_monitor(
-    epochs: pl.DataFrame, other: pl.DataFrame | None, factor: float, absent: str = NO_OTHER_SOLUTION
+    epochs: pl.DataFrame, other: pl.DataFrame | None, config: Configuration, absent: str = NO_OTHER_SOLUTION
 ) -> pl.DataFrame:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
@@ -112,25 +112,26 @@ def channel_monitor(
     pairs = paired(epochs.select("t", path_m=placed), usable)
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
     value = floats(pairs, "path_m") - floats(met, "path_m")
-    threshold = factor * np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
+    both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
     reasons = epochs.select(
         pl.when(~pl.col("fix_valid") | ~pl.col("on_track") | pl.col("sigma_along_m").is_null())
         .then(pl.lit(NO_POSITION))
         .when(met["path_m"].is_null() | met["sigma_along_m"].is_null())
         .then(pl.lit(NO_OTHER_EPOCH))
     ).to_series()
-    return judged(value, threshold, reasons)
+    return judged(value, config.monitors.threshold_factor * both_m, reasons)
 
 
 def _window(
-    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64]
+    t_s: Floats, usable: npt.NDArray[np.bool_], segment: npt.NDArray[np.int64], config: Configuration
 ) -> tuple[npt.NDArray[np.int64], Floats]:
-    """Epoch at least a second before, and the time since; NaN unless all in between are usable and connected."""
-    first = np.maximum(np.searchsorted(t_s, t_s - _WINDOW_S * (1.0 - 1e-6), side="right") - 1, 0)
+    """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between are usable and connected."""
+    least_s = config.align.speed_window_s * (1.0 - 1e-6)
+    first = np.maximum(np.searchsorted(t_s, t_s - least_s, side="right") - 1, 0)
     bad = np.concatenate([[0], np.cumsum(~usable)])
     clean = bad[np.arange(t_s.size) + 1] == bad[first]
     span = t_s - t_s[first]
-    connected = clean & (span >= _WINDOW_S * (1.0 - 1e-6)) & (span <= 2.5 * _WINDOW_S)
+    connected = clean & (span >= least_s) & (span <= config.monitors.doppler_gap_s)
     connected &= segment == segment[first]
     return first, np.where(connected, span, np.nan)
 

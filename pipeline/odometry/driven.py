@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.figures.bounds import SURE_SIGMAS
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
+from schemas.config import AlignConfig
 
 # Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
 _NEAR_SIGMAS = 2.0
 
 
-def hysteresis_m(sigma_m: Floats) -> Floats:
+def hysteresis_m(sigma_m: Floats, config: AlignConfig) -> Floats:
     """By how much the distance may leave what is held of it before it has moved [m]."""
-    return SURE_SIGMAS * sigma_m
+    return config.sure_sigmas * sigma_m
 
 
 def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
@@ -37,6 +37,20 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
         values.append(at)
     held[rows] = values
     return held
+
+
+def turns_of(distance_m: Floats, back_m: float) -> tuple[Ints, Ints, Ints]:
+    """Where the train turned, where that showed by its coming back so far, and the sense from then on (+1 or -1).
+
+    The distance grows at first, as far as anybody knows.
+    """
+    # A hysteresis half as wide, that has come from below.
+    width_m = np.full(distance_m.size + 1, 0.5 * back_m)
+    held = with_hysteresis(np.concatenate([distance_m[:1] - back_m, distance_m]), width_m)
+    moves = np.flatnonzero(np.diff(held))
+    sense = np.sign(np.diff(held)[moves]).astype(np.int64)
+    turns = np.flatnonzero(sense[1:] != sense[:-1])
+    return moves[turns], moves[turns + 1], sense[turns + 1]
 
 
 def driven_m(distance_m: Floats, width_m: Floats) -> Floats:
@@ -74,12 +88,15 @@ def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.where(moving, way, since))])
 
 
-def evenly_driven(t_s: Floats, distance_m: Floats, width_m: Floats, least_mps: float) -> tuple[Floats, Floats]:
+def evenly_driven(
+    t_s: Floats, distance_m: Floats, sigma_m: Floats, least_mps: float, config: AlignConfig
+) -> tuple[Floats, Floats]:
     """Times and distances [m] between which the train drove evenly, after the fact; slower than this it stood.
 
     From one row that moves the held distance to the next. Where that is a stand, it moved no sooner than from the last
     row about where it stood.
     """
+    width_m = hysteresis_m(sigma_m, config)
     held = with_hysteresis(distance_m, width_m)
     steps = np.diff(held, prepend=np.nan)
     # A width that falls with the speed moves what is held too, but not the train.
@@ -92,7 +109,7 @@ def evenly_driven(t_s: Floats, distance_m: Floats, width_m: Floats, least_mps: f
     for gap in np.flatnonzero(stood & (gaps > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
         stood_m = float(np.median(distance_m[between]))
-        near = np.abs(distance_m[between] - stood_m) <= _NEAR_SIGMAS / SURE_SIGMAS * width_m[between]
+        near = np.abs(distance_m[between] - stood_m) <= _NEAR_SIGMAS * sigma_m[between]
         last = between.start + int(np.flatnonzero(near)[-1]) if near.any() else between.start
         at_s.insert(gap + 1, float(t_s[last]))
         at_m.insert(gap + 1, stood_m)

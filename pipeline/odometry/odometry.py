@@ -16,9 +16,6 @@ from pipeline.odometry.rows import leaps, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 
-# Speeds are means over this time: the noise of single rows is no speed.
-SPEED_WINDOW_S = 1.0
-
 
 class Way(NamedTuple):
     """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known."""
@@ -66,6 +63,7 @@ class Odometry:
     slip: Bools
     noise: Noise
     deadband_mps: float
+    config: AlignConfig
     period_s: float = 0.0
     scale: float | None = None
     scale_sigma: float | None = None
@@ -164,7 +162,7 @@ class Odometry:
 
     def speed_at_s(self, t_s: Floats) -> Floats:
         """Mean speed over the second before [m/s]: causal, and free of the noise of single samples."""
-        start = np.maximum(t_s - SPEED_WINDOW_S, self.t_s[0])
+        start = np.maximum(t_s - self.config.speed_window_s, self.t_s[0])
         span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, 1e-9)
         speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
         return speed
@@ -182,25 +180,20 @@ class Odometry:
         return before, after
 
     @cached_property
-    def _width_m(self) -> Floats:
-        """Hysteresis of each sample."""
-        return hysteresis_m(self.row_sigma_m(self.t_s))
-
-    @cached_property
     def _moving_s(self) -> tuple[Floats, Floats]:
         """Times [s], and the time moving up to each [s]."""
         at_s, at_m = self.t_s, self.distance_m
         if self.noise.quantisation:
-            at_s, at_m = evenly_driven(at_s, at_m, self._width_m, self.deadband_mps)
-        moving = moving_steps(at_s, at_m, self.deadband_mps, SPEED_WINDOW_S)
+            at_s, at_m = evenly_driven(at_s, at_m, self.row_sigma_m(at_s), self.deadband_mps, self.config)
+        moving = moving_steps(at_s, at_m, self.deadband_mps, self.config.speed_window_s)
         return at_s, _sums(np.where(moving, np.diff(at_s), 0.0))
 
     @cached_property
     def _travelled_m(self) -> Floats:
         """Way driven up to each sample."""
         if self.noise.quantisation:
-            return driven_m(self.distance_m, self._width_m)
-        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, SPEED_WINDOW_S)
+            return driven_m(self.distance_m, hysteresis_m(self.row_sigma_m(self.t_s), self.config))
+        moving = moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
         return driven_or_left_m(self.distance_m, moving)
 
 
@@ -247,6 +240,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
         leaps_ns=_leaps_ns(stream, align),
+        config=align,
     )
 
 

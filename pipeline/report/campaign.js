@@ -1,22 +1,34 @@
 "use strict";
 // The page of a campaign: distributions, and where on the network positions could be had.
 (() => {
-  const { COLOUR, PASSAGE, LINES, axis, data, draw, empty, layout } = Plots;
-  const OUTCOMES = [
-    ["within the budget", COLOUR.blue, ""], ["beyond it", COLOUR.vermilion, "x"], ["not known", COLOUR.grey, "."],
-  ];
+  const { data, draw, empty } = Plots;
+  const OUTCOMES = [["in time", "right"], ["too late", "wrong"], ["could not be checked", "unknown"]];
+  const OFFERS = [["right", "accepted, right"], ["read", "balise reads"], ["lost", "lost"], ["unknown", "accepted, could not be checked"], ["wrong", "accepted at a wrong place"]];
   const LEAST_S = 0.05;
 
   // What nobody could have seen was not found either.
   const noHazard = (own) => `No hazard was found; ${own.runs_with_truth} of ${own.runs} runs had a truth to find one by.`;
 
+  // Bars on bars: `rows` of [x0, x1, [count per series]].
+  function stacked(series, rows) {
+    const layers = series.map(([name, tone]) => ({ type: "bars", name, tone, items: [] }));
+    let most = 1;
+    for (const [x0, x1, counts] of rows) {
+      let base = 0;
+      counts.forEach((count, index) => {
+        if (count) layers[index].items.push([x0, x1, base, base + count, `${series[index][0]}: ${count}`]);
+        base += count;
+      });
+      most = Math.max(most, base);
+    }
+    return [layers.filter((layer) => layer.items.length), most * 1.05];
+  }
+
   function classesPlot(id, own) {
     if (!own.hazards) { empty(id, noHazard(own)); return; }
-    const traces = OUTCOMES.map(([name, color, pattern], index) => ({
-      type: "bar", name, x: own.classes.map((row) => row[0]), y: own.classes.map((row) => row[1 + index]),
-      marker: { color, pattern: Plots.pattern(color, pattern) },
-    }));
-    draw(id, traces, layout(300, { barmode: "stack", yaxis: axis("hazards", { tickformat: "d", rangemode: "tozero" }), xaxis: axis("") }));
+    const [layers, most] = stacked(OUTCOMES, own.classes.map(([, ...counts], at) => [at - 0.3, at + 0.3, counts]));
+    draw(id, { height: 240, layers, x: { kind: "names", names: own.classes.map((row) => row[0]), lo: -0.6, hi: own.classes.length - 0.4 },
+      y: { lo: 0, hi: most, title: "hazards" } });
   }
 
   // Share that had happened by then; what happened within one epoch stands at the left edge of the logarithmic axis.
@@ -24,79 +36,77 @@
     if (!total || !times.length) return null;
     const x = [LEAST_S / 2];
     const y = [0];
-    times.forEach((time, index) => { x.push(Math.max(time, LEAST_S)); y.push((index + 1) / total); });
-    x.push(Math.max(1000, 10 * x[x.length - 1]));
+    times.forEach((time, index) => {
+      const at = Math.max(time, LEAST_S);
+      x.push(at, at);
+      y.push(index / total, (index + 1) / total);
+    });
+    x.push(1e6);
     y.push(times.length / total);
-    return { type: "scatter", mode: "lines", name: `${name}: ${times.length} of ${total}`, x, y,
-      line: { color: look[0], dash: look[1], shape: "hv", width: 2 } };
+    return { type: "line", name: `${name}: ${times.length} of ${total}`, x, y, look };
   }
 
   function detectionPlot(id, own) {
-    const traces = [
-      shareCurve(own.time_to_detect_s, own.hazards, "detected, T_D", LINES[0]),
-      shareCurve(own.hazardous_s, own.failures, "in use no longer, hazardous time with what is unknown", LINES[5]),
+    const layers = [
+      shareCurve(own.time_to_detect_s, own.hazards, "detected, T_D", "a"),
+      shareCurve(own.hazardous_s, own.failures, "in use no longer, unknown time included", "b"),
     ].filter(Boolean);
-    if (!traces.length) { empty(id, own.hazards ? `None of ${own.hazards} hazards was detected.` : noHazard(own)); return; }
-    const shapes = data.levels.map(([, allowed]) => ({ type: "line", x0: allowed, x1: allowed, yref: "paper", y0: 0, y1: 1,
-      line: { color: COLOUR.grey, dash: "dash", width: 1.2 } }));
-    const annotations = data.levels.map(([name, allowed], index) => ({ x: Math.log10(allowed), yref: "paper",
-      y: 0.05 + 0.09 * (index % 4), xanchor: "left", showarrow: false, text: ` ${name} ${allowed.toPrecision(4)} s` }));
-    draw(id, traces, layout(360, {
-      xaxis: axis(`time [s], at most ${LEAST_S} s at the left edge`, { type: "log", range: [Math.log10(LEAST_S / 2), 3] }),
-      yaxis: axis("share", { range: [0, 1.05], tickformat: ".0%" }), shapes, annotations, showlegend: true,
-    }));
+    if (!layers.length) { empty(id, own.hazards ? `None of ${own.hazards} hazards was detected.` : noHazard(own)); return; }
+    const notes = data.levels.map(([name, allowed], index) => [allowed, 0.06 + 0.08 * (index % 4), `${name} ${Scales.number(allowed)} s`]);
+    draw(id, { height: 320, layers, notes, rules: data.levels.map(([, allowed]) => ({ x: allowed })),
+      x: { kind: "log", lo: Math.log10(LEAST_S / 2), hi: 3, title: `time [s], at most ${LEAST_S} s at the left edge` },
+      y: { lo: 0, hi: 1.05, title: "share" } });
   }
 
   function locationPlot(id, own) {
     if (!own.location.length) { empty(id, "No location error is known."); return; }
-    const traces = Object.entries(PASSAGE).map(([status, [color]]) => {
-      const rows = own.location.filter((row) => row[0] === status);
-      return { type: "bar", name: status.replace("_", " "), x: rows.map((row) => row[1] + 0.5), y: rows.map((row) => row[2]),
-        width: 1, marker: { color }, hovertemplate: "%{x:.1f} m: %{y}<extra>%{fullData.name}</extra>" };
-    }).filter((trace) => trace.x.length);
+    const bins = new Map();
+    for (const [outcome, at, count] of own.location) {
+      if (!bins.has(at)) bins.set(at, OFFERS.map(() => 0));
+      bins.get(at)[OFFERS.findIndex(([key]) => key === outcome)] += count;
+    }
+    const [layers, most] = stacked(OFFERS.map(([tone, name]) => [name, tone]), [...bins].map(([at, counts]) => [at, at + 1, counts]));
     const limit = data.limits.failure_limit_m;
-    const reach = Math.max(...own.location.map((row) => Math.abs(row[1]))) + 2;
-    draw(id, traces, layout(300, {
-      barmode: "stack", showlegend: true, yaxis: axis("offers"),
-      xaxis: axis("location error [m], beyond 50 m in the last bins", { range: [-reach, reach] }),
-      shapes: [-limit, limit].filter((x) => Math.abs(x) < reach).map((x) => ({ type: "line", x0: x, x1: x, yref: "paper",
-        y0: 0, y1: 1, line: { color: COLOUR.vermilion, dash: "dash", width: 1.2 } })),
-    }));
+    const reach = Math.max(...[...bins.keys()].map(Math.abs)) + 3;
+    draw(id, { height: 280, layers, y: { lo: 0, hi: most, title: "offers" },
+      x: { lo: -reach, hi: reach, title: "location error [m], beyond 50 m in the last bins" },
+      rules: [-limit, limit].filter((x) => Math.abs(x) < reach).map((x) => ({ x })) });
   }
 
-  const CLASSES = [
-    [0.999, "all epochs", COLOUR.blue, "solid"], [0.95, "95 % and more", COLOUR.sky, "solid"],
-    [0.5, "50 % and more", COLOUR.orange, "solid"], [0, "less than half", COLOUR.vermilion, "solid"],
-  ];
+  const CLASSES = [[0.999, "all epochs", "m1"], [0.95, "95 % and more", "m2"], [0.5, "50 % and more", "m3"], [0, "less than half", "m4"]];
 
-  function mapPlot(id, own) {
-    const map = own.map;
-    if (!map.pieces.length) { empty(id, "No position of a moving train was matched to the track."); return; }
-    const lines = map.track.map((one, index) => ({ type: "scatter", mode: "lines", name: "track", legendgroup: "track",
-      showlegend: index === 0, x: one.x, y: one.y, line: { color: COLOUR.grey, width: 1.5 }, hoverinfo: "skip" }));
-    const groups = CLASSES.map(([least, name, color], index) => {
+  function mapLayers(map) {
+    const lines = map.track.map((one, index) => ({ type: "line", look: "track", name: index ? "" : "track", x: one.x, y: one.y }));
+    const groups = CLASSES.map(([least, name, look], index) => {
       const most = index ? CLASSES[index - 1][0] : Infinity;
-      const trace = { type: "scatter", mode: "lines", name, x: [], y: [], text: [], line: { color, width: 4 + 2 * index },
-        hovertemplate: "%{text}<extra></extra>" };
+      const layer = { type: "line", name, look, x: [], y: [] };
       for (const piece of map.pieces) {
         if (piece.share < least || piece.share >= most) continue;
-        const text = `${piece.name}, ${piece.from_m} to ${piece.to_m} m: ${(100 * piece.share).toFixed(1)} % of ${piece.epochs} epochs`;
-        trace.x.push(...piece.x, null);
-        trace.y.push(...piece.y, null);
-        trace.text.push(...piece.x.map(() => text), null);
+        layer.x.push(...piece.x, null);
+        layer.y.push(...piece.y, null);
       }
-      return trace;
-    }).filter((trace) => trace.x.length);
-    const hazards = { type: "scatter", mode: "markers", name: "hazard", x: map.hazards.map((one) => one[0]),
-      y: map.hazards.map((one) => one[1]), text: map.hazards.map((one) => one[2]), hovertemplate: "%{text}<extra></extra>",
-      marker: { symbol: "x", size: 11, color: COLOUR.purple, line: { width: 1, color: "#000000" } } };
-    if (map.hazards.length) groups.push(hazards);
-    const axes = map.geographic
-      ? { xaxis: axis("east [m]"), yaxis: axis("north [m]", { scaleanchor: "x", scaleratio: 1 }) }
-      : { xaxis: axis("measure on the net element [m]"),
-        yaxis: axis("", { tickvals: map.elements.map((_, i) => i), ticktext: map.elements, range: [-0.7, map.elements.length - 0.3] }) };
-    const height = map.geographic ? 420 : Math.min(900, 120 + 34 * map.elements.length);
-    draw(id, [...lines, ...groups], layout(height, { ...axes, showlegend: true }));
+      return layer;
+    }).filter((layer) => layer.x.length);
+    const places = map.pieces.filter((piece) => piece.x.length);
+    const middles = { type: "marks", tone: "none", shape: ["circle", 0], x: places.map((piece) => piece.x[piece.x.length >> 1]),
+      y: places.map((piece) => piece.y[piece.y.length >> 1]),
+      tell: (i) => `${places[i].name}, ${places[i].from_m} to ${places[i].to_m} m: ${(100 * places[i].share).toFixed(1)} % of ${places[i].epochs} epochs` };
+    const hazards = { type: "marks", tone: "hazard", name: "hazard", x: map.hazards.map((one) => one[0]),
+      y: map.hazards.map((one) => one[1]), tell: (i) => map.hazards[i][2] };
+    return [...lines, ...groups, middles, ...(map.hazards.length ? [hazards] : [])];
+  }
+
+  function mapPlot(id, own, box = null) {
+    const map = own.map;
+    if (!map.pieces.length) { empty(id, "No position of a moving train was matched to the track."); return; }
+    const layers = mapLayers(map);
+    const [xs, ys] = ["x", "y"].map((key) => map.pieces.flatMap((piece) => piece[key]));
+    const names = { kind: "names", names: map.elements, lo: -0.7, hi: map.elements.length - 0.3 };
+    const [x, y] = box ?? [Plots.range(xs, 100), map.geographic ? Plots.range(ys, 100) : names];
+    draw(id, { height: map.geographic ? 420 : Math.min(900, 90 + 34 * map.elements.length), layers, equal: map.geographic,
+      x: { ...x, title: map.geographic ? "east [m]" : "measure on the net element [m]" },
+      y: map.geographic ? { ...y, title: "north [m]" } : names,
+      zoomBox: (wx, wy) => mapPlot(id, own, [{ lo: wx[0], hi: wx[1] }, { lo: wy[0], hi: wy[1] }]), whole: () => mapPlot(id, own) });
   }
 
   data.order.forEach((name, index) => {
@@ -106,5 +116,15 @@
     locationPlot(`plot-s${index}-location`, own);
     mapPlot(`plot-s${index}-map`, own);
   });
+
+  // Keys go from link to link: hazards, and runs.
+  function step(selector, by) {
+    const links = [...document.querySelectorAll(selector)].filter((link) => !link.closest("tr").hidden);
+    if (!links.length) return;
+    const at = links.indexOf(document.activeElement);
+    links[at < 0 ? (by > 0 ? 0 : links.length - 1) : (at + by + links.length) % links.length].focus();
+  }
+  Plots.keys({ n: () => step("a[data-hazard]", 1), p: () => step("a[data-hazard]", -1),
+    "]": () => step("a[data-run]", 1), "[": () => step("a[data-run]", -1) });
   document.body.dataset.ready = "yes";
 })();

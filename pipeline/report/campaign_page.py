@@ -8,13 +8,14 @@ from html import escape
 
 import polars as pl
 
-from pipeline.campaign.outcome import worst
 from pipeline.figures.campaign_figures import failures_of
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts, word_of
 from pipeline.report.architectures import architectures_section
 from pipeline.report.availability import availability_map
+from pipeline.report.balises import balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
+from pipeline.report.headline import campaign_headline, run_headline, wrong_acceptances
 from pipeline.report.markup import (
     Cell,
     Json,
@@ -26,12 +27,14 @@ from pipeline.report.markup import (
     pairs,
     script_json,
     section,
+    tiles,
     verdict_head,
 )
 from pipeline.report.run_page import Made, configuration, hazard_cell
+from pipeline.report.words import plural
 from pipeline.safety.sentences import level_statements, plain_statements
-from schemas.campaign import CampaignBalises, CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
-from schemas.enums import TRUTH, Hazard, RunStatus, RunVerdict
+from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
+from schemas.enums import TRUTH, Hazard, RunVerdict
 from schemas.tables import Hazards
 
 
@@ -51,39 +54,40 @@ class Campaign:
 
 
 RUN_COLUMNS = (
-    *("verdict", "run_id", "status", "error", "notes", "solution", "share_unknown", "duration_s", "distance_m"),
-    *("availability", "evidence", *HAZARD_COUNTS, "hazards_detected", "missed_detections", "time_to_detect_max_s"),
-    *("hazardous_max_s", "balises_accepted", "balises_on_path", "unsafe_accepted", "unproven_accepted", "failures"),
-    *("failures_within_budget", "location_error_p95_m", "along_error_p95_m", "alarms", "false_alarms"),
-    *("exposure_max_s", "outages"),
+    *("verdict", "run_id", "why", "unsafe_accepted", "failures_beyond_budget", "missed_detections"),
+    *("unproven_accepted", "share_unknown", "balises_accepted", "balises_on_path", "location_error_max_m"),
+    *("hazards", "hazardous_max_s", "time_to_detect_max_s", "alarms", "false_alarms", "availability", "outages"),
+    *("evidence", "solution", "t_start", "duration_s", "distance_m", "status", "notes", "input_digest"),
 )
 _HAZARD_COLUMNS = (
-    *("run_id", "hazard", "failure_mode", "size_m", "t_onset", "monitor", "time_to_detect_s", "time_since_failure_s"),
-    *("hazardous_s", "hazardous_may_s", "within_budget", "balise_ids", "accepted_ids", "suspect"),
-)
-_BALISE_COLUMNS = (
-    *("balise_id", "kind", "passages", "accepted", "accepted_share", "deletions", "deletion_rate", "accepted_judged"),
-    *("unsafe_accepted", "unsafe_rate", "unproven_accepted", "location_error_mean_m", "location_error_max_m"),
+    *("run_id", "hazard", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
+    *("hazardous_s", "hazardous_may_s", "size_m", "balise_ids", "failure_mode", "t_onset", "suspect"),
 )
 _LEVEL_COLUMNS = ("service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged", "within_share")
 _PLOTS = (
-    ("classes", "Hazards by class", "Within the budget, beyond it, not known."),
-    ("detection", "Time to detect", "Share of all hazards detected by then, and of all failures in use no longer; "
-     "vertical lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never "
+    ("classes", "Hazards by class", "In time, too late, could not be checked."),
+    ("detection", "Time to detect", "Share of all hazards detected by then, and of all wrong positions in use no "
+     "longer; upright lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never "
      "detected."),
-    ("location", "Location error at VBs", "Positive: offered early. Offers by what became of them."),
+    ("location", "Location error at virtual balises", "Positive: offered early. Offers by what became of them."),
     ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; crosses are hazards."),
 )  # fmt: skip
+_RANK = {RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
+_FAILED_RANK = 1
+_SHORT = 12
 
 
 def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
+    head, named = campaign_headline(campaign.runs, campaign.passages, campaign.hazards, made.config)
     body = [
+        tiles(_verdict_tiles(campaign.runs)),
+        pairs(_facts(campaign, solutions)),
+        section("runs", "Runs", _runs_table(campaign, made)),
         *(_solution(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
         _map_in_doubt(campaign.derived["map"]),
-        section("runs", "Runs", _run_counts(campaign.runs), _runs_table(campaign)),
         section("provenance", "Provenance", _provenance(campaign.runs), _budget(made), configuration(made)),
     ]
     safety = made.config.safety
@@ -93,70 +97,131 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
         "levels": [[level, safety.allowed_time_to_detect_s(level)] for level in safety.service_levels],
         "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
     }
-    verdicts = run_verdicts(campaign.runs)
-    head = head_of(verdicts.values())
-    counts = ", ".join(f"{count} {name}" for name, count in head.counts().items())
-    heading = verdict_head(head.word, f"{counts}.") + f"<h1>Campaign of {len(verdicts)} runs</h1>"
-    return page("Campaign · balise", heading, "\n".join(body), script_json(data), "assets", "campaign.js")
+    way = "" if named is None else f'<p class="ways">{link(campaign.hrefs[named], f"Open run {named}")}</p>'
+    count = plural(campaign.runs["run_id"].n_unique(), "run")
+    heading = verdict_head(head.word, head.worst, head.reasons) + way + f"<h1>Campaign of {count}</h1>"
+    foot = ", ".join(campaign.runs["software"].unique().sort().to_list())
+    title = f"Campaign · balise: {head.word}"
+    return page(title, heading, "\n".join(body), script_json(data), "campaign.js", foot)
 
 
 def _only(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     return frame.filter(pl.col("solution") == name)
 
 
-def _run_counts(runs: pl.DataFrame) -> str:
-    """Runs by the worst status of their solutions, so that each counts once."""
-    found = [worst(part) for _, part in runs.group_by("run_id")]
-    counts = [f"{badge(status.value)} {found.count(status)}" for status in RunStatus]
-    return f"<p>{' '.join(counts)}</p>"
+def _verdict_tiles(runs: pl.DataFrame) -> list[tuple[str, str, str]]:
+    """Runs by verdict, each counted once by the worst of its solutions."""
+    tones = {"unsafe": "bad", "failed": "bad", "unproven": "doubt", "safe": "good"}
+    counts = head_of(run_verdicts(runs).values()).counts()
+    return [(f"runs {name}", str(count), tones[name] if count else "") for name, count in counts.items()]
 
 
-def _runs_table(campaign: Campaign) -> str:
-    order = {RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
-    failed = 1
+def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
+    """When, where, with what, by which program."""
+    runs = campaign.runs
+    begun, ended = runs.select(pl.col("t_start").min(), pl.col("t_end").max()).row(0)
+    elements = campaign.pieces["netelement_id"].n_unique()
+    trains = runs.select(pl.col("vehicle").cast(pl.String).fill_null("not known").value_counts(sort=True)).unnest(
+        "vehicle"
+    )
+    rates = runs["gnss_rate_hz"].drop_nulls().unique().sort().to_list()
+    once = runs.unique("run_id")
+    hours, km = (
+        float(once[name].sum() or 0.0) / unit for name, unit in (("duration_s", 3600.0), ("distance_m", 1000.0))
+    )
+    found = {
+        "Dates": f"{begun:%Y-%m-%d %H:%M} to {ended:%Y-%m-%d %H:%M} UTC" if begun and ended else "not known",
+        "Ridden": f"{number(hours)} h, {number(km)} km",
+        "Line": f"{plural(elements, 'net element')}, {plural(campaign.passages['balise_id'].n_unique(), 'balise')} met",
+        "Trains (vehicle file)": ", ".join(f"{name} {count}" for name, count in trains.iter_rows()),
+        "Receivers": f"{', '.join(solutions)} at {', '.join(number(rate) for rate in rates)} Hz",
+        "Files": "each run's digest of log and site is in the last column of Table 1",
+    }
+    return list(found.items())
+
+
+def _runs_table(campaign: Campaign, made: Made) -> str:
     runs = (
         known_counts(campaign.runs)
-        .with_columns(order=pl.col("verdict").cast(pl.String).replace_strict(order, default=failed))
-        .sort("order", "run_id", "solution")
+        .with_columns(
+            order=pl.col("verdict").cast(pl.String).replace_strict(_RANK, default=_FAILED_RANK),
+            hazards=pl.sum_horizontal(HAZARD_COUNTS, ignore_nulls=False),
+        )
+        .sort(
+            *("order", "unsafe_accepted", "failures_beyond_budget", "share_unknown", "run_id", "solution"),
+            descending=[False, True, True, True, False, False],
+            nulls_last=True,
+        )
     )
+    why = _whys(campaign, made)
 
     def verdict(row: Row) -> Cell:
         word = word_of(row["verdict"])
         return Cell(word, str(row["order"]), badge(word))
 
+    def digest(row: Row) -> Cell:
+        whole = row["input_digest"]
+        return Cell(whole[:_SHORT], whole, f'<span title="{escape(whole)}">{escape(whole[:_SHORT])}</span>')
+
     special = {
         "verdict": verdict,
-        "run_id": lambda row: Cell(row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"])),
-        "status": lambda row: Cell(row["status"], row["status"], badge(row["status"])),
+        "run_id": lambda row: Cell(
+            row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"], data_run="")
+        ),
+        "why": lambda row: Cell(text := why[row["run_id"], row["solution"]], text),
+        "status": lambda row: Cell(row["status"], row["status"], badge(f"reading {row['status']}", row["status"])),
+        "input_digest": digest,
     }
-    caption = "Runs, unsafe and failed ones first"
+    caption = "Runs, the worst first"
     return frame_table("table-runs", caption, runs, RUN_COLUMNS, CampaignRuns, special)
+
+
+def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
+    """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
+    wrong = wrong_acceptances(campaign.passages).partition_by("run_id", as_dict=True)
+    faults = campaign.hazards.partition_by("run_id", as_dict=True)
+    nothing = campaign.passages.clear(), campaign.hazards.clear()
+    return {
+        (row["run_id"], row["solution"]): ""
+        if row["verdict"] == RunVerdict.SAFE
+        else run_headline(
+            [row], wrong.get((row["run_id"],), nothing[0]), faults.get((row["run_id"],), nothing[1]), made.config
+        ).worst
+        for row in campaign.runs.iter_rows(named=True)
+    }
 
 
 def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
     found, levels, balises = (_only(campaign.derived[table], name) for table in ("figures", "detection", "balises"))
     said = "".join(f"<p>{escape(text)}</p>" for text in (*plain_statements(found), *level_statements(levels)))
     note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
-    title = "Position failures in use against the allowed T_D (TVB eq. 7)"
+    title = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
+    rows = found.drop("solution").iter_rows(named=True)
+    caption = "All figures of the campaign"
     return section(
         key,
-        f"Solution {name}" if several else "Figures",
-        said,
-        *(figures(row, CampaignFigures) for row in found.drop("solution").iter_rows(named=True)),
-        note,
-        frame_table(f"table-levels-{key}", title, levels, _LEVEL_COLUMNS, CampaignDetection),
-        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
-        frame_table(f"table-balises-{key}", "Balises over all runs", balises, _BALISE_COLUMNS, CampaignBalises),
+        f"Solution {name}" if several else "Balises, hazards, figures",
+        balise_table(f"table-balises-{key}", "Balises over all runs, the worst first", lost_shares(balises)),
         _hazards_table(key, _only(campaign.hazards, name), campaign),
+        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
+        said,
+        frame_table(f"table-levels-{key}", title, levels, _LEVEL_COLUMNS, CampaignDetection),
+        note,
+        *(figures(f"table-figures-{key}", caption, row, CampaignFigures) for row in rows),
     )
 
 
 def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
     special = {
-        "run_id": lambda row: hazard_cell(row, f"{row['run_id']} {row['hazard_id']}", campaign.hrefs[row["run_id"]]),
+        "run_id": lambda row: hazard_cell(
+            row, f"{row['run_id']} {row['hazard_id']}", campaign.hrefs[row["run_id"]], data_hazard=""
+        ),
     }
-    ordered = hazards.sort("run_id", "hazard_id")
-    return frame_table(f"table-hazards-{key}", "Hazards of all runs", ordered, _HAZARD_COLUMNS, Hazards, special)
+    ordered = hazards.sort(
+        pl.col("accepted_ids").list.len() == 0, "detected", "within_budget", "run_id", "hazard_id", nulls_last=False
+    )
+    caption = "Hazards of all runs, the worst first"
+    return frame_table(f"table-hazards-{key}", caption, ordered, _HAZARD_COLUMNS, Hazards, special)
 
 
 def _map_in_doubt(places: pl.DataFrame) -> str:
@@ -195,15 +260,15 @@ def _sorted(values: pl.Series) -> list[float]:
 
 
 def _location(passages: pl.DataFrame) -> Json:
-    """Location errors of offers as counts per bin of 1 m up to 50 m, beyond in the last bins."""
+    """Location errors of offers as counts per outcome and bin of 1 m up to 50 m, beyond in the last bins."""
     known = passages.filter(pl.col("location_error_m").is_not_null())
     counts = (
         known.group_by(
-            status=pl.col("status").cast(pl.String),
+            outcome=outcome(),
             at=pl.col("location_error_m").floor().clip(-51, 50).cast(pl.Int64),
         )
         .len("count")
-        .sort("status", "at")
+        .sort("outcome", "at")
     )
     return [list(row) for row in counts.iter_rows()]
 
@@ -214,4 +279,6 @@ def _provenance(runs: pl.DataFrame) -> str:
 
 
 def _budget(made: Made) -> str:
-    return f"<p>Budget of the hazards: {number(made.config.budget_s, 4)} s ({made.config.hazards.service_level}).</p>"
+    level = made.config.hazards.service_level
+    allowed = number(made.config.budget_s, 4)
+    return f"<p>A wrong position may be in use for {allowed} s (service level {escape(level)}).</p>"

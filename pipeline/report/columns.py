@@ -8,13 +8,23 @@ from typing import Any
 import dataframely as dy
 import polars as pl
 
-from pipeline.report.markup import UNKNOWN, Cell, cell, number, pairs, table
+from pipeline.report.markup import UNKNOWN, Cell, cell, number, table
+from pipeline.report.words import OPINIONS, TITLES, WORDS
 
 Row = Mapping[str, Any]
 Special = Mapping[str, Callable[[Row], Cell]]
 """How the cells of some columns are made."""
 
 _UNITS = {"_per_h": "1/h", "_mps": "m/s", "_hz": "Hz", "_m": "m", "_s": "s", "_h": "h"}
+_MOST_NAMES = 8
+# A table shows 2,000 runs: what is `bad` or in `doubt` above zero, and which words look how.
+_TONES = {
+    **dict.fromkeys(("unsafe_accepted", "failures_beyond_budget", "missed_detections", "exceeded"), "bad"),
+    **dict.fromkeys(("accepted_ids", "common_missed"), "bad"),
+    **dict.fromkeys(("unproven_accepted", "share_unknown", "unknown"), "doubt"),
+    **dict.fromkeys(("lost", "missed", "not_available", "false_alarms"), "lost"),
+}
+_WORD_TONES = {"wrong": "bad", "exceeded": "bad", "unknown": "doubt", "right": "good", "kept": "good"}
 
 
 def frame_table(
@@ -33,14 +43,17 @@ def frame_table(
         [special[name](row) if name in special else _cell(row, name) for name in shown]
         for row in frame.iter_rows(named=True)
     ]
-    return table(identity, caption, [(_title(name), meanings.get(name, "")) for name in shown], rows)
+    return table(identity, caption, [(title(name), meanings.get(name, "")) for name in shown], rows)
 
 
-def figures(row: Row, contract: type[dy.Schema], names: Sequence[str] = ()) -> str:
-    """What columns of one row mean, and their values with unit and bounds."""
+def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema], names: Sequence[str] = ()) -> str:
+    """One row as a table downwards: the name of each column as in the data, its value with unit and bounds, and what
+    it means.
+    """
     shown = list(names) or [name for name in row if not _is_bound(name, row)]
     meanings = _meanings(contract)
-    return pairs((meanings[name], _text(row, name)) for name in shown)
+    rows = [[Cell(name, name), Cell(_text(row, name)), Cell(meanings[name], meanings[name])] for name in shown]
+    return table(identity, caption, [("figure", "column in the data"), ("value", ""), ("meaning", "")], rows)
 
 
 def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:
@@ -54,7 +67,10 @@ def _parts(name: str) -> tuple[str, str]:
     return name.removesuffix(ending), ending
 
 
-def _title(name: str) -> str:
+def title(name: str) -> str:
+    """A column's title for people."""
+    if name in TITLES:
+        return TITLES[name]
     stem, ending = _parts(name)
     words = stem.replace("_", " ")
     return f"{words} [{_UNITS[ending]}]" if ending else words
@@ -74,8 +90,23 @@ def _bounds(row: Row, name: str) -> tuple[float | None, float | None] | None:
 
 
 def _cell(row: Row, name: str) -> Cell:
-    bounds = _bounds(row, name)
-    return Cell(_bounded(row[name], *bounds, UNKNOWN), row[name]) if bounds else cell(row[name], 4)
+    value = row[name]
+    if bounds := _bounds(row, name):
+        return Cell(_bounded(value, *bounds, UNKNOWN), value)
+    if isinstance(value, list) and len(value) > _MOST_NAMES:
+        value = [*value[:_MOST_NAMES], f"and {len(value) - _MOST_NAMES} more"]
+    plain = cell(value, 4)
+    if isinstance(value, str):
+        opinion = name == "suspect"
+        words = (OPINIONS if opinion else WORDS).get(value, value)
+        return Cell(words, value, tone="" if opinion else _WORD_TONES.get(value, ""))
+    return Cell(plain.text, plain.order, tone=_tone(name, value))
+
+
+def _tone(name: str, value: object) -> str:
+    if name == "within_budget":
+        return "bad" if value is False else ""
+    return _TONES.get(name, "") if value else ""
 
 
 def _text(row: Row, name: str) -> str:

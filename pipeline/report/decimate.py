@@ -9,6 +9,8 @@ import numpy as np
 from schemas.arrays import Bools, Floats, Ints
 
 BINS = 2500
+WHOLE_SERIES = 4 * BINS
+"""A series of no more values is sent as it is."""
 DETAIL_EPOCHS = 6000
 BAND_PIECES = 3000
 
@@ -31,6 +33,12 @@ def kept_rows(values: Floats, whole: Bools, bins: int = BINS) -> Ints:
         np.array([0, count - 1]),
     ]
     return np.unique(np.concatenate(rows))
+
+
+def worst_rows(codes: Ints, stride: int) -> Ints:
+    """Of every so many rows the first with the largest code: what is bad is not left out."""
+    edges = np.append(np.arange(0, len(codes), stride), len(codes))
+    return _extreme_rows(codes.astype(np.float64), edges, np.maximum)
 
 
 def _extreme_rows(values: Floats, edges: Ints, extreme: np.ufunc) -> Ints:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cache
 from html import escape
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -17,11 +21,16 @@ Json = Any
 
 UNKNOWN = "–"
 _LONG = 32
+# What a page takes along: it is one file.
+_SHARED_SCRIPTS = ("tables.js", "scales.js", "plots.js")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What is shown, what it is sorted by, and HTML instead of the text where there is some."""
+    """What is shown, what it is sorted by, and HTML instead of the text where there is some.
+
+    `tone`: `bad` (wrong), `doubt` (not known), `lost` or `good`; a sign before the text says the same.
+    """
 
     text: str
     order: float | str | None = None
@@ -72,8 +81,9 @@ def table(identity: str, caption: str, heads: Sequence[tuple[str, str]], rows: S
     """A table whose columns have a title and a meaning; the script sorts it, and searches a long one."""
     if not rows:
         return f'<p class="none">{escape(caption)}: none.</p>'
-    body = "\n".join(f"<tr>{''.join(_td(item) for item in row)}</tr>" for row in rows)
-    titles = "".join(_th(*head, [row[column] for row in rows]) for column, head in enumerate(heads))
+    numeric = [any(isinstance(item.order, float) for item in column) for column in zip(*rows, strict=True)]
+    body = "\n".join(f"<tr>{''.join(map(_td, row, numeric))}</tr>" for row in rows)
+    titles = "".join(map(_th, heads, numeric))
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
         f'<table class="data" id="{identity}"><caption>{escape(caption)}</caption>'
@@ -85,6 +95,14 @@ def pairs(rows: Iterable[tuple[str, str]]) -> str:
     """Names and values, text only."""
     items = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in rows)
     return f'<dl class="pairs">{items}</dl>'
+
+
+def tiles(rows: Iterable[tuple[str, str, str]]) -> str:
+    """The figures that matter, large: name, value and tone as of a cell."""
+    items = "".join(
+        f'<div class="tile {tone}"><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>' for name, value, tone in rows
+    )
+    return f'<dl class="tiles">{items}</dl>'
 
 
 def section(identity: str, title: str, *content: str) -> str:
@@ -101,56 +119,101 @@ def figure(name: str, title: str, explanation: str = "") -> str:
     )
 
 
-def badge(status: str) -> str:
-    return f'<span class="badge {escape(status)}">{escape(status)}</span>'
+def badge(kind: str, text: str = "") -> str:
+    return f'<span class="badge {escape(kind)}">{escape(text or kind)}</span>'
 
 
-def verdict_head(word: str, text: str) -> str:
-    """The verdict as the first words of a page, coloured by it."""
-    return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong> {escape(text)}</p>'
+def verdict_head(word: str, worst: str, reasons: str = "") -> str:
+    """The verdict as the first sentence of a page, coloured by it, and what speaks for it."""
+    why = f"<br><small>{escape(reasons)}</small>" if reasons else ""
+    return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong>: {escape(worst)}.{why}</p>'
 
 
-def page(title: str, heading: str, body: str, data: str, assets: str, script: str) -> str:
-    """A whole page. The policy forbids every request a script could make; styles and scripts lie beside it."""
-    policy = "connect-src 'none'; font-src 'none'; frame-src 'none'; object-src 'none'; form-action 'none'"
+def page(title: str, heading: str, body: str, data: str, script: str, foot: str) -> str:
+    """A whole page in one file. The policy lets no script run but ours, and no request leave.
+
+    `title` and `foot` stand on each sheet of paper.
+    """
+    shared, printed = _text("report.css"), _sheets(title, foot)
+    code = _code(script)
+    policy = (
+        f"default-src 'none'; script-src {_digest(code)}; style-src {_digest(shared)} {_digest(printed)}; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
 <title>{escape(title)}</title>
 <link rel="icon" href="data:,">
-<link rel="stylesheet" href="{assets}/report.css">
+<style>{shared}</style>
+<style>{printed}</style>
 </head>
 <body>
 <a class="skip" href="#content">Skip to the content</a>
 <header>{heading}</header>
 <main id="content">
-{body}
+{_numbered(body)}
 </main>
 <noscript><p>Tables can be read without scripts; drawings need them.</p></noscript>
 <script type="application/json" id="data">{data}</script>
-<script src="{assets}/plotly.min.js"></script>
-<script src="{assets}/tables.js"></script>
-<script src="{assets}/plots.js"></script>
-<script src="{assets}/{script}"></script>
+<script>{code}</script>
 </body>
 </html>
 """
 
 
-def _th(title: str, meaning: str, cells: Sequence[Cell]) -> str:
-    kind = ' class="number"' if any(isinstance(item.order, float) for item in cells) else ""
+@cache
+def _text(name: str) -> str:
+    return (files("pipeline.report") / name).read_text(encoding="utf-8")
+
+
+@cache
+def _code(script: str) -> str:
+    return "\n".join(_text(name) for name in (*_SHARED_SCRIPTS, script))
+
+
+@cache
+def _digest(content: str) -> str:
+    """The source of the policy that allows this very script or style."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
+
+
+def _sheets(head: str, foot: str) -> str:
+    """What stands at the top and the bottom of each sheet of paper."""
+    return (
+        f"@page {{ @top-left {{ content: {_css_text(head)}; }} @bottom-left {{ content: {_css_text(foot)}; }}"
+        ' @bottom-right { content: "page " counter(page) " of " counter(pages); } }'
+    )
+
+
+def _css_text(text: str) -> str:
+    """A string of CSS in which no character of the text can end anything."""
+    return '"' + re.sub(r"[^A-Za-z0-9 .,:]", lambda found: f"\\{ord(found[0]):x} ", text) + '"'
+
+
+def _numbered(body: str) -> str:
+    """Figures and tables with their numbers, in the order of the page."""
+    for opening, word in (("<figcaption><h3>", "Figure"), ("<caption>", "Table")):
+        first, *parts = body.split(opening)
+        body = first + "".join(f"{opening}{word} {number}. {part}" for number, part in enumerate(parts, start=1))
+    return body
+
+
+def _th(head: tuple[str, str], numeric: bool) -> str:
+    title, meaning = head
+    kind = ' class="number"' if numeric else ""
     told = f' title="{escape(meaning)}"' if meaning else ""
     return f'<th scope="col"{kind}{told}>{escape(title)}</th>'
 
 
-def _td(item: Cell) -> str:
+def _td(item: Cell, numeric: bool) -> str:
     order = item.order
     key = "" if order is None else f' data-order="{escape(repr(order) if isinstance(order, float) else order)}"'
-    shape = "number" if isinstance(order, float) else "long" if len(item.text) > _LONG else ""
+    shape = "number" if numeric else "long" if len(item.text) > _LONG else ""
     kinds = [name for name in (shape, item.tone) if name]
     classes = f' class="{" ".join(kinds)}"' if kinds else ""
     return f"<td{key}{classes}>{item.html if item.html is not None else escape(item.text)}</td>"

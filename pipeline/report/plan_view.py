@@ -1,4 +1,4 @@
-"""The run seen from above: track, GNSS positions by state, balises with their windows and passages.
+"""The run seen from above: track, GNSS positions as they were judged, balises and what became of them.
 
 With a site in metres east and north of its first point; without one along the path and across it.
 """
@@ -22,14 +22,16 @@ from pipeline.export.places import (
     stretches_of,
     thinned,
 )
-from pipeline.report.decimate import detail_rows
+from pipeline.report.balises import OUTCOMES, outcome
+from pipeline.report.decimate import detail_rows, worst_rows
 from pipeline.report.markup import Json, packed
-from pipeline.report.series import UNKNOWN
 from schemas.arrays import Floats, Ints, floats
-from schemas.enums import Direction, LdsState, PassageStatus
+from schemas.enums import Judgement
 from schemas.run import Site
 
-STATES = (*(state.value for state in LdsState), UNKNOWN)
+STATES = (Judgement.RIGHT.value, Judgement.UNKNOWN.value, Judgement.WRONG.value)
+"""From harmless to bad."""
+
 _POINTS = 8000
 _TRACK_POINTS = 3000
 _AROUND_M = 500.0
@@ -62,11 +64,11 @@ def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, m
     view = _View(site, stretches_of(epochs), (0.0, 0.0) if site is None else origin_of(site))
     shown = epochs.filter(pl.col("path_m").is_not_null())
     t_ns = shown["t"].to_physical().to_numpy()
-    rows = _shown_rows(t_ns, moments_ns)
+    order = pl.Series(range(len(STATES)), dtype=pl.Int64)
+    codes = shown["judgement"].cast(pl.String).replace_strict(pl.Series(STATES), order).to_numpy()
+    rows = _shown_rows(t_ns, codes, moments_ns)
     x, y = view.gnss(shown[rows])
     t0_ns = int(epochs["t"].to_physical()[0]) if epochs.height else 0
-    states = {name: code for code, name in enumerate(STATES)}
-    codes = shown[rows]["lds_state"].cast(pl.String).fill_null(UNKNOWN).replace_strict(states, return_dtype=pl.Int64)
     return {
         "geographic": site is not None,
         "states": list(STATES),
@@ -74,16 +76,19 @@ def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, m
         "x": packed(x, "f4"),
         "y": packed(y, "f4"),
         "t": packed((t_ns[rows] - t0_ns) // 1_000_000, "u4"),
-        "codes": packed(codes.to_numpy(), "u1"),
+        "codes": packed(codes[rows], "u1"),
         "balises": _balises(view, passages),
-        "windows": _windows(view, passages),
     }
 
 
-def _shown_rows(t_ns: Ints, moments_ns: Ints) -> Ints:
-    stride = max(1, -(-len(t_ns) // _POINTS))
-    near = detail_rows(t_ns, moments_ns, reach_s=30.0) if stride > 1 else np.zeros(len(t_ns), dtype=np.bool_)
-    return np.flatnonzero(near | (np.arange(len(t_ns)) % stride == 0))
+def _shown_rows(t_ns: Ints, codes: Ints, moments_ns: Ints) -> Ints:
+    """So many rows at even distances, the worst in between, and all near the moments that matter."""
+    stride = -(-len(t_ns) // _POINTS)
+    if stride <= 1:
+        return np.arange(len(t_ns))
+    near = detail_rows(t_ns, moments_ns, reach_s=30.0)
+    near[worst_rows(codes, stride)] = True
+    return np.flatnonzero(near)
 
 
 def _track(site: Site, x: Floats, y: Floats) -> list[Json]:
@@ -112,39 +117,26 @@ def _axis(x: Floats) -> list[Json]:
 
 
 def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
-    """One entry per balise and status, with how often it came to that."""
-    groups = passages.group_by("balise_id", "status", maintain_order=True).agg(
-        pl.col("path_m").first(), pl.len().alias("count"), pl.col("kind").first(), pl.col("measure_m").first(),
-        pl.col("netelement_id").first(),
-    )  # fmt: skip
+    """One entry per balise with the worst that became of it; the worst balises last, so that they lie on top."""
+    worst = pl.col("outcome").replace_strict({name: code for code, name in enumerate(OUTCOMES)}, return_dtype=pl.Int64)
+    groups = (
+        passages.with_columns(outcome=outcome())
+        .group_by("balise_id", "netelement_id", "measure_m", maintain_order=True)
+        .agg(pl.col("path_m").first(), worst=worst.max(), told=pl.col("outcome").value_counts(sort=True))
+        .sort("worst", maintain_order=True)
+    )
     x, y = view.at(floats(groups, "path_m"))
     return [
         {
             "id": row["balise_id"],
-            "status": row["status"],
-            "kind": row["kind"],
-            "count": row["count"],
+            "outcome": OUTCOMES[row["worst"]],
+            "told": ", ".join(sorted(f"{one['count']} {one['outcome']}" for one in row["told"])),
             "place": f"{row['netelement_id']} at {row['measure_m']:.1f} m",
             "x": _rounded(x[number]),
             "y": _rounded(y[number]),
         }
         for number, row in enumerate(groups.iter_rows(named=True))
     ]
-
-
-def _windows(view: _View, passages: pl.DataFrame) -> list[Json]:
-    """Expectation windows laid along the path from the balise accepted last before (SUBSET-026 3.4.4.4.3)."""
-    windows: list[Json] = []
-    reference: float | None = None
-    for row in passages.sort("t_offered", nulls_last=True, maintain_order=True).iter_rows(named=True):
-        if row["window_open_m"] is not None and reference is not None and row["direction"] is not None:
-            sign = 1.0 if row["direction"] == Direction.GROWING else -1.0
-            ends = reference + sign * np.linspace(row["window_open_m"], row["window_close_m"], 12)
-            x, y = view.at(ends)
-            windows.append({"id": row["balise_id"], "x": packed(x, "f4"), "y": packed(y, "f4")})
-        if row["status"] == PassageStatus.ACCEPTED:
-            reference = row["path_m"]
-    return windows
 
 
 def _rounded(value: float) -> float | None:

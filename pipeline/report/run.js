@@ -1,21 +1,37 @@
 "use strict";
 // The page of a run: every drawing over time shows the same stretch of it.
 (() => {
-  const { COLOUR, STATE, PASSAGE, LINES, axis, data, draw, empty, layout, unpack } = Plots;
+  const { data, draw, empty, range, unpack } = Plots;
+  const { clock, number } = Scales;
   const POINTS = 1200;
   const PIECES = 400;
-  const PLAN_POINTS = 2000;
+  const PLAN_POINTS = 2500;
   const LEAST_MS = 500;
   const RATIO_REACH = 5;
-  const state = { solution: null, index: 0, lo: 0, hi: 0, hazard: null, drawing: false };
+  const FEW = 20;
+  const KMH = 3.6;
+  const OUTCOMES = [
+    ["read", "balise read"], ["right", "accepted, right"], ["lost", "lost"],
+    ["unknown", "accepted, could not be checked"], ["wrong", "accepted at a wrong place"],
+  ];
+  // Which look a state has, and what it is called.
+  const STATES = {
+    P0: ["right", "P0: in order"], P1: ["wrong", "P1: wrong and in use"], P2: ["lost", "P2: position blocked"],
+    P3: ["unknown", "P3: diagnosis faulty"], "not known": ["faint", "not known"],
+    linked: ["right"], initialising: ["faint"], odometry: ["lost"], fail_safe: ["wrong", "fail-safe"],
+    TVB: ["right"], "no TVB": ["lost"], right: ["right"], unknown: ["unknown", "could not be checked"], wrong: ["wrong"],
+    "no alarm": ["calm"], alarm: ["wrong"], pass: ["right", "passed"], not_evaluated: ["faint", "not evaluated"], fail: ["wrong", "failed"],
+  };
+  const state = { solution: null, index: 0, lo: 0, hi: 0, hazard: null, box: null };
   const prepared = new Map();
 
   function prepare(name) {
     if (prepared.has(name)) return prepared.get(name);
     const raw = data.solutions[name];
+    const shared = raw.time.t && unpack(raw.time.t);
     const series = {};
     for (const [key, packed] of Object.entries(raw.time.series)) {
-      series[key] = { x: unpack(packed.x), y: unpack(packed.y) };
+      series[key] = { x: packed.x ? unpack(packed.x) : shared, y: unpack(packed.y) };
     }
     const bands = raw.time.bands.map((band) => ({ ...band, starts: unpack(band.starts), codes: unpack(band.codes) }));
     const plan = { ...raw.plan, x: unpack(raw.plan.x), y: unpack(raw.plan.y), t: unpack(raw.plan.t),
@@ -62,48 +78,39 @@
     return { x, y };
   }
 
-  function line(now, key, name, look, extra = {}) {
+  function line(now, key, name, look, factor = 1) {
     const series = now.series[key];
     if (!series) return null;
-    const [color, dash] = look;
-    return { ...visible(series, now.t0), type: "scatter", mode: "lines", name, line: { color, dash, width: 1.4 },
-      connectgaps: false, ...extra };
+    const part = visible(series, now.t0);
+    const y = factor === 1 ? part.y : part.y.map((value) => (value === null ? null : value * factor));
+    return { type: "line", name, look, x: part.x, y };
   }
 
   // Hazards on the time axis: shaded from onset to end, lines where the chosen one began, failed and was detected.
-  function hazardShapes(now) {
-    const shapes = [];
+  function hazardMarks(now, y) {
+    const items = { shade: [], "shade chosen": [] };
+    const rules = [];
     for (const hazard of now.raw.hazards) {
       const begin = hazard.t_onset ?? hazard.t_hazard;
-      if (begin > state.hi || (hazard.t_end ?? Infinity) < state.lo) continue;
-      shapes.push({ type: "rect", xref: "x", yref: "paper", x0: begin, x1: hazard.t_end ?? now.raw.time.t1_ms, y0: 0,
-        y1: 1, line: { width: 0 }, fillcolor: COLOUR.orange, opacity: hazard.id === state.hazard ? 0.22 : 0.1,
-        layer: "below" });
-      if (hazard.id !== state.hazard) continue;
-      for (const [key, dash] of [["t_onset", "dot"], ["t_failure", "dash"], ["t_detected", "solid"]]) {
-        if (hazard[key] === null) continue;
-        shapes.push({ type: "line", xref: "x", yref: "paper", x0: hazard[key], x1: hazard[key], y0: 0, y1: 1,
-          line: { color: COLOUR.vermilion, dash, width: 1.5 } });
+      const chosen = hazard.id === state.hazard;
+      items[chosen ? "shade chosen" : "shade"].push([begin, hazard.t_end ?? now.raw.time.t1_ms, y.lo, y.hi, `hazard ${hazard.id} ${hazard.class}`]);
+      if (!chosen) continue;
+      for (const [key, look] of [["t_onset", "dots"], ["t_failure", "dash"], ["t_detected", "solid"]]) {
+        if (hazard[key] !== null) rules.push({ x: hazard[key], look });
       }
     }
-    return shapes;
+    const layers = Object.entries(items).filter(([, some]) => some.length).map(([tone, some]) => ({ type: "bars", tone, items: some }));
+    return [layers, rules];
   }
 
-  function level(y, dash = "dash") {
-    return { type: "line", xref: "paper", x0: 0, x1: 1, y0: y, y1: y, line: { color: COLOUR.vermilion, dash, width: 1 } };
-  }
-
-  const timeAxis = () => axis("", { type: "date", range: [state.lo, state.hi], hoverformat: "%H:%M:%S.%L" });
-
-  function timePlot(now, name, title, traces, height, levels = [], extra = {}) {
+  function timePlot(now, name, unit, layers, height, { levels = [], y = null, least = 0 } = {}) {
     const id = `plot-s${state.index}-${name}`;
-    const known = traces.filter(Boolean);
+    const known = layers.filter(Boolean);
     if (!known.length) { empty(id, "Nothing is known to draw here."); return; }
-    draw(id, known, layout(height, {
-      margin: { l: 125, r: 20, t: 12, b: 40 }, xaxis: timeAxis(), yaxis: axis(title, { automargin: false }), shapes: [...hazardShapes(now), ...levels.map((y) => level(y))],
-      showlegend: known.length > 1, ...extra,
-    }));
-    listen(id);
+    const upright = y ?? { ...range([...known.flatMap((layer) => layer.y), ...levels], least), title: unit, unit };
+    const [shades, rules] = hazardMarks(now, upright);
+    draw(id, { height, layers: [...shades, ...known], rules: [...rules, ...levels.map((level) => ({ y: level }))],
+      x: { kind: "time", lo: state.lo, hi: state.hi }, y: upright, zoom: show, whole: showAll });
   }
 
   // The visible pieces of a band as [start, end, code]; where they are too many the worst in a bin stands for it.
@@ -138,159 +145,119 @@
   }
 
   function bandPlot(now, name, group) {
-    const id = `plot-s${state.index}-${name}`;
     const bands = now.bands.filter((band) => band.group === group).reverse();
-    const traces = new Map();
-    for (const band of bands) {
+    const layers = new Map();
+    bands.forEach((band, row) => {
       for (const [from, to, code] of visiblePieces(band, now.t0)) {
         if (code === 0) continue;
-        const label = band.states[code];
-        if (!traces.has(label)) {
-          const [color, , pattern] = STATE[label];
-          traces.set(label, { type: "bar", orientation: "h", name: label.replace("_", " "), base: [], x: [], y: [],
-            marker: { color, line: { width: 0 }, pattern: Plots.pattern(color, pattern) },
-            width: 0.8, hovertemplate: `%{y}: ${label.replace("_", " ")}<extra></extra>` });
-        }
-        const trace = traces.get(label);
-        trace.base.push(from + now.t0);
-        trace.x.push(to - from);
-        trace.y.push(band.name);
+        const [tone, word] = STATES[band.states[code]];
+        const called = word ?? band.states[code];
+        if (!layers.has(called)) layers.set(called, { type: "bars", tone, name: called, items: [] });
+        layers.get(called).items.push([from + now.t0, to + now.t0, row - 0.4, row + 0.4, `${band.name}: ${called}`]);
       }
-    }
-    const names = bands.map((band) => band.name);
-    timePlot(now, name, "", [...traces.values()], 70 + 26 * bands.length, [], {
-      barmode: "overlay", showlegend: true, bargap: 0.1,
-      yaxis: axis("", { automargin: false, type: "category", categoryorder: "array", categoryarray: names, fixedrange: true,
-        range: [-0.5, names.length - 0.5] }),
     });
+    const names = bands.map((band) => band.name);
+    timePlot(now, name, "", [...layers.values()], 40 + 24 * bands.length, { y: { kind: "names", names, lo: -0.6, hi: names.length - 0.4 } });
   }
 
+  const marksOf = (some, xOf, yOf, tell) => OUTCOMES.map(([tone, name]) => {
+    const own = some.filter((one) => one.outcome === tone);
+    return { type: "marks", tone, name, x: own.map(xOf), y: own.map(yOf), tell: (i) => tell(own[i]) };
+  }).filter((layer) => layer.x.length);
+
   function linkingPlot(now) {
-    const traces = [line(now, "distance_from_lrvb_m", "distance since the LRVB", LINES[0])];
     const offered = now.raw.passages.filter((one) => one.t_ms !== null && one.odometer_m !== null);
-    const windows = { type: "scatter", mode: "lines", name: "window", x: [], y: [],
-      line: { color: COLOUR.green, width: 4 }, hoverinfo: "skip" };
+    const windows = { type: "line", name: "expectation window", look: "window", x: [], y: [] };
     for (const one of offered) {
-      windows.x.push(one.t_ms, one.t_ms, null);
+      windows.x.push(one.t_ms, one.t_ms, one.t_ms);
       windows.y.push(one.open_m, one.close_m, null);
     }
-    if (offered.length) traces.push(windows);
-    for (const [status, [color, symbol]] of Object.entries(PASSAGE)) {
-      const some = offered.filter((one) => one.status === status);
-      if (!some.length) continue;
-      traces.push({ type: "scatter", mode: "markers", name: status.replace("_", " "), x: some.map((one) => one.t_ms),
-        y: some.map((one) => one.odometer_m), text: some.map((one) => one.id), marker: { color, symbol, size: 9 },
-        hovertemplate: "%{text}<br>%{y:.1f} m<extra>%{fullData.name}</extra>" });
+    timePlot(now, "linking", "m", [
+      line(now, "distance_from_lrvb_m", "distance since the LRVB", "a"), offered.length ? windows : null,
+      ...marksOf(offered, (one) => one.t_ms, (one) => one.odometer_m, (one) => `${one.id} ${one.status}, ${number(one.odometer_m)} m`),
+    ], 250);
+  }
+
+  // What became of each balise, in the order of the line: readable with hundreds of them.
+  function balisesPlot(now) {
+    const id = `plot-s${state.index}-balises`;
+    const some = now.raw.passages.filter((one) => one.path_m !== null);
+    if (!some.length) { empty(id, "No balise was met."); return; }
+    const limit = data.limits.failure_limit_m;
+    const errors = some.map((one) => one.error_m).filter((error) => error !== null);
+    const most = Math.max(1.3 * limit, ...errors.map(Math.abs));
+    const floor = -1.12 * most;
+    const layers = marksOf(some, (one) => one.path_m / 1000, (one) => one.error_m ?? floor,
+      (one) => `${one.id}: ${one.status}, ${one.error_m === null ? "error not known" : `${number(one.error_m)} m`}`);
+    for (const layer of layers) {
+      const own = some.filter((one) => one.outcome === layer.tone);
+      if (["wrong", "unknown"].includes(layer.tone) || own.length <= FEW) layer.labels = own.map((one) => one.id);
     }
-    timePlot(now, "linking", "m", traces, 260);
+    draw(id, { height: 280, layers, rules: [{ y: limit }, { y: -limit }, { y: 0, look: "solid faint" }],
+      x: { ...range(some.map((one) => one.path_m / 1000), 0.1), title: "path position [km]" },
+      y: { lo: -1.25 * most, hi: 1.12 * most, title: "location error [m]" } });
   }
 
   const AXES = [["raw", "raw"], ["ewma_0p1", "EWMA 0.1"], ["ewma_0p01", "EWMA 0.01"], ["ewma_0p001", "EWMA 0.001"]];
   const OTHERS = ["link_order", "link_distance", "along_doppler", "pseudorange", "channel"];
+  const LOOKS = ["a", "b", "c", "d", "e"];
 
   // A monitor far beyond its threshold must not flatten those that are near theirs.
-  function ratioPlot(now, name, traces) {
-    const sizes = traces.filter(Boolean).map((trace) => trace.y.reduce((most, y) => Math.max(most, Math.abs(y ?? 0)), 0));
+  function ratioPlot(now, name, layers) {
+    const sizes = layers.filter(Boolean).map((layer) => layer.y.reduce((most, y) => Math.max(most, Math.abs(y ?? 0)), 0));
     const reach = Math.min(RATIO_REACH, Math.max(1.3, 1.1 * Math.max(0, ...sizes)));
-    const yaxis = axis("value / threshold", { automargin: false, range: [-reach, reach] });
-    timePlot(now, name, "", traces, 230, [-1, 1], { yaxis });
+    timePlot(now, name, "", layers, 210, { levels: [-1, 1], y: { lo: -reach, hi: reach, title: "value / threshold" } });
   }
 
   function monitorPlots(now) {
     for (const along of ["along", "cross", "up"]) {
-      const traces = AXES.map(([key, name], i) => line(now, `ratio_${along}_${key}`, name, LINES[i]));
-      ratioPlot(now, `monitors-${along}`, traces);
+      ratioPlot(now, `monitors-${along}`, AXES.map(([key, name], i) => line(now, `ratio_${along}_${key}`, name, LOOKS[i])));
     }
-    const traces = OTHERS.map((name, i) => line(now, `ratio_${name}`, name.replace("_", " "), LINES[i]));
-    ratioPlot(now, "monitors-other", traces);
+    ratioPlot(now, "monitors-other", OTHERS.map((name, i) => line(now, `ratio_${name}`, name.replace("_", " "), LOOKS[i])));
   }
 
-  function mirrored(now, key, name) {
-    const upper = line(now, key, name, [COLOUR.grey, "dash"]);
+  function confidence(now) {
+    const upper = line(now, "confidence_m", "confidence", "soft");
     if (!upper) return [];
-    const lower = { ...upper, y: upper.y.map((value) => (value === null ? null : -value)), showlegend: false };
-    return [upper, lower];
+    return [upper, { ...upper, name: "", y: upper.y.map((value) => (value === null ? null : -value)) }];
   }
 
   function timePlots(now) {
     const limit = data.limits.failure_limit_m;
     bandPlot(now, "bands", "lds");
-    timePlot(now, "speed", "m/s", [line(now, "speed_mps", "speed", LINES[0])], 200);
-    const along = line(now, "error_along_m", "error", LINES[0]) ?? line(now, "residual_m", "GNSS minus odometer", LINES[0]);
-    timePlot(now, "along", "m", [along, ...mirrored(now, "confidence_m", "confidence")], 260, along ? [-limit, limit] : []);
+    timePlot(now, "speed", "km/h", [line(now, "speed_mps", "speed", "a", KMH)], 180, { least: 5 });
+    const along = line(now, "error_along_m", "error", "a") ?? line(now, "residual_m", "GNSS minus odometer", "a");
+    timePlot(now, "along", "m", [...confidence(now), along], 250, { levels: along ? [-limit, limit] : [] });
     timePlot(now, "across", "m", [
-      line(now, "error_cross_m", "across", LINES[0]) ?? line(now, "cross_track_m", "across, residual", LINES[0]),
-      line(now, "error_up_m", "height", LINES[1]) ?? line(now, "vertical_m", "height, residual", LINES[1]),
-    ], 230);
+      line(now, "error_cross_m", "across", "a") ?? line(now, "cross_track_m", "across, residual", "a"),
+      line(now, "error_up_m", "height", "b") ?? line(now, "vertical_m", "height, residual", "b"),
+    ], 220, { least: 1 });
     linkingPlot(now);
-    timePlot(now, "exposure", "s", [line(now, "exposure_s", "exposure", LINES[0])], 200);
+    timePlot(now, "exposure", "s", [line(now, "exposure_s", "exposure", "a")], 180, { least: 1 });
     monitorPlots(now);
     bandPlot(now, "states", "monitors");
   }
 
-  function trackTraces(plan) {
-    return plan.track.map((element, index) => ({ type: "scatter", mode: "lines", name: "track", legendgroup: "track",
-      showlegend: index === 0, x: [...unpack(element.x)], y: [...unpack(element.y)], text: element.name,
-      line: { color: COLOUR.grey, width: 2 }, hovertemplate: `${element.name}<extra></extra>` }));
-  }
+  const inView = (t) => t >= state.lo && t <= state.hi;
+  const whole = (now) => state.lo <= now.raw.time.t0_ms && state.hi >= now.raw.time.t1_ms;
+  const GNSS = { right: ["circle", 1.4], unknown: ["square", 1.6], wrong: ["cross", 3] };
 
-  function windowTrace(plan) {
-    const trace = { type: "scatter", mode: "lines", name: "expectation window", x: [], y: [], opacity: 0.5,
-      line: { color: COLOUR.green, width: 9 }, hoverinfo: "skip" };
-    for (const one of plan.windows) {
-      trace.x.push(...unpack(one.x), null);
-      trace.y.push(...unpack(one.y), null);
-    }
-    return plan.windows.length ? [trace] : [];
-  }
-
-  // Positions of the stretch in view, and where the state changes in any case.
-  function shownRows(plan, t0) {
+  // Positions of the stretch in view, and what is not right in any case.
+  function gnssLayers(plan, t0) {
     const within = [...plan.codes.keys()].filter((row) => inView(plan.t[row] + t0));
     const stride = Math.ceil(within.length / PLAN_POINTS);
-    return within.filter((row, at) => at % stride === 0 || plan.codes[row] !== plan.codes[row - 1]);
-  }
-
-  function gnssTraces(plan, t0) {
-    const shown = shownRows(plan, t0);
+    const shown = within.filter((row, at) => at % stride === 0 || (plan.codes[row] !== 0 && plan.codes[row] !== plan.codes[row - 1]));
     return plan.states.map((name, code) => {
-      const [color, symbol] = STATE[name];
       const rows = shown.filter((row) => plan.codes[row] === code);
-      return { type: "scatter", mode: "markers", name: `GNSS, ${name}`, x: rows.map((row) => plan.x[row]),
-        y: rows.map((row) => plan.y[row]), customdata: rows.map((row) => clock(plan.t[row] + t0)),
-        marker: { color, symbol, line: { width: 0 }, size: 5 },
-        hovertemplate: "%{customdata}<extra>%{fullData.name}</extra>" };
-    }).filter((trace) => trace.x.length);
+      return { type: "marks", tone: name, shape: GNSS[name], name: `GNSS ${STATES[name][1] ?? name}`, x: rows.map((row) => plan.x[row]),
+        y: rows.map((row) => plan.y[row]), tell: (i) => `GNSS ${name}, ${clock(plan.t[rows[i]] + t0)}` };
+    }).filter((layer) => layer.x.length);
   }
-
-  function baliseTraces(plan) {
-    return Object.entries(PASSAGE).map(([status, [color, symbol]]) => {
-      const some = plan.balises.filter((one) => one.status === status && one.x !== null);
-      return { type: "scatter", mode: "markers+text", name: `balise ${status.replace("_", " ")}`, x: some.map((one) => one.x),
-        y: some.map((one) => one.y), text: some.map((one) => one.id), textposition: "top center",
-        customdata: some.map((one) => `${one.place}, ${one.kind}, ${one.count}×`),
-        marker: { color, symbol, size: 12, line: { width: 1.5, color } },
-        hovertemplate: "%{text}<br>%{customdata}<extra>%{fullData.name}</extra>" };
-    }).filter((trace) => trace.x.length);
-  }
-
-  const inView = (t) => t >= state.lo && t <= state.hi;
-  const clock = (ms) => new Date(ms).toISOString().slice(11, 23);
-  const whole = (now) => state.lo <= now.raw.time.t0_ms && state.hi >= now.raw.time.t1_ms;
 
   // The plan follows the time axis: it shows where the train was in that stretch.
-  function planRanges(now) {
-    const { plan, t0 } = now;
-    let [x0, x1, y0, y1] = [Infinity, -Infinity, Infinity, -Infinity];
-    for (let row = 0; row < plan.t.length; row += 1) {
-      if (!inView(plan.t[row] + t0) || Number.isNaN(plan.x[row]) || Number.isNaN(plan.y[row])) continue;
-      x0 = Math.min(x0, plan.x[row]); x1 = Math.max(x1, plan.x[row]);
-      y0 = Math.min(y0, plan.y[row]); y1 = Math.max(y1, plan.y[row]);
-    }
-    if (x0 > x1) return null;
-    const margin = 0.08 * Math.max(x1 - x0, plan.geographic ? y1 - y0 : 0) + 20;
-    const beside = plan.geographic ? margin : 0.1 * (y1 - y0) + 1;
-    return { x: [x0 - margin, x1 + margin], y: [y0 - beside, y1 + beside] };
+  function planRanges({ plan, t0 }) {
+    const rows = [...plan.t.keys()].filter((row) => inView(plan.t[row] + t0));
+    return [range(rows.map((row) => plan.x[row]), 60), range(rows.map((row) => plan.y[row]), plan.geographic ? 60 : 4)];
   }
 
   function planPlot(now) {
@@ -298,41 +265,33 @@
     const { plan, t0 } = now;
     if (!plan.x.length) { empty(id, "No position was matched to the track."); return; }
     const titles = plan.geographic ? ["east [m]", "north [m]"] : ["path position [m]", "across, left positive [m]"];
-    const ranges = whole(now) ? null : planRanges(now);
-    const shape = layout(460, {
-      xaxis: axis(titles[0], ranges ? { range: ranges.x } : { autorange: true }),
-      yaxis: axis(titles[1], { ...(ranges ? { range: ranges.y } : { autorange: true }),
-        ...(plan.geographic ? { scaleanchor: "x", scaleratio: 1 } : {}) }),
-      showlegend: true,
-    });
-    draw(id, [...trackTraces(plan), ...windowTrace(plan), ...gnssTraces(plan, t0), ...baliseTraces(plan)], shape);
+    const [x, y] = state.box ?? planRanges(now);
+    const track = plan.track.map((element, index) => ({ type: "line", look: "track", name: index ? "" : "track",
+      x: unpack(element.x), y: unpack(element.y) }));
+    const places = plan.balises.filter((one) => one.x !== null);
+    const balises = marksOf(places, (one) => one.x, (one) => one.y, (one) => `${one.id}: ${one.told} (${one.place})`);
+    for (const layer of balises) layer.labels = places.filter((one) => one.outcome === layer.tone).map((one) => one.id);
+    for (const layer of balises) layer.name = `balise: ${layer.name}`;
+    draw(id, { height: 460, layers: [...track, ...gnssLayers(plan, t0), ...balises], equal: plan.geographic,
+      x: { ...x, title: titles[0] }, y: { ...y, title: titles[1] }, whole: () => { state.box = null; planPlot(now); },
+      zoomBox: (wx, wy) => { state.box = [{ lo: wx[0], hi: wx[1] }, { lo: wy[0], hi: wy[1] }]; planPlot(now); } });
   }
 
   function stanfordPlot(now) {
     const id = `plot-s${state.index}-stanford`;
     const { cells, bins, width_m: width, limit_m: limit, epochs } = now.raw.stanford;
     if (!epochs) { empty(id, "No error along the track is known: there was no truth."); return; }
-    const middle = (bin) => (bin + 0.5) * width;
-    const counts = cells.map((one) => one[2]);
     const edge = bins * width;
-    const trace = { type: "heatmap", x: Array.from({ length: bins }, (_, i) => middle(i)),
-      y: Array.from({ length: bins }, (_, i) => middle(i)),
-      z: Array.from({ length: bins }, () => new Array(bins).fill(null)),
-      customdata: Array.from({ length: bins }, () => new Array(bins).fill(0)), colorscale: "Cividis", reversescale: true,
-      zmin: 0, zmax: Math.log10(Math.max(10, ...counts)),
-      colorbar: { title: { text: "epochs" }, tickvals: [0, 1, 2, 3, 4, 5, 6], ticktext: ["1", "10", "100", "1e3", "1e4", "1e5", "1e6"] },
-      hovertemplate: "error %{x:.1f} m, confidence %{y:.1f} m<br>%{customdata} epochs<extra></extra>" };
-    for (const [x, y, count] of cells) { trace.z[y][x] = Math.log10(count); trace.customdata[y][x] = count; }
-    const rule = (x0, y0, x1, y1) => ({ type: "line", x0, y0, x1, y1, line: { color: COLOUR.vermilion, width: 1.2, dash: "dash" } });
-    const note = (x, y, text) => ({ x, y, text, showarrow: false, font: { size: 12 } });
-    draw(id, [trace], layout(480, {
-      xaxis: axis("error along the track [m], last bin: beyond", { range: [0, edge], constrain: "domain" }),
-      yaxis: axis("confidence [m]", { range: [0, edge], scaleanchor: "x", constrain: "domain" }),
-      shapes: [rule(0, 0, limit, limit), rule(0, limit, edge, limit), rule(limit, 0, limit, limit)],
-      annotations: [note(limit * 0.3, limit * 0.75, "nominal"), note(limit * 0.7, limit * 0.25, "misleading"),
-        note(limit * 1.5, limit * 0.5, "hazardous"), note(limit, limit * 1.5, "unavailable")],
-      dragmode: "zoom",
-    }));
+    const steps = [1, 10, 100, 1e3, 1e4, 1e5];
+    const layers = steps.map((least, step) => ({ type: "bars", tone: "heat", opacity: (step + 1) / steps.length, name: `${number(least, 6)} epochs and more`,
+      items: cells.filter(([, , count]) => count >= least && count < (steps[step + 1] ?? Infinity)).map(([x, y, count]) => [x * width, (x + 1) * width, y * width, (y + 1) * width,
+        `error ${number(x * width)} to ${number((x + 1) * width)} m, confidence ${number(y * width)} to ${number((y + 1) * width)} m: ${count} epochs`]),
+    })).filter((layer) => layer.items.length);
+    const rule = (x, y) => ({ type: "line", look: "limit", x, y });
+    draw(id, { height: 460, layers: [...layers, rule([0, limit], [0, limit]), rule([0, edge], [limit, limit]), rule([limit, limit], [0, limit])],
+      x: { lo: 0, hi: edge, title: "error along the track [m], last bin: beyond" }, y: { lo: 0, hi: edge, title: "confidence [m]" },
+      notes: [[limit * 0.3, limit * 0.75, "nominal"], [limit * 0.7, limit * 0.25, "misleading"],
+        [limit * 1.5, limit * 0.5, "hazardous"], [limit, limit * 1.5, "unavailable"]] });
   }
 
   function say(now) {
@@ -355,30 +314,16 @@
     const span = Math.max(LEAST_MS, Math.min(hi - lo, last - first + 2 * room));
     state.lo = Math.max(first - room, Math.min(lo, last + room - span));
     state.hi = state.lo + span;
-    state.drawing = true;
+    state.box = null;
     timePlots(now);
     planPlot(now);
     say(now);
-    state.drawing = false;
   }
 
   function showAll() {
     const time = prepare(state.solution).raw.time;
     state.hazard = null;
     show(time.t0_ms - 1e9, time.t1_ms + 1e9);
-  }
-
-  function listen(id) {
-    const place = document.getElementById(id);
-    if (place.dataset.listening) return;
-    place.dataset.listening = "yes";
-    place.on("plotly_relayout", (event) => {
-      if (state.drawing) return;
-      if (event["xaxis.autorange"]) showAll();
-      if (event["xaxis.range[0]"] === undefined) return;
-      const at = (value) => (typeof value === "number" ? value : Date.parse(`${value.replace(" ", "T")}Z`));
-      show(at(event["xaxis.range[0]"]), at(event["xaxis.range[1]"]));
-    });
   }
 
   function zoomTo(id) {
@@ -403,6 +348,7 @@
       button.setAttribute("aria-pressed", String(button.dataset.solution === name));
     }
     stanfordPlot(prepare(name));
+    balisesPlot(prepare(name));
   }
 
   function follow() {
@@ -412,9 +358,7 @@
     if (other) choose(name);
     const known = wanted.has("h") && zoomTo(Number(wanted.get("h")));
     if (other && !known) showAll();
-    if (known) {
-      document.getElementById(`drawings-s${state.index}`).scrollIntoView();
-    }
+    if (known) document.getElementById(`drawings-s${state.index}`).scrollIntoView();
   }
 
   function step(by) {
@@ -434,11 +378,25 @@
     previous: () => step(-1),
     next: () => step(1),
   };
+  const move = (name) => () => MOVES[name](state.hi - state.lo);
+  const RUNS = { "[": () => Plots.follow("previous"), "]": () => Plots.follow("next"), c: () => Plots.follow("campaign") };
+
+  // Paper has no buttons: every solution is printed, whole.
+  function printAll(begin) {
+    const [shown, lo, hi, hazard] = [state.solution, state.lo, state.hi, state.hazard];
+    if (begin && data.order.length > 1) {
+      for (const name of Object.keys(data.solutions)) { choose(name); showAll(); }
+      for (const part of document.querySelectorAll(".solution")) part.hidden = false;
+      state.solution = shown;
+    } else if (!begin) {
+      choose(shown);
+      state.hazard = hazard;
+      show(lo, hi);
+    }
+  }
 
   if (Object.keys(data.solutions).length) {
-    for (const button of document.querySelectorAll("button[data-move]")) {
-      button.addEventListener("click", () => MOVES[button.dataset.move](state.hi - state.lo));
-    }
+    for (const button of document.querySelectorAll("button[data-move]")) button.addEventListener("click", move(button.dataset.move));
     for (const button of document.querySelectorAll("button[data-solution]")) {
       button.addEventListener("click", () => { choose(button.dataset.solution); showAll(); });
     }
@@ -448,7 +406,13 @@
       const link = event.target.closest?.("a[data-hazard]");
       if (link && link.hash === location.hash) follow();
     });
+    Plots.keys({ n: move("next"), p: move("previous"), "+": move("in"), "=": move("in"), "-": move("out"), 0: move("all"),
+      ArrowLeft: move("back"), ArrowRight: move("forward"), ...RUNS });
+    window.addEventListener("beforeprint", () => printAll(true));
+    window.addEventListener("afterprint", () => printAll(false));
     follow();
+  } else {
+    Plots.keys(RUNS);
   }
   document.body.dataset.ready = "yes";
 })();

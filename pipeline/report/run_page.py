@@ -1,8 +1,8 @@
-"""The page of one run: what happened, where, when, and what the replay made of it."""
+"""The page of one run: the verdict and why, what happened, where, when, and what the replay made of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -10,58 +10,63 @@ from urllib.parse import quote
 
 import polars as pl
 
+from pipeline.figures.campaign_tables import campaign_balises, with_truth
 from pipeline.figures.known_counts import known_counts
 from pipeline.figures.levels import LEVEL_LISTS
-from pipeline.figures.verdict import verdict_reasons, word_of, worst_verdict
 from pipeline.report.architectures import architectures_section
+from pipeline.report.balises import balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
-from pipeline.report.markup import Cell, Json, badge, figure, link, page, pairs, script_json, section, verdict_head
+from pipeline.report.headline import run_headline
+from pipeline.report.markup import (
+    Cell,
+    Json,
+    figure,
+    link,
+    page,
+    pairs,
+    script_json,
+    section,
+    tiles,
+    verdict_head,
+)
 from pipeline.report.plan_view import plan_data
+from pipeline.report.route_found import route_section
+from pipeline.report.run_facts import FILES, JUDGES, facts, file_table, tile_figures
 from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
-from schemas.campaign import STANFORD, CampaignLevels
+from pipeline.report.words import WORDS
+from schemas.campaign import CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
 
-_FIGURES = (
-    *("verdict", "duration_s", "distance_m", "epochs", "gnss_rate_hz", "evidence", "share_unknown", "vehicle"),
-    *("odometer_contradicted", "availability", "outages", "longest_outage_s", "along_error_p95_m"),
-    *("along_error_max_m", "along_error_epochs", "cross_error_p95_m", "up_error_p95_m", "balises_on_path"),
-    *("balises_accepted", "balises_rejected", "balises_missed", "balises_not_available", "unsafe_accepted"),
-    *("unproven_accepted", "location_error_p95_m", "location_error_count", "failures", "failures_within_budget"),
-    *("failures_beyond_budget", "missed_detections", "time_to_detect_max_s", "hazardous_max_s", "alarms"),
-    *("false_alarms", "false_alarm_rate_per_h", "exposure_max_s", "exposure_p99_s", "mtbf_h", "latency_s"),
-    *("odometer_scale", "ambiguous_stretches", "duplicates", "out_of_order"),
-    *(f"share_{state}" for state in ("p0", "p1", "p2", "p3")),
-    *(f"{prefix}_{kind}" for prefix in ("stanford", "stanford_hpl") for kind in STANFORD),
-)
 _HAZARDS = (
-    *("hazard_id", "failure_mode", "timing", "size_m", "rate_mps", "t_onset", "t_failure", "t_detected", "monitor"),
-    *("time_to_detect_s", "time_since_failure_s", "hazardous_s", "hazardous_may_s", "budget_s", "within_budget"),
-    *("balise_ids", "accepted_ids", "suspect", "evidence", "speed_mps", "caused_by"),
+    *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
+    *("hazardous_s", "hazardous_may_s", "budget_s", "size_m", "timing", "balise_ids", "failure_mode", "rate_mps"),
+    *("t_onset", "t_failure", "t_detected", "suspect", "evidence", "speed_mps", "caused_by"),
 )
 _PASSAGES = (
-    *("balise_id", "status", "kind", "direction", "t_offered", "t_true", "judgement", "location_error_m"),
+    *("balise_id", "judgement", "status", "location_error_m", "t_offered", "t_true", "kind", "direction"),
     *("location_accuracy_m", "speed_mps", "window_open_m", "odometer_distance_m", "window_close_m", "confidence_m"),
     *("linking_error", "reaction", "failure_mode", "cause", "suspect_after_the_fact", "hazard_id"),
 )
 _ALARMS = (
-    *("t_start", "t_end", "monitors", "peak_ratio", "verdict", "suspect", "hazard_id", "netelement_id", "measure_m"),
+    *("t_start", "t_end", "verdict", "monitors", "peak_ratio", "suspect", "hazard_id", "netelement_id", "measure_m"),
 )
 _PLOTS = (
-    ("plan", "Plan", "GNSS positions coloured by the state of the LDS; balises by what became of them; "
-     "thick lines are expectation windows."),
-    ("bands", "LDS mode, state, TVB and alarm", "Where nothing is drawn there was no epoch. Hazards are shaded; "
-     "of the chosen one the dotted line is the onset, the solid one the detection, the dashed one the failure."),
+    ("balises", "Balises along the path", "Location error of each offer where it is known, early is positive; dashed: "
+     "the limit beyond which a position is wrong. Below: offers of unknown error, and balises that were lost."),
+    ("plan", "Plan", "GNSS positions by what the evidence says of them, balises by the worst that became of them."),
+    ("bands", "State of the system over time", "Where nothing is drawn there was no epoch. Hazards are shaded; of the "
+     "chosen one the dotted line is the begin of the fault, the dashed one the failure, the solid one the detection."),
     ("speed", "Speed", ""),
-    ("along", "Error along the track", "Positive ahead of the train, drawn where it is known to 5 m; the confidence "
-     "interval is dashed. Where it is never known: GNSS minus odometer."),
+    ("along", "Error along the track", "Positive: ahead of the train. Drawn where it is known to 5 m, else GNSS minus "
+     "odometer. Dashed: the confidence interval, and the limit beyond which a position is wrong."),
     ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
     ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
-     "in odometer distance; markers are the offers."),
-    ("exposure", "Exposure", "Time since the last linked TVB or accepted VB."),
-    ("monitors-along", "Monitors along the track", "Value over threshold: beyond ±1 the monitor fails."),
+     "in odometer distance; marks are the offers."),
+    ("exposure", "Exposure", "Time since the last linked TVB or accepted balise."),
+    ("monitors-along", "Monitors along the track", "Value over threshold: beyond 1 or -1 the monitor fails."),
     ("monitors-cross", "Monitors across the track", "Value over threshold."),
     ("monitors-up", "Monitors of height", "Value over threshold."),
     ("monitors-other", "Other monitors", "Value over threshold."),
@@ -69,6 +74,7 @@ _PLOTS = (
     ("stanford", "Stanford diagram", "Epochs of known error: error along the track against the confidence claimed. "
      "Below the diagonal the claim was wrong."),
 )  # fmt: skip
+_KEYS = "Keys: n p next and previous hazard, + - 0 zoom, ← → time, [ ] previous and next run"
 
 
 @dataclass(frozen=True)
@@ -80,8 +86,20 @@ class Made:
     site: Site | None
 
 
+@dataclass(frozen=True)
+class Neighbours:
+    """The runs before and after in the campaign, each with its page; None at the ends."""
+
+    before: tuple[str, str] | None = None
+    after: tuple[str, str] | None = None
+
+
 def run_page(
-    tables: RunTables, metadata: Mapping[str, str], made: Made, architectures: pl.DataFrame | None = None
+    tables: RunTables,
+    metadata: Mapping[str, str],
+    made: Made,
+    architectures: pl.DataFrame | None = None,
+    neighbours: Neighbours | None = None,
 ) -> str:
     """HTML of one run with all its solutions; one is shown at a time, all of them are in the page.
 
@@ -89,31 +107,33 @@ def run_page(
     """
     rows = list(tables.runs.iter_rows(named=True))
     names = [row["solution"] for row in rows if row["solution"]]
-    parts = [_solution(f"s{number}", row, tables, len(rows) > 1) for number, row in enumerate(rows)]
+    parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
     side_by_side = "" if architectures is None else architectures_section("architectures", architectures)
-    body = "\n".join([_navigation(names), *parts, side_by_side, _provenance(rows, metadata, made)])
+    told = pairs(facts(rows, tables, metadata))
+    body = "\n".join([told, _navigation(names), *parts, side_by_side, _provenance(metadata, made)])
     data = {
         "run": tables.run_id,
         "limits": _limits(made.config),
         "order": [row["solution"] for row in rows],
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
-    status = "".join(badge(status) for status in dict.fromkeys(str(row["status"]) for row in rows))
-    title = f"<p>{link('../index.html', 'Campaign')}</p><h1>Run {escape(tables.run_id)} {status}</h1>"
-    heading = _verdict(rows, made.config) + title
-    return page(f"{tables.run_id} · balise", heading, body, script_json(data), "../assets", "run.js")
+    head = run_headline(rows, tables.passages, tables.hazards, made.config)
+    heading = (
+        verdict_head(head.word, head.worst, head.reasons)
+        + _ways(neighbours or Neighbours())
+        + f"<h1>Run {escape(tables.run_id)}</h1>"
+    )
+    foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
+    return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
 
 
-def _verdict(rows: Sequence[Row], config: Configuration) -> str:
-    """The worst verdict of the solutions, and what it follows from."""
-    limit = config.hazards.unknown_share_limit
-    reasons = [
-        f"{row['solution']}: {word_of(row['verdict'])}, {verdict_reasons(row, limit)}."
-        if row["verdict"] is not None
-        else f"{row['solution'] or 'run'}: failed."
-        for row in rows
-    ]
-    return verdict_head(word_of(worst_verdict(row["verdict"] for row in rows)), " ".join(reasons))
+def _ways(neighbours: Neighbours) -> str:
+    """To the campaign, and to the runs beside this one."""
+    ways = [link("../index.html", "Campaign", data_go="campaign")]
+    for go, words, other in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
+        if other is not None:
+            ways.append(link(other[1], f"{words} {other[0]}", data_go=go))
+    return f'<p class="ways">{" · ".join(ways)}</p>'
 
 
 def _limits(config: Configuration) -> Json:
@@ -136,7 +156,7 @@ def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
         "plan": plan_data(epochs, passages, made.site, moments_ns),
         "stanford": stanford_data(epochs, made.config.lds.ci_limit_m),
         "hazards": [_hazard_data(row) for row in hazards.iter_rows(named=True)],
-        "passages": [_passage_data(row) for row in passages.iter_rows(named=True)],
+        "passages": [_passage_data(row) for row in passages.with_columns(outcome=outcome()).iter_rows(named=True)],
     }
 
 
@@ -148,8 +168,10 @@ def _hazard_data(row: Row) -> Json:
 def _passage_data(row: Row) -> Json:
     return {
         "id": row["balise_id"],
-        "status": str(row["status"]),
+        "outcome": row["outcome"],
+        "status": WORDS[row["status"]],
         "t_ms": _milliseconds(row["t_offered"] or row["t_true"]),
+        "path_m": row["path_m"],
         "error_m": row["location_error_m"],
         "open_m": row["window_open_m"],
         "close_m": row["window_close_m"],
@@ -175,39 +197,60 @@ def _navigation(names: list[str]) -> str:
     )
     chooser = f'<div role="group" aria-label="Solution">{buttons}</div>' if len(names) > 1 else ""
     moves = (
-        ("back", "← earlier"), ("forward", "later →"), ("in", "zoom in"), ("out", "zoom out"), ("all", "whole run"),
-        ("previous", "previous hazard"), ("next", "next hazard"),
+        ("back", "← earlier", "←"), ("forward", "later →", "→"), ("in", "zoom in", "+"), ("out", "zoom out", "-"),
+        ("all", "whole run", "0"), ("previous", "previous hazard", "p"), ("next", "next hazard", "n"),
     )  # fmt: skip
-    tools = "".join(f'<button type="button" data-move="{key}">{text}</button>' for key, text in moves)
+    tools = "".join(
+        f'<button type="button" data-move="{move}" title="key {key}">{text}</button>' for move, text, key in moves
+    )
     if not names:
         return ""
     return (
         f'<nav class="tools" aria-label="Time axis">{chooser}<div role="group" aria-label="Zoom">{tools}</div>'
-        '<p id="window" aria-live="polite"></p></nav>'
+        f'<p id="window" aria-live="polite"></p><p class="keys">{_KEYS}</p></nav>'
     )
 
 
-def _solution(key: str, row: Row, tables: RunTables, several: bool) -> str:
+def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
     name = row["solution"]
-    notes = [f'<p class="notice {row["status"]}">{escape(text)}</p>' for text in (row["error"], row["notes"]) if text]
+    notes = _notices(row)
     if not name:
-        return "".join(notes) or '<p class="notice failed">The run failed.</p>'
-    hazards, passages, alarms = (
-        frame.filter(pl.col("solution") == name) for frame in (tables.hazards, tables.passages, tables.alarms)
+        return notes
+    own = pl.col("solution") == name
+    hazards, passages, alarms, epochs = (
+        frame.filter(own) for frame in (tables.hazards, tables.passages, tables.alarms, tables.epochs)
     )
-    epochs = tables.epochs.filter(pl.col("solution") == name)
-    known = known_counts(tables.runs.filter(pl.col("solution") == name)).row(0, named=True)
-    title = f"Figures of {name}" if several else "Figures"
+    runs = tables.runs.filter(own)
+    known = known_counts(runs).row(0, named=True)
+    balises = _balises(tables.run_id, passages, runs)
+    shown = tiles(tile_figures(known, balises, made.config.hazards.unknown_share_limit))
+    sure = made.config.matching.ambiguity_probability
     parts = [
-        section(f"figures-{key}", title, *notes, figures(known, Runs, _FIGURES), _levels(key, row)),
+        section(f"figures-{key}", f"Summary of {name}" if several else "Summary", shown, notes),
         section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
+        section(f"balises-{key}", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
         _drawings(key),
         section(f"passages-{key}", "Passages", _passages(key, passages)),
+        section(f"levels-{key}", "Service levels", _levels(key, row)),
         section(f"alarms-{key}", "Alarms", _alarms(key, alarms)),
         section(f"reasons-{key}", "Monitors not evaluated", _reasons(key, epochs)),
+        route_section(f"route-{key}", tables.run_id, epochs, sure),
+        section(f"all-{key}", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
     ]
     opening = f'<div class="solution" id="{key}" data-solution="{escape(name)}">'
     return opening + "\n".join(parts) + "</div>"
+
+
+def _notices(row: Row) -> str:
+    """The error, and what reading and matching found out."""
+    told = [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
+    items = "".join(f"<li>{escape(text)}</li>" for text in told)
+    return f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
+
+
+def _balises(run_id: str, passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
+    named = (frame.with_columns(run_id=pl.lit(run_id)) for frame in (passages, runs))
+    return lost_shares(campaign_balises(with_truth(*named)))
 
 
 def _drawings(key: str) -> str:
@@ -217,7 +260,7 @@ def _drawings(key: str) -> str:
 def _levels(key: str, run: Row) -> str:
     """What the run would be worth at each service level."""
     shown = pl.DataFrame({name: run[column] or [] for name, column in LEVEL_LISTS.items()})
-    title = "Position failures against the allowed T_D (TVB eq. 7)"
+    title = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
     return frame_table(f"table-levels-{key}", title, shown, contract=CampaignLevels)
 
 
@@ -231,8 +274,10 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
                 " was wrong, never that it was right.</p>"
             )
         share = run["share_unknown"]
-        left = "; no position was in use" if share is None else f"; {share:.1%} of the moving time in use is not judged"
-        return f'<p class="none">No hazard was found; judged by: {escape(str(run["evidence"]))}{left}.</p>'
+        left = (
+            "no position was in use" if share is None else f"{share:.1%} of the moving time in use could not be checked"
+        )
+        return f'<p class="none">No hazard was found, judged by {JUDGES[run["evidence"]]}; {left}.</p>'
 
     def named(row: Row) -> Cell:
         return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
@@ -243,9 +288,10 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
 
 def _passages(key: str, passages: pl.DataFrame) -> str:
     def status(row: Row) -> Cell:
-        return Cell(row["status"], row["status"], tone="" if row["status"] == "accepted" else "bad")
+        word = WORDS[row["status"]]
+        return Cell(word, word, tone="" if row["status"] == "accepted" else "lost")
 
-    caption = "Passages of balises"
+    caption = "Passages of balises, in order of time"
     return frame_table(f"table-passages-{key}", caption, passages, _PASSAGES, Passages, {"status": status})
 
 
@@ -257,10 +303,10 @@ def _reasons(key: str, epochs: pl.DataFrame) -> str:
     return frame_table(f"table-reasons-{key}", "Why monitors could not judge", reasons(epochs))
 
 
-def _provenance(rows: Sequence[Row], metadata: Mapping[str, str], made: Made) -> str:
-    first = rows[0]
-    named = {key: str(first[key]) for key in ("software", "contract", "config_digest", "input_digest")}
-    return section("provenance", "Provenance", pairs(sorted((named | dict(metadata)).items())), configuration(made))
+def _provenance(metadata: Mapping[str, str], made: Made) -> str:
+    digests = {name: value for name, value in metadata.items() if not name.endswith(FILES)}
+    shown = pairs(sorted(digests.items()))
+    return section("provenance", "Provenance", file_table(metadata), shown, configuration(made))
 
 
 def configuration(made: Made) -> str:
@@ -268,4 +314,4 @@ def configuration(made: Made) -> str:
     if made.config_text is None:
         return '<p class="notice partial">The result holds no config.toml: limits are the defaults.</p>'
     text = f'<pre tabindex="0">{escape(made.config_text)}</pre>'
-    return f"<details><summary>Resolved configuration (TOML)</summary>{text}</details>"
+    return f"<details><summary>Configuration as it was used (TOML)</summary>{text}</details>"

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
-from pipeline.report.decimate import Band, band, detail_rows, kept_rows
+from pipeline.report.decimate import WHOLE_SERIES, Band, band, detail_rows, kept_rows
 from pipeline.report.markup import Json, packed
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
@@ -35,7 +35,7 @@ MOMENTS = ("t_onset", "t_hazard", "t_failure", "t_detected", "t_negated", "t_end
 def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Json:
     """Series and bands over time; times are milliseconds from `t0_ms`. Across a gap lines are broken."""
     if epochs.is_empty():
-        return {"t0_ms": 0, "t1_ms": 0, "series": {}, "bands": []}
+        return {"t0_ms": 0, "t1_ms": 0, "t": None, "series": {}, "bands": []}
     t_ns = epochs["t"].to_physical().to_numpy()
     t0_ms = int(t_ns[0] // 1_000_000)
     t_ms = t_ns // 1_000_000 - t0_ms
@@ -50,6 +50,7 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
     return {
         "t0_ms": t0_ms,
         "t1_ms": int(t_ns[-1] // 1_000_000),
+        "t": packed(shown_ms, "u4") if len(shown_ms) <= WHOLE_SERIES else None,
         "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
         "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
     }
@@ -91,6 +92,8 @@ def _residual(epochs: pl.DataFrame) -> Floats:
 
 
 def _series(t_ms: Ints, values: Floats, whole: Bools) -> Json:
+    if len(values) <= WHOLE_SERIES:
+        return {"y": packed(values, "f4")}  # at every time in `t`
     rows = kept_rows(values, whole)
     return {"x": packed(t_ms[rows], "u4"), "y": packed(values[rows], "f4")}
 

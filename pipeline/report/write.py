@@ -1,4 +1,4 @@
-"""Reports on disk: a page for the campaign, one per run, and what they share."""
+"""Reports on disk: a page for the campaign and one per run, each a file that needs no other."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
@@ -17,7 +16,7 @@ from pipeline.campaign.workers import each
 from pipeline.figures.derived_tables import derived_tables
 from pipeline.report.availability import availability_pieces
 from pipeline.report.campaign_page import Campaign, campaign_page
-from pipeline.report.run_page import Made, run_page
+from pipeline.report.run_page import Made, Neighbours, run_page
 from pipeline.results.store import (
     check_site,
     complete_runs,
@@ -35,7 +34,6 @@ from schemas.run import Site
 from schemas.tables import TABLES
 
 _PAGES_PER_PROCESS = 20
-_OWN_ASSETS = ("report.css", "tables.js", "plots.js", "run.js", "campaign.js")
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,15 @@ class _Page:
     run: str
     path: Path
     made: Made
+    neighbours: Neighbours
 
 
 def write_report(
     out: Path, site: Site | None = None, jobs: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> list[Path]:
-    """Write `OUT/report`: `index.html`, `runs/RUN.html`, `assets/`; returns the files, the index first.
+    """Write `OUT/report`: `index.html`, `runs/RUN.html`; returns the files, the index first.
 
-    The pages open from disk and make no request beyond the files beside them. Plans need the site; without it
+    The pages open from disk and make no request. Plans need the site; without it
     places are drawn along the path. Pages of runs that are no longer in the result are removed; those that were made
     from these very tables, settings and program are left as they are. `jobs` processes make the others, by
     default one per core where there are many; `progress` is told how many pages of how many are done.
@@ -61,8 +60,9 @@ def write_report(
     runs = complete_runs(out)
     made = _made(out, site)
     names = {run: page_name(run) for run in runs}
-    pages = [_Page(out, run, out / "report" / "runs" / name, made) for run, name in names.items()]
-    written = [*_write_assets(out / "report" / "assets")]
+    beside = _neighbours(names)
+    pages = [_Page(out, run, out / "report" / "runs" / name, made, beside[run]) for run, name in names.items()]
+    written: list[Path] = []
     found: dict[str, pl.DataFrame] = {}
     for done, (page, tallies) in enumerate(
         zip(pages, each(_written, pages, jobs or _worth(len(pages))), strict=True), start=1
@@ -84,6 +84,12 @@ def page_name(run_id: str) -> str:
     return f"{file_name(run_id)}.html"
 
 
+def _neighbours(names: dict[str, str]) -> dict[str, Neighbours]:
+    """The pages before and after each run's."""
+    ways = [None, *((run, quote(name)) for run, name in names.items()), None]
+    return {run: Neighbours(ways[at], ways[at + 2]) for at, run in enumerate(names)}
+
+
 def _worth(pages: int) -> int:
     """Processes that so many pages are worth: starting one takes as long as some pages."""
     return min(os.cpu_count() or 1, 1 + pages // _PAGES_PER_PROCESS)
@@ -103,7 +109,7 @@ def _written(page: _Page) -> pl.DataFrame | None:
     if tables.runs.height > 1:
         tallies = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, page.made.config)
     if not kept:
-        _write(page.path, run_page(tables, metadata, page.made, tallies).encode() + mark)
+        _write(page.path, run_page(tables, metadata, page.made, tallies, page.neighbours).encode() + mark)
     return tallies
 
 
@@ -114,7 +120,8 @@ def _made_from(page: _Page) -> str:
         table = Path(str(table_address(page.out, name, page.run)))
         digest.update(table.read_bytes() if table.exists() else b"missing")  # which reading the tables tells
     site = page.made.site
-    digest.update(f"{page.run}\n{page.made.config_text}\n{None if site is None else site.digest}".encode())
+    beside = f"{page.run}\n{page.neighbours}"
+    digest.update(f"{beside}\n{page.made.config_text}\n{None if site is None else site.digest}".encode())
     return digest.hexdigest()
 
 
@@ -140,12 +147,6 @@ def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, pl.
         hrefs=hrefs,
         architectures=added(found.values()),
     )
-
-
-def _write_assets(folder: Path) -> list[Path]:
-    own = [_write(folder / name, (files("pipeline.report") / name).read_bytes()) for name in _OWN_ASSETS]
-    library = (files("plotly") / "package_data" / "plotly.min.js").read_bytes()
-    return [*own, _write(folder / "plotly.min.js", library)]
 
 
 def _write(path: Path, content: bytes) -> Path:

@@ -20,32 +20,29 @@ from schemas.campaign import CAMPAIGN_TABLES
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
-# After comments and brackets, the words that a query begins with.
-_QUERY = re.compile(r"(\s|\(|--[^\n]*(\n|$)|/\*.*?\*/)*(select|with|explain|from|values)\b", re.IGNORECASE | re.DOTALL)
+# What may stand before the words that a query begins with, one piece at a time: in one expression it takes for ever.
+_BEFORE = re.compile(r"\s+|\(|--[^\n]*|/\*.*?\*/", re.DOTALL)
+_QUERY = re.compile(r"(select|with|explain|from|values)\b", re.IGNORECASE)
+# Functions of polars' SQL that open files; looked for in texts and comments, too, so that no quoting hides them.
+_FILES = re.compile(r"\bread_(csv|parquet|ipc|json|ndjson)\b", re.IGNORECASE)
 
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
 _REMEDY = "`balise dictionary` lists the columns of each table."
 
 
-def run_sql(out: Address, sql: str) -> pl.DataFrame:
+def run_sql(out: Address, sql: str, allow_files: bool = False) -> pl.DataFrame:
     """The answer to one SELECT over the complete runs of a result.
 
     Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, and those of the
     campaign where they are written. A condition on `run_id` reads the files of these runs only.
+    `allow_files`: the query may also read other files of this machine (`read_csv` and its like).
     """
-    if not _QUERY.match(sql):
-        raise UsageError(
-            "is no query",
-            place="SQL",
-            found=sql.strip()[:80] or "nothing",
-            expected=f"{_EXPECTED} (WITH ... SELECT, EXPLAIN SELECT); results are only read",
-            remedy=_REMEDY,
-        )
+    _check_query(sql, allow_files)
     tables = _tables(out, sql)
     try:
         with catalogue.patient():
             return pl.SQLContext(tables).execute(sql).collect()
-    except pl.exceptions.PolarsError as error:
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
         if not is_url(out):
             store.check_tables(out, [name for name in TABLES if name in tables])
         raise UsageError(
@@ -54,6 +51,28 @@ def run_sql(out: Address, sql: str) -> pl.DataFrame:
             expected=_EXPECTED,
             remedy=_REMEDY,
         ) from None
+
+
+def _check_query(sql: str, allow_files: bool) -> None:
+    begin = 0
+    while before := _BEFORE.match(sql, begin):
+        begin = before.end()
+    if not _QUERY.match(sql, begin):
+        raise UsageError(
+            "is no query",
+            place="SQL",
+            found=sql.strip()[:80] or "nothing",
+            expected=f"{_EXPECTED} (WITH ... SELECT, EXPLAIN SELECT); results are only read",
+            remedy=_REMEDY,
+        )
+    if not allow_files and (found := _FILES.search(sql)):
+        raise UsageError(
+            "reads files beside the result",
+            place="SQL",
+            found=found[0],
+            expected=_EXPECTED,
+            remedy="`--allow-files` lets a query that you trust read files of this machine.",
+        )
 
 
 def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
@@ -84,5 +103,5 @@ def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFra
     return {name: pl.read_parquet(content).lazy() for name, content in there.items() if content is not None}
 
 
-def _first_line(error: Exception) -> str:
+def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -16,7 +16,7 @@ from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, settings_from, to_toml
 from schemas.conform import conform, dtypes
-from schemas.errors import UsageError
+from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
 
@@ -25,6 +25,8 @@ PREFIX = "balise."
 _COMPRESSION_LEVEL = 3
 _ROWS_PER_GROUP = 262_144
 _MARKER = "runs"
+# Of 255 bytes that file systems allow, `run_id=` takes seven.
+LONGEST_NAME = 248
 
 
 def table_address(out: Address, table: str, run_id: str) -> Address:
@@ -179,8 +181,10 @@ def complete_runs(out: Address) -> list[str]:
 
 def check_site(site: Site | None, replayed_digest: str | None, run_id: str) -> None:
     """Refuse a site that is known to be another one than the run was replayed on."""
-    if site is not None and site.digest and replayed_digest and site.digest != replayed_digest:
-        raise UsageError("was replayed on another site", place=run_id, found=site.digest, expected=replayed_digest)
+    # A run replayed with a route of its own adds the route's digest (`campaign/plan.py`).
+    replayed = replayed_digest.split()[0] if replayed_digest else None
+    if site is not None and site.digest and replayed and site.digest != replayed:
+        raise UsageError("was replayed on another site", place=run_id, found=site.digest, expected=replayed)
 
 
 def completed_runs(out: Address) -> dict[str, dict[str, str]]:
@@ -210,8 +214,16 @@ def sweep(out: Address) -> None:
             if folder.startswith("run_id=") and folder not in complete:
                 storage.remove_folder(join(join(out, table), folder))
     if not is_url(out):
-        for folder in ("", "*/", "*/run_id=*/"):
-            _remove_unfinished(Path(out).glob(folder + storage.UNFINISHED))
+        for folder in _folders(Path(out)):
+            _remove_unfinished(folder)
+
+
+def _folders(out: Path) -> Iterator[str]:
+    """The folders of a result, runs and all."""
+    yield str(out)
+    for table in storage.folders_in(out):
+        yield f"{out}/{table}"
+        yield from (f"{out}/{table}/{run}" for run in storage.folders_in(out / table))
 
 
 def sweep_run(out: Path, run_id: str) -> None:
@@ -220,14 +232,14 @@ def sweep_run(out: Path, run_id: str) -> None:
     for table in TABLES:
         folder = Path(table_address(out, table, run_id)).parent
         if complete:
-            _remove_unfinished(folder.glob(storage.UNFINISHED))
+            _remove_unfinished(folder)
         else:
             storage.remove_folder(folder)
 
 
-def _remove_unfinished(files: Iterable[Path]) -> None:
-    for file in files:
-        file.unlink(missing_ok=True)
+def _remove_unfinished(folder: Path | str) -> None:
+    for name in storage.unfinished_in(folder):
+        Path(folder, name).unlink(missing_ok=True)
 
 
 def read_config(out: Address) -> Configuration | None:
@@ -235,7 +247,14 @@ def read_config(out: Address) -> Configuration | None:
     address = join(out, "config.toml")
     if not exists(address):
         return None
-    return settings_from(tomllib.loads(read_bytes(address).decode()), Configuration, str(address))
+    try:
+        return settings_from(tomllib.loads(read_bytes(address).decode()), Configuration, str(address))
+    except (ConfigError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(
+            f"was not written by this build of the program: {error}",
+            place=shown(address),
+            remedy="Replay the runs again into the same output; `balise replay` sees which are due.",
+        ) from None
 
 
 def write_config(out: Address, settings: Settings) -> None:
@@ -253,7 +272,10 @@ def _read_remote(table: str, paths: list[str], runs: list[str]) -> pl.LazyFrame:
     for path, run in zip(paths, runs, strict=True):
         if path not in contents:
             raise _unreadable(table, run, "no such object")
-        frame = pl.read_parquet(contents[path])
+        try:
+            frame = pl.read_parquet(contents[path])
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+            raise _unreadable(table, run, str(error).strip().partition("\n")[0]) from None
         _check_columns(table, run, frame.schema)
         frames.append(frame.lazy().with_columns(run_id=pl.lit(run)))
     return pl.concat(frames, how="diagonal")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -14,7 +15,11 @@ import polars as pl
 from rich.console import Console
 from rich.table import Table
 
+from schemas.errors import visible
+
 _SAID_EVERY_S = 5.0
+# Control characters that JSON itself lets stand.
+_STEERING = re.compile("[\x7f-\x9f]")
 
 
 def show_table(frame: pl.DataFrame, title: str = "") -> None:
@@ -50,7 +55,8 @@ def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
 
 def to_json(value: Any) -> str:
     """JSON of frames, instants and plain values; what is not known is null."""
-    return json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)
+    text = json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)
+    return _STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def duration_text(seconds: float) -> str:
@@ -90,7 +96,7 @@ def _text(value: object) -> str:
         case list():
             return " ".join(map(_text, value))
         case _:
-            return str(value)
+            return visible(str(value)).replace("\n", r"\n")
 
 
 def _plain(value: Any) -> Any:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import AlarmEpisode
-from pipeline.judge.alarms import margins_m
+from pipeline.judge.alarms import verdict_within
+from pipeline.judge.judgement import margins_m
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
@@ -36,12 +38,10 @@ def _of_side(alarm: AlarmEpisode, side: Solution, config: HazardConfig) -> Verdi
     since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, alarm.end_ns))
     known = part.filter(pl.col("path_m").is_not_null())
-    margin = margins_m(floats(known, "sigma_along_m"), config)
-    low, high = floats(known, "error_low_m"), floats(known, "error_high_m")
-    if _known_wrong(alarm, side) or ((low > margin) | (high < -margin)).any():
+    low_m, high_m, sigma_m = (floats(known, name) for name in ("error_low_m", "error_high_m", "sigma_along_m"))
+    if _known_wrong(alarm, side):
         return Verdict.TRUE
-    silent = side.with_truth and known.height and ((low >= -margin) & (high <= margin)).all()
-    return Verdict.FALSE if silent else Verdict.UNKNOWN
+    return verdict_within(low_m, high_m, margins_m(sigma_m, config), np.full(known.height, side.with_truth))
 
 
 def _known_wrong(alarm: AlarmEpisode, side: Solution) -> bool:

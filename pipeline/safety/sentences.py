@@ -65,8 +65,8 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
         open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
         if open_cases.height:
             said.append(
-                f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs are neither true nor"
-                " false for want of evidence: the rate of false alarms leaves these runs out."
+                f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs could not be"
+                " checked: the rate of false alarms leaves these runs out."
             )
     return said
 
@@ -118,29 +118,29 @@ def _statement(row: dict[str, Any]) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
     head = " ".join([_failures(row), _missed(row), _acceptances(row)])
     if row["share_p1"]:
-        head += f" Judged wrong and not negated: {row['share_p1']:.3%} of the time in runs with a truth."
+        head += f" Wrong and not blocked: {row['share_p1']:.3%} of the time in runs with a truth."
     if row["hours_still_needed"] == 0.0:
-        return f"{head} This substantiates a {claim}."
+        return f"{head} By counting, this proves a {claim}."
     return (
-        f"{head} This trial cannot substantiate a {claim}: it takes {row['hours_needed']:.3g} h with a truth and no"
-        f" further failure, {row['hours_still_needed']:.3g} h more. The claim has to rest on the time to detect."
+        f"{head} Fault-free hours still needed to prove a {claim} by counting: {row['hours_still_needed']:.3g} of"
+        f" {row['hours_needed']:.3g} h with a truth. The claim has to rest on the time to detect."
     )
 
 
 def _failures(row: dict[str, Any]) -> str:
     within, beyond = row["failures_within_budget"], row["failures_beyond_budget"]
     unknown = row["failures"] - within - beyond
-    beside = f", of {unknown} it cannot be said" if unknown else ""
+    beside = f", {unknown} could not be checked" if unknown else ""
     return (
         f"{row['solution']}: of {row['failures']} position failures in use, at a virtual balise or not, {within} were"
-        f" within the budget and {beyond} beyond it{beside}, in {row['hours_with_evidence']:.6g} h judged,"
+        f" in time and {beyond} too late{beside}, in {row['hours_with_evidence']:.6g} h judged,"
         f" {row['hours_with_truth']:.6g} h of these by a truth (reference or balise reads)."
     )
 
 
 def _missed(row: dict[str, Any]) -> str:
     known, missed = row["missed_known"], row["missed_judged"]
-    said = f"Of {known} faults with a failure that a truth judged {missed} were missed detections"
+    said = f"Of {known} faults with a failure that a truth judged {missed} were not found in time"
     if row["missed"] > missed:
         said += f"; {row['missed'] - missed} more were seen by the odometer alone, and shares leave them out"
     return f"{said}."
@@ -152,5 +152,5 @@ def _acceptances(row: dict[str, Any]) -> str:
     if seen > unsafe:
         said += f", and {seen - unsafe} more by the odometer alone"
     if row["unproven_accepted"]:
-        said += f"; of {row['unproven_accepted']} accepted ones nothing says whether the position was right"
+        said += f"; of {row['unproven_accepted']} accepted ones the position could not be checked"
     return f"{said}."

@@ -12,10 +12,9 @@ from itertools import permutations
 
 import polars as pl
 
-from pipeline.epochs.clock import Clock, flags, trusted
+from pipeline.epochs.clock import Clock, met, trusted
 from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.epochs.timeline import held_s, uptime
-from pipeline.figures.bounds import threshold_factor
 from pipeline.figures.independent import independent_episodes, missed_detection
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.channels import on_path_of, paired
@@ -103,8 +102,7 @@ def _evaluated(monitor: str) -> pl.Expr:
 def _composite(one: Solution, other: Solution, config: Configuration) -> Row:
     placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
-    factor = threshold_factor(config.monitors.false_alarm_probability)
-    compared = channel_monitor(positioned, placed, factor).select(
+    compared = channel_monitor(positioned, placed, config).select(
         pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
     )
     met = other.epochs.select(other_trusted=trusted(config).gather(paired(one.epochs, other.epochs)["row_other"]))
@@ -127,13 +125,13 @@ def _channel(
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
-    seen = flags(epochs, judged)
-    working = seen & flags(epochs, position)
+    seen = met(epochs, judged)
+    working = seen & met(epochs, position)
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
-    known = flags(one.epochs, judged_epoch() & pl.lit(one.with_truth))
-    wrong = known & flags(one.epochs, pl.col("judgement") == Judgement.WRONG)
+    known = met(one.epochs, judged_epoch() & pl.lit(one.with_truth))
+    wrong = known & met(one.epochs, pl.col("judgement") == Judgement.WRONG)
     return _Channel(clock, fails, seen, working, known, wrong)
 
 

@@ -11,7 +11,7 @@ import polars as pl
 from scipy.spatial import cKDTree
 
 from pipeline.track.geodesy import points_of
-from pipeline.track.survey import GAP_COUNTS_M, Track, end_places, geometric_measures_m, track_of
+from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
 from schemas.enums import Navigability
 from schemas.run import Finding
 
@@ -26,7 +26,6 @@ LENGTH_TOLERANCE_M = 0.5
 CHORD_ERROR_M = 0.25
 # Of a finding about one balise: this and its id.
 BALISE_PLACE = "balises: "
-MEASURE_TOLERANCE_M = 0.5
 # An end's direction is that of its last metres: single vertices may lie a centimetre apart.
 END_REACH_M = 20.0
 

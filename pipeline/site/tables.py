@@ -49,7 +49,7 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
     """A Parquet or CSV file as it stands, or a breach."""
     try:
         return _parquet(file, data) if file.endswith(".parquet") else _csv(file, data)
-    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         kind = "Parquet" if file.endswith(".parquet") else "CSV"
         breaches.append(f"{file}: is not readable as {kind} ({str(error).splitlines()[0]})")
         return None

@@ -5,11 +5,11 @@ Touches files and stores, and knows nothing of what they hold.
 
 `address` is how places are named; `files` reads one file; `fetching` lists, and reads many; `writing` puts files there
 whole or not at all; `identity` tells whether content is still the same; `object_store` opens the stores, and is the
-patience with those that fail.
+patience with those that fail; `objects` is what they say of an object, and whether what came is that.
 """
 
 from pipeline.storage.fetching import content_of, folders_in, glob_remote, local_copy, reach, read_many
-from pipeline.storage.identity import FileState, content_digest, signature, version, version_of, versions
+from pipeline.storage.identity import FileState, content_digest, signature, version, versions
 from pipeline.storage.writing import (
     UNFINISHED,
     SweptError,
@@ -19,7 +19,10 @@ from pipeline.storage.writing import (
     discard,
     remove,
     remove_folder,
+    replace_files,
     stage,
+    unfinished_in,
+    whole_file,
     write_bytes,
 )
 
@@ -40,10 +43,12 @@ __all__ = [
     "read_many",
     "remove",
     "remove_folder",
+    "replace_files",
     "signature",
     "stage",
+    "unfinished_in",
     "version",
-    "version_of",
     "versions",
+    "whole_file",
     "write_bytes",
 ]

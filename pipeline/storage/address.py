@@ -5,9 +5,16 @@ from __future__ import annotations
 import re
 from pathlib import Path, PurePosixPath
 
+from schemas.errors import UsageError
+
 Address = Path | str
 
-_SECRETS = re.compile(r"(?<=://)[^/@\s]+@|\?[^\s'\"]*|((?:AKIA|ASIA)[A-Z0-9]{12,})")
+# User and password up to the last @ (a key may hold slashes), what follows a question mark, keys by their looks.
+_SECRETS = re.compile(
+    r"(?<=://)(?:[^/@\s]+|[^/@:\s]*:[^\s]*)@|(?<=://)(?!arn:)[^/\s:@]+:(?!\d+(?:[/\s]|$))[^\s'\"]*"
+    r"|\?[^\s'\"]*|(?:AKIA|ASIA)[A-Z0-9]{12,}"
+)
+_BUCKETS = re.compile(r"s3a?://(?!arn:)[^/]*[:@]")
 
 
 def is_url(path: Address) -> bool:
@@ -25,9 +32,23 @@ def shown(path: Address) -> str:
     return redacted(str(path)) if is_url(path) else str(path)
 
 
+def check_public(path: Address) -> None:
+    """Refuse a bucket's address with a key in it: no store reads it there, and error messages would repeat it."""
+    if _BUCKETS.match(str(path)):
+        raise UsageError(
+            "holds credentials or a port, which have no place in the address of a bucket",
+            place=redacted(str(path)),
+            expected="s3://BUCKET/...",
+            remedy="Set AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL in the environment.",
+        )
+
+
 def name_of(path: Address) -> str:
-    """The last part of the path, without a trailing slash."""
-    return PurePosixPath(str(path).rstrip("/")).name if is_url(path) else Path(path).name
+    """The last part of the path, without a trailing slash, nor the signature that a web address may carry."""
+    if not is_url(path):
+        return Path(path).name
+    bare = str(path).partition("?")[0] if str(path).startswith("http") else str(path)
+    return PurePosixPath(bare.rstrip("/")).name
 
 
 def stem_of(path: Address) -> str:

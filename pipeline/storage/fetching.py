@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.object_store import arrivals, on_store, opened
-from schemas.errors import InputError
+from pipeline.storage.objects import AlteredError, Listing, check_copy, entries_of, kind_of, objects_at, version_in
+from schemas.errors import InputError, OutputError
 
 
 def reach(address: Address) -> None:
     """Raises `InputError` where the store of an address does not answer; local paths answer always."""
     if is_url(address):
-        on_store(address, lambda store, path: store.isdir(path), kind=InputError)
+        on_store(address, kind_of, kind=InputError)
 
 
 def folders_in(address: Address) -> list[str]:
@@ -27,25 +31,41 @@ def folders_in(address: Address) -> list[str]:
             return sorted(entry.name for entry in os.scandir(address) if entry.is_dir())
         except (FileNotFoundError, NotADirectoryError):
             return []
-
-    def names(store: Any, path: str) -> list[str]:
-        try:
-            entries = store.ls(path, detail=True)
-        except FileNotFoundError:
-            return []
-        return sorted(name_of(entry["name"]) for entry in entries if entry["type"] == "directory")
-
-    return on_store(address, names)
+        except OSError as error:
+            raise OutputError(f"cannot be listed: {error.strerror}", place=str(address)) from None
+    found = on_store(address, entries_of)
+    return sorted(name_of(entry["name"]) for entry in found if entry["type"] == "directory")
 
 
 def glob_remote(pattern: str) -> list[Address]:
     """Addresses that match a glob in an object store, sorted."""
-    return [
-        str(found)
-        for found in on_store(
-            pattern, lambda store, path: sorted(store.unstrip_protocol(p) for p in store.glob(path)), kind=InputError
-        )
-    ]
+    return on_store(
+        pattern,
+        lambda store, path: sorted(store.unstrip_protocol(found) for found in _globbed(store, path)),
+        kind=InputError,
+    )
+
+
+def _globbed(store: Any, pattern: str) -> list[str]:
+    """Folder by folder: the glob of fsspec leaves out those that the store failed to list."""
+    root, *parts = pattern.split("/")
+    places = [root]
+    for part in parts:
+        if part == "**":
+            places = [folder for place in places for folder in _folders_below(store, place)]
+        elif glob.has_magic(part):
+            inside = [entry["name"].rstrip("/") for place in places for entry in entries_of(store, place)]
+            places = [name for name in inside if fnmatchcase(name.rpartition("/")[2], part)]
+        else:
+            places = [f"{place}/{part}" for place in places]
+    return [place for place in places if glob.has_magic(parts[-1]) or kind_of(store, place)]
+
+
+def _folders_below(store: Any, place: str) -> Iterator[str]:
+    yield place
+    for entry in entries_of(store, place):
+        if entry["type"] == "directory":
+            yield from _folders_below(store, entry["name"].rstrip("/"))
 
 
 def read_many(addresses: list[str]) -> dict[str, bytes]:
@@ -73,22 +93,46 @@ def content_of(address: Address) -> bytes | None:
         return Path(address).read_bytes()
     except FileNotFoundError:
         return None
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror}", place=str(address)) from None
 
 
 @contextlib.contextmanager
-def local_copy(address: Address) -> Iterator[Path]:
-    """A local path with the content of the address; downloads are removed afterwards."""
+def local_copy(address: Address, version: str | None = None) -> Iterator[Path]:
+    """A local path with the content of the address, of a folder the files directly in it; removed afterwards.
+
+    What came is held against names, sizes and digests that the store lists, and the list against `version`, if given.
+    """
     if not is_url(address):
         yield Path(address)
         return
     with tempfile.TemporaryDirectory(prefix="balise-") as folder:
-        target = Path(folder) / name_of(address)
+        yield on_store(address, lambda store, path: _fetched(store, path, Path(folder), version), kind=InputError)
 
-        def fetch(store: Any, path: str) -> None:
-            if store.isdir(path):
-                store.get(path, str(target), recursive=True, callback=arrivals(store))
-            else:
-                store.get_file(path, str(target), callback=arrivals(store))
 
-        on_store(address, fetch, kind=InputError)
-        yield target
+def _fetched(store: Any, path: str, folder: Path, version: str | None) -> Path:
+    """One attempt, in a folder of its own: what an attempt that failed has left must not pass for content."""
+    for left in folder.iterdir():
+        shutil.rmtree(left, ignore_errors=True)
+    listing = objects_at(store, path)
+    if not listing:
+        raise FileNotFoundError(path)
+    if version is not None and version_in(listing) != version:
+        raise AlteredError("changed while it was read")
+    target = Path(tempfile.mkdtemp(dir=folder)) / name_of(path)
+    copies = _copies(listing, path, target)
+    try:
+        store.get(list(copies), [str(copy) for copy in copies.values()], callback=arrivals(store))
+        for place, copy in copies.items():
+            check_copy(store, place, listing[place], copy)
+    except FileNotFoundError as error:
+        raise AlteredError(f"is listed and does not come: {error}") from None
+    return target
+
+
+def _copies(listing: Listing, path: str, target: Path) -> dict[str, Path]:
+    """Where the object goes, or each of those in the folder."""
+    if path in listing:
+        return {path: target}
+    target.mkdir()
+    return {place: target / name_of(f"x://{place}") for place in listing}

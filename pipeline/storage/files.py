@@ -12,17 +12,18 @@ from typing import IO, Any, TypeVar
 from pipeline.storage.address import Address, is_url, name_of
 from pipeline.storage.fetching import local_copy
 from pipeline.storage.object_store import on_store
+from pipeline.storage.objects import kind_of
 from schemas.errors import InputError
 
 T = TypeVar("T")
 
 
 def exists(path: Address) -> bool:
-    return _either(path, Path.exists, lambda store, inner: bool(store.exists(inner)))
+    return _either(path, Path.exists, lambda store, inner: bool(kind_of(store, inner)))
 
 
 def is_dir(path: Address) -> bool:
-    return _either(path, Path.is_dir, lambda store, inner: bool(store.isdir(inner)))
+    return _either(path, Path.is_dir, lambda store, inner: kind_of(store, inner) == "directory")
 
 
 def list_dir(path: Address) -> list[str]:

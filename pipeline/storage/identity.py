@@ -5,16 +5,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from pipeline.storage.address import Address, is_url, name_of
+from pipeline.storage.address import Address, is_url
 from pipeline.storage.fetching import folders_in
 from pipeline.storage.object_store import on_store
+from pipeline.storage.objects import objects_at, version_in, version_of
 from schemas.errors import InputError
-
-_BLOCK_BYTES = 1 << 20
 
 
 def versions(folder: Address, name: str) -> dict[str, str] | None:
@@ -24,36 +22,15 @@ def versions(folder: Address, name: str) -> dict[str, str] | None:
     """
     if not is_url(folder):
         return _local_versions(str(folder), name)
-    infos = {
-        place.split("/")[-2]: info for place, info in on_store(folder, _infos).items() if place.endswith(f"/{name}")
-    }
+    listed = on_store(folder, lambda store, path: store.find(path, detail=True))
+    infos = {place.split("/")[-2]: info for place, info in listed.items() if place.endswith(f"/{name}")}
     found = {part: version_of(info) for part, info in infos.items()}
     return None if None in found.values() else {part: str(version) for part, version in found.items()}
 
 
 def version(address: Address) -> str | None:
     """What changes with the content of an object, or of the objects in a folder; none where that is not known."""
-    infos = on_store(address, _infos, kind=InputError)
-    found = {place: version_of(info) for place, info in infos.items()}
-    if not found or None in found.values():
-        return None
-    return "\n".join(f"{name_of(place)} {text}" for place, text in sorted(found.items()))
-
-
-def _infos(store: Any, path: str) -> dict[str, Any]:
-    """What a store tells of an object, or of each object in a folder, by its path."""
-    try:
-        return dict(store.find(path, detail=True))
-    except FileNotFoundError:
-        return {}
-
-
-def version_of(info: Mapping[str, Any]) -> str | None:
-    """An object's entity tag, size and time; weak tags stand for other content too, and are none."""
-    tag = info.get("ETag") or info.get("etag")
-    if not tag or str(tag).startswith("W/"):
-        return None
-    return f"{tag} {info.get('size')} {info.get('LastModified')}"
+    return version_in(on_store(address, objects_at, kind=InputError))
 
 
 def _local_versions(folder: str, name: str) -> dict[str, str]:
@@ -79,11 +56,8 @@ def content_digest(path: Path, known: str = "") -> str:
 
 
 def _file_digest(file: Path) -> str:
-    digest = hashlib.sha256()
     with file.open("rb") as stream:
-        while block := stream.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 class FileState(NamedTuple):
@@ -91,12 +65,16 @@ class FileState(NamedTuple):
 
     name: str
     size_bytes: int
+    written_ns: int
     changed_ns: int
     inode: int
 
 
 def signature(path: Path) -> tuple[FileState, ...]:
     """The state of a file, or of each file directly in a folder."""
-    files = sorted(entry for entry in path.iterdir() if entry.is_file()) if path.is_dir() else [path]
-    stats = [(file.name, file.stat()) for file in files]
-    return tuple(FileState(name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in stats)
+    if path.is_dir():
+        with os.scandir(path) as entries:
+            stats = sorted((entry.name, entry.stat()) for entry in entries if entry.is_file())
+    else:
+        stats = [(path.name, path.stat())]
+    return tuple(FileState(name, s.st_size, s.st_mtime_ns, s.st_ctime_ns, s.st_ino) for name, s in stats)

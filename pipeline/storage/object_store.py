@@ -13,7 +13,8 @@ from functools import lru_cache, partial
 from itertools import count
 from typing import Any, TypeVar
 
-from pipeline.storage.address import Address, redacted
+from pipeline.storage.address import Address, check_public, redacted
+from pipeline.storage.objects import AlteredError
 from schemas.errors import BaliseError, InputError, OutputError, UsageError
 
 T = TypeVar("T")
@@ -21,6 +22,7 @@ T = TypeVar("T")
 _PATIENCE = "BALISE_STORE_PATIENCE_S"
 _PATIENCE_S = 45.0
 _TRIES = 4
+_TRIES_OF_ALTERED = 6
 _TRIES_OF_WHAT_MAY_PASS = 12
 _FIRST_PAUSE_S = 0.25
 _LONGEST_PAUSE_S = 8.0
@@ -57,7 +59,8 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
             pause_s = min(_FIRST_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
             silent = _may_pass(error) and watched.silence_s + pause_s > limit_s
             if silent or attempt + 1 >= _tries(error):
-                raise _refused(address, reason, kind, limit_s if silent else None) from None
+                what = "" if isinstance(error, AlteredError) else _failure(limit_s if silent else None)
+                raise _refused(address, what + reason, kind) from None
             time.sleep(pause_s)
     raise AssertionError("the last attempt returns or raises")
 
@@ -76,6 +79,7 @@ def patience_s() -> float:
 
 def opened(address: Address, kind: type[BaliseError] = OutputError) -> tuple[Any, str]:
     """The file system of an address and its path there: every access to a store goes through this one."""
+    check_public(address)
     protocol, _, rest = str(address).partition("://")
     try:
         store = _filesystem(protocol, f"{protocol}://{rest.split('/', 1)[0]}")
@@ -163,6 +167,8 @@ def _told(error: Exception, before: str) -> str:
 def _tries(error: Exception) -> int:
     if isinstance(error, FileNotFoundError | PermissionError):
         return 1
+    if isinstance(error, AlteredError):
+        return _TRIES_OF_ALTERED
     return _TRIES_OF_WHAT_MAY_PASS if _may_pass(error) else _TRIES
 
 
@@ -179,10 +185,13 @@ def _absent(address: Address) -> InputError:
     )
 
 
-def _refused(address: Address, reason: str, kind: type[BaliseError], after_s: float | None) -> BaliseError:
-    what = "the store refused" if after_s is None else f"the store was asked in vain for {after_s:g} s"
+def _failure(silent_s: float | None) -> str:
+    return "the store refused: " if silent_s is None else f"the store was asked in vain for {silent_s:g} s: "
+
+
+def _refused(address: Address, reason: str, kind: type[BaliseError]) -> BaliseError:
     return kind(
-        f"{what}: {redacted(reason)}",
+        redacted(reason),
         place=redacted(str(address)),
         remedy="Check address, rights and connection; complete runs stay and are skipped next time.",
     )

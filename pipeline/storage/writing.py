@@ -1,4 +1,4 @@
-"""Writing: local files appear under their final name by one rename.
+"""Writing: local files appear under their final name by one rename, which a power cut does not undo.
 
 Object stores have no rename, but an object appears there whole or not at all, so that writing the marker of a result
 last serves both.
@@ -7,12 +7,14 @@ last serves both.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from pipeline.storage.address import Address, is_url, redacted
 from pipeline.storage.object_store import on_store
@@ -21,6 +23,9 @@ from schemas.errors import OutputError
 # The names, beside their final ones, of files that are being written; what a killed process leaves is found by it.
 _RANDOM_BYTES = 6
 UNFINISHED = f".*.{'[0-9a-f]' * 2 * _RANDOM_BYTES}.tmp"
+_OF_THE_NAME = 100
+# What file systems answer whose folders need no syncing, or cannot be synced.
+_NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 
 
 def absolute(address: Address) -> str:
@@ -39,18 +44,56 @@ def stage(address: Address, content: bytes) -> tuple[Address, Address]:
         on_store(address, lambda store, path: store.pipe_file(path, content))
         return address, address
     final = Path(address)
-    temporary = final.with_name(f".{final.name}.{secrets.token_hex(_RANDOM_BYTES)}.tmp")
-    with as_output_error(address):
-        final.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+    temporary = _temporary(final)
+    with as_output_error(address), _writing(temporary) as file:
+        file.write(content)
     return temporary, final
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """A file to write to that is there under its name when it is whole, and not at all where writing fails."""
+    temporary = _temporary(path)
+    with as_output_error(path), _writing(temporary) as file:
+        yield file
+    commit([(temporary, path)])
+
+
+def replace_files(folder: Path, contents: Mapping[str, bytes | None], marker: str) -> None:
+    """Write files of one folder, and remove those without content; the marker goes first and comes last.
+
+    So a folder with its marker is whole, whenever somebody looks.
+    """
+    staged: list[tuple[Address, Address]] = []
+    try:
+        for name in sorted(contents, key=lambda name: name == marker):
+            if (content := contents[name]) is not None:
+                staged.append(stage(folder / name, content))
+        for name in sorted(contents, key=lambda name: name != marker):
+            if name == marker or contents[name] is None:
+                remove(folder / name)
+        commit(staged)
+    except BaseException:
+        discard(staged)
+        raise
+
+
+def _temporary(final: Path) -> Path:
+    return final.with_name(f".{final.name[:_OF_THE_NAME]}.{secrets.token_hex(_RANDOM_BYTES)}.tmp")
+
+
+@contextlib.contextmanager
+def _writing(temporary: Path) -> Iterator[IO[bytes]]:
+    """A file that is on the disk in the end, or gone."""
+    temporary.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 class SweptError(OutputError):
@@ -58,14 +101,41 @@ class SweptError(OutputError):
 
 
 def commit(staged: list[tuple[Address, Address]]) -> None:
-    """Give staged files their names, in order. Raises `SweptError` where somebody removed one."""
-    for temporary, final in staged:
-        if temporary != final:
+    """Give staged files their names, in order, the last when the others are sure to stay.
+
+    Raises `SweptError` where somebody removed one; whatever fails, nothing stays that has no name yet.
+    """
+    try:
+        _commit(staged)
+    except BaseException:
+        discard(staged)
+        raise
+
+
+def _commit(staged: list[tuple[Address, Address]]) -> None:
+    local = [(Path(temporary), Path(final)) for temporary, final in staged if temporary != final]
+    for part in (local[:-1], local[-1:]):
+        for temporary, final in part:
             with as_output_error(final):
                 try:
-                    Path(temporary).replace(final)
+                    temporary.replace(final)
                 except FileNotFoundError:
                     raise SweptError("was removed while it was written", place=str(final)) from None
+        _sync(final for _, final in part)
+
+
+def _sync(files: Iterable[Path]) -> None:
+    """What was named in folders, and that these are in theirs, outlives a power cut."""
+    for folder in {above for file in files for above in (file.parent, file.parent.parent)}:
+        with as_output_error(folder):
+            number = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            except OSError as error:
+                if error.errno not in _NOT_SYNCED:
+                    raise
+            finally:
+                os.close(number)
 
 
 def discard(staged: list[tuple[Address, Address]]) -> None:
@@ -75,13 +145,24 @@ def discard(staged: list[tuple[Address, Address]]) -> None:
             Path(temporary).unlink(missing_ok=True)
 
 
+def unfinished_in(folder: Path | str) -> list[str]:
+    """Names of files in a folder that were being written; none where it does not exist."""
+    with as_output_error(folder):
+        try:
+            names = os.listdir(folder)  # noqa: PTH208 - of thousands of folders
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+    return [name for name in names if fnmatchcase(name, UNFINISHED)]
+
+
 def remove(address: Address) -> None:
     """Remove a file; its absence is no error."""
     if is_url(address):
         _remove_remote(address, lambda store, path: store.rm_file(path))
         return
-    with as_output_error(address):
-        Path(address).unlink(missing_ok=True)
+    with as_output_error(address), contextlib.suppress(FileNotFoundError):
+        Path(address).unlink()
+        _sync([Path(address)])
 
 
 def remove_folder(address: Address) -> None:

@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.track.survey import Track, end_places, gaps_m
-from schemas.arrays import Bools
+from schemas.arrays import Bools, Ints
 from schemas.enums import Navigability
 
 
@@ -111,13 +111,15 @@ BARRED_DETOUR_M = 10_000.0
 
 
 def network_of(track: Track, links: pl.DataFrame) -> Network:
-    """The network of a site; gaps between linked ends count as track."""
+    """The network of a site; gaps between linked ends count as track. Pieces of one element are joined in order."""
     successors: list[list[Edge]] = [[] for _ in range(2 * len(track.ids))]
+    for number in range(1, len(track.ids)):
+        if track.ids[number] == track.ids[number - 1]:
+            successors[2 * number - 2].append(Edge(2 * number, 0.0, True, True))
+            successors[2 * number + 1].append(Edge(2 * number - 1, 0.0, True, True))
     usable_links = links.filter(pl.col("navigability") != Navigability.NONE.value)
-    one = np.array([track.index[name] for name in usable_links["netelement_a"].to_list()], dtype=np.int64)
-    other = np.array([track.index[name] for name in usable_links["netelement_b"].to_list()], dtype=np.int64)
-    position_a = usable_links["position_a"].to_numpy().astype(np.int64)
-    position_b = usable_links["position_b"].to_numpy().astype(np.int64)
+    one, position_a = _linked_ends(track, usable_links, "a")
+    other, position_b = _linked_ends(track, usable_links, "b")
     ends = end_places(track)
     gap = gaps_m(ends[one, position_a], ends[other, position_b]).tolist()
     leaving, entering = (2 * one + 1 - position_a).tolist(), (2 * other + position_b).tolist()
@@ -128,6 +130,14 @@ def network_of(track: Track, links: pl.DataFrame) -> Network:
         _add(successors[entering[row] ^ 1], Edge(leaving[row] ^ 1, gap[row], back, there))
     usable, orientable = oriented_sheet(successors)
     return Network(track, successors, usable, orientable)
+
+
+def _linked_ends(track: Track, links: pl.DataFrame, side: str) -> tuple[Ints, Ints]:
+    """Elements of one side of the links and the ends linked; of an element in pieces the first or the last one."""
+    last = {name: number for number, name in enumerate(track.ids)}
+    position = links[f"position_{side}"].to_numpy().astype(np.int64)
+    ends = zip(links[f"netelement_{side}"].to_list(), position.tolist(), strict=True)
+    return np.array([(last if end else track.index)[name] for name, end in ends], dtype=np.int64), position
 
 
 def _add(edges: list[Edge], edge: Edge) -> None:

@@ -13,6 +13,8 @@ from schemas.arrays import Floats, Ints, floats
 
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
 GAP_COUNTS_M = 0.5
+# A balise this far beyond its element's end is still on it: surveys and balise lists round [m].
+MEASURE_TOLERANCE_M = 0.5
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import polars as pl
 
-from pipeline.figures.bounds import threshold_factor
 from pipeline.lds.relink import Held
 from pipeline.monitors.bank import AxisRecord
 from pipeline.monitors.recursion import ewma_weight
@@ -145,7 +144,7 @@ def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Config
     Both learn from the positions that the fault moves. They are taken to stay within the threshold factor times their
     prior deviation, whatever the fault; nothing holds them there.
     """
-    factor = threshold_factor(config.monitors.false_alarm_probability)
+    factor = config.monitors.threshold_factor
     scale = late_s = np.zeros(epoch.size)
     if vehicle.odometer_scale is None:
         scale = factor * config.align.scale_prior_sigma + np.abs(floats(epochs, "odometer_scale")[epoch] - 1.0)

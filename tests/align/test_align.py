@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, odometer_at
-from pipeline.figures.bounds import threshold_factor
+from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at, speed_of_positions
 from pipeline.monitors.bank import MonitorBank
-from schemas.config import Configuration, Vehicle
-from tests.align.straight import Straight, align_run, distance, odometry_from, run, times
+from pipeline.odometry.odometry import Noise
+from pipeline.odometry.quantisation import QuantisationNoise
+from schemas.config import Configuration, Vehicle, threshold_factor
+from tests.align.straight import Straight, align_run, distance, epochs_of, odometer_of, odometry_from, run, times
 
 CONFIG = Configuration()
-FACTOR = threshold_factor(1e-7)
 REAL = Straight(scale=1.004, latency_s=0.08)
 
 
 def alarms(aligned):
-    bank = MonitorBank(aligned, {}, CONFIG, FACTOR)
+    bank = MonitorBank(aligned, {}, CONFIG)
     return [k for k in range(aligned.height) if bank.failed(k)]
 
 
@@ -173,3 +175,46 @@ def test_learning_counts_with_the_calibrated_sigma():
     learned = ["odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"]
     assert_frame_equal(found.select(learned), stated.select(learned), rel_tol=1e-9)
     assert stated["scale_sigma"][-1] < align_run(overstated, odometer, Vehicle(), CONFIG)["scale_sigma"][-1]
+
+
+def test_a_long_stand_where_rows_scatter_with_the_speed_alone():
+    """Stamps on receipt: no row scatters at a stand, and the thresholds' model of the errors stays the same."""
+    t_s = np.arange(0.0, 650.0, 0.1)
+    way_m = np.minimum(20.0 * t_s, 2000.0)
+    odometry = odometry_from(odometer_of(t_s, way_m), Vehicle(), CONFIG)
+    scattered = replace(odometry, noise=Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3)))
+    aligned = align(epochs_of(t_s[20:-20], way_m[20:-20]), scattered, Vehicle(), CONFIG)
+    # 0.03 s at 20 m/s, 0.6 m, counts under way alone; GNSS and odometer agree, so the scale stays 1.
+    rows_m = aligned["odometer_rows_m"]
+    assert rows_m[500] == pytest.approx(20.0 * 1e-3**0.5, rel=1e-3)
+    assert rows_m[-1] == 0.0
+    assert aligned["odometer_scale"][-1] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_speed_of_positions_is_over_the_window_before():
+    speed = speed_of_positions(np.array([0.0, 1.0, 2.0, 2.5]), np.array([0.0, 10.0, 30.0, 45.0]), 1.0)
+    # At 2.5 s the last position a second before is that of 1 s.
+    assert speed == pytest.approx([np.nan, 10.0, 20.0, 35.0 / 1.5], nan_ok=True)
+
+
+def test_the_odometer_at_any_time_goes_on_from_the_epoch_before_at_its_time_of_validity():
+    """20 m/s; the position of 10 s is 0.5 s old, where 190 m were counted."""
+    t_s = np.arange(0.0, 20.0, 0.1)
+    odometry = odometry_from(odometer_of(t_s, 20.0 * t_s))
+    aligned = pl.DataFrame(
+        {"t": times(np.array([10.0])), "odometer_m": [190.0], "odometer_scale": [1.0], "latency_s": [0.5]}
+    )
+    found = odometer_at(times(np.array([9.0, 10.0, 12.0, 30.0])), aligned, odometry)
+    assert found.to_list() == pytest.approx([180.0, 200.0, 240.0, None])
+
+
+def test_nothing_is_learned_from_positions_off_the_track():
+    epochs, odometer = run(Straight(duration_s=400.0, period_s=1.0, scale=1.004), 3)
+    aside = pl.int_range(epochs.height).is_between(150, 300)
+    off = epochs.with_columns(path_m=pl.when(~aside).then("path_m"), on_track=~aside, near_track=~aside)
+    off = off.with_columns(fix_valid=~aside)
+    aligned = align_run(off, odometer, Vehicle(), CONFIG)
+    assert aligned["odometer_scale"].is_finite().all()
+    assert aligned["odometer_scale"][-1] == pytest.approx(1.004, abs=4.0 * aligned["scale_sigma"][-1])
+    # What comes after them still teaches.
+    assert aligned["scale_sigma"][-1] < 0.9 * aligned["scale_sigma"][149]

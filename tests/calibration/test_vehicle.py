@@ -10,7 +10,7 @@ from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run
 from pipeline.monitors.axis import error_model
 from pipeline.odometry.odometry import Noise, Odometry
 from pipeline.odometry.quantisation import count_step_m, quantisation_noise
-from schemas.config import Configuration, MonitorConfig
+from schemas.config import AlignConfig, Configuration, MonitorConfig
 
 SHARES, TAUS_S = error_model(MonitorConfig())
 SCALE, LATENCY_S, SIGMA_M = 1.004, 0.12, 1.2
@@ -37,7 +37,7 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
     position = np.interp(at - LATENCY_S, t, true) + error + 500.0
     none = np.zeros(t.size, dtype=bool)
     segment = np.zeros(t.size, dtype=np.int64)
-    track = Odometry(0, t, true / SCALE + walk, segment, none[1:], none, Noise(0.05**2), 0.3)
+    track = Odometry(0, t, true / SCALE + walk, segment, none[1:], none, Noise(0.05**2), 0.3, AlignConfig())
     return Observations(at, position, np.full(at.size, SIGMA_M)), track
 
 

@@ -14,6 +14,7 @@ from pipeline import storage
 from pipeline.campaign import run_campaign
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
+from pipeline.storage.objects import version_of
 from schemas.errors import UsageError
 from tests.campaign.compare import plan_of
 from tests.campaign.test_local import undisturbed
@@ -122,5 +123,5 @@ def test_no_copy_where_a_store_names_no_versions() -> None:
     fsspec.filesystem("memory").pipe_file("/versions/runs/run_id=a/runs.parquet", b"x")
     assert storage.versions("memory://versions/runs", "runs.parquet") is None
     assert storage.versions("memory://versions/none", "runs.parquet") == {}
-    assert storage.version_of({"ETag": "abc", "size": 3, "LastModified": "noon"}) == "abc 3 noon"
-    assert storage.version_of({"etag": 'W/"abc"', "size": 3}) is None
+    assert version_of({"ETag": "abc", "size": 3, "LastModified": "noon"}) == "abc 3 noon"
+    assert version_of({"etag": 'W/"abc"', "size": 3}) is None

@@ -72,11 +72,15 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
 def test_cluster_that_lost_its_workers(
     small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.campaign.cluster._PATIENCE_S", 0.5)
-    monkeypatch.setattr("pipeline.campaign.cluster._COUNT_EVERY_S", 0.2)
+    """Said within seconds, with what is done and what to do; given up after the patience."""
+    monkeypatch.setattr("pipeline.campaign.loop._PATIENCE_S", 6.5)
     cluster.kill_workers()
-    with pytest.raises(UsageError, match="has had no worker"):
-        run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address)
+    spy = Spy(lambda *_: None)
+    with pytest.raises(UsageError, match=r"has had no worker for 6.5 s; 0 of 4 runs are done. Start workers"):
+        run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[spy])
+    assert [
+        f"{cluster.address} has no worker left; 0 of 4 runs are done. Start workers" in note for note in spy.notes
+    ] == [True]
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -108,17 +109,11 @@ def test_stop_on_request_at_the_very_end(
     assert (tmp_path / "campaign/runs.parquet").exists()
 
 
-def test_kills_at_random_moments(small_trial: SmallTrial, tmp_path: Path) -> None:
-    """One of each kind; `python -m benchmarks interruptions` does fifty."""
-    job = Job(small_trial.runs, small_trial.site, tmp_path)
-    for kill in disturb(job, list(Victim), trials=4, seed=7):
-        assert (kill.half_done, kill.different) == ((), ()), kill
-
-
 def test_trials_see_what_is_wrong(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result that is not what an undisturbed campaign gives does not pass for one."""
+    """The kills of `make bench`: a result that is not what an undisturbed campaign gives does not pass for one."""
+    shutil.copytree(small_trial.paths[0], tmp_path / "logs/run0")
     monkeypatch.setattr(interruptions, "_kill", lambda *_: _spoil(tmp_path / "killed"))
-    (kill,) = disturb(Job(small_trial.runs, small_trial.site, tmp_path), [Victim.PARENT], trials=1, seed=7)
+    (kill,) = disturb(Job(tmp_path / "logs", small_trial.site, tmp_path), [Victim.PARENT], trials=1, seed=7)
     assert kill.different == ("stray.parquet",)
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import Plan, RunOutcome, Summary, run_campaign, worker
+from pipeline.campaign import Plan, RunOutcome, Summary, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost
 from pipeline.campaign.progress import LogWatch
 from pipeline.ingest import read_run
@@ -36,6 +36,7 @@ class Spy:
         self.act = act
         self.seen: list[RunOutcome] = []
         self.losses: list[tuple[str, int]] = []
+        self.notes: list[str] = []
 
     def begin(self, plan: Plan) -> None:
         self.seen.clear()
@@ -46,6 +47,9 @@ class Spy:
 
     def lost(self, run_id: str, attempt: int) -> None:
         self.losses.append((run_id, attempt))
+
+    def noted(self, text: str) -> None:
+        self.notes.append(text)
 
     def finished(self, outcome: RunOutcome) -> None:
         self.seen.append(outcome)
@@ -138,11 +142,9 @@ def test_skipped_failures_are_still_failures(small_trial: SmallTrial, tmp_path: 
 def test_what_changed_is_replayed_again(small_trial: SmallTrial, tmp_path: Path) -> None:
     run, site, out = one_run(small_trial, tmp_path), tmp_path / "site", tmp_path / "out"
     shutil.copytree(small_trial.site, site)
-    trial = SmallTrial(site, tmp_path)
 
     def skipped(config: Configuration | None = None) -> int:
-        plan = plan_of(trial, out, [run])
-        return run_campaign(Plan(tuple(_with(plan, config)), plan.out, plan.config, plan.vehicle)).skipped
+        return run_campaign(make_plan([str(run)], site, out, config)).skipped
 
     assert skipped() == 0
     stat = (run / "odometer.parquet").stat()
@@ -154,12 +156,6 @@ def test_what_changed_is_replayed_again(small_trial: SmallTrial, tmp_path: Path)
     assert (out / "runs/run_id=run0/runs.parquet").exists()
     (site / "balises.parquet").unlink()
     assert [skipped(), skipped()] == [0, 1]
-
-
-def _with(plan: Plan, config: Configuration | None) -> list[worker.RunJob]:
-    from dataclasses import replace
-
-    return [replace(job, config=config or job.config) for job in plan.jobs]
 
 
 def test_clock_and_file_times_decide_nothing(
@@ -185,13 +181,34 @@ def test_log_that_changes_while_it_is_read(
         return log
 
     with monkeypatch.context() as patched:
-        patched.setattr(worker, "read_run", read_and_append)
+        patched.setattr(recorded_log, "read_run", read_and_append)
         changed = by_run(run_campaign(plan_of(small_trial, out, [run])))["run0"]
     assert changed.status is RunStatus.FAILED
     assert "changed while it was read" in (changed.error or "")
     shutil.copy(small_trial.paths[0] / "gnss.parquet", run / "gnss.parquet")
     again = by_run(run_campaign(plan_of(small_trial, out, [run])))["run0"]
     assert (again.status, again.skipped) == (RunStatus.OK, False)
+
+
+def test_a_panic_fails_its_run_only(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Libraries written in Rust raise what is no `Exception`; decoding, it is the log's fault, later our own."""
+    panics: dict[str, BaseException] = {
+        "run1": pl.exceptions.PanicException("range end index 7 out of range"),
+        "run2": BaseExceptionGroup("of many", [GeneratorExit()]),
+    }
+
+    def read(path: Path, config: IngestConfig) -> RunLog:
+        if path.name in panics:
+            raise panics[path.name]
+        return read_run(path, config)
+
+    monkeypatch.setattr(recorded_log, "read_run", read)
+    plans = [plan_of(small_trial, tmp_path, [path]) for path in small_trial.paths[:3]]
+    outcomes = [run_campaign(plan).outcomes[0] for plan in plans]
+    assert [outcome.status for outcome in outcomes] == [RunStatus.OK, RunStatus.FAILED, RunStatus.FAILED]
+    assert [outcome.defect for outcome in outcomes] == [False, False, True]
+    assert re.search("run1: cannot be decoded, it is damaged: range end", outcomes[1].error or "")
+    assert store.run_ids(tmp_path) == ["run0", "run1", "run2"]
 
 
 def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,10 +7,13 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from pipeline.campaign import find_runs
+from pipeline.campaign import find_runs, run_campaign
+from pipeline.results import store
 from pipeline.storage import files
 from pipeline.storage.address import Address
 from schemas.errors import InputError, UsageError
+from tests.campaign.compare import plan_of
+from tests.conftest import SmallTrial
 
 
 @pytest.fixture
@@ -89,3 +92,15 @@ def test_a_store_that_falls_silent_leaves_no_run_out(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(files, "list_dir", silent)
     with pytest.raises(InputError, match="silent/y: the store was asked in vain"):
         find_runs(["memory://silent"])
+
+
+def test_names_too_long_to_file_are_refused_at_once(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """A file system allows 255 bytes; what a path cannot hold everywhere takes three per byte."""
+    for name in ("\N{STEAM LOCOMOTIVE}" * 25, "\N{CYRILLIC SMALL LETTER YA}" * 42):
+        (tmp_path / f"{name}.mcap").touch()
+        with pytest.raises(UsageError, match=f"{name}.mcap: its name is too long to file results under"):
+            plan_of(small_trial, tmp_path / "out", [tmp_path / f"{name}.mcap", small_trial.paths[0]])
+    longest = "\N{CYRILLIC SMALL LETTER YA}" * 41
+    (tmp_path / f"{longest}.mcap").touch()
+    (outcome,) = run_campaign(plan_of(small_trial, tmp_path / "out", [tmp_path / f"{longest}.mcap"])).outcomes
+    assert (outcome.run_id, store.run_ids(tmp_path / "out")) == (longest, [longest])

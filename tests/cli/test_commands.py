@@ -252,7 +252,7 @@ def test_safety_of_a_result(balise: Balise, result: Path, tmp_path: Path) -> Non
     said = json.loads(balise("safety", result, "--json").out)
     assert {"figures", "time_to_detect", "levels", "levels_of_runs", "accuracy", "side_by_side", "map"} <= set(said)
     assert said["figures"] == json.loads(balise("sql", result, "SELECT * FROM campaign_figures", "--json").out)
-    assert "cannot substantiate a THR_VB of 6.70e-10/h" in " ".join(said["statements"])
+    assert "needed to prove a THR_VB of 6.70e-10/h" in " ".join(said["statements"])
     assert {row["service_level"] for row in said["levels"]} == {"npa", "lpv200", "egnos_observed", "horizontal_sis"}
     shown = balise("safety", result)
     assert shown.status == 0

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.lds import LdsLimits, LdsResult, run_lds
-from schemas.config import Configuration, LdsConfig, Vehicle
+from pipeline.lds import LdsResult, run_lds
+from schemas.config import Configuration, LdsConfig, MonitorConfig
 
-VEHICLE = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4)
-LIMITS = LdsLimits.of(Configuration(), VEHICLE)
+SCALE_SIGMA = 1e-4
+K_T = 5.3267238
 INSTANT = pl.Datetime("ns", "UTC")
 
 
@@ -78,7 +78,9 @@ def epochs_of(
     series = [
         value.alias(name) if isinstance(value, pl.Series) else pl.Series(name, value) for name, value in columns.items()
     ]
-    return frame.with_columns(series)
+    # As matching says it: without a fix no path position, off the track no probability of the path.
+    placed, sure = pl.when("fix_valid").then("path_m"), pl.when("on_track").then("gate_probability")
+    return frame.with_columns(series).with_columns(path_m=placed, gate_probability=sure)
 
 
 def balises_at(places: dict[str, float], **columns: Any) -> pl.DataFrame:
@@ -110,11 +112,16 @@ def run(
     balises: pl.DataFrame,
     bank: ScriptedBank | None = None,
     reads: pl.DataFrame | None = None,
-    limits: LdsLimits = LIMITS,
-    **config: Any,
+    scale_sigma: float | None = SCALE_SIGMA,
+    disabled: Sequence[str] = (),
+    **lds: Any,
 ) -> LdsResult:
     on_odometer = None if reads is None else with_odometer(reads, epochs)
-    return run_lds(epochs, bank or ScriptedBank(), balises, on_odometer, LdsConfig(**config), limits)
+    return run_lds(epochs, bank or ScriptedBank(), balises, on_odometer, scale_sigma, settings(disabled, **lds))
+
+
+def settings(disabled: Sequence[str] = (), **lds: Any) -> Configuration:
+    return Configuration(lds=LdsConfig(**lds), monitors=MonitorConfig(disabled=tuple(disabled)))
 
 
 def with_odometer(reads: pl.DataFrame, epochs: pl.DataFrame) -> pl.DataFrame:

@@ -6,14 +6,14 @@ The train runs 20 m a second, one epoch a second, so V1 at 110 m is passed at 5.
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from typing import Any
 
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, negations, run, steps, told
+from tests.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, reads_at, run, steps, told
 
 V1, V2 = {"V1": 110.0}, {"V1": 110.0, "V2": 510.0}
 STATUS = ("balise_id", "status", "t_offered")
@@ -259,7 +259,7 @@ def test_jump_over_two_balises_offers_both_in_order() -> None:
     # The linking distance fails at the same epoch, and a failing monitor comes first.
     seen = run(epochs_of(path_m, odometer_m), balises)
     assert [row[1] for row in told(seen, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
-    result = run(epochs_of(path_m, odometer_m), balises, limits=replace(LIMITS, disabled=("link_distance",)))
+    result = run(epochs_of(path_m, odometer_m), balises, disabled=["link_distance"])
     assert told(result, *STATUS, "odometer_distance_m", "linking_error") == [
         ("V1", "accepted", 5.5, None, "none"),
         ("V2", "rejected_window", 14.5, 180.0, "early"),
@@ -330,8 +330,7 @@ def test_overlapping_windows_cannot_tell_two_balises_apart() -> None:
     path_m = [value + (40.0 if k >= 12 else 0.0) for k, value in enumerate(odometer_m)]
     balises = balises_at({"V1": 110.0, "V2": 510.0, "V3": 550.0})
     epochs = epochs_of(path_m, odometer_m)
-    static_only = replace(LIMITS, disabled=("link_distance", "link_order"))
-    by_linking_alone = run(epochs, balises, ScriptedBank(), limits=static_only)
+    by_linking_alone = run(epochs, balises, ScriptedBank(), disabled=["link_distance", "link_order"])
     assert [row[1] for row in told(by_linking_alone, *STATUS)] == ["accepted"] * 3
     with_tvb = run(epochs, balises, ScriptedBank())
     assert [row[1] for row in told(with_tvb, *STATUS)] == ["accepted"] + ["rejected_monitor"] * 2
@@ -367,3 +366,22 @@ def test_falling_runs_mirror_growing_ones(seed: int) -> None:
     mirrored = {name: -place for name, place in reversed(places.items())}
     falling = run(epochs_of([-x for x in path_m], [-x for x in odometer_m]), balises_at(mirrored), ScriptedBank(fails))
     assert told(falling, *columns) == told(growing, *columns)
+
+
+def test_without_an_odometer_a_balise_is_re_armed_by_the_way_of_the_position() -> None:
+    """The position goes to and fro over 110 m by a few metres, then 40 m back and over it again."""
+    path_m = [60.0, 80.0, 100.0, 112.0, 108.0, 113.0, 120.0, 80.0, 100.0, 120.0]
+    result = run(epochs_of(path_m, [None] * len(path_m)), balises_at({"V1": 110.0}))
+    crossed = result.crossings.select(pl.col("epoch"), "offered").rows()
+    # 112 m is no farther from it than `rearm_m`; 120 m is, and so is 80 m.
+    assert crossed == [(3, True), (4, False), (5, False), (7, True), (9, True)]
+
+
+def test_where_a_telegram_was_read_the_telegram_before_and_the_odometer_say() -> None:
+    """A balise stands on the path twice; the position is 400 m ahead of the train."""
+    odometer_m = steps(0.0, 20.0, 40)
+    epochs = epochs_of([x + 400.0 for x in odometer_m], odometer_m)
+    places = balises_at({"P1": 110.0, "P2": 500.0, "P3": 100.0, "P4": 900.0}, kind="physical")
+    twice = places.with_columns(balise_id=pl.col("balise_id").replace({"P3": "P2", "P4": "P2"}))
+    result = run(epochs, twice, reads=reads_at([(5.5, "P1"), (25.0, "P2")]))
+    assert result.crossings.select("balise_id", "path_m").rows() == [("P1", 110.0), ("P2", 500.0)]

@@ -5,7 +5,6 @@ One epoch a second at 20 m/s; the bank has its first verdict at 1 s (the first i
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from math import sqrt
 from typing import Any
@@ -15,7 +14,7 @@ import pytest
 
 from pipeline.lds import LdsResult
 from schemas.tables import Epochs, Passages
-from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, run, steps, told
+from tests.lds.scripted import K_T, ScriptedBank, balises_at, epochs_of, run, steps, told
 
 FAR = {"V9": 1e6}
 V1 = {"V1": 110.0}
@@ -187,7 +186,7 @@ def test_link_distance_bounds() -> None:
     # At 25 s: 390 m since V1: 5 m + 19.5 m + 5.3267 sqrt(2) m.
     row = epochs.row(25, named=True)
     assert row["link_distance_value"] == pytest.approx(31.0)
-    assert row["link_distance_threshold"] == pytest.approx(24.5 + LIMITS.threshold_factor * sqrt(2.0))
+    assert row["link_distance_threshold"] == pytest.approx(24.5 + K_T * sqrt(2.0))
     assert (epochs["link_distance_state"][24], row["link_distance_state"]) == ("pass", "pass")
     # Nearer to the balise the same offset is out of bounds.
     nearer = [x + (31.0 if k >= 24 else 0.0) for k, x in enumerate(odometer_m)]
@@ -220,8 +219,7 @@ def test_linking_monitors_say_why_they_were_not_evaluated(
 
 
 def test_disabled_linking_monitors() -> None:
-    limits = replace(LIMITS, disabled=("link_order", "link_distance"))
-    epochs = run(epochs_of(steps(0.0, 20.0, 10)), balises_at(V1), limits=limits).epochs
+    epochs = run(epochs_of(steps(0.0, 20.0, 10)), balises_at(V1), disabled=["link_order", "link_distance"]).epochs
     assert set(epochs["link_order_reason"]) == set(epochs["link_distance_reason"]) == {"disabled by configuration"}
 
 

@@ -2,36 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import UTC, datetime
 from math import sqrt
 from typing import Any
 
 import pytest
 
-from pipeline.lds import LdsLimits, LdsResult
+from pipeline.lds import LdsResult
 from pipeline.lds.crossings import balises_of
 from pipeline.lds.journey import journey_of
 from pipeline.lds.reads import reads_of
 from pipeline.lds.relink import LOST, NO_VEHICLE, SWITCHED_OFF, Relink
-from schemas.config import Configuration, LdsConfig, Vehicle
 from schemas.enums import BaliseKind
-from tests.lds.scripted import LIMITS, ScriptedBank, balises_at, epochs_of, negations, reads_at, run, steps, told
+from tests.lds.scripted import (
+    K_T,
+    SCALE_SIGMA,
+    ScriptedBank,
+    balises_at,
+    epochs_of,
+    negations,
+    reads_at,
+    run,
+    settings,
+    steps,
+    told,
+)
 
 V1 = {"V1": 110.0}
 V1_P1 = {"V1": 110.0, "P1": 1410.0}
 KINDS = ["virtual", "physical"]
-K_T = LIMITS.threshold_factor
-NO_FILE = LdsLimits.of(Configuration(), Vehicle())
 
 
 def relink_of(offsets_m: list[float], tvb: list[int], lag_s: float, **columns: Any) -> tuple[Relink, Any]:
     """Ten epochs whose position is `offsets_m` ahead of the odometer; `tvb`: epochs that are TVBs."""
     odometer_m = steps(0.0, 20.0, 10)
     path_m = [x + offset_m for x, offset_m in zip(odometer_m, offsets_m, strict=True)]
-    config = LdsConfig(anchor_lag_s=lag_s)
-    journey = journey_of(epochs_of(path_m, odometer_m, **columns), config, LIMITS)
-    return Relink(journey, [k in tvb for k in range(10)], config, LIMITS), journey
+    config = settings(anchor_lag_s=lag_s)
+    journey = journey_of(epochs_of(path_m, odometer_m, **columns), SCALE_SIGMA, config)
+    return Relink(journey, [k in tvb for k in range(10)], config), journey
 
 
 # The anchor, by tables of ten rows
@@ -105,11 +113,10 @@ def test_before_any_alarm_the_later_of_telegram_and_tvb_is_the_anchor() -> None:
 @pytest.mark.parametrize(("scale_sigma", "bound_m"), [(1e-4, K_T * sqrt(2.0 + 0.05**2 * 43 + 0.086**2)), (0.01, 10.0)])
 def test_bound_of_the_relink(scale_sigma: float, bound_m: float) -> None:
     # First TVB at 7 s, test at 50 s, 860 m later; never more than half the failure limit.
-    limits = replace(LIMITS, odometer_scale_sigma=scale_sigma)
     odometer_m = steps(0.0, 20.0, 52)
     for offset_m, end in ((bound_m - 0.01, 50), (bound_m + 0.01, None)):
         path_m = [x + (offset_m if k >= 20 else 0.0) for k, x in enumerate(odometer_m)]
-        result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([20]), limits=limits)
+        result = run(epochs_of(path_m, odometer_m), balises_at(V1), ScriptedBank([20]), scale_sigma=scale_sigma)
         assert negations(result) == [(20, end)]
 
 
@@ -148,7 +155,7 @@ def test_a_telegram_says_where_the_train_is_and_the_same_test_decides() -> None:
 def test_without_a_vehicle_file_only_a_telegram_returns_a_position() -> None:
     epochs, balises = epochs_of(steps(0.0, 20.0, 90)), balises_at(V1_P1, kind=KINDS)
     for reads, end in ((None, None), (reads_at([(70.5, "P1")]), 71), (reads_at([(45.5, "P1")]), None)):
-        result = run(epochs, balises, ScriptedBank([20]), reads, limits=NO_FILE)
+        result = run(epochs, balises, ScriptedBank([20]), reads, scale_sigma=None)
         assert negations(result) == [(20, end)]
 
 
@@ -220,7 +227,7 @@ def test_over_a_gap_that_the_bank_bridges_its_increment_decides() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "reason"),
-    [({"limits": NO_FILE}, NO_VEHICLE), ({"lost": True}, LOST), ({"relink": False}, SWITCHED_OFF)],
+    [({"scale_sigma": None}, NO_VEHICLE), ({"lost": True}, LOST), ({"relink": False}, SWITCHED_OFF)],
 )
 def test_what_cannot_re_link_after_an_outage_is_not_used_and_raises_no_alarm(
     settings: dict[str, Any], reason: str
@@ -236,10 +243,10 @@ def test_what_cannot_re_link_after_an_outage_is_not_used_and_raises_no_alarm(
 def test_a_telegram_after_an_outage_returns_the_position_without_a_vehicle_file() -> None:
     # P1 is read at 145.5 s, 35 s after the outage.
     balises = balises_at({"V1": 110.0, "P1": 2910.0}, kind=KINDS)
-    result = outage(90.0, 0.0, balises=balises, reads=reads_at([(145.5, "P1")]), limits=NO_FILE)
+    result = outage(90.0, 0.0, balises=balises, reads=reads_at([(145.5, "P1")]), scale_sigma=None)
     assert negations(result) == [(BEFORE, BEFORE + 36)]
 
 
 def test_without_the_monitor_there_is_no_test_after_an_outage() -> None:
-    result = outage(90.0, 40.0, limits=replace(LIMITS, disabled=("link_distance",)))
+    result = outage(90.0, 40.0, disabled=["link_distance"])
     assert negations(result) == []

@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from benchmarks.topologies import WORLDS, judge
 from schemas.arrays import Floats
 from schemas.run import Site
 from tests.matching.builders import Link, line, matched, odometer, run, site, times
@@ -131,6 +132,29 @@ def test_a_balloon_loop_brings_the_train_back_turned_round(seed: int) -> None:
     assert found.path.elements() in (["s", "r", "q", "s"], ["s", "q", "r", "s"])
     moved = found.epochs["path_m"].to_numpy() - found.epochs["path_m"][0]
     assert np.abs(moved - (at - at[0])).max() < 5.0
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_worlds_by_chance(name: str) -> None:
+    """Short form of `python -m benchmarks.topologies`, whose seeds are others."""
+    found = [judge(name, seed) for seed in (71, 72)]
+    assert max(one.sure_and_wrong for one in found) == 0.0
+    assert max(one.path_off_m for one in found) < 25.0
+    assert sum(one.claimed for one in found) > 1.0
+
+
+@pytest.mark.parametrize("height_m", [300.0, 308.0])
+def test_heights_tell_tracks_over_each_other(height_m: float) -> None:
+    """8 m apart in height alone; without a height of the position both are as likely."""
+    place = site(
+        {"low": line((0, 0), (2000, 0)), "high": line((0, 0), (2000, 0))},
+        heights_m={"low": np.full(201, 300.0), "high": np.full(201, 308.0)},
+    )
+    x = np.arange(20.0, 1980.0, 20.0)
+    found = matched(run(x, 0.0 * x, height_m=np.full(len(x), height_m + 1.0)), place).epochs
+    assert found["netelement_id"].unique().to_list() == ["low" if height_m == 300.0 else "high"]
+    assert found["path_probability"].min() > 0.9
+    assert matched(run(x, 0.0 * x), place).epochs["path_probability"].max() == pytest.approx(0.5)
 
 
 def test_a_shuttle_turns_four_times_on_one_leg() -> None:

@@ -7,11 +7,10 @@ import polars as pl
 import pytest
 
 from pipeline.alignment.align import NO_ODOMETER
-from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.bank import MonitorBank
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
 from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.tables import BANK_MONITORS
 from tests.align.straight import Straight, align_run, epochs_of, odometer_of, run
 
@@ -21,7 +20,7 @@ KNOWN = Vehicle(odometer_scale=1.0, gnss_latency_s=0.0)
 
 
 def bank_of(epochs, odometer=None, config=CONFIG, vehicle=KNOWN):
-    return MonitorBank(align_run(epochs, odometer, vehicle, config), {}, config, FACTOR)
+    return MonitorBank(align_run(epochs, odometer, vehicle, config), {}, config)
 
 
 def table(bank):
@@ -160,7 +159,7 @@ def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
     path = epochs["path_m"].to_numpy().copy()
     path[2:] += 4.0
     aligned = align_run(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
-    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config, FACTOR)}, config, FACTOR)
+    bank = MonitorBank(aligned, {"along_doppler": doppler_monitor(aligned, config)}, config)
     result = table(bank)
     assert result["along_raw_reason"].unique().to_list() == [DISABLED]
     assert result["along_doppler_reason"].unique().to_list() == [DISABLED]
@@ -178,13 +177,13 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
     slip = 5.0 * np.clip(odometer_t - 10.0, 0.0, 1.0)
     epochs = epochs_of(t, 20.0 * t, velocity_along_mps=np.full(t.size, 20.0))
     aligned = align_run(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
-    result = doppler_monitor(aligned, CONFIG, FACTOR)
+    result = doppler_monitor(aligned, CONFIG)
     fails = [t[k] for k in range(t.size) if result["state"][k] == "fail"]
     assert 10.0 < fails[0] < 10.5
     assert fails[-1] < 12.1
     assert result["value"][120] == pytest.approx(-1.0, abs=4.1)
     without = doppler_monitor(
-        align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG, FACTOR
+        align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG), CONFIG
     )
     assert without["reason"].unique().to_list() == [NO_VELOCITY]
 
@@ -192,7 +191,7 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
 def test_channels_are_compared_where_both_have_a_position():
     one = epochs_of([0.0, 1.0, 2.0], [0.0, 20.0, 40.0])
     other = epochs_of([0.0, 1.0, 2.0], [0.0, 30.0, 41.0], fix_valid=[True, True, False])
-    result = channel_monitor(one, other, FACTOR)
+    result = channel_monitor(one, other, CONFIG)
     assert result["state"].to_list() == ["pass", "fail", "not_evaluated"]
     assert result["value"].to_list() == [0.0, -10.0, None]
     assert result["threshold"][0] == pytest.approx(FACTOR * np.sqrt(2.0))
@@ -207,3 +206,12 @@ def test_a_single_monitor_without_value_or_threshold_is_no_pass():
     )
     assert frame["state"].to_list() == ["pass", "fail", "not_evaluated", "not_evaluated", "not_evaluated"]
     assert frame["reason"].to_list() == [None, None, NO_VALUE, NO_VALUE, "why"]
+
+
+def test_an_axis_without_any_epoch_hides_no_fail_of_the_others():
+    """No heights; a step of 30 m along the track far behind what is looked at first."""
+    count = 8400
+    path_m = 20.0 * np.arange(count) + np.where(np.arange(count) >= 8300, 30.0, 0.0)
+    epochs, odometer = steady(count)
+    bank = bank_of(epochs.with_columns(path_m=pl.Series(path_m)), odometer)
+    assert [bank.failed(k) for k in (0, 8299, 8300)] == [False, False, True]

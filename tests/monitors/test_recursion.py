@@ -158,3 +158,12 @@ def test_a_weight_of_two_half_seconds_is_that_of_one_second():
     half, whole = ewma_weight(ALPHAS, np.array([0.5, 1.0]))
     np.testing.assert_allclose(1 - (1 - half) ** 2, whole, rtol=1e-12)
     np.testing.assert_allclose(whole, ALPHAS, rtol=1e-12)
+
+
+def test_sigmas_before_steps_leave_the_sigmas_as_they_are():
+    """The first source steps at row 2, the second at row 1; a source without memory knows no step."""
+    sigma_m = np.array([[1.0, 1.0, 1.0], [1.0, 3.0, 3.0], [2.0, 3.0, 1.0], [2.0, 3.0, 1.0]], order="F")
+    kept, decorrelation = sigma_m.copy(), np.tile([0.01, 0.01, 1.0], (4, 1))
+    before = before_steps(sigma_m, decorrelation, 1.5)
+    assert sigma_m.tolist() == kept.tolist()
+    assert before.tolist() == [[1.0, 1.0, 1.0], [1.0, 1.0, 3.0], [1.0, 3.0, 1.0], [2.0, 3.0, 1.0]]

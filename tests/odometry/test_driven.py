@@ -6,7 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.odometry.driven import driven_m, evenly_driven, hysteresis_m, with_hysteresis
+from pipeline.odometry.driven import driven_m, evenly_driven, with_hysteresis
+from schemas.config import AlignConfig
 from tests.replay.journeys import VEHICLE, journey, replay
 
 STOPS = {
@@ -57,7 +58,7 @@ def test_a_stand_ends_where_the_rows_leave_it():
     t = np.arange(0.0, 60.0, 0.1)
     driven = np.maximum(t - 30.0, 0.0)
     rows = driven + np.random.default_rng(2).normal(0.0, 0.1, t.size)
-    at_s, at_m = evenly_driven(t, rows, hysteresis_m(np.full(t.size, 0.1)), 0.3)
+    at_s, at_m = evenly_driven(t, rows, np.full(t.size, 0.1), 0.3, AlignConfig())
     speed = np.interp(t + 0.5, at_s, at_m) - np.interp(t - 0.5, at_s, at_m)
     began_s = t[np.flatnonzero(speed > 0.3)[0]]
     assert began_s == pytest.approx(30.0, abs=0.7)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.odometry.driven import turns_of
+from pipeline.odometry.odometry import Noise
 from pipeline.odometry.polarity import polarity
+from pipeline.odometry.quantisation import QuantisationNoise
 from tests.align.straight import odometer_of, odometry_from
 
 
@@ -225,3 +230,23 @@ def test_nothing_is_filled_in_where_the_way_is_lost():
     odometry = odometry_from(frame)
     assert odometry.known_at_s(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
     assert odometry.segment_at_s(np.array([1.0, 5.0, 27.0])).tolist() == [0, 1, 2]
+
+
+def test_the_variance_between_two_instants_has_the_noise_of_both_rows():
+    """Rows off by 0.5 m at a stand: 0.25 m2 at each end; under way white noise of 0.05 m per second beside."""
+    t_s = np.arange(0.0, 40.0, 0.5)
+    still = odometry_from(odometer_of(t_s, distance_m=np.maximum(20.0 * (t_s - 20.0), 0.0)))
+    noisy = replace(still, noise=Noise(still.noise.white_m2_per_s, QuantisationNoise(0.25, 0.0)))
+    begin, end = (still.epoch_ns + np.array([round(at * 1e9) for at in pair]) for pair in ((2.0, 22.0), (18.0, 32.0)))
+    standing, driving = noisy.between(begin, end).variance_m2
+    assert standing == pytest.approx(2.0 * 0.25, abs=1e-9)
+    assert driving == pytest.approx(2.0 * 0.25 + 10.0 * 0.05**2, abs=1e-6)
+
+
+def test_turns_show_once_the_train_came_back_so_far():
+    """Back by 4 m is none, by 6 m is one, and so is going on by 6 m: with 5 m."""
+    distance_m = np.array([0.0, 10.0, 6.0, 20.0, 17.0, 14.0, 10.0, 13.0, 16.0])
+    assert [values.tolist() for values in turns_of(distance_m, 5.0)] == [[3, 6], [5, 8], [-1, 1]]
+    back = [values.tolist() for values in turns_of(np.array([0.0, -3.0, -6.0, -20.0]), 5.0)]
+    assert back == [[0], [2], [-1]]
+    assert [values.tolist() for values in turns_of(np.zeros(0), 5.0)] == [[], [], []]

@@ -6,12 +6,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.figures.bounds import threshold_factor
 from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
 from pipeline.monitors.axis import run_axis
 from pipeline.odometry.odometry import Increments
 from pipeline.odometry.quantisation import QuantisationNoise, count_step_m
-from schemas.config import Configuration
+from schemas.config import Configuration, threshold_factor
 from tests.align.straight import align_run, epochs_of, odometer_of, odometry_from
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import re
-from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,13 @@ from typer.testing import CliRunner
 from cli import app
 from pipeline.report import page_name, write_report
 from pipeline.report.campaign_page import RUN_COLUMNS
+from pipeline.report.route_found import found_route
 from pipeline.results.store import write_run
+from pipeline.site.route import route_table
 from schemas.campaign import STANFORD
 from schemas.errors import UsageError
 from schemas.run import RunTables, Site
-from schemas.tables import MONITORS, Runs
+from schemas.tables import MONITORS
 from tests.report.conftest import FAILED, REASON, RUNS
 
 
@@ -70,9 +72,65 @@ def test_markup_is_whole_and_names_nothing_outside(out: Path, page: str) -> None
     parser.feed(text_of(out, page))
     assert parser.open == []
     assert len(parser.ids) == len(set(parser.ids))
-    outside = [one for one in parser.addresses if re.match(r"[a-z]+:|//|/", one) and one != "data:,"]
+    outside = [one for one in parser.addresses if re.match(r"[a-z]+:|//|/", one) and not one.startswith("data:")]
     assert outside == []
     assert "<b>odd" not in text_of(out, page)
+
+
+@pytest.mark.parametrize("page", ["index.html", "runs/jump_two.html"])
+def test_no_script_runs_but_ours(out: Path, page: str) -> None:
+    """The policy names the page's one script and its styles by their digest, and nothing may be fetched."""
+    text = text_of(out, page)
+    policy = re.findall(r'Content-Security-Policy" content="(.*?)"', text)[0]
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+
+    def digests(tag: str) -> list[str]:
+        contents = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
+        return [f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in contents]
+
+    assert rules["default-src"] == "'none'"
+    assert [rules["script-src"]] == digests("script")
+    assert rules["style-src"].split() == digests("style")
+    assert not re.search(
+        r"<script (?!type=.application/json)|\son[a-z]+=|style=", text.replace(digests("script")[0], "")
+    )
+
+
+def test_what_stands_on_paper_cannot_leave_its_string(replayed: dict[str, RunTables], tmp_path: Path) -> None:
+    run_id = 'a"; } body { display: none } </style><b>'
+    write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": run_id}), tmp_path, {})
+    write_report(tmp_path)
+    (page,) = (tmp_path / "report" / "runs").glob("*.html")
+    _, sheets = re.findall(r"<style>(.*?)</style>", page.read_text(), re.DOTALL)
+    assert sheets.count("{") == sheets.count("}") == 4
+    assert "<" not in sheets
+
+
+def test_the_worst_balise_stands_first(out: Path) -> None:
+    """VB04 is accepted twice at a wrong place in the run without odometer; each table says so in its first row."""
+    for page in ("runs/jump_one_no_odometer.html", "index.html"):
+        identity = "table-balises-s0" if page.startswith("runs") else "table-balises-s1"
+        first = rows_of_table(text_of(out, page), identity)[0]
+        assert (first[0], first[3]) == ("VB04", "2")
+
+
+def test_the_found_route_can_be_taken_away(out: Path, site: Site, replayed: dict[str, RunTables]) -> None:
+    text = text_of(out, "runs/jump_two.html")
+    name, packed = re.findall(r'download="(.*?)" href="data:application/octet-stream;base64,(.*?)"', text)[0]
+    assert name == "jump_two.csv"
+    breaches: list[str] = []
+    route = route_table(name, base64.b64decode(packed), breaches)
+    assert route is not None
+    assert breaches == []
+    assert route.select("netelement_id", "direction").rows() == [("NE1", "AB"), ("NE2", "BA"), ("NE3", "AB")]
+    doubted = replayed["jump_two"].epochs.with_columns(
+        path_probability=pl.when(pl.col("netelement_id") == "NE2").then(0.9).otherwise(pl.col("path_probability"))
+    )
+    found = found_route(doubted, 0.99)
+    assert found is not None
+    assert found.filter("doubtful")["netelement_id"].to_list() == ["NE2"]
+    back = doubted.filter(pl.col("netelement_id") == "NE1").with_columns(path_m=pl.col("path_m") + 30_000.0)
+    assert found_route(pl.concat([doubted, back]), 0.99) is None
 
 
 def test_every_epoch_of_a_short_run_is_there(out: Path, replayed: dict[str, RunTables]) -> None:
@@ -81,7 +139,7 @@ def test_every_epoch_of_a_short_run_is_there(out: Path, replayed: dict[str, RunT
     series = time["series"]["error_along_m"]
     np.testing.assert_array_equal(unpacked(series["y"]), epochs["error_along_m"].to_numpy().astype("<f4"))
     t_ms = epochs["t"].dt.timestamp("ms").to_numpy()
-    np.testing.assert_array_equal(unpacked(series["x"]), t_ms - t_ms[0])
+    np.testing.assert_array_equal(unpacked(time["t"]), t_ms - t_ms[0])
 
 
 def test_ratios_cross_one_exactly_where_monitors_fail(out: Path, replayed: dict[str, RunTables]) -> None:
@@ -121,7 +179,7 @@ def test_an_outage_is_a_gap(out: Path, replayed: dict[str, RunTables], tmp_path:
     write_run(RunTables("gap", tables.hazards, tables.passages, tables.alarms, cut, tables.runs), tmp_path, {})
     write_report(tmp_path)
     time = data_of(tmp_path, "runs/gap.html")["solutions"]["primary"]["time"]
-    x, y = (unpacked(time["series"]["speed_mps"][key]) for key in "xy")
+    x, y = unpacked(time["t"]), unpacked(time["series"]["speed_mps"]["y"])
     assert len(x) == cut.height + 1
     broken = x[np.isnan(y) & (x > 10_000)]
     assert len(broken) == 1
@@ -134,12 +192,12 @@ def test_an_outage_is_a_gap(out: Path, replayed: dict[str, RunTables], tmp_path:
 def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
     """Three faults for `primary`, one of them missed; two failures in use, one within the budget."""
     text = text_of(out, "index.html")
-    section = text[text.index('id="s1"') : text.index("table-levels-s1")]
-    assert "of 2 position failures in use, at a virtual balise or not, 1 were within the budget and 1 beyond" in section
-    assert "Of 3 faults with a failure that a truth judged 1 were missed detections" in section
-    assert "<dt>share of missed ones of these</dt><dd>0.333 (95 %: 0.0084 to 0.906)</dd>" in section
-    assert "<dt>runs that were replayed</dt><dd>3</dd>" in section
-    assert "<dt>runs that could not be, with this solution or before any was known</dt><dd>1</dd>" in section
+    section = text[text.index('id="s1"') : text.index('id="architectures"')]
+    assert "of 2 position failures in use, at a virtual balise or not, 1 were in time and 1 too late" in section
+    assert "Of 3 faults with a failure that a truth judged 1 were not found in time" in section
+    told = {row[0]: row[1] for row in rows_of_table(text, "table-figures-s1")}
+    assert told["missed_share"] == "0.333 (95 %: 0.0084 to 0.906)"
+    assert (told["runs"], told["runs_failed"]) == ("3", "1")
 
 
 def test_allowed_times_of_every_level_are_drawn(out: Path) -> None:
@@ -198,14 +256,15 @@ def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_
     write_report(tmp_path)
     run, index = text_of(tmp_path, "runs/blind.html"), text_of(tmp_path, "index.html")
     assert "there was nothing to judge the positions by" in run
-    for name in ("unsafe_accepted", "missed_detections", "stanford_nominal"):
-        assert f"<dt>{escape(Runs.columns()[name].description or '')}</dt><dd>not known<" in run, name
+    figures = {row[0]: row[1] for row in rows_of_table(run, "table-all-s0")}
+    names = ("unsafe_accepted", "missed_detections", "stanford_nominal", "hazards_1a", "hazards_detected")
+    assert {figures[name] for name in names} == {"not known"}
+    assert '<div class="tile doubt"><dt>accepted at a wrong place</dt>' in run
     (row,) = rows_of_table(index, "table-runs")
     told = dict(zip(RUN_COLUMNS, row, strict=True))
-    names = ("hazards_1a", "hazards_detected", "missed_detections", "unsafe_accepted")
-    assert {told[name] for name in names} == {"–"}
+    assert {told[name] for name in ("hazards", "missed_detections", "unsafe_accepted")} == {"–"}
     assert told["balises_accepted"] != "–"
-    assert "<dt>false alarms per judged hour</dt><dd>not known</dd>" in index
+    assert dict(row[:2] for row in rows_of_table(index, "table-figures-s0"))["false_alarm_rate_per_h"] == "not known"
 
 
 def test_by_the_odometer_alone_no_hazard_is_no_health(replayed: dict[str, RunTables], tmp_path: Path) -> None:
@@ -229,6 +288,7 @@ def test_by_the_odometer_alone_no_hazard_is_no_health(replayed: dict[str, RunTab
 
 def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
     files = sorted(path for path in (out / "report").rglob("*") if path.is_file())
+    assert len(files) == 1 + len(RUNS) + 1
     before = {path: path.read_bytes() for path in files}
     (out / "report" / "runs" / "gone.html").write_text("left over")
     written = write_report(out, site)
@@ -332,18 +392,14 @@ def test_architectures_stand_side_by_side_where_there_are_two_solutions(out: Pat
 def test_levels_stand_on_the_page_of_a_run(out: Path) -> None:
     rows = rows_of_table(text_of(out, "runs/jump_two.html"), "table-levels-s0")
     assert [row[0] for row in rows] == ["npa", "lpv200", "egnos_observed", "horizontal_sis"]
-    assert {row[4] for row in rows} <= {"kept", "exceeded", "no_failure", "unknown"}
+    assert {row[4] for row in rows} <= {"in time", "too late", "no wrong position", "could not be checked"}
 
 
 def test_stanford_counts_stand_beside_the_figures(out: Path, replayed: dict[str, RunTables]) -> None:
     row = replayed["jump_two"].runs.row(0, named=True)
-    page = text_of(out, "runs/jump_two.html")
-    for prefix in ("stanford", "stanford_hpl"):
-        for kind in STANFORD:
-            meaning = escape(Runs.columns()[f"{prefix}_{kind}"].description or "")
-            shown = re.search(rf"<dt>{re.escape(meaning)}</dt><dd>([\d\u202f]+)</dd>", page)
-            assert shown is not None
-            assert int(shown[1].replace("\u202f", "")) == row[f"{prefix}_{kind}"]
+    told = {one[0]: one[1] for one in rows_of_table(text_of(out, "runs/jump_two.html"), "table-all-s0")}
+    for name in [f"{prefix}_{kind}" for prefix in ("stanford", "stanford_hpl") for kind in STANFORD]:
+        assert int(told[name].replace("\u202f", "")) == row[name]
 
 
 def test_places_where_the_map_is_in_doubt(replayed: dict[str, RunTables], tmp_path: Path) -> None:

@@ -34,13 +34,16 @@ def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTab
     spent = {"failure_hazardous_s": [failed_s], "failure_hazardous_may_s": [failed_s]}
     plain = {"solution": "primary", "evidence": "balise", "vehicle": "file", "duration_s": 60.0, "evidence_s": 60.0}
     judgement = ["right", "unknown", "wrong"]
+    errors_m, hit_by = ([0.5, None, 500.0], [None, None, 0]) if failed_s else ([0.5], [None])
+    offers: dict[str, Any] = {"solution": "primary", "status": "accepted", "measure_m": 1.0, "path_m": 1.0}
+    offers |= {"judgement": judgement[: len(errors_m)], "balise_id": ["VB0", "VB1", "VB2"][: len(errors_m)]}
     hit = (
         hazards(1, solution="primary", accepted_ids=[["VB2"]], t_failure=NS, budget_s=0.5025) if failed_s else hazards()
     )
     return RunTables(
         run_id,
         epochs=epochs([0.0, 1.0, 2.0], solution="primary", judgement=judgement, netelement_id="A", measure_m=1.0),
-        passages=passages(3, solution="primary", status="accepted", judgement=judgement, measure_m=1.0, path_m=1.0),
+        passages=passages(len(errors_m), location_error_m=errors_m, hazard_id=hit_by, **offers),
         hazards=hit,
         alarms=alarms(),
         runs=table(Runs, 1, **(plain | levels | spent | counts)),
@@ -50,7 +53,8 @@ def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTab
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("verdicts")
-    write_run(run_of("good", SAFE, []), out, {})
+    files = '[["good/gnss.parquet", 1200, "ab12"], ["good/<b>", 7, "cd34"]]'
+    write_run(run_of("good", SAFE, []), out, {"log_files": files, "log_digest": "ef56"})
     write_run(run_of("bad", UNSAFE, [0.2, 7.0, 0.1]), out, {})
     empty = {name: schema.create_empty() for name, schema in TABLES.items()}
     lost = failed_row("gnss.parquet: column t: not in order", Provenance("c", "i", "test"))
@@ -62,22 +66,32 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("page", "word", "reason"),
     [
-        ("index.html", "unsafe", "1 unsafe, 0 unproven, 1 safe, 1 failed."),
-        ("runs/good.html", "safe", "primary: safe, every acceptance was right, and every position failure within"),
-        ("runs/bad.html", "unsafe", "primary: unsafe, 1 VBs accepted despite a wrong position; 1 position failures in"),
-        ("runs/lost.html", "failed", "run: failed."),
+        ("index.html", "unsafe", "VB2 accepted 500 m early, no monitor saw it (run bad)."),
+        ("runs/good.html", "safe", "every acceptance right, every position failure within the time allowed."),
+        ("runs/bad.html", "unsafe", "VB2 accepted 500 m early, no monitor saw it."),
+        ("runs/lost.html", "failed", "gnss.parquet: column t: not in order."),
     ],
 )
 def test_the_verdict_is_the_first_word(report: Path, page: str, word: str, reason: str) -> None:
     body = (report / page).read_text().partition("<header>")[2]
-    assert body.startswith(f'<p class="verdict {word}"><strong>{word}</strong> {reason}')
+    assert body.startswith(f'<p class="verdict {word}"><strong>{word}</strong>: {reason}')
 
 
 def test_all_reasons_stand_behind_it(report: Path) -> None:
     page = (report / "runs" / "bad.html").read_text()
-    assert "1 position failures of which nothing says whether they were within the budget" in page
-    assert "5.0% of the moving time in use cannot be judged" in page
+    assert "VBs accepted despite a wrong position: 1; position failures in use for longer than allowed: 1" in page
+    assert "position failures of unknown length: 1" in page
+    assert "5.0% of the moving time in use could not be checked" in page
     assert "accepted despite the fault" in page
+    assert "1 unsafe, 1 safe, 1 failed." in (report / "index.html").read_text()
+
+
+def test_bad_tiles_look_bad(report: Path) -> None:
+    tiles = [
+        dict(re.findall(r'<div class="tile ?(\w*)"><dt>accepted at a wrong place</dt><dd>(\d)</dd>', page.read_text()))
+        for page in (report / "runs" / "bad.html", report / "runs" / "good.html")
+    ]
+    assert tiles == [{"bad": "1"}, {"good": "0"}]
 
 
 def test_runs_stand_worst_first(report: Path) -> None:
@@ -90,3 +104,9 @@ def test_failures_against_the_levels(report: Path) -> None:
     levels = (report / "index.html").read_text().partition('id="table-levels-s0"')[2]
     row = levels.partition(">lpv200<")[2].partition("</tr>")[0]
     assert re.findall(r'data-order="([\d.]+)"', row)[1:4] == ["3.0", "2.0", "1.0"]
+
+
+def test_the_files_of_a_run_are_named(report: Path) -> None:
+    page = (report / "runs" / "good.html").read_text().partition('id="table-files"')[2].partition("</table>")[0]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in page.split("<tr>")[2:]]
+    assert rows == [["log", "good/gnss.parquet", "1\u202f200", "ab12"], ["log", "good/&lt;b&gt;", "7", "cd34"]]

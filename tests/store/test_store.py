@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import random
+import time
 from pathlib import Path
 
 import dataframely as dy
@@ -10,11 +14,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline import storage
+from pipeline.campaign import find_runs
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
-from pipeline.storage.address import Address, redacted
+from pipeline.results.terminal import plain_table, to_json
+from pipeline.storage import files
+from pipeline.storage.address import Address, redacted, stem_of
 from schemas.config import Configuration
-from schemas.errors import OutputError, UsageError
+from schemas.errors import InputError, OutputError, UsageError
 from schemas.run import RunTables
 from schemas.tables import CONTRACT_VERSION, TABLES
 
@@ -221,6 +228,10 @@ def test_config_is_written_resolved(tmp_path: Path) -> None:
         ("https://store/run?X-Amz-Signature=abc refused", "https://store/run refused"),
         ("key AKIAIOSFODNN7EXAMPLE refused", "key  refused"),
         ("/data/run.mcap: damaged", "/data/run.mcap: damaged"),
+        ("s3://KEY:sec/ret@bucket/run.mcap: damaged", "s3://bucket/run.mcap: damaged"),
+        ("s3://KEY:sec/ret", "s3://"),
+        ("s3://bucket/run@2.mcap", "s3://bucket/run@2.mcap"),
+        ("tcp://10.0.0.1:8786 does not answer", "tcp://10.0.0.1:8786 does not answer"),
     ],
 )
 def test_secrets_are_taken_out(text: str, clean: str) -> None:
@@ -273,6 +284,12 @@ def test_configuration_comes_back(tmp_path: Path) -> None:
     assert store.read_config(tmp_path) == config
 
 
+def test_configuration_of_another_build_is_one_message(tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text("[matching]\nbias_sigma_m = 2.0\n")
+    with pytest.raises(UsageError, match=r"config.toml: was not written by this build.*bias_sigma_m.*[Rr]eplay"):
+        store.read_config(tmp_path)
+
+
 @pytest.mark.parametrize(
     "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show tables", "", "-- x"]
 )
@@ -293,3 +310,81 @@ def test_results_are_only_read(tmp_path: Path, sql: str) -> None:
 def test_queries_in_any_dress_are_answered(tmp_path: Path, sql: str) -> None:
     store.write_run(tables_of("r1"), tmp_path, METADATA)
     assert run_sql(tmp_path, sql).rows() == [("r1",)]
+
+
+@pytest.mark.parametrize("address", ["s3://KEY:sec/ret@bucket/run.mcap", "s3://KEY:sec@bucket", "s3a://KEY:sec/ret"])
+def test_a_key_in_the_address_of_a_bucket_is_refused_and_not_repeated(address: str) -> None:
+    for read in (store.run_ids, files.exists, lambda name: find_runs([name])):
+        with pytest.raises(UsageError, match="AWS_ACCESS_KEY_ID") as caught:
+            read(address)
+        assert "sec" not in str(caught.value)
+
+
+def test_a_signature_is_no_part_of_a_run_id() -> None:
+    assert stem_of("https://host/runs/run7.mcap?X-Amz-Signature=abc") == "run7"
+    assert stem_of("s3://bucket/run7?.mcap") == "run7?"
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT * FROM read_csv('{file}')",
+        "select * from READ_CSV('{file}')",
+        "SELECT * FROM \"read_csv\"('{file}')",
+        "SELECT * FROM read_csv /* of all */ ('{file}')",
+        "WITH a AS (SELECT * FROM read_csv('{file}')) SELECT * FROM a",
+        "SELECT run_id FROM runs UNION ALL SELECT * FROM read_csv('{file}')",
+    ],
+)
+def test_sql_reads_other_files_only_when_it_may(tmp_path: Path, sql: str) -> None:
+    store.write_run(tables_of("r1"), tmp_path / "out", METADATA)
+    (tmp_path / "secret.csv").write_text("run_id\nsecret\n")
+    query = sql.format(file=tmp_path / "secret.csv")
+    with pytest.raises(UsageError, match=r"reads files beside the result.*--allow-files"):
+        run_sql(tmp_path / "out", query)
+    assert "secret" in run_sql(tmp_path / "out", query, allow_files=True)["run_id"].to_list()
+
+
+def test_any_query_has_an_answer_or_one_message(tmp_path: Path) -> None:
+    """Seeded random SQL, and what once took minutes: many empty comments."""
+    store.write_run(tables_of("r1"), tmp_path, METADATA)
+    words = [
+        *(
+            "SELECT",
+            "FROM",
+            "WHERE",
+            "runs",
+            "hazards",
+            "epochs",
+            "run_id",
+            "t",
+            "hazard",
+            "(",
+            ")",
+            ",",
+            "*",
+            "1",
+            "-1",
+        ),
+        *("1e308", "'x'", "NULL", "IS", "NOT", "AND", "OR", "=", "<", "+", "/", "COUNT(*)", "SUM(", "GROUP BY", "AS a"),
+        *("ORDER BY", "LIMIT", "JOIN", "USING (run_id)", "UNION ALL", "CASE", "WHEN", "THEN", "END", "CAST(", "[", ";"),
+    ]
+    draw = random.Random(11)
+    for _ in range(300):
+        sql = "SELECT " + " ".join(draw.choices(words, k=draw.randint(1, 14)))
+        with contextlib.suppress(UsageError):
+            assert isinstance(run_sql(tmp_path, sql), pl.DataFrame), sql
+    begun_s = time.monotonic()
+    assert run_sql(tmp_path, "/**/" * 2000 + "SELECT run_id FROM runs").height == 1
+    with pytest.raises(UsageError, match="is no query"):
+        run_sql(tmp_path, "/**/" * 2000 + "DROP")
+    assert time.monotonic() - begun_s < 2.0
+
+
+def test_control_characters_are_shown_and_not_sent() -> None:
+    title = "\x1b]0;owned\x07\x9b31m\u202e\n"
+    frame = pl.DataFrame({"name": [title]})
+    for text in (plain_table(frame), to_json(frame), str(InputError("bad", place=title))):
+        assert not set(text) & {"\x1b", "\x07", "\x9b"}
+    assert plain_table(frame).splitlines()[-1] == r"\x1b]0;owned\x07\x9b31m\u202e\n"
+    assert json.loads(to_json(frame))[0]["name"] == title

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.figures.summary import Alignment, SolutionResults, failed_row, summarise
+from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import StreamCounts
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration, LdsConfig
@@ -108,7 +108,12 @@ def test_what_cleaning_and_alignment_found() -> None:
     found = row(
         epochs(seconds(3)),
         counts=StreamCounts(duplicates=4, out_of_order=2),
-        alignment=Alignment(0.08, 0.01, 1.004, 2e-4),
+        alignment={
+            "latency_s": 0.08,
+            "latency_sigma_s": 0.01,
+            "odometer_scale": 1.004,
+            "odometer_scale_sigma": 2e-4,
+        },
         ambiguous_stretches=3,
     )
     assert (found["duplicates"], found["out_of_order"], found["ambiguous_stretches"]) == (4, 2, 3)

@@ -139,6 +139,7 @@ def test_each_gap_in_the_data_has_its_reason() -> None:
     epochs = epochs_of(
         6,
         fix_valid=[True, False, True, True, True, True],
+        on_track=[True, False, True, True, True, True],
         gate_probability=[1.0, 1.0, 0.5, 1.0, 1.0, None],
     )
     satellites = satellites_of(epochs, np.zeros((6, SKY.height)))
@@ -194,3 +195,14 @@ def test_stamps_may_differ_by_rounding_and_rows_come_in_any_order() -> None:
     full = pseudorange_monitor(epochs, satellites, Configuration())
     again = pseudorange_monitor(epochs, shifted, Configuration())
     assert again["value"].to_list() == pytest.approx(full["value"].to_list(), rel=1e-9)
+
+
+def test_an_epoch_of_few_satellites_is_judged_by_these_alone() -> None:
+    """Beside an epoch that sees all of them, and by itself."""
+    epochs, residuals = epochs_of(2), np.random.default_rng(4).normal(0.0, 2.0, (2, SKY.height))
+    satellites = satellites_of(epochs, residuals)
+    few = satellites.filter((pl.col("t") == epochs["t"][0]) | pl.col("sv").is_in(SKY["sv"].head(7).implode()))
+    together = pseudorange_monitor(epochs, few, Configuration())
+    alone = pseudorange_monitor(epochs.tail(1), few.filter(pl.col("t") == epochs["t"][1]), Configuration())
+    assert together["value"][1] == pytest.approx(alone["value"][0], rel=1e-9)
+    assert together["value"][0] != pytest.approx(together["value"][1], rel=1e-3)

@@ -1,0 +1,95 @@
+"""Which runs are complete and unchanged, known without opening a log or a table.
+
+`OUT/.catalogue/complete` keeps the outcome of each run with a proof: a digest over the states (size, times, inode) of
+its log and of its `runs` file, and over all that decides its tables. It may be deleted at any time. A run whose proof
+is another one goes to a worker, which holds contents against each other. Local results of local logs only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from pipeline import storage
+from pipeline.campaign.outcome import RunOutcome
+from pipeline.campaign.plan import Plan, RunJob, digests
+from pipeline.results import store
+from pipeline.storage.address import is_url, join
+from schemas.enums import RunStatus, RunVerdict
+from schemas.errors import OutputError
+
+# What changed as lately as this may change again without showing another time [ns].
+_SETTLED_NS = 2_000_000_000
+
+
+def proof_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
+    """The proof that the tables there now were made of the log in this state; empty where there is none."""
+    if is_url(job.address) or is_url(job.out) or not log:
+        return ""
+    if max(file.changed_ns for file in log) > time.time_ns() - _SETTLED_NS:
+        return ""
+    try:
+        return _digest(job, log)
+    except OSError:
+        return ""
+
+
+def unchanged(plan: Plan) -> list[RunOutcome]:
+    """The outcomes of the runs of a plan that are complete, and whose log nobody has touched since."""
+    kept = _kept(plan.out)
+    found = ((job, kept[job.run_id]) for job in plan.jobs if job.run_id in kept)
+    return [replace(outcome, skipped=True) for job, outcome in found if _holds(job, outcome)]
+
+
+def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
+    """Keep what can be proved, beside what is known of runs that this call did not name."""
+    if is_url(plan.out):
+        return
+    named = {job.run_id for job in plan.jobs}
+    others = [outcome for run_id, outcome in _kept(plan.out).items() if run_id not in named]
+    rows = [asdict(replace(outcome, attempts=1)) for outcome in (*others, *outcomes) if outcome.proof]
+    # It can be done without, and so must not hide why a campaign ends.
+    with contextlib.suppress(OutputError):
+        storage.write_bytes(_place(plan.out), json.dumps(rows).encode())
+
+
+def _kept(out: str) -> dict[str, RunOutcome]:
+    try:
+        rows = json.loads(storage.content_of(_place(out)) or b"[]") if not is_url(out) else []
+        outcomes = [RunOutcome(**row) for row in rows]
+        return {
+            outcome.run_id: replace(
+                outcome,
+                status=RunStatus(outcome.status),
+                verdict=None if outcome.verdict is None else RunVerdict(outcome.verdict),
+                seconds=0.0,
+                log_bytes=0,
+            )
+            for outcome in outcomes
+        }
+    except (ValueError, TypeError, OutputError):
+        # Of another build, or damaged: a copy that is not needed.
+        return {}
+
+
+def _holds(job: RunJob, outcome: RunOutcome) -> bool:
+    if is_url(job.address) or (job.write_route and not Path(job.write_route).exists()):
+        return False
+    try:
+        return _digest(job, storage.signature(Path(job.address))) == outcome.proof
+    except OSError:
+        return False
+
+
+def _digest(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
+    marker = storage.signature(Path(store.table_address(job.out, "runs", job.run_id)))
+    return hashlib.sha256(repr((job.address, log, marker, digests(job, ""))).encode()).hexdigest()
+
+
+def _place(out: str) -> str:
+    return str(join(join(out, ".catalogue"), "complete"))

@@ -1,0 +1,95 @@
+"""The path that a run was matched to, as a route file to confirm or correct (CONTRACT section 2)."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from io import BytesIO
+
+import polars as pl
+
+from pipeline.export.places import Stretches, stretches_of
+from pipeline.report.columns import frame_table
+from pipeline.report.markup import section
+from pipeline.results.store import file_name
+
+_NOTE = (
+    "This is the path that the positions were matched to. Correct it where you know better, and hand it in with "
+    "<code>balise replay --route FILE</code>: nothing stays ambiguous then. The results do not hold which rival tracks "
+    "were possible: the notes above name them, and <code>balise replay --write-route DIR</code> writes them beside "
+    "each net element. A net element without any position is not in this list."
+)
+_TURNED = (
+    "The train came back over a net element, and the results do not tell the legs of such a ride apart: "
+    "<code>balise replay --write-route DIR</code> writes the route of this run."
+)
+
+
+def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
+    """Net elements in the order of growing path, from one solution's epochs; None where the train turned over switches.
+
+    `doubtful`: the least probability of the path there is below `sure`.
+    """
+    ways = stretches_of(epochs)
+    if not ways.elements or len(set(ways.elements)) < len(ways.elements):
+        return None
+    told = (
+        epochs.filter(pl.col("path_m").is_not_null() & pl.col("netelement_id").is_in(ways.elements))
+        .group_by("netelement_id")
+        .agg(probability=pl.col("path_probability").min(), t_start=pl.col("t").min(), t_end=pl.col("t").max())
+    )
+    return (
+        _directions(ways)
+        .join(told, on="netelement_id", how="left")
+        .sort("from_m")
+        .select(
+            "netelement_id",
+            "direction",
+            "probability",
+            "t_start",
+            "t_end",
+            doubtful=(pl.col("probability") < sure).fill_null(value=True),
+        )
+    )
+
+
+def _directions(ways: Stretches) -> pl.DataFrame:
+    directions = ["AB" if sign > 0 else "BA" for sign in ways.sign.tolist()]
+    return pl.DataFrame({"netelement_id": ways.elements, "direction": directions, "from_m": ways.first_m})
+
+
+def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float) -> str:
+    """The route with its doubtful stretches, and both files to take away; nothing without matched positions."""
+    if epochs["path_m"].null_count() == epochs.height:
+        return ""
+    route = found_route(epochs, sure)
+    if route is None:
+        return section(identity, "Route found", f"<p>{_TURNED}</p>")
+    doubtful = route.filter("doubtful")["netelement_id"].to_list()
+    said = f"In doubt: {_some(doubtful)}." if doubtful else "No stretch is in doubt."
+    shown = route.select("doubtful", "netelement_id", "direction", "probability", "t_start", "t_end")
+    return section(
+        identity,
+        "Route found",
+        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {_downloads(run_id, route)}</p>',
+        f"<p>{_NOTE}</p>",
+        frame_table(f"table-{identity}", "Route found, in the order of the path", shown),
+    )
+
+
+def _some(names: Sequence[str], most: int = 8) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def _downloads(run_id: str, route: pl.DataFrame) -> str:
+    parquet = BytesIO()
+    route.write_parquet(parquet)
+    return f"{_download(run_id, 'csv', route.write_csv().encode())} {_download(run_id, 'parquet', parquet.getvalue())}"
+
+
+def _download(run_id: str, ending: str, content: bytes) -> str:
+    """A link that holds its file."""
+    href = f"data:application/octet-stream;base64,{base64.b64encode(content).decode()}"
+    return f'<a download="{escape(file_name(run_id))}.{ending}" href="{href}">route as {ending}</a>'

@@ -1,0 +1,1 @@
+"""Evidence: routes, and what the judge makes of small pieces of it."""

@@ -1,0 +1,129 @@
+"""Single rules of the judge on a handful of rows, worked out by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.evidence.evidence import Alternative, EvidenceSet
+from pipeline.evidence.routes import Place, Route
+from pipeline.judge.across import errors_across
+from pipeline.judge.alarms import verdict_within
+from pipeline.judge.judge import undetected_ns
+from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, margins_m
+from pipeline.judge.passings import Passing, train_passings
+from pipeline.judge.rows import within_budget
+from pipeline.judge.states import odometer_beyond_confidence
+from schemas.config import HazardConfig, LdsConfig
+from schemas.enums import Verdict
+
+NS = 1_000_000_000
+DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
+
+
+def seconds(*t_s: float) -> Any:
+    return np.array([round(t * NS) for t in t_s], dtype=np.int64)
+
+
+@pytest.mark.parametrize(
+    ("codes", "accepted", "numbers", "may_s", "kept"),
+    [
+        ([WRONG], [True], [1], 0.2, True),  # accepted before the episode
+        ([WRONG], [False], [3], 0.2, True),  # offered in it, not accepted
+        ([WRONG], [True], [3], 0.2, False),
+        ([UNKNOWN], [True], [3], 0.2, None),
+        ([RIGHT], [True], [3], 0.7, None),  # 0.2 s wrong for sure, 0.7 s at most, 0.5 s allowed
+    ],
+)
+def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_episode(
+    codes: list[int], accepted: list[bool], numbers: list[int], may_s: float, kept: bool | None
+) -> None:
+    episode = SimpleNamespace(holds=lambda number: number >= 2, hazardous_s=0.2, hazardous_may_s=may_s)
+    judged = SimpleNamespace(code=np.array(codes))
+    offers = SimpleNamespace(judged=judged, accepted=np.array(accepted), number=np.array(numbers))
+    assert within_budget(cast(Any, episode), cast(Any, offers), 0.5) is kept
+
+
+def test_the_distance_counts_from_the_last_accepted_balise() -> None:
+    """The odometer misses 30 m between 1 s and 2 s; a balise accepted at 3 s is a new begin."""
+    t_ns, odometer_m = seconds(0, 1, 2, 3, 4), 10.0 * np.arange(5)
+    train_m = odometer_m + np.array([0.0, 0.0, 30.0, 30.0, 30.0])
+    beyond = odometer_beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
+    assert beyond.tolist() == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize(("first", "begin_ns"), [(None, 10), (1, 1), (2, 10)])
+def test_what_a_step_offers_on_its_way_lies_before_its_first_position(first: int | None, begin_ns: int) -> None:
+    step = None if first is None else SimpleNamespace(first=first)
+    episode = SimpleNamespace(onset_ns=10, end_ns=30, detected_ns=None, step=step)
+    series = SimpleNamespace(t_ns=np.array([0, 10, 20]))
+    assert undetected_ns(cast(Any, episode), cast(Any, series)) == (begin_ns, 30)
+
+
+@pytest.mark.parametrize(
+    ("low_m", "high_m", "told", "verdict"),
+    [
+        ([-1.0, 4.0], [1.0, 9.0], [True, True], Verdict.UNKNOWN),  # 4 to 9 m against 5 m
+        ([-1.0, 6.0], [1.0, 9.0], [False, False], Verdict.TRUE),
+        ([-9.0, 0.0], [-6.0, 1.0], [True, True], Verdict.TRUE),
+        ([-1.0, -5.0], [1.0, 5.0], [True, True], Verdict.FALSE),
+        ([-1.0, -5.0], [1.0, 5.0], [True, False], Verdict.UNKNOWN),
+        ([-1.0, np.nan], [1.0, np.nan], [True, True], Verdict.UNKNOWN),
+        ([], [], [], Verdict.UNKNOWN),
+    ],
+)
+def test_an_alarm_is_false_only_where_all_of_its_positions_were_well(
+    low_m: list[float], high_m: list[float], told: list[bool], verdict: Verdict
+) -> None:
+    margin_m = np.full(len(told), 5.0)
+    assert verdict_within(np.array(low_m), np.array(high_m), margin_m, np.array(told, dtype=bool)) is verdict
+
+
+def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
+    """Two samples of a reference on the equator, 2 s and 20 m east apart; positions 1 m north and 3 m above."""
+    stamps = pl.Series("t", [0, 2 * NS], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    reference = pl.DataFrame(
+        {"t": stamps, "latitude_deg": [0.0, 0.0], "longitude_deg": [0.0, 20.0 * DEG_PER_M], "height_m": [50.0, 52.0]}
+    )
+    at_s, east_m = [0.0, 1.0, 1.0, 2.0, 2.5], np.array([0.0, 10.0, 35.0, 20.0, 25.0])
+    north_deg = np.degrees(1.0 / 6335439.3)  # radius of curvature of the meridian at the equator, WGS 84
+    fixes = pl.DataFrame({"latitude_deg": [north_deg] * 5, "longitude_deg": east_m * DEG_PER_M, "height_m": [54.0] * 5})
+    for heading_deg, left_m in ((90.0, 1.0), (270.0, -1.0)):
+        across, up = errors_across(fixes, np.full(5, heading_deg), seconds(*at_s), reference, 2.0, 20.0)
+        # The third is 25 m ahead, the last after the reference ended.
+        assert across == pytest.approx([left_m, left_m, np.nan, left_m, np.nan], abs=1e-3, nan_ok=True)
+        assert up == pytest.approx([4.0, 3.0, np.nan, 2.0, np.nan], abs=1e-3, nan_ok=True)
+    nothing = errors_across(fixes, np.full(5, 90.0), seconds(*at_s), reference.head(1), 2.0, 20.0)
+    assert all(np.isnan(values).all() for values in nothing)
+
+
+def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of() -> None:
+    """On element 0 alone up to 98 m at 2 s, from 106 m at 3 s on over element 1, which begins at 100 m."""
+    before = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
+    after = Route(
+        np.array([0, 1]), np.array([True, True]), np.array([0.0, 100.0]), np.array([0.0, 0.0]), np.array([100.0, 100.0])
+    )
+    alternatives = tuple(
+        Alternative(np.array(rows), route, np.array(at_m) - 1.0, np.array(at_m) + 1.0)
+        for rows, route, at_m in (
+            ([0, 1, 2], before, [80.0, 90.0, 98.0]),
+            ([3, 4, 5], after, [106.0, 114.0, 122.0]),
+        )
+    )
+    none = np.zeros(0, dtype=np.int64)
+    evidence = EvidenceSet(np.zeros(6, dtype=np.int64), alternatives, none, none)
+    places = {"V1": Place(1, 2.0), "V2": Place(1, 60.0)}
+    found = train_passings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 5.0, 3.0)
+    # 102 m lies in the middle between 98 m and 106 m; 160 m was not reached.
+    assert found == {"V1": [Passing(round(2.5 * NS), 1, True)], "V2": []}
+    # Where the place is known to 0.5 m only, evidence of 1 m to both sides tells of no passing.
+    assert train_passings(seconds(0, 1, 2, 3, 4, 5), evidence, places, 0.5, 3.0) == {"V1": [], "V2": []}
+
+
+def test_the_margin_of_a_healthy_position() -> None:
+    """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
+    assert margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
