@@ -19,6 +19,9 @@ from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, Vehicle
 
 NO_ROW = -1
+_BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
+# Of positions so far beside a curve, nothing along it could be said any more.
+_MOST_HIDDEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -27,12 +30,12 @@ class Watched:
 
     `epoch`: row among all epochs; `t_s`: seconds after the first epoch. `fresh`: nothing led here, so the fault may
     have changed unseen, by `unseen_m` at most; `free`: the averages are not known here, only that they were silent.
-    `way_s`: metres of fault per m/s that the bank sees over the increment (its time over g). `rate_mps`: u.
-    `least_mps`, `most_mps`: bounds of y by the raw monitor and the largest rate of a fault. `weight`, `average_mps`,
-    `threshold_mps` (m, averages): alpha(dt), what each average was, and its threshold. `low_m`, `high_m`: bounds of the
-    fault itself by monitors without memory. `anchor`: row that a re-link held this one against, -1 where none, and
-    `held_low_m`, `held_high_m`: the bounds of the difference. `learned_m`: by how much a learned scale can hide the
-    fault on the way to this row (a sum), `learned_late_m`: a learned latency at this row.
+    `way_s`: metres of fault per m/s that the bank sees over the increment (its time over g, see `_share_seen`).
+    `rate_mps`: u. `least_mps`, `most_mps`: bounds of y by the raw monitor and the largest rate of a fault.
+    `weight`, `average_mps`, `threshold_mps` (m, averages): alpha(dt), what each average was, and its threshold.
+    `low_m`, `high_m`: bounds of the fault itself by monitors without memory. `anchor`: row that a re-link held this one
+    against, -1 where none, and `held_low_m`, `held_high_m`: the bounds of the difference. `learned_m`: by how much a
+    learned scale can hide the fault on the way to this row (a sum), `learned_late_m`: a learned latency at this row.
     """
 
     epoch: Ints
@@ -129,13 +132,15 @@ def _thresholds(bank: AxisRecord, epoch: Ints) -> Floats:
     return np.where(np.isfinite(threshold), threshold, np.inf)
 
 
-def _share_seen(epochs: pl.DataFrame, epoch: Ints) -> Floats:
-    """How much of a change of the position along the path the increments show: a curve takes a little out beside it.
+def _share_seen(epochs: pl.DataFrame, epoch: Ints) -> float:
+    """How much of a fault the increments show, at least; one on straight track.
 
-    `along_m` leaves out the way that a curve adds to a position beside the track (`pipeline.alignment.align.unrolled`).
+    `along_m` leaves out the way that a curve adds to a position y beside it (`pipeline.alignment.align.unrolled`). A
+    fault carries the position to where the track lies otherwise, and so hides y times the turn in between: at most y
+    times the sharpest curvature times the fault.
     """
-    beside = floats(epochs, "curvature_per_m")[epoch] * floats(epochs, "cross_track_m")[epoch]
-    return 1.0 - np.nan_to_num(beside)
+    curvature, beside = (np.abs(np.nan_to_num(floats(epochs, name)[epoch])) for name in _BESIDE_CURVES)
+    return 1.0 - min(float(curvature.max(initial=0.0) * beside.max(initial=0.0)), _MOST_HIDDEN)
 
 
 def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Configuration) -> tuple[Floats, Floats]:
