@@ -282,6 +282,7 @@ def undetected(
     print(
         f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most."
     )
+    print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
     print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
     print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 

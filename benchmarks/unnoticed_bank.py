@@ -21,6 +21,7 @@ from pipeline.monitors.recursion import ewma_weight
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
 from pipeline.results.terminal import show_table
 from pipeline.undetected.error import largest_errors
+from pipeline.undetected.shapes import Shape, largest_of_shape
 from pipeline.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Floats
 from schemas.config import threshold_factor
@@ -34,6 +35,7 @@ BANKS: dict[str, tuple[float, ...]] = {
     "0.001 alone": (0.001,),
     "0.1 0.03 0.01": (0.1, 0.03, 0.01),
 }
+SHAPES: tuple[Shape, ...] = ("step", "ramp")
 MINUTES = (1, 10, 30, 60, 120)
 HEADINGS_DEG = (0.0, 45.0, 90.0)
 _WARM_S = 2000
@@ -45,7 +47,8 @@ def along_sigmas_m(sky: Geometry, heading_deg: float) -> Floats:
     """Deviation along the track of each source of the position error [m]."""
     heading = np.radians(heading_deg)
     ahead = np.array([np.sin(heading), np.cos(heading), 0.0])
-    return np.sqrt(np.einsum("a,jab,b->j", ahead, sky.source_covariances_m2, ahead))
+    sigmas: Floats = np.sqrt(np.einsum("a,jab,b->j", ahead, sky.source_covariances_m2, ahead))
+    return sigmas
 
 
 def noise_of(sigmas_m: Floats, seconds: int, rng: np.random.Generator) -> Floats:
@@ -125,6 +128,26 @@ def bank_figures(
     return {"sky": constellation, "bank": name, **told, "20 m after min": beyond[0] / 60 if beyond.size else None}
 
 
+def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple[int, ...]) -> list[dict[str, object]]:
+    """Medians of what steps and ramps may become, by the default bank."""
+    sky, alphas = default_geometry(constellation), np.array(BANKS["0.1 0.01 0.001"])
+    told: list[dict[str, object]] = []
+    for shape in SHAPES:
+        larger = []
+        for repetition in range(repetitions):
+            for heading in HEADINGS_DEG:
+                sigmas, rng = along_sigmas_m(sky, heading), np.random.default_rng([9, repetition, int(heading)])
+                rows = watched_of(noise_of(sigmas, _WARM_S + 60 * minutes[-1] + 1, rng), sigmas, alphas)
+                ends = [_WARM_S + 60 * minute for minute in minutes]
+                both = (rows, rows.mirrored())
+                larger.append([max(largest_of_shape(one, _WARM_S, end, shape) for one in both) for end in ends])
+        median = np.median(larger, axis=0)
+        told.append(
+            {"sky": constellation, "shape": shape} | {f"{m} min": v for m, v in zip(minutes, median, strict=True)}
+        )
+    return told
+
+
 def range_figure(constellation: Constellation, heading_deg: float) -> float:
     """The largest fault along the track by one range that the pseudorange monitor passes, noise at its mean [m]."""
     sky = default_geometry(constellation)
@@ -147,6 +170,7 @@ def main() -> None:
     given = parser.parse_args()
     skies: tuple[Constellation, ...] = ("gps", "gps_galileo")
     show_table(pl.DataFrame([bank_figures(sky, name, given.repetitions, MINUTES) for sky in skies for name in BANKS]))
+    show_table(pl.DataFrame([row for sky in skies for row in shape_figures(sky, given.repetitions, MINUTES[:4])]))
     ranges = [{"sky": sky, **{f"{h:.0f} deg": range_figure(sky, h) for h in HEADINGS_DEG}} for sky in skies]
     show_table(pl.DataFrame(ranges), "One range at fault, by the pseudorange monitor alone [m]")
     spread = [

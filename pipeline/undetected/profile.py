@@ -10,6 +10,7 @@ import polars as pl
 from pipeline.undetected.columns import Diagnosis, rows_of, rows_of_passages
 from pipeline.undetected.error import largest_errors
 from pipeline.undetected.exact import largest_profile
+from pipeline.undetected.shapes import largest_of_shape
 from pipeline.undetected.watched import Watched
 from pipeline.undetected.windows import windows
 from schemas.arrays import NS_PER_S, Ints, ints, times_ns
@@ -25,14 +26,17 @@ MARGIN = 1e-6
 class Profile:
     """`fault`: `t_s` after the first epoch and `size_m` along growing path; `t`: stamps of where it begins and ends.
 
-    `error_m`: its size at the end, as the linear program finds it; `bound_m`: as the tables have it. `monitors`: those
-    whose thresholds it reaches, the most often reached first.
+    `error_m`: its size at the end, as the linear program finds it; `bound_m`: as the tables have it; `step_m` and
+    `ramp_m`: what a step and a ramp could have become there. `monitors`: those whose thresholds the profile reaches,
+    the most often reached first.
     """
 
     fault: pl.DataFrame
     t: pl.Series
     error_m: float
     bound_m: float
+    step_m: float
+    ramp_m: float
     monitors: tuple[str, ...]
 
 
@@ -57,6 +61,8 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
         t=diagnosis.epochs["t"].gather(part.epoch[[0, -1]]),
         error_m=found.error_m,
         bound_m=float(largest_errors(seen, start, row).most_m[-1]),
+        step_m=largest_of_shape(seen, start, row, "step"),
+        ramp_m=largest_of_shape(seen, start, row, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in found.binding),
     )
 

@@ -129,7 +129,7 @@ def watched(window: Rows) -> Watched:
     """The same rows as the program has them."""
     alphas, size = np.array(window.alphas), window.size
     unseen = np.where(window.fresh, np.inf, 1.0)
-    averages = np.zeros((size, alphas.size))
+    averages = recursions(window, np.zeros(size))
     averages[0] = window.start_mps
     infinite, zero = np.full(size, np.inf), np.zeros(size)
     return Watched(

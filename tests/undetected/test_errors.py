@@ -9,7 +9,9 @@ import pytest
 
 from pipeline.undetected.error import largest_errors
 from pipeline.undetected.exact import largest_profile
+from pipeline.undetected.shapes import Shape, largest_of_shape
 from pipeline.undetected.stretch import paid_m, stretch_after
+from schemas.arrays import Floats
 from tests.undetected.oracle import Rows, beyond, optimum, recursions, rows, watched
 
 SIZES = [(2, 0), (3, 0), (9, 0), (30, 0), (60, 0)]
@@ -111,6 +113,30 @@ def test_a_learned_scale_adds_its_way() -> None:
     seen = replace(watched(window), learned_m=np.full(11, 2.0), learned_late_m=np.full(11, 7.0))
     # 10 rows of 2 m, the latency once, at the end; the bank's own 0.5 + 0.09 beside.
     assert largest_errors(seen, 0, 10).most_m[-1] == pytest.approx(0.59 + 20.0 + 7.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("shape", ["step", "ramp"])
+@pytest.mark.parametrize(("seed", "resets"), [(1, 0), (2, 0), (3, 1)])
+def test_steps_and_ramps_are_as_large_as_the_first_threshold_lets_them(seed: int, resets: int, shape: Shape) -> None:
+    window = rows(np.random.default_rng(seed), 25, resets)
+    t_s, most = np.cumsum(window.dt_s), 0.0
+    for begin in range(1, 25):
+        one = np.where(np.arange(25) >= begin, t_s - t_s[begin - 1] if shape == "ramp" else 1.0, 0.0)
+        most = max(most, _largest_scale(window, one) * one[-1])
+    found = largest_of_shape(watched(window), 0, 24, shape)
+    assert found == pytest.approx(most, rel=1e-6)
+    assert found <= optimum(window) + 1e-9
+
+
+def _largest_scale(window: Rows, one: Floats) -> float:
+    """By halving, on the recursions as printed; a fault is never faster than the largest rate."""
+    low, high = 0.0, window.largest_mps / np.abs(np.diff(one) / window.dt_s[1:]).max()
+    if beyond(window, high * one) <= 1.0:
+        return high
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if beyond(window, middle * one) <= 1.0 else (low, middle)
+    return low
 
 
 def test_recursions_of_the_oracle_by_hand() -> None:
