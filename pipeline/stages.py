@@ -11,6 +11,7 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
+from pipeline.figures.fit_notes import fit_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
@@ -26,6 +27,7 @@ from pipeline.monitors.pseudorange import pseudorange_monitor
 from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
 from pipeline.odometry import Odometry, odometry_of
 from pipeline.odometry.polarity import polarity
+from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network
 from pipeline.track.route import site_network
@@ -49,6 +51,7 @@ class _Context:
     vehicle: Vehicle
     config: Configuration
     counts: CleanCounts
+    fits: dict[str, Fit]
     odometry: Odometry | None
     evidence: Evidence
 
@@ -85,13 +88,14 @@ def diagnosed(
 
 
 def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> _Context:
-    """The run in order, its odometer, and what is known of where the train was."""
-    cleaned, counts = clean(run)
+    """The run in order, whether it fits, its odometer, and what is known of where the train was."""
+    cleaned, counts = clean(run, config.ingest)
+    fits = {name: fit_run(cleaned, name, vehicle, config.ingest, site) for name in cleaned.solutions()}
     odometry = odometry_of(cleaned.odometer, vehicle, config)
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)
     evidence = evidence_of(reference, cleaned.balise_reads, site.balises, odometry, network, config)
-    return _Context(cleaned, site, vehicle, config, counts, odometry, evidence)
+    return _Context(cleaned, site, vehicle, config, counts, fits, odometry, evidence)
 
 
 def _reference_places(
@@ -138,6 +142,7 @@ def _match(context: _Context, solution: str) -> Match:
     fixes = run.gnss.filter(pl.col("solution") == solution)
     require_two_times(fixes, "gnss", f" of solution {solution!r}")
     require_one_journey(fixes, f"gnss of solution {solution!r}")
+    refuse_impossible(context.fits[solution], f"{run.run_id}: solution {solution!r}", context.config.ingest)
     return match(
         fixes,
         context.odometry,
@@ -231,7 +236,9 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.odometry,
         context.config.align.straight_s,
     )
-    notes = (*notes, *reading_notes(ride.aligned, context.config), *reference_notes(context.evidence.disputed))
+    fit = context.fits[name]
+    notes = (*fit_notes(fit), *notes, *reading_notes(ride.aligned, context.config))
+    notes = (*notes, *reference_notes(context.evidence.disputed))
     return SolutionResults(
         solution=name,
         epochs=epochs,
@@ -249,6 +256,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
         spacing=ride.spacing,
+        impossible=len(fit.impossible),
     )
 
 
