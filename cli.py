@@ -257,6 +257,43 @@ def safety(
 
 @app.command(
     epilog=_examples(
+        "balise claim week12 --site line9",
+        "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
+    )
+)
+def claim(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
+    site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
+    front_ahead: Annotated[
+        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+    ] = 0.0,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    as_json: Json = False,
+) -> None:
+    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    from pipeline.claim import claim as hold
+    from pipeline.claim import for_reading, load_profile, read_areas
+    from pipeline.results.answer_files import write_csv
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+
+    wanted = load_profile(profile)
+    ground = None if site is None else read_site(site)
+    areas = None if site is None or ground is None else read_areas(site, ground)
+    found = hold(out, wanted, ground, areas, front_ahead)
+    if csv is not None:
+        write_csv(found.table, csv)
+    if as_json:
+        head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
+        _print_json({**head, "notes": found.notes, "requirements": found.table})
+    elif str(csv) != "-":
+        show_table(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
+        print("\n".join(["", *found.notes]))
+
+
+@app.command(
+    epilog=_examples(
         "balise inspect monday.mcap",
         "balise inspect line9",
         "balise inspect line9 --result week12",
