@@ -23,7 +23,11 @@ MODULES = (
     "interruptions",
     "experiment",
     "relink",
+<<<<<<< HEAD
     "line",
+=======
+    "undetected",
+>>>>>>> main
 )
 
 
