@@ -23,11 +23,8 @@ MODULES = (
     "interruptions",
     "experiment",
     "relink",
-<<<<<<< HEAD
     "line",
-=======
     "undetected",
->>>>>>> main
 )
 
 
