@@ -12,7 +12,7 @@ from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.results import store
-from pipeline.site.describe import describe_site
+from pipeline.site.describe import describe_site, elements_table, without_balises
 from pipeline.site.parallels import parallel_findings
 from pipeline.site.read import is_geojson, read_site
 from pipeline.site.survey_findings import survey_findings
@@ -108,7 +108,8 @@ def inspect_site(
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
     alike = (*window_findings(site), *parallel_findings(site, matching or MatchingConfig()))
-    tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *alike))}
+    found = (*description.findings, *without_balises(site.balises), *alike)
+    tables = {"Site": _figures(figures), "Elements": elements_table(site), "Findings": findings_table(found)}
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
@@ -126,7 +127,8 @@ def _figures(figures: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame({"figure": list(figures), "value": [_value(value) for value in figures.values()]})
 
 
-def _findings(findings: tuple[Finding, ...]) -> pl.DataFrame:
+def findings_table(findings: tuple[Finding, ...]) -> pl.DataFrame:
+    """Findings as they are shown."""
     columns = ("severity", "place", "message", "remedy")
     rows = [tuple(getattr(finding, name) for name in columns) for finding in findings]
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")
