@@ -52,9 +52,10 @@ def make_network(survey: Survey, join_m: float) -> Network:
         survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
     nodes = _nodes(pieces, join_m)
     pieces, nodes = _without_doubles(pieces, nodes, survey)
-    crossings = _crossings(pieces, nodes, survey)
+    switches = _nodes_at(pieces, nodes, survey.switches_deg)
+    crossings = _crossings(pieces, nodes, switches, survey)
     elements, ends = _cut(pieces, nodes, crossings)
-    links = _links(elements, ends, crossings, survey) if elements else Links.create_empty()
+    links = _links(elements, ends, crossings, switches, survey) if elements else Links.create_empty()
     return Network(elements, ends, links)
 
 
@@ -124,7 +125,7 @@ def _runs(wanted: np.ndarray) -> Iterator[tuple[int, int]]:
     yield from zip(turns[::2].tolist(), turns[1::2].tolist(), strict=True)
 
 
-def _crossings(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> set[int]:
+def _crossings(pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey) -> set[int]:
     """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
 
     Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
@@ -135,7 +136,7 @@ def _crossings(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> set[in
     at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
     through, count = np.unique(inner, return_counts=True)
     told = _nodes_at(pieces, nodes, survey.crossings_deg)
-    by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - _nodes_at(pieces, nodes, survey.switches_deg)
+    by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - switches
     for node in sorted(by_form - told):
         names = sorted({piece.name for piece, own in zip(pieces, nodes, strict=True) if node in own})
         text = "cross where neither ends: taken as a crossing without a switch"
@@ -176,7 +177,7 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
-def _links(elements: list[Piece], ends: Ints, crossings: set[int], survey: Survey) -> pl.DataFrame:
+def _links(elements: list[Piece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
     """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
     arms: dict[int, list[tuple[int, int]]] = {}
     for element, pair in enumerate(ends.tolist()):
@@ -187,24 +188,30 @@ def _links(elements: list[Piece], ends: Ints, crossings: set[int], survey: Surve
     rows: list[tuple[str, int, str, int, str]] = []
     for node, meeting in arms.items():
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
-        pairs = _navigable(units, node in crossings)
+        pairs = _navigable(units, node in crossings, node in switches)
         for one, other in itertools.combinations(range(len(meeting)), 2):
             way = Navigability.BOTH if (one, other) in pairs else Navigability.NONE
             (a, a_end), (b, b_end) = meeting[one], meeting[other]
             rows.append((names[a], a_end, names[b], b_end, way.value))
-        _tell_of_node([names[element] for element, _ in meeting], pairs, node in crossings, survey)
+        if node not in crossings | switches:
+            _tell_of_node([names[element] for element, _ in meeting], pairs, survey)
     return Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
 
 
-def _navigable(units: list[Floats], crossing: bool) -> set[tuple[int, int]]:
-    """Pairs of arms that a train can take; at a crossing each arm goes on straight only."""
+def _navigable(units: list[Floats], crossing: bool, switch: bool) -> set[tuple[int, int]]:
+    """Pairs of arms that a train can take; at a crossing each arm goes on straight only.
+
+    Two arms that meet two are a crossing, unless the survey names a switch (a slip) there.
+    """
     turns = {
         (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
         for one, other in itertools.combinations(range(len(units)), 2)
     }
     most = _MOST_AT_JOINT_DEG if len(units) == 2 else _MOST_AT_SWITCH_DEG
     possible = {pair for pair, turn in turns.items() if turn <= most}
-    if not crossing:
+    ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
+    two_by_two = ways == [2, 2, 2, 2]
+    if not (crossing or (two_by_two and not switch)):
         return possible
     straight: set[tuple[int, int]] = set()
     for pair in sorted(possible, key=lambda pair: turns[pair]):
@@ -213,12 +220,13 @@ def _navigable(units: list[Floats], crossing: bool) -> set[tuple[int, int]]:
     return straight
 
 
-def _tell_of_node(names: list[str], pairs: set[tuple[int, int]], crossing: bool, survey: Survey) -> None:
+def _tell_of_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
     place = f"links: {', '.join(names)}"
     lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
     if lonely:
         text = f"no train gets from {', '.join(lonely)} to another of these: the corner is too sharp"
         survey.told("warning", place, text, "Mend the survey there, or the relation.")
-    if len(names) > 3 and not crossing:
-        text = f"{len(names)} ends meet at one node: taken as switches, by their angles"
-        survey.told("note", place, text, "Set relations to `none` where no train turns off.")
+    if len(names) > 3:
+        kind = "a crossing without a switch" if len(pairs) == len(names) / 2 else "switches, by their angles"
+        text = f"{len(names)} ends meet at one node, which the survey does not name: taken as {kind}"
+        survey.told("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")
