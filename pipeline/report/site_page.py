@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -56,7 +57,7 @@ _ELEMENT_HEADS = [
 _BALISE_HEADS = [(name, "") for name in ("balise", "net element", "measure [m]", "kind", "accuracy [m]")]
 
 
-def _rows(identity: str, caption: str, heads: list[tuple[str, str]], rows: list[tuple[object, ...]]) -> str:
+def _rows(identity: str, caption: str, heads: list[tuple[str, str]], rows: Sequence[tuple[object, ...]]) -> str:
     return table(identity, caption, heads, [[cell(value, 6) for value in row] for row in rows])
 
 

@@ -47,7 +47,9 @@ def read_geojson(place: str, stem: str, data: bytes) -> Survey:
 
 
 def _feature(item: Any) -> tuple[dict[str, Any], Mapping[str, Any]]:
-    """Tags and geometry; some programs put tags into a property of their own."""
+    """Tags and geometry; some programs put tags into a property of their own. Raises TypeError."""
+    if not isinstance(item, Mapping):
+        raise TypeError("a feature is no object")
     tags = dict(item.get("properties") or {})
     nested = tags.get("tags")
     tags |= nested if isinstance(nested, Mapping) else {}

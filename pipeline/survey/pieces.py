@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -62,7 +62,7 @@ class Survey:
         self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
 
 
-def piece_of(place: str, name: str, columns: dict[str, Iterable[float | None]], recorded: bool = False) -> Piece:
+def piece_of(place: str, name: str, columns: Mapping[str, Iterable[float | None]], recorded: bool = False) -> Piece:
     """A piece whose positions are places on earth, without points that repeat the one before.
 
     Raises `SiteError` where a position is none.

@@ -24,7 +24,8 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
     if points is None:
         fixed = run.gnss.filter(pl.col("fix").cast(pl.String) == Fix.RTK_FIXED.value)
         sigma_m = ((pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2).sqrt()
-        points = fixed.filter(pl.col("solution") == fixed["solution"].min()).with_columns(sigma_m=sigma_m)
+        first = fixed["solution"].unique().sort().head(1)
+        points = fixed.filter(pl.col("solution").is_in(first.implode())).with_columns(sigma_m=sigma_m)
     points = points.drop_nulls(["latitude_deg", "longitude_deg"]).sort("t")
     if points.height < 2:
         expected = "a stream `reference`, or positions with fix `rtk_fixed`"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 
 import polars as pl
 
@@ -43,7 +42,7 @@ def read_points(place: str, stem: str, data: bytes, epsg: int | None) -> Survey:
         table = table.with_columns(netelement_id=pl.lit(stem))
     survey = Survey()
     for (name,), part in table.group_by(["netelement_id"], maintain_order=True):
-        columns: dict[str, Iterable[float | None]] = {key: part[key] for key in COLUMNS if key in part.columns}
+        columns = {key: part[key] for key in COLUMNS if key in part.columns}
         survey.pieces.append(piece_of(place, str(name), columns))
     return survey
 

@@ -165,7 +165,7 @@ def _toe(lap: Piece, row: int, step: int, known: list[Piece]) -> Piece | None:
 
 def _joined(one: Piece | None, other: Piece | None) -> Piece:
     given = [piece for piece in (one, other) if piece is not None]
-    return Piece(given[0].name, *(np.concatenate([getattr(piece, name) for piece in given]) for name in COLUMNS))
+    return replace(given[0], **{name: np.concatenate([getattr(piece, name) for piece in given]) for name in COLUMNS})
 
 
 def _length_m(piece: Piece) -> float:
