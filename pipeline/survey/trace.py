@@ -90,9 +90,8 @@ def _new_track(piece: Piece, name: str, survey: Survey) -> list[Piece]:
     for lap in _laps(piece):
         covered = _covered(_surface(lap), known)
         for first, last in _stretches(~covered):
-            part = _with_toes(lap, first, last, known)
-            if _length_m(part) >= _LEAST_M:
-                parts.append(part)
+            if _length_m(lap.take(np.arange(first, last + 1))) >= _LEAST_M:
+                parts.append(_with_toes(lap, first, last, known))
         known = [*survey.pieces, *parts]
         if covered.any():
             share = float(np.mean(covered))
@@ -110,7 +109,7 @@ def _laps(piece: Piece) -> Iterator[Piece]:
         yield piece
         return
     unit = np.diff(places, axis=0)
-    turned = np.flatnonzero(np.einsum("ij,ij->i", unit[:-1], unit[1:]) < 0) + 1
+    turned = np.flatnonzero(np.einsum("ij,ij->i", unit[:-1], unit[1:]) < 0) + 2
     tree = cKDTree(places)
     again = [row for row in rows if _was_here(tree, places, way, int(row))]
     starts = [row for number, row in enumerate(again) if number == 0 or again[number - 1] != row - 1]
