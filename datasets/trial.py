@@ -6,7 +6,6 @@ one run written alone has the bytes that it has in the whole trial.
 
 from __future__ import annotations
 
-import io
 import zlib
 from collections.abc import Callable
 from datetime import timedelta
@@ -23,6 +22,7 @@ from datasets.odometer import odometer_stream
 from datasets.receiver import Journey, gnss_streams, reference_stream
 from datasets.scenario import LogKind, RunSpec, Scenario
 from pipeline.storage import replace_files
+from pipeline.storage.parquet import parquet_bytes
 from schemas.config import Vehicle, settings_from, to_toml
 from schemas.errors import OutputError
 from schemas.run import STREAMS, RunLog, Site
@@ -99,7 +99,7 @@ def write_site(site: Site, folder: Path) -> None:
     for name in ("track", "links", "balises", "route"):
         table: pl.DataFrame | None = getattr(site, name)
         if table is not None:
-            table.write_parquet(folder / f"{name}.parquet")
+            (folder / f"{name}.parquet").write_bytes(parquet_bytes(table))
 
 
 def write_run_log(run: RunLog, folder: Path, log: LogKind = "parquet") -> Path:
@@ -116,16 +116,9 @@ def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
         write_mcap(run, path, encoding=log)
         return
     # No stream that an earlier run left here may be taken for one of this run, and without GNSS none is a run.
-    contents = {f"{name}.parquet": _parquet(run.stream(name)) for name in STREAMS}
+    streams = {f"{name}.parquet": run.stream(name) for name in STREAMS}
+    contents = {file: None if table is None else parquet_bytes(table) for file, table in streams.items()}
     replace_files(path, contents, marker="gnss.parquet")
-
-
-def _parquet(table: pl.DataFrame | None) -> bytes | None:
-    if table is None:
-        return None
-    buffer = io.BytesIO()
-    table.write_parquet(buffer)
-    return buffer.getvalue()
 
 
 def _start_ns(scenario: Scenario, spec: RunSpec) -> int:

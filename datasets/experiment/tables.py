@@ -8,6 +8,7 @@ from pathlib import Path
 
 import polars as pl
 
+from pipeline.storage.parquet import parquet_bytes
 from schemas.config import Configuration
 from schemas.errors import OutputError, UsageError
 
@@ -30,7 +31,7 @@ def write_tables(out: Path, tables: Mapping[str, pl.DataFrame], settings: Mappin
         written = []
         for name, frame in tables.items():
             path = out / f"{name}.parquet"
-            frame.write_parquet(path, compression="zstd", statistics=False)
+            path.write_bytes(parquet_bytes(frame))
             written.append(path)
         path = out / "settings.json"
         path.write_text(json.dumps(dict(settings), indent=2, sort_keys=True) + "\n", encoding="utf-8")

@@ -11,6 +11,11 @@ from pipeline.diff.tables import Difference, compare_tables
 from schemas.tables import Hazards
 
 HAZARD_WINDOW_S = 2.0
+# Columns of a hazard that say what it was, whether it was seen in time and what it hit.
+_DECIDING = {
+    *("failure_mode", "timing", "evidence", "caused_by", "monitor", "detected", "within_budget"),
+    *("balise_ids", "accepted_ids"),
+}
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,18 @@ class HazardChange:
     hazard: str
     t_hazard: str
     differences: tuple[Difference, ...] = ()
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is more than other figures of the same hazard."""
+        return self.change != "changed" or bool({item.column for item in self.differences} & _DECIDING)
+
+    @property
+    def short(self) -> str:
+        """The change in one line; of changed values the columns alone."""
+        columns = ", ".join(item.column for item in self.differences if item.column in _DECIDING)
+        head = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
+        return f"{head}: {columns}" if columns else head
 
     def __str__(self) -> str:
         text = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
@@ -60,10 +77,11 @@ def _matched(a: pl.DataFrame, b: pl.DataFrame, window_s: float) -> dict[int, int
     )
     window_ns = round(window_s * 1e9)
     near = sorted(
-        (abs(t_a - t_b), row_a, row_b)
+        (apart_ns, row_a, row_b)
         for row_a, (solution_a, class_a, t_a) in enumerate(rows_a)
         for row_b, (solution_b, class_b, t_b) in enumerate(rows_b)
-        if (solution_a, class_a) == (solution_b, class_b) and abs(t_a - t_b) <= window_ns
+        if (solution_a, class_a) == (solution_b, class_b)
+        and (apart_ns := 0 if t_a == t_b else window_ns + 1 if None in (t_a, t_b) else abs(t_a - t_b)) <= window_ns
     )
     pairs: dict[int, int] = {}
     taken: set[int] = set()
@@ -75,7 +93,8 @@ def _matched(a: pl.DataFrame, b: pl.DataFrame, window_s: float) -> dict[int, int
 
 
 def _stamp(frame: pl.DataFrame, row: int) -> int:
-    return int(frame["t_hazard"].to_physical()[row])
+    """The hazard's time [ns]; those without one come first."""
+    return int(frame["t_hazard"].to_physical()[row] or 0)
 
 
 def _change(
@@ -84,5 +103,5 @@ def _change(
     row: int,
     differences: tuple[Difference, ...] = (),
 ) -> HazardChange:
-    t_text = frame["t_hazard"].dt.to_string("%Y-%m-%dT%H:%M:%S%.3fZ")[row]
+    t_text = frame["t_hazard"].dt.to_string("%Y-%m-%dT%H:%M:%S%.3fZ")[row] or "an unknown time"
     return HazardChange(change, frame["solution"][row], str(frame["hazard"][row]), t_text, differences)

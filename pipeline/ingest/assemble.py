@@ -24,17 +24,24 @@ class Decoded:
     frame: pl.DataFrame
 
 
-def stream_frames(decoded: Sequence[Decoded], breaches: list[Breach], remarks: list[str]) -> dict[str, pl.DataFrame]:
-    """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out."""
+def stream_frames(
+    decoded: Sequence[Decoded], breaches: list[Breach], few: float, remarks: list[str]
+) -> dict[str, pl.DataFrame]:
+    """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out.
+
+    `few`: share of the messages that may be left out for their date.
+    """
     frames: dict[str, pl.DataFrame] = {}
     for stream in STREAMS:
         parts = [part for part in decoded if part.source.stream == stream]
         if parts:
-            frames[stream] = _stream(stream, parts, breaches, remarks)
+            frames[stream] = _stream(stream, parts, breaches, few, remarks)
     return frames
 
 
-def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], remarks: list[str]) -> pl.DataFrame:
+def _stream(
+    stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], few: float, remarks: list[str]
+) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [
         missing_field(part.source.channel, [], column, [path])
@@ -43,7 +50,7 @@ def _stream(stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], re
         if part.frame[path].null_count() == part.frame.height
     ]
     supplements = [part for part in parts if part.source.recipe.supplement]
-    rows = [_rows(part, supplements, remarks) for part in parts if not part.source.recipe.supplement]
+    rows = [_rows(part, supplements, few, remarks) for part in parts if not part.source.recipe.supplement]
     joined = pl.concat(rows, how="diagonal_relaxed")
     frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
     return conform(frame, stream, place, breaches)
@@ -67,22 +74,46 @@ def _same_receiver(part: Decoded, other: Decoded) -> bool:
     return part.source.channel.topic.rpartition("/")[0] == other.source.channel.topic.rpartition("/")[0]
 
 
-def _rows(part: Decoded, supplements: Sequence[Decoded], remarks: list[str]) -> pl.DataFrame:
+def _rows(part: Decoded, supplements: Sequence[Decoded], few: float, remarks: list[str]) -> pl.DataFrame:
     source = part.source
     columns = _columns(part.frame, {ORDINAL: pl.col(ORDINAL), **source.columns})
     try:
         times = [time.instants(part.frame, name) for name, time in source.times.items()]
-    except pl.exceptions.PolarsError as error:
+    except (ValueError, pl.exceptions.PolarsError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
     columns = _explicit(columns, source)
     frame = _supplemented(_named(columns.with_columns(times), source), part, supplements)
-    frame = _stamped(frame, source, remarks)
-    if source.recipe.time is None or not frame["t"].null_count():
+    if "t" not in source.times:
         return frame
-    # The calendar of a receiver that does not know the time yet: there is no epoch to be placed anywhere.
-    remarks.append(f"{source.channel.topic}: {frame['t'].null_count()} messages without valid time")
-    return frame.drop_nulls("t")
+    if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), few, remarks):
+        frame = frame.drop_nulls("t")
+    return _stamped(frame, source, remarks)
+
+
+def _may_be_left_out(part: Decoded, unknown: pl.Series, few: float, remarks: list[str]) -> bool:
+    """Whether messages without time may be left out, which is counted.
+
+    They may where a receiver does not know the time yet, and where a few have a date that no trial can have.
+    """
+    source, time = part.source, part.source.times["t"]
+    if source.recipe.time is not None:
+        remarks.append(f"{source.channel.topic}: {unknown.sum()} messages without valid time")
+        return True
+    wrong = part.frame.select(~pl.any_horizontal(pl.col(*time.fields).is_null())).to_series() & unknown
+    if wrong.sum() > few * wrong.len():
+        row = int(wrong.arg_max() or 0)
+        written = ", ".join(str(part.frame[name][row]) for name in time.fields)
+        raise InputError(
+            "has stamps that no trial can have",
+            place=source.channel.place,
+            found=f"{wrong.sum()} of {wrong.len()}, the first in message {row} of the topic: {written}",
+            expected="times from 1970 to 2200",
+            remedy='Check the unit of the stamps ([ingest] factors), or map the topic with time = "log".',
+        )
+    if wrong.any():
+        remarks.append(f"{source.channel.topic}: {wrong.sum()} messages with a date that no trial can have")
+    return bool((wrong == unknown).all())
 
 
 _NEVER_ZERO = ("hpl_m", "vpl_m", "sbas_prn", "sigma_m", "sigma_speed_mps")

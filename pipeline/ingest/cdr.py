@@ -2,77 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import lru_cache
 
 import polars as pl
 
 from pipeline.ingest.layout import Field, Fixed, Flag, Text, UnfitError, check_type
+from pipeline.ingest.ros_message import (
+    DEEPEST,
+    HEADER_SIZE,
+    PRIMITIVES,
+    Definition,
+    Member,
+    parse_definitions,
+    short_name,
+)
 from pipeline.ingest.template import Template, template_of
 
 _MOST_ELEMENTS = 4096
-_HEADER_SIZE = 4  # encapsulation: representation, options
-
-_PRIMITIVES = {
-    "bool": "u1", "byte": "u1", "char": "i1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
-}  # fmt: skip
-_LINE = re.compile(
-    r"^(?P<type>[A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)$"
-)
-
-
-@dataclass(frozen=True)
-class Member:
-    """A field of a message: `count` none for a single value, 0 for a sequence, else a fixed array."""
-
-    name: str
-    type: str
-    count: int | None
-
-
-Definition = tuple[Member, ...]
-_TIME = (Member("sec", "uint32", None), Member("nanosec", "uint32", None))
-
-
-@lru_cache(maxsize=64)  # the logs of a campaign share their schemas
-def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
-    """All messages of a concatenated definition by short name (`pkg/Type`)."""
-    found: dict[str, Definition] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
-    text = "\n".join(text.splitlines())  # whatever ends the recorder's lines
-    for index, section in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
-        title = re.search(r"^MSG:\s+(\S+)\s*$", section, flags=re.MULTILINE)
-        if title is None and index > 0:
-            raise UnfitError("a part of the definition has no name")
-        full = title.group(1) if title else name
-        package = full.split("/")[0]
-        lines = [line for line in section.splitlines() if not line.startswith("MSG:")]
-        found[_short(full)] = tuple(member for line in lines if (member := _member(line, package)))
-    return found
-
-
-def _short(full: str) -> str:
-    parts = full.split("/")
-    return f"{parts[0]}/{parts[-1]}"
-
-
-def _member(line: str, package: str) -> Member | None:
-    content = line.split("#", 1)[0].strip()
-    match = _LINE.match(content)
-    if not content or (match and match["rest"].startswith("=")):
-        return None
-    if match is None:
-        raise UnfitError(f"the definition line {content!r} is not understood")
-    kind = match["type"]
-    if kind not in _PRIMITIVES and kind not in ("string", "wstring"):
-        kind = _short(kind) if "/" in kind else f"{package}/{kind}"
-    array = match["array"]
-    if array is None:
-        return Member(match["name"], kind, None)
-    size = array[1:-1]
-    return Member(match["name"], kind, int(size) if size.isdigit() else 0)
 
 
 class CdrWalk:
@@ -80,13 +26,13 @@ class CdrWalk:
 
     def __init__(self, name: str, text: str, types: Mapping[str, pl.DataType]) -> None:
         self._definitions = parse_definitions(name, text)
-        self._root = _short(name)
+        self._root = short_name(name)
         self._types = types
         if self._root not in self._definitions:
             raise UnfitError(f"no definition of {name}")
 
     def __call__(self, payload: bytes) -> Template:
-        if len(payload) < _HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
+        if len(payload) < HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
             raise UnfitError("not plain CDR")
         walk = _Walk(payload, self._definitions, self._types)
         walk.message(self._root, "", 0)
@@ -106,12 +52,12 @@ class _Walk:
         self._payload = payload
         self._definitions = definitions
         self._types = types
-        self._at = _HEADER_SIZE
+        self._at = HEADER_SIZE
         self._order = "little" if payload[1] else "big"
         self._mark = "<" if payload[1] else ">"
 
     def message(self, name: str, path: str, depth: int) -> None:
-        if name not in self._definitions or depth > 32:
+        if name not in self._definitions or depth > DEEPEST:
             raise UnfitError(f"no definition of {name}")
         members = self._definitions[name]
         if not members:
@@ -124,7 +70,7 @@ class _Walk:
             self._value(member.type, path, depth)
             return
         count = member.count or self._prefix()
-        if member.type in _PRIMITIVES:
+        if member.type in PRIMITIVES:
             self._numbers(member.type, path, count)
             return
         if count > _MOST_ELEMENTS:
@@ -133,7 +79,7 @@ class _Walk:
             self._value(member.type, f"{path}[{index}]", depth)
 
     def _value(self, kind: str, path: str, depth: int) -> None:
-        if kind in _PRIMITIVES:
+        if kind in PRIMITIVES:
             self._keep(path, kind, self._skip(_size(kind), _size(kind)))
         elif kind == "string":
             self._text(path)
@@ -156,7 +102,7 @@ class _Walk:
     def _keep(self, path: str, kind: str, offset: int) -> None:
         if path not in self._types:
             return
-        field: Field = Flag(offset) if kind == "bool" else Fixed(offset, self._mark + _PRIMITIVES[kind])
+        field: Field = Flag(offset) if kind == "bool" else Fixed(offset, self._mark + PRIMITIVES[kind])
         self.fields[path] = check_type(field, self._types[path])
 
     def _text(self, path: str) -> None:
@@ -175,7 +121,7 @@ class _Walk:
         return int.from_bytes(self._payload[offset : offset + 4], self._order)  # type: ignore[arg-type]
 
     def _skip(self, size: int, alignment: int) -> int:
-        start = self._at + -(self._at - _HEADER_SIZE) % alignment
+        start = self._at + -(self._at - HEADER_SIZE) % alignment
         if start + size > len(self._payload):
             raise UnfitError("the message ends too early")
         self._at = start + size
@@ -183,4 +129,4 @@ class _Walk:
 
 
 def _size(kind: str) -> int:
-    return int(_PRIMITIVES[kind][1])
+    return int(PRIMITIVES[kind][1])

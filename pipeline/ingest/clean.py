@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.ingest.placeholders import without_placeholders
 from schemas.arrays import Bools
+from schemas.config import IngestConfig, Vehicle
 from schemas.errors import InputError
-from schemas.run import STREAMS, RunLog, Stream
+from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 _KEYS: dict[Stream, list[str]] = {
     "gnss": ["solution", "t"],
@@ -19,22 +22,22 @@ _KEYS: dict[Stream, list[str]] = {
 }
 _PLACE = ("latitude_deg", "longitude_deg")
 _DAY_NS = 86_400_000_000_000
-# Share of positions with a wrong date that may be left out.
-_FEW = 0.1
 
 
 @dataclass(frozen=True)
 class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
-    Of GNSS also `contradicting`, how many of those dropped are of another place than the one that stays, and `far_off`,
-    how many were dropped for a time of another day.
+    `far_off`: dropped for a time of another day. Of GNSS also `contradicting`, how many of the doubles are of another
+    place than the one that stays, and
+    `placeholders`, how many positions are none.
     """
 
     duplicates: int = 0
     out_of_order: int = 0
     contradicting: int = 0
     far_off: int = 0
+    placeholders: int = 0
 
 
 @dataclass(frozen=True)
@@ -45,47 +48,85 @@ class CleanCounts:
     streams: dict[str, StreamCounts] = field(default_factory=dict)
 
 
-def clean(run: RunLog) -> tuple[RunLog, CleanCounts]:
+def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
-    A few positions more than a day from the others (a receiver that did not know the date yet) are left out.
-    Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
-    nothing can be replayed.
+    A few rows more than a day from the others (a receiver that did not know the date yet), and all before 1970, are
+    left out; placeholders stay as epochs without a fix. Raises `InputError` where no solution or not the odometer has
+    two different times, or both have no time in common: nothing can be replayed.
     """
-    stray = _strays(run.gnss)
-    far = run.gnss.filter(stray)
-    run = run.with_streams(gnss=run.gnss.filter(~stray)) if far.height else run
-    streams: dict[str, pl.DataFrame | None] = {}
+    streams: dict[str, pl.DataFrame] = {}
     counts: dict[str, StreamCounts] = {}
+    far = run.gnss.clear()
     for name in STREAMS:
         frame = run.stream(name)
         if frame is None or name == "faults":
             continue
-        streams[name], counts[name] = _in_order(frame, _KEYS.get(name, ["t"]))
-    recorded = run.gnss.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
-    solutions = {part["solution"][0]: _of_solution(part, far) for part in recorded}
-    gnss = streams["gnss"]
-    parts = [] if gnss is None else gnss.select("solution").partition_by("solution", maintain_order=True)
-    if parts and all(part.height < 2 for part in parts):
-        require_two_times(parts[0], f"{run.run_id}: gnss", f" of solution {parts[0]['solution'][0]!r}")
-    odometer = streams.get("odometer")
+        stray = _strays(frame, config.wrong_dates_share)
+        if name == "gnss":
+            far, recorded = frame.filter(stray), frame.filter(~stray)
+        kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
+        streams[name], counts[name] = kept, replace(found, far_off=int(stray.sum()))
+    parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
+    solutions = {part["solution"][0]: _of_solution(part, far) for part in parts}
+    streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
+    solutions = {name: replace(one, placeholders=placeholders.get(name, 0)) for name, one in solutions.items()}
+    gnss, odometer = streams["gnss"], streams.get("odometer")
+    _require_two_positions(run.run_id, gnss)
     if odometer is not None:
         require_two_times(odometer, f"{run.run_id}: odometer")
-        _require_common_time(run.run_id, gnss, odometer)
-    return run.with_streams(**streams), CleanCounts(solutions, counts)
+        _require_common_time(run.with_streams(**streams))
+    cleaned = replace(run, notes=_noted(run.notes, counts))
+    return cleaned.with_streams(**streams), CleanCounts(solutions, counts)
 
 
-def _strays(gnss: pl.DataFrame) -> Bools:
-    """Positions that more than a day parts from most of their solution, where they are few."""
-    t_ns = gnss["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
-    stray = np.zeros(gnss.height, dtype=np.bool_)
-    if gnss.is_empty() or t_ns.max() - t_ns.min() <= _DAY_NS:
+def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Positions without placeholders, and how many these were, by solution."""
+    if not {"fix", *_PLACE} <= set(gnss.columns):
+        return gnss, {}
+    names = gnss["solution"].unique().to_list()
+    counts: dict[str, int] = {}
+    for name in names:
+        part = gnss if len(names) == 1 else gnss.filter(pl.col("solution") == name)
+        marked, counts[name] = without_placeholders(part, config)
+        if counts[name]:
+            row = pl.int_range(pl.len()).over("solution")
+            kinds = marked.select("solution", row.alias("_row"), pl.col("fix").alias("_fix"))
+            joined = gnss.with_columns(row.alias("_row")).join(
+                kinds, on=["solution", "_row"], how="left", maintain_order="left"
+            )
+            gnss = joined.with_columns(pl.coalesce("_fix", "fix").alias("fix")).drop("_row", "_fix")
+    return gnss, counts
+
+
+def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
+    """Also with the rows that were left out of streams other than GNSS, whose runs say it for each solution."""
+    told = [
+        f"{name}: {found.far_off} rows more than a day from the others"
+        for name, found in counts.items()
+        if found.far_off and name != "gnss"
+    ]
+    return replace(notes, skipped_topics=(*notes.skipped_topics, *told))
+
+
+def _require_two_positions(run_id: str, gnss: pl.DataFrame) -> None:
+    parts = gnss.select("solution").partition_by("solution", maintain_order=True)
+    if all(part.height < 2 for part in parts):
+        of = f" of solution {gnss['solution'][0]!r}" if parts else ""
+        require_two_times(parts[0] if parts else gnss, f"{run_id}: gnss", of)
+
+
+def _strays(frame: pl.DataFrame, few: float) -> Bools:
+    """Rows before 1970, and those that more than a day parts from most of their solution, where they are `few`."""
+    t_ns = frame["t"].cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
+    stray: Bools = t_ns < 0
+    if not t_ns.size or int(t_ns.max()) - int(t_ns.min()) <= _DAY_NS:
         return stray
-    solutions = gnss["solution"].to_numpy()
-    for name in gnss["solution"].unique().sort():
-        rows = np.flatnonzero(solutions == name)
+    solutions = frame["solution"].to_numpy() if "solution" in frame.columns else np.zeros(t_ns.size)
+    for name in np.unique(solutions[~stray]):
+        rows = np.flatnonzero((solutions == name) & ~stray)
         far = _far_from_most(t_ns[rows])
-        stray[rows] = far & (far.sum() <= _FEW * rows.size)
+        stray[rows] = far & (far.sum() <= few * rows.size)
     return stray
 
 
@@ -157,16 +198,29 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
         )
 
 
-def _require_common_time(run_id: str, gnss: pl.DataFrame | None, odometer: pl.DataFrame) -> None:
+def _require_common_time(run: RunLog) -> None:
     """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
-    if gnss is None or gnss.is_empty():
+    gnss, odometer = run.gnss, run.odometer
+    if gnss.is_empty() or odometer is None:
         return
     (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
     if odometer_begin > end or odometer_end < begin:
         raise InputError(
             "has no time in common with the GNSS",
-            place=f"{run_id}: odometer, column t",
+            place=f"{run.run_id}: odometer, column t",
             found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
             expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
-            remedy="Check date and time scale of the two recorders; leave the odometer out to replay without it.",
+            remedy=_clock_remedy(run),
         )
+
+
+def _clock_remedy(run: RunLog) -> str:
+    """What makes both records one journey, if anything does."""
+    # Imported here because only such a run needs it.
+    from pipeline.plausibility.fit import fit_run, remedy_of
+
+    known = "Check date and time scale of the two recorders; leave the odometer out to replay without it."
+    if not {"fix", *_PLACE} <= set(run.gnss.columns):
+        return known
+    found = fit_run(run, run.solutions()[0], Vehicle(), IngestConfig()).impossible
+    return " ".join([known, *(f"{check.sentence}." for check in found), remedy_of(found)]).rstrip(" ")

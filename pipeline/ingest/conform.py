@@ -15,6 +15,9 @@ from schemas.run import Stream
 Defaults = Mapping[str, str | float | bool]
 DEFAULTS: Defaults = {"solution": "primary"}
 NEVER_EMPTY: tuple[Stream, ...] = ("gnss", "odometer")
+# Numbers of no stream are larger, in whatever unit (receivers write variances up to 1e13 m2 for "not known"); their
+# squares and products stay finite.
+_LARGEST = 1e15
 _EXACT_INTEGER = 2**53  # above it not every integer is a float
 
 
@@ -41,12 +44,6 @@ def conform_to(
         if name in frame.columns or name in defaults or _may_be_absent(name, column, frame, place, breaches)
     }
     return pl.DataFrame({name: series for name, series in conformed.items() if series is not None})
-
-
-def extra_columns(frame: pl.DataFrame, stream: Stream) -> list[str]:
-    """Recorded columns that the contract does not know."""
-    known = STREAM_SCHEMAS[stream].columns()
-    return [name for name in frame.columns if name not in known]
 
 
 def _may_be_absent(name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[Breach]) -> bool:
@@ -192,15 +189,17 @@ def all_finite(series: pl.Series) -> bool:
 
 def _check_range(series: pl.Series, column: dy.Float64 | dy.Int64, where: str, breaches: list[Breach]) -> None:
     low, high = series.min(), series.max()
-    bounds = [(column.min, "at least"), (getattr(column, "min_exclusive", None), "more than")]
-    for bound, words in bounds:
-        if bound is not None and low is not None:
-            outside = low < bound if words == "at least" else low <= bound  # type: ignore[operator]
-            if outside:
-                mask = series < bound if words == "at least" else series <= bound
-                breaches.append(_out_of_range(where, low, mask, f"{words} {bound}"))
-    if column.max is not None and high is not None and high > column.max:  # type: ignore[operator]
-        breaches.append(_out_of_range(where, high, series > column.max, f"at most {column.max}"))
+    if low is None or high is None:
+        return
+    least = -_LARGEST if column.min is None else column.min
+    most = _LARGEST if column.max is None else column.max
+    over = getattr(column, "min_exclusive", None)
+    if low < least:  # type: ignore[operator]
+        breaches.append(_out_of_range(where, low, series < least, f"at least {least:g}"))
+    if over is not None and low <= over:
+        breaches.append(_out_of_range(where, low, series <= over, f"more than {over:g}"))
+    if high > most:  # type: ignore[operator]
+        breaches.append(_out_of_range(where, high, series > most, f"at most {most:g}"))
 
 
 def _out_of_range(where: str, value: object, mask: pl.Series, expected: str) -> Breach:

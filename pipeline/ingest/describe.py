@@ -14,7 +14,7 @@ from pipeline.ingest.generic import UndecodableError, decoder_for
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
-from pipeline.ingest.mcap_run import walk_log
+from pipeline.ingest.mcap_run import LARGEST_MESSAGE, walk_log
 from pipeline.ingest.plan import Sample, candidates, source_of
 from pipeline.ingest.run import read_run
 from pipeline.storage import files
@@ -24,6 +24,7 @@ from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 _GAP_PERIODS = 1.5
+_MOST_SAMPLES = 1000  # topics whose fields are looked for: each takes the time of parsing its schema
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class LogDescription:
     notes: IngestNotes
     problems: tuple[str, ...]
     starting_config: str
+    run: RunLog | None = None
 
 
 def describe_log(path: Address, config: IngestConfig) -> LogDescription:
@@ -97,6 +99,7 @@ def describe_log(path: Address, config: IngestConfig) -> LogDescription:
         notes=notes,
         problems=problems,
         starting_config=starting_config(topics),
+        run=run,
     )
 
 
@@ -164,7 +167,8 @@ class _Census:
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
         for channel_id, messages in block.items():
             if channel_id not in self.met:
-                self.met[channel_id] = _Met(channels[channel_id], _fields(channels[channel_id], messages))
+                fields = _fields(channels[channel_id], messages) if len(self.met) < _MOST_SAMPLES else {}
+                self.met[channel_id] = _Met(channels[channel_id], fields)
             met = self.met[channel_id]
             times = messages.times("log_time")
             met.messages += len(messages)
@@ -172,6 +176,9 @@ class _Census:
 
 
 def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
+    """The fields of the first message; none of pictures and point clouds, which are too large to look into."""
+    if messages.length[0] > LARGEST_MESSAGE:
+        return {}
     try:
         return fields_of(decoder_for(channel)(messages.payload(0)))
     except (UndecodableError, InputError):

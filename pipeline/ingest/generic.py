@@ -1,16 +1,18 @@
-"""The ordinary decoders, message by message: for what the columnar decoders do not cover."""
+"""Decoding message by message: for what the columnar decoders do not cover, and the first of each channel."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from graphlib import TopologicalSorter
 from typing import Any
 
 import polars as pl
 
 from pipeline.ingest.mcap_block import Messages
-from pipeline.ingest.mcap_model import Channel, Schema, as_mcap_schema
+from pipeline.ingest.mcap_model import Channel, Schema
+from pipeline.ingest.ros_message import DefinitionError, message_reader
 from schemas.errors import InputError
 
 Value = Any
@@ -22,7 +24,7 @@ class UndecodableError(Exception):
 
 
 def decoder_for(channel: Channel) -> Decode:
-    """The decoder of a channel's messages: to dicts (json) or objects with attributes."""
+    """The decoder of a channel's messages: to dicts (json, cdr) or messages with attributes (protobuf)."""
     if channel.encoding == "json":
         return parse_json
     makers = {"protobuf": _protobuf_decoder, "cdr": _cdr_decoder}
@@ -59,68 +61,78 @@ def _refuse_literal(literal: str) -> Value:
 def _protobuf_decoder(channel: Channel) -> Decode:
     from google.protobuf.message import DecodeError
 
-    decode = _made(_stock_protobuf, channel)
+    make = _made(_protobuf_class, channel)
 
     def checked(payload: bytes) -> Value:
+        message = make()
         try:
-            return decode(payload)
+            message.ParseFromString(payload)
         except DecodeError as error:
             raise UndecodableError(f"not the protobuf message of its schema: {error}") from None
+        return message
 
     return checked
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    decode = _made(_stock_ros2, channel)
+    read = _made(_ros_reader, channel)
 
     def checked(payload: bytes) -> Value:
-        if len(payload) < 4 or payload[0] != 0 or payload[1] not in (0, 1):
-            raise UndecodableError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
         try:
-            return decode(payload)
-        except Exception as error:
-            # The reader raises struct.error, UnicodeDecodeError, MemoryError and more on short messages.
-            raise UndecodableError(f"not the CDR message of its schema: {type(error).__name__}") from None
+            return read(payload)
+        except DefinitionError as error:
+            raise UndecodableError(f"not the CDR message of its schema: {error}") from None
 
     return checked
 
 
 # A schema takes as long to parse as ten thousand messages to decode, and the logs of a campaign share theirs.
 @lru_cache(maxsize=64)
-def _stock_protobuf(schema: Schema | None) -> Decode | None:
-    from mcap_protobuf.decoder import DecoderFactory
+def _protobuf_class(schema: Schema) -> Any:
+    """The class of a schema's messages, of the descriptors that it carries."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
 
-    return DecoderFactory().decoder_for("protobuf", as_mcap_schema(schema))
+    found = FileDescriptorSet.FromString(schema.data).file
+    files = {file.name: file for file in found}
+    if len(files) < len(found):
+        raise ValueError("two of its files have the same name")
+    needed = {name: [other for other in file.dependency if other in files] for name, file in files.items()}
+    pool = DescriptorPool()
+    for name in TopologicalSorter(needed).static_order():
+        pool.Add(files[name])
+    return GetMessageClass(pool.FindMessageTypeByName(schema.name))
 
 
-@lru_cache(maxsize=64)
-def _stock_ros2(schema: Schema | None) -> Decode | None:
-    from mcap_ros2.decoder import DecoderFactory
-
-    return DecoderFactory().decoder_for("cdr", as_mcap_schema(schema))
+def _ros_reader(schema: Schema) -> Decode:
+    return message_reader(schema.name, schema.data.decode())
 
 
-def _made(make: Callable[[Schema | None], Decode | None], channel: Channel) -> Decode:
-    """A decoder of the `mcap` family, whose schema parsers raise whatever they stumble over."""
-    try:
-        decode = make(channel.schema)
-    except Exception as error:
-        raise InputError(
-            f"has a schema that cannot be parsed: {error}", place=channel.place, found=channel.schema_name
-        ) from None
-    if decode is None:
+_SCHEMA_ENCODINGS = {"protobuf": "protobuf", "cdr": "ros2msg"}
+
+
+def _made(make: Callable[[Schema], Any], channel: Channel) -> Any:
+    """What `make` makes of the schema; parsers of schemas raise whatever they stumble over."""
+    if channel.schema is None or channel.schema.encoding != _SCHEMA_ENCODINGS[channel.encoding]:
         raise InputError(
             "has no schema that fits its encoding",
             place=channel.place,
             found=f"encoding {channel.encoding}, schema encoding {channel.schema_encoding or 'none'}",
             expected="protobuf with protobuf, cdr with ros2msg",
         )
-    return decode
+    try:
+        return make(channel.schema)
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise InputError(
+            f"has a schema that cannot be parsed: {reason[:200]}", place=channel.place, found=channel.schema_name
+        ) from None
 
 
 def protobuf_descriptor(channel: Channel) -> Any:
     """The descriptor of a channel's messages."""
-    return _protobuf_decoder(channel)(b"").DESCRIPTOR
+    return _made(_protobuf_class, channel).DESCRIPTOR
 
 
 def decode_columns(
@@ -189,41 +201,46 @@ def child(value: Value, step: str | int) -> Value:
     if isinstance(value, dict):
         return value.get(step)
     descriptor = getattr(value, "DESCRIPTOR", None)
-    if descriptor is not None:
-        known = descriptor.fields_by_name.get(step)
-        if known is None or (known.has_presence and not value.HasField(step)):
-            return None
-    return getattr(value, step, None)
+    known = descriptor.fields_by_name.get(step) if descriptor is not None else None
+    if known is None or (known.has_presence and not value.HasField(step)):
+        return None
+    return getattr(value, step)
+
+
+def _shown(value: Value) -> str:
+    """The value in an error, however long it is (Python does not even write integers of 4,300 digits)."""
+    long = isinstance(value, int) and value.bit_length() > 1024
+    return f"an integer of {value.bit_length()} bits" if long else repr(value)[:80]
 
 
 def _as_float(value: Value) -> float | None:
     if value is None or (isinstance(value, float)):
         return value
-    if isinstance(value, int) and not isinstance(value, bool):
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**1023:
         return float(value)
-    raise UndecodableError(f"{value!r} is not a number")
+    raise UndecodableError(f"{_shown(value)} is not a number")
 
 
 def _as_int(value: Value) -> int | None:
     if value is None or (isinstance(value, int) and not isinstance(value, bool)):
         if value is not None and not -(2**63) <= value < 2**63:
-            raise UndecodableError(f"{value!r} is no 64-bit integer")
+            raise UndecodableError(f"{_shown(value)} is no 64-bit integer")
         return value
     if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
         return int(value)
-    raise UndecodableError(f"{value!r} is not an integer")
+    raise UndecodableError(f"{_shown(value)} is not an integer")
 
 
 def _as_text(value: Value) -> str | None:
     if value is None or isinstance(value, str):
         return value
-    raise UndecodableError(f"{value!r} is not a text")
+    raise UndecodableError(f"{_shown(value)} is not a text")
 
 
 def _as_flag(value: Value) -> bool | None:
     if value is None or isinstance(value, bool):
         return value
-    raise UndecodableError(f"{value!r} is not true or false")
+    raise UndecodableError(f"{_shown(value)} is not true or false")
 
 
 _COERCIONS: dict[type[pl.DataType], Callable[[Value], Value]] = {

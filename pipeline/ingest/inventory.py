@@ -36,8 +36,6 @@ def _children(value: Any) -> list[tuple[str, Any]] | None:
     descriptor = getattr(value, "DESCRIPTOR", None)
     if descriptor is not None:
         return [(field.name, _protobuf_child(value, field)) for field in descriptor.fields]
-    if hasattr(value, "__dict__"):
-        return [(name, getattr(value, name)) for name in _attributes(value)]
     if isinstance(value, str | bytes) or not hasattr(value, "__len__"):
         return None
     return [(f"[{index}]", child) for index, child in enumerate(list(value[:_LARGEST_LIST]))]
@@ -48,11 +46,6 @@ def _protobuf_child(message: Any, field: Any) -> Any:
     value = getattr(message, field.name)
     recursive = field.message_type is not None and field.message_type is message.DESCRIPTOR
     return None if recursive else value
-
-
-def _attributes(value: Any) -> list[str]:
-    names = getattr(type(value), "__slots__", None) or vars(value)
-    return [name for name in names if not name.startswith("_")]
 
 
 def _kind(value: Any) -> str:

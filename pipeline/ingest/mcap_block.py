@@ -51,8 +51,6 @@ class Messages:
         times: Ints = self.heads[name].astype(np.int64)
         if self.picked is not None:
             times = times[self.picked]
-        if len(times) and times.min() < 0:
-            raise DamageError(0, "a time of a message is beyond the year 2262")
         return times
 
     def payload(self, row: int) -> bytes:
@@ -90,14 +88,15 @@ def block_of(data: Bytes, starts: Ints, locate: Locate, first_ordinal: int) -> B
     if starts.max() > len(data) - MESSAGE_HEAD_SIZE:
         raise DamageError(locate(int(starts.max())), "a message is shorter than its header")
     heads = gathered(data, starts, MESSAGE_HEAD)
-    channels, lengths = heads["channel"], heads["length"].astype(np.int64)
-    found = np.flatnonzero(np.bincount(channels)).tolist()
-    if len(found) == 1:
-        return {found[0]: messages_of(data, starts, lengths, heads, locate, first_ordinal)}
+    order = np.argsort(heads["channel"], kind="stable")
+    starts, heads = starts[order], heads[order]
+    lengths = heads["length"].astype(np.int64)
+    firsts = np.flatnonzero(np.diff(heads["channel"].astype(np.int64), prepend=-1)).tolist()
     return {
-        channel: messages_of(data, starts[mine], lengths[mine], heads[mine], locate, first_ordinal)
-        for channel in found
-        for mine in (channels == channel,)
+        int(heads["channel"][first]): messages_of(
+            data, starts[first:end], lengths[first:end], heads[first:end], locate, first_ordinal
+        )
+        for first, end in zip(firsts, [*firsts[1:], len(starts)], strict=True)
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -35,12 +34,3 @@ class Channel:
     @property
     def schema_encoding(self) -> str:
         return self.schema.encoding if self.schema else ""
-
-
-def as_mcap_schema(schema: Schema | None) -> Any:
-    """The schema as the decoder packages want it."""
-    from mcap.records import Schema as McapSchema
-
-    if schema is None:
-        return None
-    return McapSchema(id=schema.id, data=schema.data, encoding=schema.encoding, name=schema.name)

@@ -75,18 +75,6 @@ class ChunkRecord(NamedTuple):
     records: memoryview
 
 
-class ChunkSummary(NamedTuple):
-    """What the file's chunk index says of a chunk, and what the walk found."""
-
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    compression: str
-    compressed_size: int
-    size: int
-
-
 def parse(kind: type[Record], body: memoryview, offset: int) -> Record:
     """A record by the reader of the `mcap` package; it must be used up exactly."""
     stream = _Stream(BytesIO(body))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
 import polars as pl
 from isal.isal_zlib import crc32
 
@@ -29,6 +30,9 @@ from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog
 
 _MIB = 1024 * 1024
+LARGEST_MESSAGE = 4 * _MIB  # of messages that are decoded; pictures and point clouds are not
+_DECODED_TOGETHER = 16 * _MIB
+_MOST_TOPICS = 256  # that may feed a stream: no train has as many receivers
 
 
 class McapStreams:
@@ -43,14 +47,42 @@ class McapStreams:
             readers = self.readers.get(channel_id)
             if readers is None:
                 readers = self.readers[channel_id] = self._readers(messages, channels[channel_id])
+            if readers:
+                _check_sizes(messages, channels[channel_id])
             for reader in readers:
-                reader.add(messages)
+                for part in _pieces(messages):
+                    reader.add(part)
 
     def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
         if not is_candidate(channel, self._config):
             return []
+        if sum(map(bool, self.readers.values())) >= _MOST_TOPICS:
+            raise InputError(
+                f"holds more than {_MOST_TOPICS} topics of positions, speeds or reads",
+                place=channel.file,
+                expected="those of one train",
+                remedy="Choose topics by [ingest] in the configuration, or take the others out of the log.",
+            )
+        _check_sizes(messages, channel)
         sample = sample_of(messages, channel)
         return [SourceReader(source_of(sample, candidate)) for candidate in candidates(sample, self._config)]
+
+
+def _check_sizes(messages: Messages, channel: Channel) -> None:
+    largest = int(messages.length.max())
+    if largest > LARGEST_MESSAGE:
+        raise InputError(
+            f"has a message of {largest} bytes", place=channel.place, expected=f"at most {LARGEST_MESSAGE} for a stream"
+        )
+
+
+def _pieces(messages: Messages) -> Iterator[Messages]:
+    """The messages of an unusually large block in parts: decoding needs several times their size."""
+    if messages.length.sum() < _DECODED_TOGETHER:
+        yield messages
+        return
+    cuts = np.flatnonzero(np.diff(messages.length.cumsum() // _DECODED_TOGETHER)) + 1
+    yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
 
 
 def sample_of(messages: Messages, channel: Channel) -> Sample:
@@ -127,11 +159,11 @@ def _check_data_crc(path: Address, walk: McapWalk) -> None:
     walk.crc_covers_chunks = False
 
 
-def _crc_of(path: Address, end: int, left_out: Sequence[tuple[int, int]]) -> int:
-    """CRC-32 of the file up to `end`, without some parts."""
+def _crc_of(path: Address, end: int, left_out: Sequence[int]) -> int:
+    """CRC-32 of the file up to `end`, without some parts (each from and to)."""
     crc, at = 0, 0
     with files.open_binary(path) as stream:
-        for stop, resume in [*left_out, (end, end)]:
+        for stop, resume in zip([*left_out[::2], end], [*left_out[1::2], end], strict=True):
             while at < stop and (piece := stream.read(min(stop - at, 4 * _MIB))):
                 crc = crc32(piece, crc)
                 at += len(piece)
@@ -158,7 +190,7 @@ def _frames(
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[Breach] = []
     remarks: list[str] = []
-    frames = stream_frames(decoded, breaches, remarks)
+    frames = stream_frames(decoded, breaches, config.wrong_dates_share, remarks)
     if "gnss" not in frames:
         breaches.append(_no_gnss(path, walk, left_over))
     refuse(breaches)
@@ -175,7 +207,7 @@ def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breac
     return Breach(
         str(path),
         "holds no GNSS stream",
-        found=", ".join(left_over) or "no messages of other topics",
+        found=", ".join(left_over[:40]) or "no messages of other topics",
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints a starting one.",
     )

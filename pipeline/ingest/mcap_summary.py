@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from struct import Struct
 
+import numpy as np
 from isal.isal_zlib import crc32
 from mcap.records import ChunkIndex, Footer, Statistics
 
 from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.mcap_records import HEAD_SIZE, MAGIC, ChunkSummary, DamageError, Op, parse
+from pipeline.ingest.mcap_records import HEAD_SIZE, MAGIC, DamageError, Op, parse
+
+# Of a chunk: first and last time, offset, length, compressed size, size, compression. Packed, for a log may have a
+# million.
+CHUNK_ENTRY = np.dtype(
+    [(name, "<u8") for name in ("start", "end", "offset", "length", "compressed", "size")] + [("compression", "S16")]
+)
+_ENTRY = Struct("<6Q16s")
 
 
 @dataclass
@@ -17,7 +26,7 @@ class Met:
     """What the walk counted on its way."""
 
     message_counts: Counter[int] = field(default_factory=Counter)
-    chunks: list[ChunkSummary] = field(default_factory=list)
+    chunks: bytearray = field(default_factory=bytearray)  # entries of `CHUNK_ENTRY`
     attachments: int = 0
     metadata: int = 0
     span_ns: tuple[int, int] | None = None
@@ -34,13 +43,13 @@ class Summary:
         self._start = start
         self._met = met
         self._crc = 0
-        self._indexed: list[ChunkSummary] = []
+        self._indexed = bytearray()
 
     def add(self, opcode: int, whole: memoryview, position: int) -> None:
         """A record before the footer."""
         self._crc = crc32(whole, self._crc)
         if opcode == Op.CHUNK_INDEX:
-            self._indexed.append(_summary_of(parse(ChunkIndex, whole[HEAD_SIZE:], position)))
+            self._indexed += _entry_of(parse(ChunkIndex, whole[HEAD_SIZE:], position))
         elif opcode == Op.STATISTICS:
             self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
 
@@ -49,7 +58,7 @@ class Summary:
         per_channel = {channel: count for channel, count in told.channel_message_counts.items() if count}
         pairs = [
             ("messages", told.message_count, met.message_counts.total()),
-            ("chunks", told.chunk_count, len(met.chunks)),
+            ("chunks", told.chunk_count, len(met.chunks) // CHUNK_ENTRY.itemsize),
             ("attachments", told.attachment_count, met.attachments),
             ("metadata records", told.metadata_count, met.metadata),
             ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
@@ -79,23 +88,29 @@ class Summary:
         """A chunk index lists every chunk once, or there is none."""
         if not self._indexed:
             return
-        chunks = self._met.chunks
-        if sorted(chunk.offset for chunk in self._indexed) != [chunk.offset for chunk in chunks]:
-            told = f"the chunk index names {len(self._indexed)} chunks, not the {len(chunks)} there are"
-            raise DamageError(position, told)
-        if sorted(self._indexed, key=lambda chunk: chunk.offset) != chunks:
+        told, chunks = (np.frombuffer(entries, dtype=CHUNK_ENTRY) for entries in (self._indexed, self._met.chunks))
+        told = told[np.argsort(told["offset"], kind="stable")]
+        if not np.array_equal(told["offset"], chunks["offset"]):
+            kind = f"the chunk index names {len(told)} chunks, not the {len(chunks)} there are"
+            raise DamageError(position, kind)
+        if (told != chunks).any():
             raise DamageError(position, "the chunk index disagrees with the chunks")
 
 
-def _summary_of(index: ChunkIndex) -> ChunkSummary:
-    return ChunkSummary(
+def chunk_entry(start: int, end: int, offset: int, length: int, compressed: int, size: int, compression: str) -> bytes:
+    """What a chunk index says of a chunk, to be compared."""
+    return _ENTRY.pack(start, end, offset, length, compressed, size, compression.encode())
+
+
+def _entry_of(index: ChunkIndex) -> bytes:
+    return chunk_entry(
         index.message_start_time,
         index.message_end_time,
         index.chunk_start_offset,
         index.chunk_length,
-        index.compression,
         index.compressed_size,
         index.uncompressed_size,
+        index.compression,
     )
 
 

@@ -7,6 +7,7 @@ checksums, statistics) is then held against what was met.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -16,14 +17,13 @@ import numpy as np
 from pipeline.ingest.byte_window import ByteWindow
 from pipeline.ingest.decompress import Decompressor
 from pipeline.ingest.mcap_block import Block, block_of
-from pipeline.ingest.mcap_chunk import Index, Placed, messages_in
+from pipeline.ingest.mcap_chunk import Allowance, Index, Placed, messages_in
 from pipeline.ingest.mcap_model import Channel, Schema
 from pipeline.ingest.mcap_records import (
     HEAD,
     HEAD_SIZE,
     MAGIC,
     ChunkRecord,
-    ChunkSummary,
     DamageError,
     Op,
     check_attachment,
@@ -31,11 +31,13 @@ from pipeline.ingest.mcap_records import (
     parse_chunk,
     parse_message_index,
 )
-from pipeline.ingest.mcap_summary import Met, Summary
+from pipeline.ingest.mcap_summary import Met, Summary, chunk_entry
 
 _DATA_OPS = (Op.CHUNK, Op.MESSAGE, Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.HEADER)
 _TOGETHER = 8 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _RAW_BLOCK = 1 << 16  # messages of a log without chunks that are handed on together
+_LEAST_PENDING = 8 * 1024  # what a chunk that waits takes itself
+_FREE_RECORDS = 1 << 18  # records of chunks without index that a log may hold beyond one per byte
 _SLACK = 1024 * 1024  # what does not compress grows a little
 _ATTACHMENT_HEAD = 64 * 1024  # holds times, name and media type of an attachment
 
@@ -48,11 +50,11 @@ class Pending:
     length: int
     indexes: list[Index] = field(default_factory=list)
 
-    def summary(self) -> ChunkSummary:
+    def entry(self) -> bytes:
         """What a chunk index must say of it."""
         chunk = self.chunk
-        return ChunkSummary(
-            chunk.start_ns, chunk.end_ns, chunk.offset, self.length, chunk.compression, len(chunk.records), chunk.size
+        return chunk_entry(
+            chunk.start_ns, chunk.end_ns, chunk.offset, self.length, len(chunk.records), chunk.size, chunk.compression
         )
 
 
@@ -64,7 +66,7 @@ class McapWalk:
         self.met = Met()
         self.data_crc = (0, 0)
         self.crc_covers_chunks = True
-        self.without_own_crc: list[tuple[int, int]] = []  # contents of chunks, from and to
+        self.without_own_crc = array("q")  # contents of chunks, from and to
         self._loose_blocks = 0
         self.cut_at: int | None = None
         self._window = window
@@ -74,9 +76,11 @@ class McapWalk:
         self._definitions: dict[int, mcap.records.Channel] = {}
         self._pending: list[Pending] = []
         self._pending_size = 0
-        self._unpacker = Decompressor()
         self._memory = np.empty(0, dtype=np.uint8)
+        self._unpacker = Decompressor()
         self._ordinal = 0
+        self._allowance = Allowance(_FREE_RECORDS + window.size)
+        self._known: set[bytes] = set()
         self._summary: Summary | None = None
 
     def blocks(self) -> Iterator[Block]:
@@ -107,7 +111,7 @@ class McapWalk:
     def without_crc(self) -> int:
         """Blocks of messages whose content no checksum covers."""
         loose = 0 if self.data_crc[0] else self._loose_blocks
-        return loose + (0 if self.data_crc[0] and self.crc_covers_chunks else len(self.without_own_crc))
+        return loose + (0 if self.data_crc[0] and self.crc_covers_chunks else len(self.without_own_crc) // 2)
 
     def _first_record(self) -> int | None:
         size = self._window.size
@@ -224,15 +228,17 @@ class McapWalk:
             told = f"a chunk declares {chunk.size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
             raise DamageError(position, told)
         end = position + HEAD_SIZE + len(body)
-        if not chunk.crc:
-            self.without_own_crc.append((end - len(chunk.records), end))
+        if not chunk.crc and chunk.size:  # that of nothing is 0
+            self.without_own_crc.extend((end - len(chunk.records), end))
         self._pending.append(Pending(chunk, len(body) + HEAD_SIZE))
-        self._pending_size += chunk.size
+        self._pending_size += max(chunk.size, len(body), _LEAST_PENDING)
 
     def _message_index(self, body: memoryview, position: int) -> None:
         if not self._pending:
             raise DamageError(position, "a message index follows no chunk")
-        self._pending[-1].indexes.append(parse_message_index(body, position))
+        channel, entries = parse_message_index(body, position)
+        if len(entries):  # recovered logs have empty ones
+            self._pending[-1].indexes.append((channel, entries))
 
     def _attachment(self, length: int, position: int) -> None:
         head = self._window.at(position + HEAD_SIZE, min(length, _ATTACHMENT_HEAD))
@@ -249,7 +255,7 @@ class McapWalk:
     def _finished_chunks(self) -> Block:
         """The messages of the chunks that waited, which are taken at once."""
         pending, self._pending = self._pending, []
-        size, self._pending_size = self._pending_size, 0
+        size, self._pending_size = sum(waiting.chunk.size for waiting in pending), 0
         if size > len(self._memory):
             self._memory = np.empty(max(size, _TOGETHER + _SLACK), dtype=np.uint8)
         data = self._memory[:size]
@@ -258,16 +264,17 @@ class McapWalk:
             chunk = waiting.chunk
             placed.append(Placed(placed[-1].end if placed else 0, chunk.size, chunk.offset, waiting.indexes))
             self._unpacker.unpack(chunk, memoryview(data.data)[placed[-1].base : placed[-1].end])
-            self.met.chunks.append(waiting.summary())
-        found = messages_in(data, placed, self._ordinal, self._chunk_record)
+            self.met.chunks += waiting.entry()
+        found = messages_in(data, placed, self._ordinal, self._chunk_record, self._allowance)
         return self._counted(found, placed[0].offset, size)
 
     def _chunk_record(self, opcode: int, body: memoryview, position: int) -> None:
-        """A record inside a chunk that is no message."""
-        if opcode == Op.SCHEMA:
-            self._schema(body, position)
-        elif opcode == Op.CHANNEL:
-            self._channel(body, position)
+        """A record inside a chunk that is no message; definitions are repeated in every chunk."""
+        if opcode in (Op.SCHEMA, Op.CHANNEL):
+            key = bytes((opcode,)) + body
+            if key not in self._known:
+                _HANDLERS[opcode](self, body, position)
+                self._known.add(key)
         elif opcode <= max(Op):
             raise DamageError(position, f"a record of opcode {opcode} stands inside a chunk")
 
@@ -277,6 +284,8 @@ class McapWalk:
                 raise DamageError(offset, f"a message belongs to the unknown channel {channel_id}")
             self.met.message_counts[channel_id] += len(messages)
             times = messages.heads["log_time"]
+            if times.min() < 0:
+                raise DamageError(offset, "a log time is beyond the year 2262")
             self.met.add_times(int(times.min()), int(times.max()))
         self._ordinal += size
         return block

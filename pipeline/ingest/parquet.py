@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from collections.abc import Iterable
 
 import polars as pl
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from pipeline.ingest.breaches import Breach, refuse
-from pipeline.ingest.conform import conform, extra_columns
+from pipeline.ingest.conform import conform
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
+from pipeline.storage.parquet import ParquetError, Schema, read_parquet, without_checksums
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
@@ -26,6 +25,7 @@ def read_folder(path: Address, with_digest: bool = True) -> RunLog:
     digest = hashlib.sha256()
     frames: dict[str, pl.DataFrame] = {}
     skipped: list[str] = []
+    unproved: list[str] = []
     for stream in STREAMS:
         if f"{stream}.parquet" not in present:
             continue
@@ -37,12 +37,13 @@ def read_folder(path: Address, with_digest: bool = True) -> RunLog:
         recorded = _read(content, stream, str(file), breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
-            skipped += [f"{stream}.parquet: column {name}" for name in extra_columns(recorded, stream)]
+            unproved += [f"{stream}.parquet"] if without_checksums(content) else []
+            skipped += [f"{stream}.parquet: column {name}" for name in _others(recorded.columns, stream)]
     refuse(breaches)
     skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
     return RunLog(
         run_id=stem_of(path),
-        notes=IngestNotes(skipped_topics=tuple(skipped)),
+        notes=IngestNotes(skipped_topics=tuple(skipped), files_without_crc=tuple(unproved)),
         input_digest=digest.hexdigest() if with_digest else "",
         **frames,
     )
@@ -62,25 +63,22 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[Breach]) ->
     if not content:
         breaches.append(Breach(place, "is empty", found="0 bytes", expected="a Parquet file"))
         return None
+    contract = STREAM_SCHEMAS[stream].columns()
+    met: Schema = {}
+
+    def known(found: Schema) -> list[str]:
+        met.update(found)
+        return [name for name in found if name in contract]
+
     try:
-        return _frame(pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True), stream)
-    except (pa.ArrowException, pl.exceptions.PolarsError, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        breaches.append(Breach(place, f"cannot be read as Parquet ({reason})", remedy="Record or copy the file again."))
+        frame = read_parquet(content, known)
+    except ParquetError as error:
+        breaches.append(Breach(place, f"cannot be read as Parquet ({error})", remedy="Record or copy the file again."))
         return None
+    return frame.with_columns(pl.lit(None).alias(name) for name in _others(met, stream))
 
 
-def _frame(file: Any, stream: Stream) -> pl.DataFrame:
-    """Row group by row group; of columns outside the contract only the names are kept."""
-    names = list(file.schema_arrow.names)
-    if len(set(names)) != len(names):
-        raise ValueError("a column name stands twice")
-    known = [name for name in names if name in STREAM_SCHEMAS[stream].columns()]
-    groups = [
-        pl.DataFrame(pl.from_arrow(file.read_row_group(index, columns=known))) for index in range(file.num_row_groups)
-    ]
-    # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
-    empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], file.schema_arrow)))
-    frame = pl.concat([empty.select(known), *groups], rechunk=True)
-    others = [pl.lit(None).alias(name) for name in names if name not in known]
-    return frame.with_columns(others)
+def _others(columns: Iterable[str], stream: Stream) -> list[str]:
+    """Columns outside the contract, of which only the names are kept."""
+    known = STREAM_SCHEMAS[stream].columns()
+    return [name for name in columns if name not in known]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Literal
 
 import polars as pl
@@ -11,6 +12,8 @@ import polars as pl
 from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
 from schemas.config import StreamMapping
 
+_SECOND_NS = 1_000_000_000
+_LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * _SECOND_NS  # leaves room in 64 bits for the GPS epoch
 LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
 # How fields are read that may hold a time, by what their first value is.
@@ -34,7 +37,10 @@ class TimeSource:
         return replace(self, fields=fields, types=types)
 
     def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
-        """Times in UTC; null where a part of the stamp is null."""
+        """Times in UTC; null where a part of the stamp is null, and where the date is one that no trial can have.
+
+        Raises ValueError where the nanoseconds of a stamp make a second or more: it contradicts itself.
+        """
         t = self._nanoseconds(frame).alias(name)
         if self.epoch == "gps":
             t = t + GPS_EPOCH_NS
@@ -46,13 +52,27 @@ class TimeSource:
     def _nanoseconds(self, frame: pl.DataFrame) -> pl.Series:
         first = frame[self.fields[0]]
         if len(self.fields) == 2:
-            return first * 1_000_000_000 + frame[self.fields[1]]
+            rest = frame[self.fields[1]]
+            wrong = ~rest.is_between(0, _SECOND_NS - 1).fill_null(True)
+            if wrong.any():
+                row = int(wrong.arg_max() or 0)
+                raise ValueError(f"{rest[row]} nanoseconds beside whole seconds in message {row} of the topic")
+            return _within(first, _SECOND_NS) * _SECOND_NS + rest
         dtype = self.types.get(self.fields[0], pl.Int64())
         if dtype == pl.String:
-            return first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True).to_physical()
+            # Beyond 64 bits polars goes round without a word, so the date is read in microseconds before.
+            date = first.str.to_datetime("%+", time_unit="us", time_zone="UTC", strict=True).to_physical()
+            t = first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True).to_physical()
+            return t.set(_within(date, 1000).is_null(), None)
         if dtype == pl.Int64:
-            return first * (1 if self.unit_s is None else round(self.unit_s * 1e9))
-        return (first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round().cast(pl.Int64)
+            unit_ns = 1 if self.unit_s is None else round(self.unit_s * 1e9)
+            return _within(first, unit_ns) * unit_ns
+        return _within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
+
+
+def _within(counts: pl.Series, unit_ns: int) -> pl.Series:
+    """The counts of a unit since an epoch, null before it and after `_LATEST_NS`: nothing then overflows 64 bits."""
+    return counts.set(~counts.is_between(0, _LATEST_NS // max(unit_ns, 1)), None)
 
 
 def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamMapping | None) -> TimeSource:
@@ -84,11 +104,9 @@ class CivilTime:
 
     def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:
         """Times in UTC; null where the calendar is not valid yet (a receiver before its first fix)."""
-        year, *others = (pl.col(field) for field in self.calendar)
-        month, day, hour, minute, second = others
+        known = (pl.col(self.valid) & 3 == 3) & pl.col(self.calendar[0]).is_between(1970, 2199)
+        year, month, day, hour, minute, second = (pl.when(known).then(field) for field in self.calendar)
         # A leap second (60) is the first second of the next minute; datetime() knows none.
-        whole = pl.datetime(year, month, day, hour, minute, time_unit="ns", time_zone="UTC")
-        known = (pl.col(self.valid) & 3 == 3) & month.is_between(1, 12) & day.is_between(1, 31)
-        at = whole.to_physical() + second * 1_000_000_000 + pl.col(self.nanoseconds)
-        instant = pl.when(known).then(at).cast(pl.Datetime("ns", "UTC"))
-        return frame.select(instant.alias(name)).to_series()
+        whole = pl.datetime(year, month, day, hour, minute, time_unit="us", time_zone="UTC").to_physical() * 1000
+        at = whole + second * _SECOND_NS + pl.when(known).then(self.nanoseconds)
+        return frame.select(at.cast(pl.Datetime("ns", "UTC")).alias(name)).to_series()

@@ -211,7 +211,8 @@ class Bench:
         if not known.any():
             return np.full(t_ns.size, np.nan)
         at_s, stamps_s = ((values - self.t_ns[0]) / NS_PER_S for values in (t_ns, self.t_ns[known]))
-        return np.interp(at_s, stamps_s, speed[known])
+        found: Floats = np.interp(at_s, stamps_s, speed[known])
+        return found
 
     @cached_property
     def gap_ns(self) -> int:

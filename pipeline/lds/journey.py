@@ -134,7 +134,7 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
         return direction, direction
     known = np.flatnonzero(np.isfinite(odometer_m))
     direction, travel = np.ones((2, odometer_m.size), dtype=np.int64)
-    for turned_at, seen_at, sense in zip(*turns_of(odometer_m[known], turn_m), strict=True):
+    for turned_at, seen_at, sense in turns_of(odometer_m[known], turn_m):
         direction[known[seen_at] :] = sense
         travel[known[turned_at] :] = sense
     return direction, travel

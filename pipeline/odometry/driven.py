@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
 
 # Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
@@ -39,18 +39,23 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
     return held
 
 
-def turns_of(distance_m: Floats, back_m: float) -> tuple[Ints, Ints, Ints]:
+def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
     """Where the train turned, where that showed by its coming back so far, and the sense from then on (+1 or -1).
 
-    The distance grows at first, as far as anybody knows.
+    The distance grows at first, as far as anybody knows. In whole arrays, for each turn one: trains turn seldom.
     """
-    # A hysteresis half as wide, that has come from below.
-    width_m = np.full(distance_m.size + 1, 0.5 * back_m)
-    held = with_hysteresis(np.concatenate([distance_m[:1] - back_m, distance_m]), width_m)
-    moves = np.flatnonzero(np.diff(held))
-    sense = np.sign(np.diff(held)[moves]).astype(np.int64)
-    turns = np.flatnonzero(sense[1:] != sense[:-1])
-    return moves[turns], moves[turns + 1], sense[turns + 1]
+    turns: list[tuple[int, int, int]] = []
+    start, sense = 0, 1
+    while start < distance_m.size:
+        way_m = sense * distance_m[start:]
+        came_back_m = np.maximum.accumulate(way_m) - way_m
+        seen = int(np.argmax(came_back_m >= back_m))
+        if came_back_m[seen] < back_m:
+            break
+        sense = -sense
+        turns.append((start + int(np.argmax(way_m[: seen + 1])), start + seen, sense))
+        start += seen
+    return turns
 
 
 def driven_m(distance_m: Floats, width_m: Floats) -> Floats:

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import io
-import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote, unquote
 
 import polars as pl
 
 from pipeline import storage
+from pipeline.results.source import conjuncts, source_of
+from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.files import exists, read_bytes
-from schemas.config import Configuration, Settings, settings_from, to_toml
+from schemas.config import Configuration, Settings, settings_from, to_toml, toml_of
 from schemas.conform import conform, dtypes
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
 
 PREFIX = "balise."
-# Compression is part of "the same bytes": neither level nor row groups may follow a library's default.
-_COMPRESSION_LEVEL = 3
-_ROWS_PER_GROUP = 262_144
 _MARKER = "runs"
 # Of 255 bytes that file systems allow, `run_id=` takes seven.
 LONGEST_NAME = 248
@@ -42,11 +40,15 @@ def file_name(run_id: str) -> str:
 def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> None:
     """Write the five tables of one run; the runs table last, so that it marks the run complete.
 
-    `metadata` (digests, software) goes into every file beside the table's name and contract version.
+    `metadata` (digests, software) goes into every file beside the table's name and contract version; the runs table
+    also holds the SHA-256 of the others, so that its own digest stands for the run.
     The same tables and metadata give the same bytes. A killed process leaves either the complete
     run or one without marker, which does not count.
     """
-    contents = [(name, table_bytes(getattr(tables, name), name, metadata)) for name in TABLES]
+    others = {name: table_bytes(getattr(tables, name), name, metadata) for name in TABLES if name != _MARKER}
+    digests = json.dumps({name: hashlib.sha256(content).hexdigest() for name, content in others.items()})
+    last = table_bytes(tables.runs, _MARKER, {**metadata, "tables": digests})
+    contents = [*others.items(), (_MARKER, last)]
     marker = table_address(out, _MARKER, tables.run_id)
     if is_url(out):
         # An object store shows each object as soon as it is staged.
@@ -71,15 +73,7 @@ def table_bytes(frame: pl.DataFrame, table: str, metadata: Mapping[str, str]) ->
 
 def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str]) -> bytes:
     """A frame as Parquet with its metadata; the same content always gives the same bytes."""
-    buffer = io.BytesIO()
-    frame.rechunk().write_parquet(
-        buffer,
-        compression="zstd",
-        compression_level=_COMPRESSION_LEVEL,
-        row_group_size=_ROWS_PER_GROUP,
-        metadata={f"{PREFIX}{key}": metadata[key] for key in sorted(metadata)},
-    )
-    return buffer.getvalue()
+    return parquet.parquet_bytes(frame, {f"{PREFIX}{key}": value for key, value in metadata.items()})
 
 
 def read_run(out: Address, run_id: str) -> RunTables:
@@ -93,48 +87,50 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     if table not in TABLES:
         raise UsageError("is no table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
-    schema = {"run_id": pl.String(), **dtypes(TABLES[table])}
-    if not runs:
-        return pl.LazyFrame(schema=schema)
     if run_id is not None and not exists(table_address(out, _MARKER, run_id)):
         known = ", ".join(run_ids(out)[:10]) or "no complete run"
         raise UsageError(f"has no run {run_id!r}", place=shown(out), found=known)
-    paths = [table_address(out, table, run) for run in runs]
-    if is_url(out):
-        return _read_remote(table, [str(path) for path in paths], runs).select(list(schema))
-    for path, run in zip(paths, runs, strict=True):
-        _check_columns(table, run, _schema_of(table, run, Path(path)))
-    return scan_runs(out, table, runs).select(list(schema))
+    return scan_runs(out, table, runs)
 
 
-def scan_runs(out: Address, table: str, runs: Sequence[str], **options: Any) -> pl.LazyFrame:
-    """One table of these runs of a local result as its files hold it, and `run_id`, a condition on which prunes files.
+def scan_runs(out: Address, table: str, runs: Sequence[str]) -> pl.LazyFrame:
+    """One table of these runs, read and checked when a query asks; a condition on `run_id` reads those runs only.
 
-    `options` go to `polars.scan_parquet`.
+    Collecting it raises `UsageError` for a file that is damaged, gone, or of another build.
     """
-    files = [Path(table_address(out, table, run)) for run in runs]
-    if "=" not in str(out):
-        schema = {"run_id": pl.String()}
-        return pl.scan_parquet(files, glob=False, hive_partitioning=True, hive_schema=schema, **options)
-    # Above the tables, too, polars takes each `key=value` for a partition.
-    scans = (pl.scan_parquet(file, glob=False, hive_partitioning=False, **options) for file in files)
-    return pl.concat(scan.with_columns(run_id=pl.lit(run)) for scan, run in zip(scans, runs, strict=True))
+
+    def parts(columns: list[str], predicate: pl.Expr | None) -> Iterator[pl.DataFrame]:
+        asked = _asked(runs, predicate)
+        contents = storage.read_many([str(table_address(out, table, run)) for run in asked]) if is_url(out) else {}
+        for run in asked:
+            place = table_address(out, table, run)
+            yield _table_of(contents.get(str(place)) if is_url(out) else Path(place), table, run, columns)
+
+    return source_of({"run_id": pl.String(), **dtypes(TABLES[table])}, parts)
 
 
-def check_tables(out: Address, tables: Iterable[str]) -> None:
-    """Refuse results of another build of the program, whose tables have other columns; local results only."""
-    for table in tables:
-        for run in run_ids(out):
-            _check_columns(table, run, _schema_of(table, run, Path(table_address(out, table, run))))
+def _asked(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
+    """The runs that the conditions on `run_id` alone leave."""
+    frame = pl.DataFrame({"run_id": runs}, schema={"run_id": pl.String})
+    for condition in conjuncts(predicate):
+        if condition.meta.root_names() == ["run_id"]:
+            frame = frame.filter(condition)
+    return frame["run_id"].to_list()
 
 
-def _schema_of(table: str, run_id: str, file: Path) -> Mapping[str, pl.DataType]:
+def _table_of(source: bytes | Path | None, table: str, run: str, columns: Sequence[str]) -> pl.DataFrame:
+    if source is None:
+        raise _unreadable(table, run, "no such object")
+
+    def own(found: Mapping[str, pl.DataType]) -> list[str]:
+        _check_columns(table, run, found)
+        return [name for name in columns if name != "run_id"]
+
     try:
-        # Opened here: given a path, polars takes its brackets for a glob.
-        with file.open("rb") as source:
-            return pl.read_parquet_schema(source)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise _unreadable(table, run_id, str(error).strip().splitlines()[0]) from None
+        frame = parquet.read_parquet(source, own)
+    except parquet.ParquetError as error:
+        raise _unreadable(table, run, str(error)) from None
+    return frame.with_columns(run_id=pl.lit(run)).select(columns)
 
 
 def _unreadable(table: str, run_id: str, reason: str) -> UsageError:
@@ -248,8 +244,8 @@ def read_config(out: Address) -> Configuration | None:
     if not exists(address):
         return None
     try:
-        return settings_from(tomllib.loads(read_bytes(address).decode()), Configuration, str(address))
-    except (ConfigError, tomllib.TOMLDecodeError) as error:
+        return settings_from(toml_of(read_bytes(address), shown(address)), Configuration, str(address))
+    except ConfigError as error:
         raise UsageError(
             f"was not written by this build of the program: {error}",
             place=shown(address),
@@ -264,18 +260,3 @@ def write_config(out: Address, settings: Settings) -> None:
 
 def _partition(run_id: str) -> str:
     return f"run_id={file_name(run_id)}"
-
-
-def _read_remote(table: str, paths: list[str], runs: list[str]) -> pl.LazyFrame:
-    contents = storage.read_many(paths)
-    frames = []
-    for path, run in zip(paths, runs, strict=True):
-        if path not in contents:
-            raise _unreadable(table, run, "no such object")
-        try:
-            frame = pl.read_parquet(contents[path])
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
-            raise _unreadable(table, run, str(error).strip().partition("\n")[0]) from None
-        _check_columns(table, run, frame.schema)
-        frames.append(frame.lazy().with_columns(run_id=pl.lit(run)))
-    return pl.concat(frames, how="diagonal")

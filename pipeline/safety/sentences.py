@@ -38,7 +38,7 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     ]
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     if partial:
-        said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: what was read of them counts.")
+        said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: only what was read of them counts.")
     return [*said, *_unjudged(runs, alarms)]
 
 
@@ -58,25 +58,24 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
         if held_s - seen_s >= _WORTH_SAYING_S:
             without = rows["evidence"].null_count()
             said.append(
-                f"{solution}: for {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h nothing says whether the"
-                f" position was right ({without} of {rows.height} runs have no evidence at all): no rate counts this"
-                " time."
+                f"{solution}: in {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the position could not be"
+                f" checked ({without} of {rows.height} runs have no evidence at all). No rate counts this time."
             )
         open_cases = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
         if open_cases.height:
             said.append(
                 f"{solution}: {open_cases.height} alarms in {open_cases['run_id'].n_unique()} runs could not be"
-                " checked: the rate of false alarms leaves these runs out."
+                " checked. The rate of false alarms leaves these runs out."
             )
     return said
 
 
 def slow_receivers(levels: pl.DataFrame) -> list[str]:
-    """Service levels whose allowed time is over before the next epoch can negate anything (TVB section 5)."""
+    """Service levels whose allowed time is over before the next epoch can block a position (TVB section 5)."""
     slow = levels.filter(~pl.col("receiver_quick_enough"))
     return [
-        f"{solution}: epochs come too slowly for {level} in {runs} runs: period and negation take up to "
-        f"{needed_s:.4g} s of the {allowed_s:.4g} s allowed."
+        f"{solution}: the receiver is too slow for {level} in {runs} runs: one period and the reaction take up to "
+        f"{needed_s:.4g} s, {allowed_s:.4g} s are allowed."
         for solution, level, allowed_s, runs, needed_s in slow.group_by(
             "solution", "service_level", "allowed_s", maintain_order=True
         )
@@ -98,7 +97,7 @@ def _level(row: dict[str, Any]) -> str:
     unknown = row["failures"] - row["within"] - row["exceeded"]
     beside = f" and {unknown} unknown" if unknown else ""
     level = f"{row['allowed_s']:.4g} s ({row['service_level']}{_within_bounds(row)})"
-    return f"{row['within']} within{beside} against {level}"
+    return f"{row['within']} in time{beside} for {level}"
 
 
 def _within_bounds(row: dict[str, Any]) -> str:
@@ -118,31 +117,31 @@ def _statement(row: dict[str, Any]) -> str:
     claim = f"THR_VB of {row['thr_vb_per_h']:.2e}/h at 95 %"
     head = " ".join([_failures(row), _missed(row), _acceptances(row)])
     if row["share_p1"]:
-        head += f" Wrong and not blocked: {row['share_p1']:.3%} of the time in runs with a truth."
+        head += f" Position wrong and not blocked: {row['share_p1']:.3%} of the time in runs with a truth."
     if row["hours_still_needed"] == 0.0:
-        return f"{head} By counting, this proves a {claim}."
+        return f"{head} This proves a {claim} by counting."
     return (
-        f"{head} Fault-free hours still needed to prove a {claim} by counting: {row['hours_still_needed']:.3g} of"
-        f" {row['hours_needed']:.3g} h with a truth. The claim has to rest on the time to detect."
+        f"{head} Fault-free hours still needed to prove a {claim} by counting: {row['hours_still_needed']:.3g} h of"
+        f" {row['hours_needed']:.3g} h. No trial reaches that: the claim has to rest on the time to detect."
     )
 
 
 def _failures(row: dict[str, Any]) -> str:
     within, beyond = row["failures_within_budget"], row["failures_beyond_budget"]
     unknown = row["failures"] - within - beyond
-    beside = f", {unknown} could not be checked" if unknown else ""
+    beside = f", {unknown} unknown" if unknown else ""
     return (
-        f"{row['solution']}: of {row['failures']} position failures in use, at a virtual balise or not, {within} were"
-        f" in time and {beyond} too late{beside}, in {row['hours_with_evidence']:.6g} h judged,"
-        f" {row['hours_with_truth']:.6g} h of these by a truth (reference or balise reads)."
+        f"{row['solution']}: {row['failures']} position failures in use, at a virtual balise or not: {within} in time,"
+        f" {beyond} too late{beside}. Hours judged: {row['hours_with_evidence']:.6g}, of these"
+        f" {row['hours_with_truth']:.6g} by a truth (reference or balise reads)."
     )
 
 
 def _missed(row: dict[str, Any]) -> str:
     known, missed = row["missed_known"], row["missed_judged"]
-    said = f"Of {known} faults with a failure that a truth judged {missed} were not found in time"
+    said = f"No monitor found {missed} of {known} faults with a failure that a truth judged"
     if row["missed"] > missed:
-        said += f"; {row['missed'] - missed} more were seen by the odometer alone, and shares leave them out"
+        said += f"; {row['missed'] - missed} more are known by the odometer alone, and shares leave them out"
     return f"{said}."
 
 
@@ -152,5 +151,5 @@ def _acceptances(row: dict[str, Any]) -> str:
     if seen > unsafe:
         said += f", and {seen - unsafe} more by the odometer alone"
     if row["unproven_accepted"]:
-        said += f"; of {row['unproven_accepted']} accepted ones the position could not be checked"
+        said += f"; {row['unproven_accepted']} accepted ones could not be checked"
     return f"{said}."

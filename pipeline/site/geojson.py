@@ -41,7 +41,7 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     try:
         document = json.loads(data)
         features, epsg = list(document["features"]), _epsg(document)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
     points: dict[str, list[Any]] = {name: [] for name in _TRACK_COLUMNS}
@@ -111,33 +111,57 @@ def _add_element(
     breaches: list[str],
 ) -> None:
     name = _first(keys, _ID_KEYS)
-    coordinates = geometry.get("coordinates") or []
-    if geometry["type"] == "MultiLineString":
-        if len(coordinates) != 1:
-            breaches.append(f"{place}: MultiLineString of {len(coordinates)} parts; a net element has one axis")
-            return
-        coordinates = coordinates[0]
     if name is None:
         breaches.append(f"{place}: a LineString without property id or netelement_id")
         return
     try:
-        triples = [(float(c[0]), float(c[1]), float(c[2]) if len(c) > 2 else None) for c in coordinates]
-    except (TypeError, ValueError, IndexError):
-        breaches.append(f"{place} ({name}): coordinates are not numbers [longitude, latitude(, height)]")
+        triples = [_triple(point) for point in _axis(geometry)]
+        sigma_m, declared = _metres(keys.get("sigmam")), _first(keys, _LENGTH_KEYS)
+        declared_m = _metres(declared) if isinstance(declared, int | float) else None
+    except (TypeError, ValueError, LookupError, OverflowError) as error:
+        breaches.append(f"{place} ({str(name)[:80]}): {error}")
         return
     if str(name) in lengths:
         breaches.append(f"{place}: net element {name} stands in the file twice")
         return
-    sigma_m = keys.get("sigmam")
-    if isinstance(sigma_m, bool) or not isinstance(sigma_m, int | float | None):
-        breaches.append(f"{place} ({name}): sigma_m {sigma_m!r}; expected a number of metres")
-        return
-    declared = _first(keys, _LENGTH_KEYS)
-    lengths[str(name)] = float(declared) if isinstance(declared, int | float) else float("nan")
+    lengths[str(name)] = float("nan") if declared_m is None else declared_m
     points["netelement_id"] += [str(name)] * len(triples)
-    points["sigma_m"] += [None if sigma_m is None else float(sigma_m)] * len(triples)
+    points["sigma_m"] += [sigma_m] * len(triples)
     for column, part in (("longitude_deg", 0), ("latitude_deg", 1), ("height_m", 2)):
         points[column] += [triple[part] for triple in triples]
+
+
+def _axis(geometry: Mapping[str, Any]) -> list[Any]:
+    """The points of a line."""
+    coordinates = geometry.get("coordinates") or []
+    if not isinstance(coordinates, list):
+        raise ValueError("coordinates are no list of points")
+    if geometry["type"] == "MultiLineString":
+        if len(coordinates) != 1:
+            raise ValueError(f"MultiLineString of {len(coordinates)} parts; a net element has one axis")
+        return list(coordinates[0])
+    return coordinates
+
+
+def _triple(point: Any) -> tuple[float, float, float | None]:
+    """Longitude, latitude and height."""
+    try:
+        return float(point[0]), float(point[1]), float(point[2]) if len(point) > 2 else None
+    except (TypeError, ValueError, LookupError, OverflowError):
+        raise ValueError("coordinates are not numbers [longitude, latitude(, height)]") from None
+
+
+def _shown(value: Any) -> str:
+    """The value, shortened (Python does not even write integers of 4,300 digits)."""
+    return "a very large integer" if isinstance(value, int) and value.bit_length() > 1024 else repr(value)[:80]
+
+
+def _metres(value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 2**1023:
+        raise ValueError(f"{_shown(value)}; expected a number of metres")
+    return float(value)
 
 
 def _add_relation(place: str, keys: Mapping[str, Any], relations: dict[str, list[Any]], breaches: list[str]) -> None:

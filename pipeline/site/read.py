@@ -14,8 +14,9 @@ from pipeline.site.route import route_table
 from pipeline.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
 from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
+from pipeline.storage.parquet import without_checksums
 from pipeline.track.survey import geometric_measures_m, track_of
-from schemas.errors import InputError, SiteError
+from schemas.errors import InputError, SiteError, listed
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site
 
@@ -55,8 +56,9 @@ def read_site(path: Path | str) -> Site:
         links=Links.validate(found.links, cast=True),
         balises=None if balises is None else Balises.validate(balises, cast=True),
         route=None if route is None else Route.validate(route, cast=True),
-        findings=tuple(notes + found.findings),
+        findings=tuple(notes + _without_checksums(files) + found.findings),
         digest=_digest(files),
+        files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
 
 
@@ -86,6 +88,12 @@ def is_geojson(address: Path | str) -> bool:
     return name_of(address).lower().endswith(".geojson")
 
 
+def _without_checksums(files: dict[str, bytes]) -> list[Finding]:
+    text = "has no checksums of its pages: damage to it may stay unseen"
+    names = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
+    return [Finding("note", name, text) for name in names]
+
+
 def _digest(files: dict[str, bytes]) -> str:
     """SHA-256 over names and contents."""
     parts = [f"{name} {hashlib.sha256(data).hexdigest()}\n" for name, data in sorted(files.items())]
@@ -93,9 +101,8 @@ def _digest(files: dict[str, bytes]) -> str:
 
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
-    listed = breaches[0] if len(breaches) == 1 else "\n  ".join([f"{len(breaches)} breaches", *breaches]) + "\n"
     remedy = "Mend what is named; `balise dictionary` lists the columns of a site."
-    return SiteError(listed, place=shown(path), remedy=remedy)
+    return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:

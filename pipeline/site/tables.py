@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 
 import dataframely as dy
@@ -11,6 +10,7 @@ import polars as pl
 from pipeline.ingest.breaches import Breach, line_of
 from pipeline.ingest.conform import Defaults, conform_to, rows_text, type_name
 from pipeline.ingest.csv_text import comments_of, epsg_in, read_table
+from pipeline.storage.parquet import metadata_of, read_parquet
 from schemas.enums import Reaction
 from schemas.inputs import SITE_SCHEMAS
 
@@ -68,11 +68,8 @@ def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame 
 
 
 def _parquet(file: str, data: bytes) -> RawTable:
-    import pyarrow.parquet
-
-    metadata = pyarrow.parquet.read_schema(io.BytesIO(data)).metadata or {}
-    named = {key.lower(): value for key, value in metadata.items()}.get(b"epsg")
-    return _with_epsg(file, pl.read_parquet(io.BytesIO(data)), named.decode() if named else None)
+    named = {name.lower(): value for name, value in metadata_of(data).items()}.get("epsg")
+    return _with_epsg(file, read_parquet(data), named)
 
 
 def _csv(file: str, data: bytes) -> RawTable:

@@ -6,6 +6,9 @@ import struct
 import subprocess
 import sys
 
+import numpy as np
+
+from benchmarks import fuzz_files
 from benchmarks.fuzz_ingest import MUTATIONS, fuzz
 from tests.ingest import samples
 
@@ -69,3 +72,28 @@ def test_memory_does_not_grow_with_what_is_not_read(tmp_path):
     large = samples.save(tmp_path, content, "large.mcap")
     done = subprocess.run([sys.executable, "-c", _SCRIPT, small, large], check=True, capture_output=True, text=True)
     assert float(done.stdout) < 60
+
+
+def test_random_damage_to_what_no_checksum_covers():
+    """Messages and schemas under right checksums against the stock decoders; Parquet, CSV, GeoJSON, TOML."""
+    report = fuzz_files.fuzz(210, seed=5)
+    assert report.failures == []
+    kinds = {name.split(":")[0] for name in report.mutations}
+    assert kinds == {"cdr", "protobuf", "json", "parquet", "csv", "geojson", "toml"}
+    assert report.outcomes["error"] > 100
+    assert report.outcomes["whole"] > 20
+
+
+def test_the_stock_decoders_see_wrong_positions(tmp_path, monkeypatch):
+    """The comparison can fail: a reader that gives other latitudes is caught."""
+    case = fuzz_files.log_case("cdr", fuzz_files.run_of(0.002))
+    read = fuzz_files.read_run
+
+    def shifted(path, config):
+        log = read(path, config)
+        return log.with_streams(gnss=log.gnss.with_columns(log.gnss["latitude_deg"] + 1e-9))
+
+    monkeypatch.setattr(fuzz_files, "mutated", lambda content, _: content)
+    assert case(np.random.default_rng(1), tmp_path) == "whole"
+    monkeypatch.setattr(fuzz_files, "read_run", shifted)
+    assert case(np.random.default_rng(1), tmp_path).startswith("WRONG")

@@ -246,7 +246,6 @@ def test_the_variance_between_two_instants_has_the_noise_of_both_rows():
 def test_turns_show_once_the_train_came_back_so_far():
     """Back by 4 m is none, by 6 m is one, and so is going on by 6 m: with 5 m."""
     distance_m = np.array([0.0, 10.0, 6.0, 20.0, 17.0, 14.0, 10.0, 13.0, 16.0])
-    assert [values.tolist() for values in turns_of(distance_m, 5.0)] == [[3, 6], [5, 8], [-1, 1]]
-    back = [values.tolist() for values in turns_of(np.array([0.0, -3.0, -6.0, -20.0]), 5.0)]
-    assert back == [[0], [2], [-1]]
-    assert [values.tolist() for values in turns_of(np.zeros(0), 5.0)] == [[], [], []]
+    assert turns_of(distance_m, 5.0) == [(3, 5, -1), (6, 8, 1)]
+    assert turns_of(np.array([0.0, -3.0, -6.0, -20.0]), 5.0) == [(0, 2, -1)]
+    assert turns_of(np.zeros(0), 5.0) == []

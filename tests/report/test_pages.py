@@ -193,8 +193,8 @@ def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
     """Three faults for `primary`, one of them missed; two failures in use, one within the budget."""
     text = text_of(out, "index.html")
     section = text[text.index('id="s1"') : text.index('id="architectures"')]
-    assert "of 2 position failures in use, at a virtual balise or not, 1 were in time and 1 too late" in section
-    assert "Of 3 faults with a failure that a truth judged 1 were not found in time" in section
+    assert "2 position failures in use, at a virtual balise or not: 1 in time, 1 too late" in section
+    assert "No monitor found 1 of 3 faults with a failure that a truth judged" in section
     told = {row[0]: row[1] for row in rows_of_table(text, "table-figures-s1")}
     assert told["missed_share"] == "0.333 (95 %: 0.0084 to 0.906)"
     assert (told["runs"], told["runs_failed"]) == ("3", "1")

@@ -8,6 +8,8 @@ from typing import Any
 
 import polars as pl
 
+from pipeline.storage.parquet import parquet_bytes
+
 # Three elements east of each other at 50 N, about 100 m each, and one that branches off the first.
 POINTS = {
     "a": [(4.0000, 50.0), (4.0007, 50.0), (4.0014, 50.0)],
@@ -72,7 +74,7 @@ def write(folder: Path, **tables: pl.DataFrame | dict[str, Any] | str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in tables.items():
         if isinstance(content, pl.DataFrame):
-            content.write_parquet(folder / f"{name}.parquet")
+            (folder / f"{name}.parquet").write_bytes(parquet_bytes(content))
         elif isinstance(content, dict):
             (folder / f"{name}.geojson").write_text(json.dumps(content))
         else:

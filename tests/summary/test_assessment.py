@@ -109,17 +109,13 @@ def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     said = found.statements
     assert said[0] == "unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed."
     assert said[1].startswith("Faults were injected into 1 of 3 runs")
-    assert any(
-        text.startswith("primary: of 1 position failures in use, at a virtual balise or not, 0") for text in said
-    )
-    assert "0 within against 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
+    assert any(text.startswith("primary: 1 position failures in use, at a virtual balise or not: 0") for text in said)
+    assert "0 in time for 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
 
 
 def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     write_run(run_of("whole"), tmp_path, {})
-    assert not any(
-        "nothing says" in text or "partial" in text or "neither" in text for text in assess(tmp_path).statements
-    )
+    assert not any("could not be checked" in text or "partial" in text for text in assess(tmp_path).statements)
     blind = run_of("blind", alarms=alarms(1, solution="primary", verdict="unknown"))
     evidence = pl.lit(None, blind.runs.schema["evidence"])
     rows = blind.runs.with_columns(evidence=evidence, evidence_s=0.0, false_alarm_rate_per_h=pl.lit(None, pl.Float64))
@@ -130,11 +126,11 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     found = assess(tmp_path)
     said = found.statements
     assert set(found.tables["levels"].select("no_failure", "unknown", "no_truth").rows()) == {(2, 1, 1)}
-    assert said[1] == "1 of 3 runs are partial: what was read of them counts."
+    assert said[1] == "1 of 3 runs are partial: only what was read of them counts."
     assert said[2].startswith(
-        "primary: for 1 of 3 h nothing says whether the position was right (1 of 3 runs have no evidence at all)"
+        "primary: in 1 of 3 h the position could not be checked (1 of 3 runs have no evidence at all)"
     )
-    assert said[3].startswith("primary: 1 alarms in 1 runs could not be checked")
+    assert said[3].startswith("primary: 1 alarms in 1 runs could not be checked.")
 
 
 def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
@@ -155,10 +151,10 @@ def test_receivers_too_slow_are_named(tmp_path: Path) -> None:
     slow = run_of("a")
     write_run(RunTables(**{**vars(slow), "runs": slow.runs.with_columns(gnss_rate_hz=1.0)}), tmp_path, {})
     said = assess(tmp_path).statements
-    assert "primary: epochs come too slowly for lpv200 in 1 runs" in said[1]
+    assert "primary: the receiver is too slow for lpv200 in 1 runs" in said[1]
     assert not any("npa" in text for text in said)
     write_config(tmp_path, Configuration.model_validate({"hazards": {"reaction_s": 0.1}}))
-    assert sum("too slowly" in text for text in assess(tmp_path).statements) == 1
+    assert sum("too slow" in text for text in assess(tmp_path).statements) == 1
 
 
 def test_other_service_levels_leave_the_limits_of_the_result_alone(tmp_path: Path) -> None:
@@ -181,4 +177,19 @@ def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessmen
     shown = for_reading(found.tables)
     assert "places where the map is in doubt" in shown
     assert all(frame.height for frame in shown.values())
-    assert shown["figures"].columns == ["figure", "gps", "primary"]
+    figures = shown["figures of primary, with exact 95 % bounds"]
+    assert figures.columns == ["figure", "value", "low", "high", "unit", "source"]
+    by_name = {row["figure"]: row for row in figures.iter_rows(named=True)}
+    measured = found.tables["figures"].filter(pl.col("solution") == "primary").row(0, named=True)
+    for figure, low, high in (
+        ("false_alarm_rate_per_h", "false_alarm_rate_low_per_h", "false_alarm_rate_high_per_h"),
+        ("mtbf_h", "mtbf_low_h", "mtbf_high_h"),
+        ("unsafe_share", "unsafe_share_low", "unsafe_share_high"),
+    ):
+        row = by_name[figure]
+        assert (row["value"], row["low"], row["high"]) == (measured[figure], measured[low], measured[high])
+        assert row["source"]
+    assert {row["unit"] for row in by_name.values()} == {"1", "h", "1/h"}
+    assert all(row["source"] for row in by_name.values())
+    bounds = [name for name in measured if "_low" in name or "_high" in name]
+    assert len(by_name) == len(measured) - len(bounds) - 1

@@ -1,0 +1,108 @@
+"""Parquet with a checksum over every page: so it is written, and whatever has checksums is held against them.
+
+Polars neither writes nor verifies them (2.1), so both go through pyarrow.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+# Part of "the same bytes": none of these may follow a library's default.
+_COMPRESSION_LEVEL = 3
+_ROWS_PER_GROUP = 262_144
+
+
+class ParquetError(ValueError):
+    """Content that is no Parquet file, or a damaged one; `str` is one line."""
+
+
+def parquet_bytes(frame: pl.DataFrame, metadata: Mapping[str, str] | None = None) -> bytes:
+    """A frame as Parquet with its metadata; the same content always gives the same bytes."""
+    table = frame.rechunk().to_arrow()
+    buffer = io.BytesIO()
+    pq.write_table(
+        table.replace_schema_metadata(dict(sorted((metadata or {}).items())) or None),
+        buffer,
+        row_group_size=_ROWS_PER_GROUP,
+        compression="zstd",
+        compression_level=_COMPRESSION_LEVEL,
+        use_dictionary=[name for name, kind in frame.schema.items() if kind in (pl.String, pl.Enum, pl.Categorical)],
+        write_page_checksum=True,
+    )
+    return buffer.getvalue()
+
+
+Schema = dict[str, pl.DataType]
+# A panic of polars is a BaseException: it has one for metadata of a column that is not UTF-8.
+_ERRORS = (
+    pa.ArrowException,
+    pl.exceptions.PolarsError,
+    pl.exceptions.PanicException,
+    OSError,
+    ValueError,
+    OverflowError,
+)
+
+
+@contextmanager
+def _reading() -> Iterator[None]:
+    """Turns what pyarrow and polars raise into one error of one line."""
+    try:
+        yield
+    except _ERRORS as error:
+        raise ParquetError((str(error).strip().splitlines() or [type(error).__name__])[0]) from None
+
+
+def read_parquet(source: bytes | Path, choose: Callable[[Schema], Sequence[str]] | None = None) -> pl.DataFrame:
+    """The table; of all its columns and their types `choose` says which are read. Raises `ParquetError`."""
+    with _reading():
+        place = pa.BufferReader(source) if isinstance(source, bytes) else source
+        file = pq.ParquetFile(place, page_checksum_verification=True)
+        names = list(file.schema_arrow.names)
+        if len(set(names)) < len(names):
+            raise ValueError("a column name stands twice")
+        # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
+        empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], file.schema_arrow)))
+        wanted = list(names if choose is None else choose(dict(empty.schema)))
+        if not wanted:
+            return pl.DataFrame(height=file.metadata.num_rows)
+        return pl.DataFrame(pl.from_arrow(file.read(columns=wanted))).select(wanted)
+
+
+def metadata_of(content: bytes) -> dict[str, str]:
+    """The file's key-value metadata. Raises `ParquetError`."""
+    with _reading():
+        found = pq.read_metadata(pa.BufferReader(content)).metadata or {}
+        return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in found.items()}
+
+
+def without_checksums(content: bytes) -> bool:
+    """Whether some column has no checksum, so that damage to it may stay unseen. Raises `ParquetError`."""
+    with _reading():
+        metadata = pq.read_metadata(pa.BufferReader(content))
+        groups = (metadata.row_group(number) for number in range(metadata.num_row_groups))
+        parts = (group.column(number) for group in groups for number in range(metadata.num_columns))
+        return not all(_has_crc(content[part.data_page_offset :][:32]) for part in parts)
+
+
+def _has_crc(head: bytes) -> bool:
+    """Whether a page header (Thrift compact protocol) has its field 4, `crc`, after the three numbers before it."""
+    at = 0
+    for _ in range(3):  # type, size, compressed size: each the byte of a 32-bit field that follows, and a varint
+        if at >= len(head) or head[at] != _NEXT_I32:
+            return False
+        at += 1
+        while at < len(head) and head[at] & 0x80:
+            at += 1
+        at += 1
+    return at < len(head) and head[at] == _NEXT_I32
+
+
+_NEXT_I32 = 0x15

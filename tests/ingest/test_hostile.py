@@ -1,0 +1,243 @@
+"""Small logs that ask for much: work and memory in proportion to the file, one error, never another instant."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import zstandard
+
+from pipeline.ingest import mcap_chunk, read_run
+from pipeline.ingest.clean import clean
+from pipeline.ingest.describe import describe_log
+from pipeline.ingest.ros_message import DefinitionError, Member, message_reader, parse_definitions
+from pipeline.storage.parquet import parquet_bytes
+from schemas.config import IngestConfig
+from schemas.errors import InputError
+from tests.ingest import samples
+from tests.ingest.samples import channel, chunk, definitions, message, position, schema, some_messages, whole
+
+SECOND_NS = 1_000_000_000
+
+
+def packed(records: bytes) -> bytes:
+    return chunk(records, "zstd", packed=zstandard.compress(records))
+
+
+def numbered(count: int, kind: bytes) -> bytes:
+    """A channel and a message for every number."""
+    channels = (channel(number, topic=f"/{number}") for number in range(1, count))
+    messages = (message(position(number), channel_id=number) for number in range(1, count))
+    return whole(kind, *channels, packed(b"".join(messages)))
+
+
+def bombs() -> dict[str, bytes]:
+    """Logs of up to some 100 KB that would cost seconds or hundreds of megabytes."""
+    empty = struct.pack("<BQ", 0x80, 0)
+    return {
+        "repeated definitions": whole(*[packed(definitions() * 100_000)] * 8),
+        "records of no kind": whole(definitions(), *[packed(empty * 800_000)] * 8),
+        "messages of nothing": whole(schema(name="x.Y"), channel(topic="/x"), *[packed(message(b"") * 250_000)] * 8),
+        "a position of 100 MB": whole(definitions(), packed(message(b" " * 100_000_000))),
+        "positions of 100 MB": whole(definitions(), packed(message(position(0) + b" " * 1_000_000) * 100)),
+        "empty chunks": whole(definitions(), chunk(b"") * 20_000, some_messages()),
+        "chunks without index": whole(definitions(), chunk(message(position(0))) * 10_000),
+        "channels": numbered(60_000, schema(name="x.Y")),
+        "topics of positions": numbered(2000, schema()),
+    }
+
+
+_SCRIPT = """
+import resource, sys, time
+from pathlib import Path
+from pipeline.ingest import read_run
+from pipeline.ingest.describe import describe_log
+from schemas.config import IngestConfig
+from schemas.errors import InputError
+
+read_run(Path(sys.argv[1]), IngestConfig())
+for name in sys.argv[2:]:
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from what is resident now
+    rss = lambda word: int(Path("/proc/self/status").read_text().split(word + ":")[1].split()[0]) / 1024
+    before, begin = rss("VmRSS"), time.process_time()
+    try:
+        read_run(Path(name), IngestConfig())
+        outcome = "whole"
+    except InputError as error:
+        outcome = str(error).splitlines()[0][-400:]
+    print(f"{time.process_time() - begin:.2f}|{rss('VmHWM') - before:.0f}|{Path(name).stem}|{outcome}")
+"""
+
+
+def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Path) -> None:
+    """Far above what they take (0.1 to 1 s, 10 to 200 MB); before, each took more than 20 s or 600 MB."""
+    good = samples.save(tmp_path, whole(definitions(), some_messages()), "good.mcap")
+    logs = [samples.save(tmp_path, content, f"{name}.mcap") for name, content in bombs().items()]
+    done = subprocess.run(
+        [sys.executable, "-c", _SCRIPT, good, *logs], check=True, capture_output=True, text=True, timeout=100
+    )
+    told = [line.split("|") for line in done.stdout.splitlines()]
+    assert len(told) == len(logs)
+    assert [row for row in told if float(row[0]) > 6.0 or float(row[1]) > 300.0] == []
+    outcomes = {row[2]: row[3] for row in told}
+    for name in ("repeated definitions", "records of no kind", "messages of nothing"):
+        assert "a chunk unpacks to more records than the file has bytes" in outcomes[name]
+    assert outcomes["empty chunks"] == "whole"
+    assert outcomes["chunks without index"] == "whole"
+    assert "more than 256 topics" in outcomes["topics of positions"]
+
+
+def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
+    spent = mcap_chunk.Allowance(3)
+    data = np.frombuffer(definitions() + some_messages(1), dtype="uint8")
+    placed = [mcap_chunk.Placed(0, len(data), 0, ())]
+    mcap_chunk.messages_in(data, placed, 0, lambda *_: None, spent)
+    assert spent.left == 0
+    with pytest.raises(mcap_chunk.DamageError, match="more records"):
+        mcap_chunk.messages_in(data, placed, 0, lambda *_: None, spent)
+
+
+LETTERS = "A" * 26
+
+
+def test_definitions_are_read_in_linear_time() -> None:
+    """A wrong letter in a constant took the stock parser 24 s, with 26 capitals more than 100 s."""
+    assert parse_definitions("a/msg/B", f"int32 {LETTERS}a=3\nfloat64 x 1.5 # m")["a/B"] == (
+        Member("x", "float64", None),
+    )
+    for line in (f"string {LETTERS}!", f"uint8 {LETTERS * 4000}! x", "x" + " " * 100_000 + "!", "=" * 100_000 + "x"):
+        with pytest.raises(DefinitionError, match="is not understood"):
+            parse_definitions("a/msg/B", line)
+
+
+def test_a_message_does_not_make_more_than_it_holds() -> None:
+    read = message_reader("a/msg/B", "C[] c\nuint8[100000000] d\n===\nMSG: a/C\nC c\n")
+    for payload in (b"\0\1\0\0" + b"\xff" * 4, b"\0\1\0\0" + bytes(4)):
+        with pytest.raises(DefinitionError, match=r"too early|no definition"):
+            read(payload)
+
+
+def log_of(tmp_path: Path, stamps: list[object], name: str = "t") -> Path:
+    payloads = [position(number, **{name: stamp}) for number, stamp in enumerate(stamps)]
+    messages = (message(payload, samples.START_NS + number) for number, payload in enumerate(payloads))
+    return samples.save(tmp_path, whole(definitions(), *messages))
+
+
+DATES = [
+    {"sec": 20_166_000_000, "nsec": 0},  # 2609, which was read as 2025
+    {"sec": 16_725_225_600, "nsec": 0},  # 2500, which was read as 1915
+    {"sec": -1, "nsec": 0},
+    {"sec": 2**63 - 1, "nsec": 0},
+    "2609-01-01T00:00:00Z",
+    "1600-01-01T00:00:00Z",
+    1e300,
+    -5.0,
+    2**63 - 1,
+]
+
+
+@pytest.mark.parametrize("stamp", DATES, ids=range(len(DATES)))
+def test_a_date_that_no_trial_can_have_is_left_out_and_counted(tmp_path: Path, stamp: object) -> None:
+    good: list[object] = [{"sec": 1_700_000_000 + number, "nsec": 5} for number in range(20)]
+    if isinstance(stamp, str):
+        good = [f"2023-11-14T22:13:{number:02}Z" for number in range(20)]
+    elif not isinstance(stamp, dict):
+        good = [type(stamp)(1_700_000_000 + number) for number in range(20)]
+    log = read_run(log_of(tmp_path, [*good[:7], stamp, *good[7:]]), IngestConfig())
+    assert log.gnss.height == 20
+    assert log.notes.skipped_topics == ("/gnss: 1 messages with a date that no trial can have",)
+    with pytest.raises(InputError, match="stamps that no trial can have; found 3 of 4, the first in message 1"):
+        read_run(log_of(tmp_path, [good[0], stamp, stamp, stamp]), IngestConfig())
+
+
+@pytest.mark.parametrize("nanoseconds", [SECOND_NS, 2**32 - 1, -1])
+def test_nanoseconds_that_make_seconds_contradict_themselves(tmp_path: Path, nanoseconds: int) -> None:
+    stamps = [{"sec": 5, "nsec": 0}, {"sec": 6, "nsec": nanoseconds}]
+    with pytest.raises(InputError, match=f"{nanoseconds} nanoseconds beside whole seconds in message 1"):
+        read_run(log_of(tmp_path, stamps), IngestConfig())
+
+
+@pytest.mark.parametrize("number", [2**64, 2**63, 10**400, -(2**63) - 1], ids=["64", "63", "400 digits", "-63"])
+def test_integers_beyond_64_bits_are_refused(tmp_path: Path, number: int) -> None:
+    for fields in ({"t": {"sec": number, "nsec": 0}}, {"satellites": number}):
+        path = samples.save(tmp_path, whole(definitions(), message(position(0)), message(position(1, **fields))))
+        with pytest.raises(InputError, match=r"/gnss: the message of log time .* integer"):
+            read_run(path, IngestConfig())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b'{"a":' * 50_000,
+        b"[" * 100_000,
+        b'{"t":' + b"1" * 5000 + b"}",
+        b'{"latitude_deg":1e999}',
+        b"{" + b'"a":1,' * 9 + b'"b":2}',
+    ],
+    ids=["nested objects", "nested lists", "5000 digits", "1e999", "a name twice"],
+)
+def test_json_that_python_stumbles_over(tmp_path: Path, content: bytes) -> None:
+    path = samples.save(tmp_path, whole(definitions(), message(position(0)), message(content)))
+    with pytest.raises(InputError):
+        read_run(path, IngestConfig())
+    assert describe_log(path, IngestConfig()).problems
+
+
+@pytest.mark.parametrize("value", [1e308, -1e16, 10**400])
+def test_numbers_whose_squares_overflow_are_out_of_range(tmp_path: Path, value: float) -> None:
+    content = json.dumps(json.loads(position(0)) | {"height_m": 0.0}).replace('"height_m": 0.0', f'"height_m": {value}')
+    path = samples.save(tmp_path, whole(definitions(), message(position(0)), message(content.encode())))
+    with pytest.raises(InputError, match=r"out of range|is not a number"):
+        read_run(path, IngestConfig())
+
+
+@pytest.mark.parametrize("t_ns", [-(2**63) + 1, -9_000_000_000 * SECOND_NS, 2**63 - 1, -1])
+def test_rows_at_the_ends_of_64_bits_are_left_out_of_every_stream(t_ns: int) -> None:
+    run = samples.run()
+
+    def with_row(frame: pl.DataFrame) -> pl.DataFrame:
+        stamp = pl.Series("t", [t_ns]).cast(pl.Datetime("ns", "UTC"))
+        return pl.concat([frame, frame.head(1).with_columns(stamp)])
+
+    found, counts = clean(run.with_streams(gnss=with_row(run.gnss), odometer=with_row(run.odometer)))
+    assert found.gnss.equals(run.gnss)
+    assert found.odometer.equals(run.odometer)
+    assert (counts.solutions["primary"].far_off, counts.streams["odometer"].far_off) == (1, 1)
+    assert found.notes.skipped_topics == ("odometer: 1 rows more than a day from the others",)
+
+
+def test_parquet_without_checksums_is_said_and_with_them_is_proved(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    samples.gnss().write_parquet(folder / "gnss.parquet")
+    assert read_run(folder, IngestConfig()).notes.files_without_crc == ("gnss.parquet",)
+    content = parquet_bytes(samples.gnss())
+    (folder / "gnss.parquet").write_bytes(content)
+    run = read_run(folder, IngestConfig())
+    assert run.notes.files_without_crc == ()
+    assert run.gnss.equals(samples.gnss())
+    (folder / "gnss.parquet").write_bytes(content[:200] + bytes([content[200] ^ 1]) + content[201:])
+    with pytest.raises(InputError, match="cannot be read as Parquet"):
+        read_run(folder, IngestConfig())
+
+
+def test_a_receivers_calendar_of_the_year_65000_is_no_time(tmp_path: Path) -> None:
+    from tests.ingest.test_mapping import ros_log
+
+    lines = "uint16 year\nuint8 month\nuint8 day\nuint8 hour\nuint8 min\nuint8 sec\nuint8 valid\nint32 nano\n"
+    lines += (
+        "uint8 fix_type\nuint8 flags\nuint8 num_sv\nint32 lon\nint32 lat\nint32 height\nuint32 h_acc\nuint32 v_acc\n"
+    )
+    lines += "int32 vel_n\nint32 vel_e\nint32 vel_d\n"
+    good = {"year": 2023, "month": 11, "day": 14, "valid": 7, "fix_type": 3, "flags": 1, "lat": 505_000_000}
+    wrong = [good | {"year": 65000}, good | {"valid": 0, "month": 0, "day": 0, "hour": 99}]
+    path = ros_log(tmp_path, ("/navpvt", "ublox_msgs/msg/NavPVT", lines, [good, *wrong, good]))
+    log = read_run(path, IngestConfig())
+    assert log.gnss.height == 2
+    assert log.notes.skipped_topics == ("/navpvt: 2 messages without valid time",)
