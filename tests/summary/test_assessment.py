@@ -189,7 +189,7 @@ def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessmen
         row = by_name[figure]
         assert (row["value"], row["low"], row["high"]) == (measured[figure], measured[low], measured[high])
         assert row["source"]
-    assert {row["unit"] for row in by_name.values()} == {"1", "h", "1/h"}
+    assert {row["unit"] for row in by_name.values()} == {"1", "h", "1/h", "m"}
     assert all(row["source"] for row in by_name.values())
     bounds = [name for name in measured if "_low" in name or "_high" in name]
     assert len(by_name) == len(measured) - len(bounds) - 1
