@@ -131,7 +131,7 @@ def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     changed = (names.is_not_null() & (names.ne_missing(names.shift()) | (pl.Series(range(len(names))) == 0))).to_numpy()
     base = np.full(epochs.height, np.nan)
     for first, last in zip(*_spans(changed), strict=True):
-        places = accepted.filter(pl.col("balise_id") == names[first])["path_m"].to_numpy()
+        places = accepted.filter(pl.col("balise_id") == names[int(first)])["path_m"].to_numpy()
         if places.size:
             near = places if not np.isfinite(path[first]) else places[[np.abs(places - path[first]).argmin()]]
             base[first:last] = near[0] - origin_m[first]
