@@ -136,7 +136,7 @@ def demands(profile: Profile) -> dict[Key, Demand]:
     """The requirements of a profile in their order, each with how it is judged."""
     found: dict[Key, Demand] = {}
     for kind, area in profile.areas.items():
-        limit = f"{area.limit_m:g} m" if not area.way_s else f"max({area.limit_m:g} m, way in {area.way_s:g} s)"
+        limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m or {area.way_s:g} s"
         for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu"):
             found[name, kind.value] = Demand(limit, "always", area.limit_clause, of_always)
         found["safe_front_end", kind.value] = _rate(profile.failure_rate.aim_per_h, profile)

@@ -8,6 +8,7 @@ both at speed. Else there is no estimate. Errors do not depend on where on the t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -128,21 +129,15 @@ def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     odometer, distance = floats(epochs, "odometer_m"), floats(epochs, "distance_from_lrvb_m")
     origin_m = odometer - floats(epochs, "direction") * distance
     path, names = floats(epochs, "path_m"), epochs["lrvb_id"]
-    changed = (names.is_not_null() & (names.ne_missing(names.shift()) | (pl.Series(range(len(names))) == 0))).to_numpy()
+    changed = np.flatnonzero((names.is_not_null() & names.ne_missing(names.shift())).to_numpy())
     base = np.full(epochs.height, np.nan)
-    for first, last in zip(*_spans(changed), strict=True):
-        places = accepted.filter(pl.col("balise_id") == names[int(first)])["path_m"].to_numpy()
+    for first, last in pairwise([*changed.tolist(), epochs.height]):
+        places = accepted.filter(pl.col("balise_id") == names[first])["path_m"].to_numpy()
         if places.size:
             near = places if not np.isfinite(path[first]) else places[[np.abs(places - path[first]).argmin()]]
             base[first:last] = near[0] - origin_m[first]
     base[names.is_null().to_numpy()] = np.nan
     return base + odometer
-
-
-def _spans(changed: Bools) -> tuple[Ints, Ints]:
-    """From each change to the next."""
-    first = np.flatnonzero(changed)
-    return first, np.append(first[1:], changed.size)
 
 
 def _areas_at(front_m: Floats, path_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None) -> Placed:
