@@ -54,6 +54,11 @@ class Front:
         """The unit says where the train is."""
         return np.isfinite(self.front_m)
 
+    @property
+    def least_m(self) -> Floats:
+        """The smallest size that the error of the estimate may have."""
+        return np.maximum(np.maximum(self.low_m, -self.high_m), 0.0)
+
     def within(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
         """Whether the estimate is at most so far ahead of the train and so far behind it (`codes`)."""
         with np.errstate(invalid="ignore"):
