@@ -52,7 +52,7 @@ class Front:
     @property
     def output(self) -> Bools:
         """The unit says where the train is."""
-        return np.isfinite(self.front_m)
+        return np.isfinite(self.path_m)
 
     @property
     def least_m(self) -> Floats:
@@ -87,7 +87,8 @@ def front_of(
     low, high = floats(epochs, "error_low_m") + shift, floats(epochs, "error_high_m") + shift
     right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
     there, known = np.isfinite(estimate), np.isfinite(low) & np.isfinite(high)
-    front = estimate + direction * ahead_m if ahead_m else estimate
+    # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
+    front = estimate + np.nan_to_num(direction) * ahead_m
     return Front(
         clock=Clock.of(epochs, config),
         path_m=estimate,

@@ -260,6 +260,22 @@ def test_the_odometer_goes_on_where_no_position_is_in_use() -> None:
     assert found.within(found.over_m, found.under_m).tolist() == [1] * 6 + [0, 0, 0, -1]
 
 
+def test_the_front_end_decides_on_the_area() -> None:
+    """Antenna at 0, 20, ... 180 m, front end 30 m ahead: in the node from 80 m on; before moving, at the antenna."""
+    frame = epochs(
+        [float(second) for second in range(10)],
+        netelement_id="A",
+        measure_m=[20.0 * second for second in range(10)],
+        direction=[None] * 5 + [1] * 5,
+        error_low_m=0.0,
+        error_high_m=0.0,
+    )
+    found = front_of(frame, passages(), RUN, Configuration(), AREAS, ahead_m=30.0)
+    assert limits_m(found, PROFILE).tolist() == [30.0] * 5 + [10.0] * 5
+    assert found.output.all()
+    assert found.within(5.0, 5.0).tolist() == [1] * 10
+
+
 def test_latency_widens_the_safe_front_end() -> None:
     """At 20 m/s, K 6.18: 6.18 · 0.01 s is 1.236 m; a learned latency of 0.1 s puts the train up to 2 m ahead."""
     run = {"latency_sigma_s": 0.01, "vehicle": "learned"}
