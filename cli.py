@@ -417,6 +417,51 @@ def convert(
 
 
 @app.command(
+    "site",
+    epilog=_examples(
+        "balise site line.gpx --balises every 1000 --out line9",
+        "balise site railways.geojson --balises wanted.csv --out line9",
+    ),
+)
+def make_a_site(
+    surveys: Annotated[
+        list[Path],
+        typer.Argument(callback=_here, help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions."),
+    ],
+    out: OutFolder,
+    balises: Annotated[
+        str | None, typer.Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
+    ] = None,
+    epsg: Annotated[int | None, typer.Option(help="Of x and y in tables that do not say.")] = None,
+    join: Annotated[float, typer.Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    flat: Annotated[bool, typer.Option("--flat", help="Leave heights out.")] = False,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a site that is there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
+    from pipeline.report.site_page import site_page
+    from pipeline.results.inspection import findings_table
+    from pipeline.results.terminal import show_table
+    from pipeline.site.describe import elements_table
+    from pipeline.survey.make import make_site, wish_of, write_made
+
+    wish = wish_of(surveys, balises, epsg, join, flat)
+    site = make_site(wish, _vehicle(vehicle), _configuration(config))
+    write_made(site, site_page(out.resolve().name, site), out, force)
+    elements, findings = elements_table(site), findings_table(site.findings)
+    if as_json:
+        _print_json({"elements": elements, "findings": findings, "balises": site.balises})
+        return
+    show_table(elements.head(_SHOWN_RUNS), "Elements")
+    show_table(findings, "Findings")
+    count = 0 if site.balises is None else site.balises.height
+    print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
+    print(f"Look at {out / 'site.html'} before you replay on it.")
+
+
+@app.command(
     epilog=_examples(
         "balise calibrate good/*.mcap --site line9 --out train7.toml",
     )
