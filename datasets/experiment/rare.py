@@ -1,4 +1,4 @@
-"""Probabilities down to 1e-9 and below: missed detection and false alarm of any linear bank, and the same by counting.
+"""Probabilities down to 1e-9 and below: missed detection and false alarm of any linear bank.
 
 False alarm within a horizon (Adler, Blanchet and Liu 2012): an exceedance is forced at a monitor and epoch drawn
 at random, the rest of the path follows by conditioning, and the expected number of exceedances over the number seen is
@@ -74,18 +74,6 @@ def populations(runs: int) -> list[int]:
     return in_blocks(runs, min(max(runs // _POPULATIONS, _SMALLEST_POPULATION), _LARGEST_POPULATION))
 
 
-def plain_false_alarm(bank: LinearBank, epochs: int, runs: int, seed: int = 1, jobs: int = 1) -> Probability:
-    """The same by counting, to verify where counting can reach."""
-    return pooled(_plain_alarm_block, _works(bank, epochs, 0.0, (seed, 33), runs), runs, jobs)
-
-
-def plain_missed_detection(
-    bank: LinearBank, epochs: int, rate_mps: float, runs: int, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """The same by counting, to verify where counting can reach."""
-    return pooled(_plain_miss_block, _works(bank, epochs, rate_mps, (seed, 34), runs), runs, jobs)
-
-
 def _works(bank: LinearBank, epochs: int, rate_mps: float, key: tuple[int, ...], runs: int) -> list[_Work]:
     return [
         _Work(bank, epochs, rate_mps, None, (*key, number), size)
@@ -145,21 +133,3 @@ def _miss_block(work: _Work) -> Floats:
         raise ValueError("missed detection is sampled around the most probable miss")
     rng = generator(*work.key)
     return np.array([miss_estimate(work.bank, work.epochs, work.rate_mps, work.shift, work.runs, rng)])
-
-
-def _plain_alarm_block(work: _Work) -> Floats:
-    alarm = np.zeros(work.runs, dtype=np.bool_)
-    for noise in work.bank.paths(work.epochs, work.runs, generator(*work.key)):
-        alarm |= (np.abs(noise) > work.bank.threshold[:, None]).any(axis=0)
-    return alarm.astype(np.float64)
-
-
-def _plain_miss_block(work: _Work) -> Floats:
-    bank = work.bank
-    ramp, threshold = work.rate_mps * bank.response(work.epochs), bank.thresholds(work.epochs)
-    alive = np.ones(work.runs, dtype=np.bool_)
-    for k, noise in enumerate(bank.paths(work.epochs, work.runs, generator(*work.key))):
-        alive &= (np.abs(noise + ramp[k][:, None]) <= threshold[k][:, None]).all(axis=0)
-        if not alive.any():
-            break
-    return alive.astype(np.float64)

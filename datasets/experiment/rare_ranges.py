@@ -118,16 +118,6 @@ def missed_by_ranges(
     return pooled(_miss_block, works, runs, jobs)
 
 
-def plain_missed_by_ranges(
-    system: RangeSystem, epochs: int, rate_mps: float, runs: int, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """The same by counting."""
-    works = [
-        _Work(system, epochs, rate_mps, (seed, 36, number), size) for number, size in enumerate(in_blocks(runs, 1000))
-    ]
-    return pooled(_plain_miss_block, works, runs, jobs)
-
-
 def false_alarm_by_ranges(
     system: RangeSystem, epochs: int, runs: int = 2_000, seed: int = 1, jobs: int = 1
 ) -> Probability:
@@ -135,12 +125,6 @@ def false_alarm_by_ranges(
     sizes = in_blocks(runs, _RUNS_PER_BLOCK)
     works = [_Work(system, epochs, 0.0, (seed, 37, number), size) for number, size in enumerate(sizes)]
     return pooled(_alarm_block, works, runs, jobs)
-
-
-def plain_alarm_by_ranges(system: RangeSystem, epochs: int, runs: int, seed: int = 1, jobs: int = 1) -> Probability:
-    """The same by counting."""
-    works = [_Work(system, epochs, 0.0, (seed, 38, number), size) for number, size in enumerate(in_blocks(runs, 1000))]
-    return pooled(_plain_alarm_block, works, runs, jobs)
 
 
 def _most_probable(system: RangeSystem, epochs: int, rate_mps: float) -> tuple[Floats, Floats, float]:
@@ -187,27 +171,6 @@ def _miss_block(work: _Work) -> Floats:
 
     start = system.paths_start(work.runs, rng)
     return np.array([np.exp(log_survival(start, step, work.epochs, rng) - half)])
-
-
-def _plain_miss_block(work: _Work) -> Floats:
-    system, rng = work.system, generator(*work.key)
-    state = system.paths_start(work.runs, rng)
-    alive = np.ones(work.runs, dtype=np.bool_)
-    for range_m in system.ramp_m(work.epochs, work.rate_mps):
-        state = system.following(state, rng)
-        moved = system.values(state) + range_m * system.ramp[:, None]
-        alive &= np.square(moved).sum(axis=0) <= system.threshold
-    return alive.astype(np.float64)
-
-
-def _plain_alarm_block(work: _Work) -> Floats:
-    system, rng = work.system, generator(*work.key)
-    state = system.paths_start(work.runs, rng)
-    alarm = np.zeros(work.runs, dtype=np.bool_)
-    for _ in range(work.epochs):
-        state = system.following(state, rng)
-        alarm |= np.square(system.values(state)).sum(axis=0) > system.threshold
-    return alarm.astype(np.float64)
 
 
 def _alarm_block(work: _Work) -> Floats:
