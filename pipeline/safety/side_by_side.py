@@ -87,7 +87,7 @@ def _moving_s(epochs: pl.DataFrame) -> float | None:
     """
     steps = epochs.group_by("t").agg(may=may_move().any(), known=pl.col("moving").any()).sort("t")
     steps = steps.with_columns(step_s=(pl.col("t").shift(-1) - pl.col("t")).dt.total_nanoseconds() / NS_PER_S)[:-1]
-    return steps.filter("may")["step_s"].sum() if steps["known"].any() else None
+    return float(steps.filter("may")["step_s"].sum()) if steps["known"].any() else None
 
 
 def _solution(
