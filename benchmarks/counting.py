@@ -16,12 +16,13 @@ from functools import partial
 import numpy as np
 
 from datasets.experiment.geometry import default_geometry
-from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
+from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.plan import SENSORS
 from datasets.experiment.ranges import RangePlan
 from datasets.experiment.rare import Probability, false_alarm_probability, missed_detection_probability, pooled
-from datasets.experiment.rare_ranges import RangeSystem, false_alarm_by_ranges, missed_by_ranges, range_system
+from datasets.experiment.rare_ranges import range_system
 from datasets.experiment.rare_rows import first_below
+from datasets.experiment.splitting import System
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.figures.bounds import clopper_pearson
 from schemas.arrays import Floats
@@ -32,46 +33,28 @@ _BLOCK = 250
 _BANK_MPS, _RANGE_MPS, _ALARM_EPOCHS = 0.3, 0.05, 100
 
 
-def counted_alarms(bank: LinearBank, epochs: int, runs: int, seed: int) -> Probability:
-    """Share of runs in which a healthy bank alarms at least once."""
-
-    def block(size: int, rng: np.random.Generator) -> Floats:
-        alarm = np.zeros(size, dtype=np.bool_)
-        for noise in bank.paths(epochs, size, rng):
-            alarm |= (np.abs(noise) > bank.threshold[:, None]).any(axis=0)
-        return alarm.astype(np.float64)
-
-    return _counted(block, runs, (seed, 33))
+def counted_alarms(system: System, epochs: int, runs: int, seed: int) -> Probability:
+    """Share of runs in which healthy monitors fail at least once."""
+    passed = counted_misses(system, epochs, 0.0, runs, seed)
+    share = 1.0 - passed.value
+    error = passed.relative_error * passed.value / share if share > 0.0 else float("inf")
+    return passed._replace(value=share, relative_error=error)
 
 
-def counted_misses(bank: LinearBank, epochs: int, rate_mps: float, runs: int, seed: int) -> Probability:
+def counted_misses(system: System, epochs: int, rate_mps: float, runs: int, seed: int) -> Probability:
     """Share of runs in which no monitor fails at epochs 1 .. n of a range ramp."""
-    ramp, threshold = rate_mps * bank.response(epochs), bank.thresholds(epochs)
+    ramp, passing = system.ramp(epochs, rate_mps), system.passing(epochs)
 
     def block(size: int, rng: np.random.Generator) -> Floats:
-        alive = np.ones(size, dtype=np.bool_)
-        for k, noise in enumerate(bank.paths(epochs, size, rng)):
-            alive &= (np.abs(noise + ramp[k][:, None]) <= threshold[k][:, None]).all(axis=0)
+        state, alive = system.start(size, rng), np.ones(size, dtype=np.bool_)
+        for k in range(epochs):
+            state = system.following(state, rng)
+            alive &= passing(k, system.values(state) + ramp[k][:, None])
             if not alive.any():
                 break
         return alive.astype(np.float64)
 
     return _counted(block, runs, (seed, 34))
-
-
-def counted_by_ranges(system: RangeSystem, epochs: int, rate_mps: float, runs: int, seed: int) -> Probability:
-    """Share of runs in which the pseudorange monitor passes at all recorded epochs of a range ramp."""
-
-    def block(size: int, rng: np.random.Generator) -> Floats:
-        state = system.paths_start(size, rng)
-        alive = np.ones(size, dtype=np.bool_)
-        for range_m in system.ramp_m(epochs, rate_mps):
-            state = system.following(state, rng)
-            moved = system.values(state) + range_m * system.ramp[:, None]
-            alive &= np.square(moved).sum(axis=0) <= system.threshold
-        return alive.astype(np.float64)
-
-    return _counted(block, runs, (seed, 36))
 
 
 def _counted(block: Callable[[int, np.random.Generator], Floats], runs: int, key: tuple[int, int]) -> Probability:
@@ -100,13 +83,12 @@ def comparisons(target: float, most: int = _MOST_COUNTED) -> Iterator[tuple[str,
         alarm = false_alarm_probability(tight, _ALARM_EPOCHS, _ALARM_RUNS)
         yield f"alarm, {spec.sensors}", alarm, counted_alarms(tight, _ALARM_EPOCHS, counted, 1)
     system = range_system(RangePlan(sky, period_s=10.0), 0.0)
-    missed = partial(missed_by_ranges, system, rate_mps=_RANGE_MPS)
+    missed = partial(missed_detection_probability, system, rate_mps=_RANGE_MPS)
     epochs = _epochs_until(missed, target)
-    yield "miss, pseudorange", missed(epochs), counted_by_ranges(system, epochs, _RANGE_MPS, counted, 1)
+    yield "miss, pseudorange", missed(epochs), counted_misses(system, epochs, _RANGE_MPS, counted, 1)
     strict = range_system(RangePlan(sky, period_s=10.0, false_alarm_probability=target / 50), 0.0)
-    passed = counted_by_ranges(strict, _ALARM_EPOCHS, 0.0, counted, 2)
-    alarmed = passed._replace(value=1.0 - passed.value)
-    yield "alarm, pseudorange", false_alarm_by_ranges(strict, _ALARM_EPOCHS, _ALARM_RUNS), alarmed
+    alarm = false_alarm_probability(strict, _ALARM_EPOCHS, _ALARM_RUNS)
+    yield "alarm, pseudorange", alarm, counted_alarms(strict, _ALARM_EPOCHS, counted, 2)
 
 
 def _epochs_until(sampled: Callable[..., Probability], target: float) -> int:

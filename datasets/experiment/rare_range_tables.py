@@ -6,14 +6,8 @@ import polars as pl
 
 from datasets.experiment.geometry import CONSTELLATIONS, default_geometry
 from datasets.experiment.ranges import RangePlan
-from datasets.experiment.rare import Probability
-from datasets.experiment.rare_ranges import (
-    RangeSystem,
-    false_alarm_by_ranges,
-    miss_at_one_epoch,
-    missed_by_ranges,
-    range_system,
-)
+from datasets.experiment.rare import Probability, false_alarm_probability, missed_detection_probability
+from datasets.experiment.rare_ranges import RangeSystem, miss_at_one_epoch, range_system
 from datasets.experiment.rare_rows import SMALLEST, figures, first_below
 from schemas.config import Configuration
 
@@ -38,11 +32,11 @@ def range_table(runs: int, seed: int, jobs: int, config: Configuration | None = 
             slope = abs(float(plan.geometry.axes(_HEADING_DEG)[0] @ plan.geometry.ramp_direction)) * rate
             failure = min(plan.failure_limit_m / slope, _LONGEST_S)
             for reason, epochs in _times(system, rate, failure, seed, jobs):
-                result = missed_by_ranges(system, epochs, rate, runs, seed, jobs)
+                result = missed_detection_probability(system, epochs, rate, runs, seed, jobs)
                 rows.append(labels | _missed(system, rate, reason, epochs, failure, result))
             if rate == _ASKED[0][0] or period_s == _ASKED[2][1]:
                 epochs = int(_HOUR_S / period_s)
-                alarm = false_alarm_by_ranges(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs)
+                alarm = false_alarm_probability(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs)
                 rows.append(labels | {"event": "false_alarm", "time_s": _HOUR_S, **figures(alarm)})
     return pl.DataFrame(rows, infer_schema_length=None)
 
@@ -57,7 +51,7 @@ def _plan(constellation: str, period_s: float, config: Configuration | None) -> 
 def _times(system: RangeSystem, rate: float, failure_s: float, seed: int, jobs: int) -> list[tuple[str, int]]:
     times = [("failure", int(failure_s / system.period_s))]
     found = first_below(
-        lambda n: missed_by_ranges(system, n, rate, _SEARCH_RUNS, seed, jobs).value,
+        lambda n: missed_detection_probability(system, n, rate, _SEARCH_RUNS, seed, jobs).value,
         TARGETS,
         int(_LONGEST_S / system.period_s),
     )

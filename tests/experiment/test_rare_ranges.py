@@ -6,14 +6,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from benchmarks.counting import counted_by_ranges
+from benchmarks.counting import counted_alarms, counted_misses
 from datasets.experiment import EXPERIMENTS, rare_range_tables, rare_tables
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.ranges import RangePlan
+from datasets.experiment.rare import false_alarm_probability, missed_detection_probability
 from datasets.experiment.rare_ranges import (
-    false_alarm_by_ranges,
     miss_at_one_epoch,
-    missed_by_ranges,
     range_system,
 )
 from datasets.experiment.workers import generator
@@ -27,19 +26,19 @@ def plan(constellation: Constellation = "gps", probability: float = 1e-7, period
 @pytest.mark.parametrize("constellation", CONSTELLATIONS)
 def test_residuals_are_white_at_an_epoch_and_related_over_time_as_simulated(constellation: Constellation) -> None:
     system = range_system(plan(constellation, period_s=100.0), 30.0)
-    assert system.by_lag(np.array([0]))[0] == pytest.approx(np.eye(system.size), abs=1e-12)
+    assert system.by_lag(1)[0] == pytest.approx(np.eye(system.size), abs=1e-12)
     rng = generator(1)
-    first = system.paths_start(40_000, rng)
+    first = system.start(40_000, rng)
     second = system.following(first, rng)
     together = system.values(second) @ system.values(first).T / 40_000
-    assert together == pytest.approx(system.by_lag(np.array([1]))[0], abs=5 / np.sqrt(40_000))
+    assert together == pytest.approx(system.by_lag(2)[2], abs=5 / np.sqrt(40_000))
 
 
 @pytest.mark.parametrize("constellation", CONSTELLATIONS)
 def test_misses_agree_with_counting(constellation: Constellation) -> None:
     system = range_system(plan(constellation), 0.0)
-    clever = missed_by_ranges(system, 19, 0.1, runs=4_000, seed=2)
-    plain = counted_by_ranges(system, 19, 0.1, runs=50_000, seed=3)
+    clever = missed_detection_probability(system, 19, 0.1, runs=4_000, seed=2)
+    plain = counted_misses(system, 19, 0.1, runs=50_000, seed=3)
     assert 1e-4 < plain.value < 0.3
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)
@@ -47,19 +46,19 @@ def test_misses_agree_with_counting(constellation: Constellation) -> None:
 
 def test_one_epoch_has_the_exact_probability_and_bounds_all_others() -> None:
     system = range_system(plan(period_s=300.0), 0.0)
-    one = missed_by_ranges(system, 1, 0.1, runs=4_000, seed=4)
+    one = missed_detection_probability(system, 1, 0.1, runs=4_000, seed=4)
     assert one.value == pytest.approx(miss_at_one_epoch(system, 30.0), rel=5 * one.relative_error)
     assert one.value < 1e-6
     many = range_system(plan(period_s=10.0), 0.0)
-    assert missed_by_ranges(many, 20, 0.1, runs=2_000, seed=4).value < miss_at_one_epoch(many, 20.0)
+    assert missed_detection_probability(many, 20, 0.1, runs=2_000, seed=4).value < miss_at_one_epoch(many, 20.0)
 
 
 def test_false_alarms_agree_with_counting() -> None:
     system = range_system(plan(probability=1e-5), 0.0)
-    clever = false_alarm_by_ranges(system, 100, runs=1_000, seed=5)
-    passed = counted_by_ranges(system, 100, 0.0, runs=50_000, seed=6)
-    spread = np.hypot(clever.relative_error * clever.value, passed.relative_error * passed.value)
-    assert clever.value == pytest.approx(1.0 - passed.value, abs=4 * spread)
+    clever = false_alarm_probability(system, 100, runs=1_000, seed=5)
+    plain = counted_alarms(system, 100, runs=50_000, seed=6)
+    spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
+    assert clever.value == pytest.approx(plain.value, abs=4 * spread)
     assert clever.value < 100 * 1e-5
     assert clever.variance_reduction > 100
 
@@ -68,7 +67,7 @@ def test_false_alarms_agree_with_counting() -> None:
 def test_probabilities_of_1e_9_are_within_reach(constellation: Constellation) -> None:
     system = range_system(plan(constellation), 0.0)
     epochs = {"gps": 31, "gps_galileo": 27}[constellation]
-    result = missed_by_ranges(system, epochs, 0.1, runs=4_000, seed=7)
+    result = missed_detection_probability(system, epochs, 0.1, runs=4_000, seed=7)
     assert 1e-11 < result.value < 1e-7
     assert result.relative_error < 0.2
     assert result.variance_reduction > 1e5
