@@ -15,10 +15,17 @@ import typer
 
 if TYPE_CHECKING:
     from pipeline.campaign import Summary
+    from pipeline.safety.sensitivity import Replay
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
 _SHOWN_RUNS = 25
+
+
+def _examples(*lines: str) -> str:
+    """What stands under the help of a command; an empty line keeps each on a line of its own."""
+    return "\n\n".join(["Examples:", *lines])
+
 
 app = typer.Typer(
     name="balise",
@@ -26,7 +33,7 @@ app = typer.Typer(
     epilog="Exit status: 0 all runs ok; 1 some run failed or partial; 2 bad usage, configuration or site; "
     "3 a defect of the program; 129, 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 
@@ -75,7 +82,12 @@ def _about(
         raise typer.Exit(OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
+        "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
+    )
+)
 def replay(
     runs: Annotated[list[str], typer.Argument(help="Logs, run folders, folders of runs, globs, addresses.")],
     site: Site,
@@ -88,6 +100,9 @@ def replay(
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
+    undetected: Annotated[
+        bool, typer.Option("--undetected", help="Also the largest error that no monitor would have noticed.")
+    ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
@@ -96,9 +111,13 @@ def replay(
     """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
     from pipeline.campaign.progress import watches
+    from pipeline.results.manifest import settings_files
 
     settings, train = _configuration(config), _vehicle(vehicle)
-    plan = make_plan(runs, site, out, settings, train, route, write_route)
+    if undetected:
+        asked = settings.undetected.model_copy(update={"compute": True})
+        settings = settings.model_copy(update={"undetected": asked})
+    plan = make_plan(runs, site, out, settings, train, route, write_route, settings_files(config, vehicle))
     try:
         summary = run_campaign(
             plan,
@@ -119,7 +138,12 @@ def replay(
     raise typer.Exit(_status_of(summary))
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise dictionary --table hazards",
+        "balise dictionary --markdown > dictionary.md",
+    )
+)
 def dictionary(
     as_json: Json = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="As one Markdown page.")] = False,
@@ -144,7 +168,12 @@ def dictionary(
         show_table(settings_frame(), "Configuration and vehicle")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise demo",
+        "balise demo --out /tmp/demo --seed 7",
+    )
+)
 def demo(
     out: OutFolder = Path("demo-out"),
     seed: Annotated[int | None, typer.Option(help="Another trial than the usual one.")] = None,
@@ -158,13 +187,20 @@ def demo(
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
     page = write_demo(result, out / "tables")
     if not quiet:
-        print(result.head)
-        show_table(result.checks, "What was injected, expected and found")
-        print(f"\nThe trial is in {out}, its tables in {out / 'tables'}, the report is {page}.")
+        differing = result.checks.filter(~result.checks["agrees"])
+        if differing.height:
+            show_table(differing.drop("title", "agrees"), "What was found differs from what was expected")
+        print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {page}\n")
+        show_table(result.lines)
+        print(result.sentence)
     raise typer.Exit(OK if result.agrees else RUNS_NOT_OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise synth scenario.toml --out trial",
+    )
+)
 def synth(
     scenario: Annotated[Path, typer.Argument(callback=_here, help="Scenario (TOML).")],
     out: OutFolder,
@@ -179,15 +215,32 @@ def synth(
         print(f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise safety",
+        "balise safety week12",
+        "balise safety week12 --config other_level.toml --json",
+    )
+)
 def safety(
     out: Annotated[str | None, typer.Argument(help="A result of `balise replay`, for what it measured.")] = None,
     config: ConfigFile = None,
+    logs: Annotated[
+        list[str] | None,
+        typer.Option("--logs", help="Logs to replay with other limits, for the sensitivity of the verdict."),
+    ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
+    vehicle: VehicleFile = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Safety budget with its errata; of a result, what it measured against it, each figure with its bounds."""
+    """Safety budget with its errata; of a result, what it was made from and what it measured, each figure with bounds.
+
+    The sensitivity to service levels comes from the tables. That to `failure_limit_m` and `evidence_factor` needs the
+    logs: with --logs and --site they are replayed once per value.
+    """
     if out is not None:
-        _assess(out, config, as_json)
+        _assess(out, config, _replay_again(logs or [], site, vehicle, jobs), as_json)
         return
     from pipeline.results.terminal import show_table
     from pipeline.safety import safety_tables
@@ -202,12 +255,57 @@ def safety(
         print()
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise claim week12 --site line9",
+        "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
+    )
+)
+def claim(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
+    site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
+    front_ahead: Annotated[
+        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+    ] = 0.0,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    as_json: Json = False,
+) -> None:
+    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    from pipeline.claim import claim as hold
+    from pipeline.claim import for_reading, load_profile, read_areas
+    from pipeline.results.answer_files import write_csv
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+
+    wanted = load_profile(profile)
+    ground = None if site is None else read_site(site)
+    areas = None if site is None or ground is None else read_areas(site, ground)
+    found = hold(out, wanted, ground, areas, front_ahead)
+    if csv is not None:
+        write_csv(found.table, csv)
+    if as_json:
+        head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
+        _print_json({**head, "notes": found.notes, "requirements": found.table})
+    elif str(csv) != "-":
+        show_table(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
+        print("\n".join(["", *found.notes]))
+
+
+@app.command(
+    epilog=_examples(
+        "balise inspect monday.mcap",
+        "balise inspect line9",
+        "balise inspect line9 --result week12",
+    )
+)
 def inspect(
     path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
     result: Annotated[
         str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
     ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site to hold a log against.")] = None,
+    vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -216,7 +314,7 @@ def inspect(
     from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result, settings.matching)
+    tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
     if as_json:
         _print_json(tables)
     else:
@@ -226,7 +324,11 @@ def inspect(
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise inject monday.mcap --fault ramp.toml --out monday_ramp.mcap",
+    )
+)
 def inject(
     run: Annotated[str, typer.Argument(help="A recorded run.")],
     fault: Annotated[Path, typer.Option("--fault", callback=_here, help="Fault file (TOML).")],
@@ -251,6 +353,42 @@ def inject(
 
 
 @app.command()
+def undetected(
+    run: Annotated[str, typer.Argument(help="A recorded run.")],
+    site: Site,
+    out: Annotated[Path, typer.Option("--out", callback=_here, help="Folder for the fault file and its profile.")],
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
+    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
+    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+) -> None:
+    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    from datasets.undetected import largest_fault, write_fault
+    from pipeline.ingest import read_run
+    from pipeline.site.read import read_site
+
+    settings, train = _configuration(config), _vehicle(vehicle)
+    log = read_run(run, settings.ingest, with_digest=False)
+    found = largest_fault(log, read_site(site), train, settings, solution, balise, at_s, behind)
+    one = settings.undetected.solutions_at_fault == "one"
+    file = write_fault(found, solution if one else None, out)
+    began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
+    print(
+        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most."
+    )
+    print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
+    print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
+    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+
+
+@app.command(
+    epilog=_examples(
+        "balise convert receiver.ubx --to monday",
+        "balise convert positions.csv --config columns.toml --to monday.mcap",
+    )
+)
 def convert(
     logs: Annotated[
         list[Path],
@@ -263,6 +401,7 @@ def convert(
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
     from pipeline.receivers import convert as convert_logs
+    from pipeline.results.fit_report import fit_report
     from schemas.errors import visible
 
     settings = _configuration(config)
@@ -273,9 +412,15 @@ def convert(
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
         print(f"not used: {count} x {visible(reason)}")
+    for line in fit_report(converted.run, settings.ingest).lines():
+        print(line)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise calibrate good/*.mcap --site line9 --out train7.toml",
+    )
+)
 def calibrate(
     runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, globs.")],
     site: Site,
@@ -309,7 +454,12 @@ def calibrate(
     print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise experiment list",
+        "balise experiment diagnostics --repetitions 50",
+    )
+)
 def experiment(
     name: Annotated[str, typer.Argument(help="`list` shows the names.")],
     out: OutFolder = Path("experiment-out"),
@@ -320,6 +470,7 @@ def experiment(
         Path | None,
         typer.Option("--config", callback=_here, help="The bank to judge: `rare`, `bank`, `catalogue`."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Run a published experiment again, at its own size."""
     from datasets.experiment import EXPERIMENTS
@@ -329,33 +480,74 @@ def experiment(
         print("\n".join(EXPERIMENTS))
         return
     if name not in EXPERIMENTS:
-        raise UsageError("is no experiment", place=name, expected=", ".join(EXPERIMENTS))
+        from schemas.near import did_you_mean
+
+        raise UsageError(
+            f"is no experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
+        )
+    from pipeline.campaign.workers import watched
+    from pipeline.results.terminal import how_far
+
     bank = None if config is None else _configuration(config)
-    for path in EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank):
+    with watched(None if quiet else how_far("pieces of work")):
+        written = EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank)
+    for path in written:
         print(path)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        'balise sql week12 "SHOW TABLES"',
+        'balise sql week12 "SELECT run_id, verdict FROM runs" --csv runs.csv',
+        'balise sql week12 "SELECT r.run_id, r.verdict, o.verdict FROM runs r JOIN old_runs o USING (run_id)"'
+        " --with old=week11",
+    )
+)
 def sql(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    query: Annotated[str, typer.Argument(help="One SELECT.")],
+    query: Annotated[str, typer.Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
+    beside: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", callback=_here, help="Write CSV; `-` is standard output.")
+    ] = None,
+    parquet: Annotated[
+        Path | None, typer.Option("--parquet", metavar="FILE", callback=_here, help="Write Parquet.")
+    ] = None,
+    xlsx: Annotated[
+        Path | None,
+        typer.Option("--xlsx", metavar="FILE", callback=_here, help="Write an Excel workbook (extra `excel`)."),
+    ] = None,
     as_json: Json = False,
     allow_files: Annotated[
         bool, typer.Option("--allow-files", help="The query may read files beside the result (`read_csv`).")
     ] = False,
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
+    from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
     from pipeline.results.query import run_sql
     from pipeline.results.terminal import show_table
 
-    answer = run_sql(out, query, allow_files)
+    answer = run_sql(out, query, allow_files, _named_results(beside or []))
+    written = [(csv, write_csv), (parquet, write_parquet), (xlsx, write_xlsx)]
+    for file, write in written:
+        if file is not None:
+            write(answer, file)
+            if str(file) != "-":
+                _say(f"{answer.height} rows in {file}")
     if as_json:
         _print_json(answer)
-    else:
+    elif all(file is None for file, _ in written):
         show_table(answer)
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise report week12 --site line9",
+    )
+)
 def report(
     out: ResultFolder,
     site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
@@ -376,7 +568,12 @@ def report(
         print(f"{len(pages)} files; begin with {pages[0]}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise export week12 monday --to monday.mcap --site line9",
+        "balise export week12 monday --to monday.geojson",
+    )
+)
 def export(
     out: ResultFolder,
     run: Annotated[str, typer.Argument(help="Id of the run.")],
@@ -402,10 +599,62 @@ def export(
         print(f"Without {text}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise verify week12",
+        "balise verify week12 --logs logs --site line9 --vehicle train7.toml",
+    )
+)
+def verify(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    logs: Annotated[
+        list[str] | None, typer.Option("--logs", help="Logs to replay again and compare: paths, folders, globs.")
+    ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    route: RouteFiles = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
+    from pipeline.campaign.plan import make_plan
+    from pipeline.campaign.verify import recompute
+    from pipeline.campaign.verify import verify as compare
+    from pipeline.results.store import read_config
+    from pipeline.results.terminal import how_far, show_table
+    from schemas.errors import UsageError
+
+    found = [compare(out, None if quiet else how_far("runs"))]
+    if logs:
+        if site is None:
+            raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+        settings = _configuration(config) if config else read_config(out)
+        train = _vehicle(vehicle)
+        found.append(
+            recompute(out, lambda to: make_plan(logs, site, to, settings, train, route), jobs or os.cpu_count() or 1)
+        )
+    if as_json:
+        _print_json([{"compared": one.compared, "problems": one.table} for one in found])
+    for one in found if not as_json else []:
+        if one.problems:
+            show_table(one.table)
+        if one.problems or not quiet:
+            print(one.sentence)
+    raise typer.Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
+
+
+@app.command(
+    epilog=_examples(
+        "balise diff week11 week12",
+        "balise diff week11 week12 --detail",
+    )
+)
 def diff(
     out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     out_b: Annotated[str, typer.Argument(help="Another one.")],
+    detail: Annotated[bool, typer.Option("--detail", help="Every value that changed, too.")] = False,
     as_json: Json = False,
 ) -> None:
     """What changed between two results; exit status 1 on a difference."""
@@ -415,7 +664,7 @@ def diff(
     if as_json:
         _print_json(found.as_dict())
     else:
-        print(found.text())
+        print(found.text(detail))
     raise typer.Exit(OK if found.same else RUNS_NOT_OK)
 
 
@@ -479,12 +728,29 @@ def _print_json(value: Any) -> None:
     print(to_json(value))
 
 
-def _assess(out: str, config: Path | None, as_json: bool) -> None:
+def _replay_again(logs: list[str], site: str | None, vehicle: Path | None, jobs: int) -> Replay | None:
+    """How `safety` replays the logs with another configuration; none without logs."""
+    from pipeline.campaign import make_plan, run_campaign
+    from schemas.errors import UsageError
+
+    if not logs:
+        return None
+    if site is None:
+        raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+    ground, train = site, _vehicle(vehicle)
+
+    def replay_with(settings: Configuration, to: str) -> None:
+        run_campaign(make_plan(logs, ground, to, settings, train), jobs=jobs or os.cpu_count() or 1)
+
+    return replay_with
+
+
+def _assess(out: str, config: Path | None, replay_again: Replay | None, as_json: bool) -> None:
     from pipeline.results.terminal import show_table
     from pipeline.safety.assessment import assess, for_reading
 
     settings = None if config is None else _configuration(config)
-    found = assess(out, settings)
+    found = assess(out, settings, replay_again)
     if as_json:
         _print_json({"statements": found.statements, **found.tables})
         return
@@ -493,6 +759,16 @@ def _assess(out: str, config: Path | None, as_json: bool) -> None:
         show_table(table, name)
         print()
     print("\n".join(found.statements[1:]))
+
+
+def _named_results(given: list[str]) -> dict[str, str]:
+    """`NAME=OUT` by name."""
+    from schemas.errors import UsageError
+
+    for text in given:
+        if not re.fullmatch(r"[A-Za-z]\w*=.+", text):
+            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
+    return dict(text.split("=", 1) for text in given)
 
 
 def _status_of(summary: Summary) -> int:
@@ -504,28 +780,36 @@ def _status_of(summary: Summary) -> int:
 
 
 def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.tally import outcome_line, outcome_rows, summary_line
-    from pipeline.results.terminal import show_table
+    from pipeline.campaign.tally import outcome_line, outcome_rows
     from schemas.enums import RunStatus
 
-    rows = outcome_rows(summary)
     if as_json:
         told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
         figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
+        rows = outcome_rows(summary)
         _print_json({**told, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
     elif quiet:
         for outcome in summary.outcomes:
             if outcome.status is not RunStatus.OK:
                 print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
     else:
-        print(summary_line(summary))
-        remarkable = rows.filter((rows["verdict"] != "safe") | (rows["status"] != "ok"))
-        shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
-        if shown.height:
-            show_table(shown if (shown["attempts"] > 1).any() else shown.drop("attempts"))
-        if (more := remarkable.height - shown.height) > 0:
-            print(f"{more} more that are not safe: see replay.log beside the tables.")
-        print(f"Tables are in {out}.")
+        _show_ending(summary, out)
+
+
+def _show_ending(summary: Summary, out: str) -> None:
+    """The verdicts, the worst first; of many runs those that are not safe."""
+    from pipeline.campaign.tally import ending_rows, summary_line
+    from pipeline.results.terminal import show_table
+
+    print(summary_line(summary))
+    rows = ending_rows(summary)
+    remarkable = rows.filter(rows["verdict"] != "safe")
+    shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
+    if shown.height:
+        show_table(shown)
+    if (more := remarkable.height - shown.height) > 0:
+        print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
+    print(f"Tables are in {out}; `balise report {out}` makes pages of them.")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from benchmarks.results import Figure
 from pipeline.results.terminal import show_table, to_json
 
 MODULES = (
+    "start",
     "end_to_end",
     "ingest",
     "matching",
@@ -22,6 +23,7 @@ MODULES = (
     "interruptions",
     "experiment",
     "relink",
+    "undetected",
 )
 
 

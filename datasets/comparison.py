@@ -15,6 +15,8 @@ from schemas.errors import ConfigError
 from schemas.run import RunLog, RunTables
 
 _NOTHING = "none"
+# Of the size of a fault, where it is no length.
+_UNITS = {"latency": " s", "scale": ""}
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def describe_faults(faults: pl.DataFrame | None) -> str:
         return _NOTHING
     parts = []
     for row in faults.iter_rows(named=True):
-        size = "" if row["size"] is None else f" {row['size']:+g}"
+        size = "" if row["size"] is None else f" {row['size']:+g}{_UNITS.get(row['kind'], ' m')}"
         rate = "" if row["rate"] is None else f" at {row['rate']:+g} m/s"
         lasts = (row["t_end"] - row["t_start"]).total_seconds()
         parts.append(f"{row['kind']} {row['target']}{size}{rate} for {lasts:g} s")

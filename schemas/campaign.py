@@ -76,7 +76,7 @@ def _campaign_balises_schema() -> type[dy.Schema]:
         "accepted": count("times that the LDS accepted it"),
         **_estimate("accepted_share", "share of passages at which it was accepted"),
         "rejected": count("offers rejected"),
-        "missed": count("passages without a detection in the window"),
+        "missed": count("passages at which it was not found in its window"),
         "not_available": count("passages without a position"),
         "deletions": count("passages with the ETCS failure mode deletion"),
         **_estimate("deletion_rate", "share of passages with the failure mode deletion"),
@@ -84,11 +84,15 @@ def _campaign_balises_schema() -> type[dy.Schema]:
         "linking_errors": count("linking errors at it"),
         "accepted_judged": count("acceptances judged right or wrong by a reference or balise reads"),
         "unsafe_accepted": count("acceptances judged wrong, by any evidence"),
-        "unproven_accepted": count("acceptances of which the evidence cannot say whether the position was right"),
+        "unproven_accepted": count("acceptances whose position could not be checked"),
         **_estimate("unsafe_rate", "share of judged acceptances that are wrong"),
         "suspect_after_the_fact": count("accepted between a fault's onset and its detection"),
         "location_error_count": count("acceptances whose location error is known to 5 m: what follows is of these"),
         **_spread("location_error", "location error of acceptances"),
+        "undetected_count": count("passages with an unnoticed error computed: what follows is of these"),
+        "undetected_median_m": real("m", "median of the larger unnoticed error, ahead or behind", min=0),
+        "undetected_p95_m": real("m", "95 % of them are below", min=0),
+        "undetected_max_m": real("m", "the largest of them", min=0),
     }
     doc = "One row per balise and solution over all runs of the campaign."
     return type("CampaignBalises", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
@@ -143,10 +147,10 @@ def _figures_schema() -> type[dy.Schema]:
         "missed_judged": count("of these missed"),
         **_estimate("missed_share", "share of missed ones of these"),
         "failures": count("stretches judged wrong in use, whether they hit a VB or not"),
-        "failures_within_budget": count("of these within the budget"),
-        "failures_beyond_budget": count("of these beyond the budget; of the rest it cannot be said"),
+        "failures_within_budget": count("of these in time"),
+        "failures_beyond_budget": count("of these too late; of the rest it is unknown"),
         "failures_judged": count("failures, by a reference or balise reads, of which it can be said"),
-        "beyond_budget_judged": count("of these beyond the budget"),
+        "beyond_budget_judged": count("of these too late"),
         **_estimate("beyond_budget_share", "share of failures beyond the budget of these"),
         "beyond_budget_rate_upper_per_h": real(
             "1/h", "one-sided 95 % upper bound of failures not shown to be within the budget, per hour", min=0
@@ -159,7 +163,7 @@ def _figures_schema() -> type[dy.Schema]:
         "unsafe_judged": count("of the judged ones wrong"),
         **_estimate("unsafe_share", "share of judged acceptances that are wrong"),
         "unsafe_accepted": count("accepted ones judged wrong, by any evidence"),
-        "unproven_accepted": count("accepted ones that the evidence cannot judge"),
+        "unproven_accepted": count("accepted ones whose position could not be checked"),
         "outages": count("stretches without a usable position"),
         **_estimate("outage_rate", "outages per hour", "1/h", "_per_h"),
         "trusted_losses": count("how often a valid, confident, unambiguous position was lost"),
@@ -183,9 +187,24 @@ def _figures_schema() -> type[dy.Schema]:
             f"stanford_hpl_{kind}": count(f"epochs of these runs: {kind}, by the receiver's HPL", nullable=True)
             for kind in STANFORD
         },
+        "undetected_max_m": real(
+            "m", "largest unnoticed error at any epoch of any run; null where not computed", min=0
+        ),
+        "physical_spacing_runs": count("runs with a spacing of physical balises computed"),
+        "physical_spacing_m": real(
+            "m", "shortest way from a physical balise at any time to one beyond the limit", min=0
+        ),
+        "physical_spacing_median_m": real("m", "median over the runs that reach the limit", min=0),
+        "physical_spacing_share_low": real(
+            "1", "share of runs in which the shortest spacing suffices: one-sided 95 % bound from below", min=0, max=1
+        ),
         "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
-        "hours_needed": real("h", "hours that show THR_VB at 95 % with so many failures not within the budget", min=0),
-        "hours_still_needed": real("h", "of these still to run without a further one", min=0),
+        "hours_needed": real(
+            "h",
+            "hours that prove THR_VB by counting, 95 %",
+            min=0,
+        ),
+        "hours_still_needed": real("h", "of these still needed", min=0),
     }
     doc = "One row per solution: what the campaign measured, with exact bounds, and what it cannot show."
     return type("CampaignFigures", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
@@ -201,8 +220,8 @@ class CampaignDetection(dy.Schema):
     service_level = text("service level of the configuration")
     allowed_s = real("s", "allowed T_D", min=0)
     failures = count("stretches judged wrong in use, whether they hit a VB or not")
-    within = count("of these within the allowed T_D, what is unknown included")
-    exceeded = count("of these beyond the allowed T_D; of the rest it cannot be said")
+    within = count("of these in time, what is unknown counted as wrong")
+    exceeded = count("of these too late; of the rest it is unknown")
     failures_judged = count("failures, by a reference or balise reads, of which it can be said")
     within_judged = count("of these within the allowed T_D")
     within_share = real("1", "share of these within it", min=0)
@@ -227,12 +246,12 @@ class CampaignLevels(dy.Schema):
     allowed_s = real("s", "allowed T_D of the level", min=0)
     evidence = one_of(Evidence, "what served as truth", nullable=True)
     failures = count("stretches judged wrong in use, whether they hit a VB or not")
-    within = count("of these within the allowed T_D, what is unknown included")
-    exceeded = count("of these beyond the allowed T_D; of the rest it cannot be said")
+    within = count("of these in time, what is unknown counted as wrong")
+    exceeded = count("of these too late; of the rest it is unknown")
     hazardous_max_s = real("s", "longest hazardous time", min=0)
     hazardous_may_max_s = real("s", "the longest with the time that is unknown", min=0)
-    verdict = one_of(ThrVerdict, "kept, exceeded, no failure, or unknown where the evidence does not say")
-    receiver_needs_s = real("s", "period of the epochs and negation: the least that any fault takes", min=0)
+    verdict = one_of(ThrVerdict, "kept: in time; exceeded: too late; no failure; unknown where it could not be checked")
+    receiver_needs_s = real("s", "period of the epochs and reaction: the least that any fault takes", min=0)
     receiver_quick_enough = flag("that is within the allowed T_D (TVB section 5)", nullable=True)
 
 

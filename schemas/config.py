@@ -11,10 +11,10 @@ from typing import Annotated, Literal, Self, TypeVar
 
 import tomli_w
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
 
+from schemas.breaches import told
 from schemas.enums import Fix
-from schemas.errors import BaliseError, ConfigError
+from schemas.errors import BaliseError, ConfigError, listed
 from schemas.tables import MONITORS
 
 # Strict: neither text nor true or false is a number.
@@ -50,8 +50,25 @@ class StreamMapping(Settings):
     solution: str = "primary"
 
 
+class StreamCorrection(Settings):
+    """What mends a recorded stream before anything else looks at it, whatever file it came from.
+
+    First two columns are exchanged, then `factors` multiply, `shift_s` is added to the times and `shift_*_m` to the
+    positions. `solution`: of GNSS and satellites only this one.
+    """
+
+    stream: Literal["gnss", "odometer", "satellites", "reference", "balise_reads"]
+    solution: str | None = None
+    exchange: tuple[str, str] | None = None
+    factors: dict[str, Number] = {}
+    shift_s: Number = 0.0
+    shift_east_m: Number = 0.0
+    shift_north_m: Number = 0.0
+    shift_up_m: Number = 0.0
+
+
 class IngestConfig(Settings):
-    """Which topics feed which stream; empty: recognised by schema name."""
+    """Which topics feed which stream, empty: recognised by schema name; and whether what they hold can be."""
 
     gnss: tuple[StreamMapping, ...] = ()
     odometer: tuple[StreamMapping, ...] = ()
@@ -62,6 +79,20 @@ class IngestConfig(Settings):
     chunk_limit_mib: Positive = 128.0
     # A receiver before its first fix, or a week that rolls over, touches some rows; more is another recording. Ours.
     wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
+    correct: tuple[StreamCorrection, ...] = ()
+    # What no train can have and a known cause explains fails a run (`fail`), or is told and leaves it unproven.
+    plausibility: Literal["fail", "warn"] = "fail"
+    # Worn wheels count 4 % too much, bad radars 6 %; the nearest wrong unit (yards) 9 %.
+    fit_scale_limit: Probability = 0.08
+    fit_scale_told: Probability = 0.03
+    # Receivers and buses are late by 2 s at most; the nearest wrong clock (leap seconds) is 18 s off.
+    fit_lag_limit_s: Positive = 5.0
+    # 0.3 s at 40 m/s is more than half the failure limit of 20 m.
+    fit_lag_told_s: Positive = 0.3
+    # Positions without corrections are within 5 m of the track, 95 %; half the usual `ci_limit_m` and more is told.
+    fit_shift_told_m: Positive = 8.0
+    # Nearer, a wrong position may be a fault; a default place or 0/0 is thousands of kilometres away.
+    placeholder_far_m: Positive = 10_000.0
 
     @model_validator(mode="before")
     @classmethod
@@ -361,6 +392,21 @@ class HazardConfig(Settings):
     service_level: str = "lpv200"
 
 
+class UndetectedConfig(Settings):
+    """The largest error that no monitor would have noticed (DOMAIN section 5.6)."""
+
+    # A second or so for an hour of run: asked for, as `replay --undetected`.
+    compute: bool = False
+    # The fastest fault of DIAG's simulation; only where nothing looks on does it decide.
+    max_rate_mps: Positive = 5.0
+    # What says, independently of GNSS, that the position was right; a fault began after the last of them.
+    fixes: tuple[Literal["read", "reference"], ...] = ("read",)
+    # `all`: the fault is in every solution, and comparing two of them shows nothing. `one`: in this one alone.
+    solutions_at_fault: Literal["all", "one"] = "all"
+    # Physical balises are thought of at epochs so far apart, to find their largest spacing.
+    spacing_step_s: Positive = 60.0
+
+
 class ServiceLevel(Settings):
     """Hazard rate of a signal-in-space service: `integrity_risk` per `exposure_s`."""
 
@@ -406,6 +452,7 @@ class Configuration(Settings):
     lds: LdsConfig = LdsConfig()
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
+    undetected: UndetectedConfig = UndetectedConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:
@@ -445,22 +492,7 @@ def settings_from(
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        breaches = [_told(breach) for breach in error.errors()]
-        raise ConfigError("; ".join(breaches), place=place, remedy=remedy) from None
-
-
-def _told(breach: ErrorDetails) -> str:
-    """One breach with its path, and what was found where that is a single value."""
-    key = ".".join(str(part) for part in breach["loc"]) or "(file)"
-    found, unknown = breach["input"], breach["type"] == "extra_forbidden"
-    single = isinstance(found, str | int | float) and not unknown
-    return f"{key}: {breach['msg'].removeprefix('Value error, ')}" + (f", found {_shown(found)}" if single else "")
-
-
-def _shown(value: str | int | float) -> str:
-    """The value, shortened (Python does not even write integers of 4,300 digits)."""
-    long = isinstance(value, int) and value.bit_length() > 1024
-    return "a very large integer" if long else repr(value)[:100]
+        raise ConfigError(listed(told(error, kind)), place=place, remedy=remedy) from None
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:

@@ -6,6 +6,7 @@ Ends at the command line, at the batch boundary that turns a failed run into a r
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 # C0 and C1 control characters but the line feed, and what turns the direction of writing.
 _HIDDEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
@@ -45,7 +46,7 @@ class BaliseError(Exception):
         if self.expected is not None:
             text += f"; expected {self.expected}"
         if self.remedy is not None:
-            text += f". {self.remedy}"
+            text += self.remedy if text.endswith("\n") else f". {self.remedy}"
         return visible(text)
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -63,6 +64,13 @@ def _rebuild(
     remedy: str | None,
 ) -> BaliseError:
     return kind(message, place=place, found=found, expected=expected, remedy=remedy)
+
+
+def listed(problems: Sequence[str]) -> str:
+    """Problems of one file as one message: a single one as it is, several one below the other."""
+    if len(problems) == 1:
+        return problems[0]
+    return "\n  ".join([f"{len(problems)} problems in this file", *problems]) + "\n"
 
 
 class UsageError(BaliseError):

@@ -22,7 +22,8 @@ STREAMS: tuple[Stream, ...] = (
 class IngestNotes:
     """What reading found out about the log beside its data.
 
-    `partial_until_ns` is set when the log is damaged at its end and read up to there.
+    `partial_until_ns` is set when the log is damaged at its end and read up to there; `corrections`: what the
+    configuration changed in it.
     """
 
     partial_until_ns: int | None = None
@@ -31,6 +32,7 @@ class IngestNotes:
     chunks_without_crc: int = 0
     files_without_crc: tuple[str, ...] = ()
     skipped_topics: tuple[str, ...] = ()
+    corrections: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Site:
-    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`."""
+    """What does not change from run to run, in WGS 84, tables as in `schemas.inputs`.
+
+    `files`: name, size [bytes] and SHA-256 of each file that it was read from; `digest` is over names and contents.
+    """
 
     track: pl.DataFrame
     links: pl.DataFrame
@@ -79,6 +84,7 @@ class Site:
     route: pl.DataFrame | None = None
     findings: tuple[Finding, ...] = ()
     digest: str = ""
+    files: tuple[tuple[str, int, str], ...] = ()
 
 
 @dataclass(frozen=True)

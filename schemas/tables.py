@@ -73,7 +73,7 @@ class Hazards(dy.Schema):
     t_hazard = instant("the step, or the offered crossing of the first VB hit")
     t_failure = instant("begin of the position failure", nullable=True)
     t_detected = instant("first failing monitor from onset to the end of the episode", nullable=True)
-    t_negated = instant("detection plus reaction", nullable=True)
+    t_negated = instant("position blocked: detection plus reaction", nullable=True)
     t_end = instant("end of the episode", nullable=True)
     monitor = text("monitor that failed first", nullable=True)
     detected = flag("a monitor failed within the episode")
@@ -85,13 +85,13 @@ class Hazards(dy.Schema):
     size_m = real("m", "largest error along the track, signed, + = ahead of the train; of a jump back, its step")
     rate_mps = real("m/s", "slope of the error from onset to failure; null for a step")
     balise_ids = texts("VBs hit, in order")
-    accepted_ids = texts("VBs of those that the LDS accepted despite the fault")
+    accepted_ids = texts("of these the VBs that the LDS accepted despite the fault")
     netelement_id = text("net element of the train at t_hazard", nullable=True)
     measure_m = real("m", "measure of the train at t_hazard")
     path_m = real("m", "path position of the train at t_hazard")
     speed_mps = real("m/s", "speed of the train at t_hazard")
     budget_s = real("s", "allowed T_D of the configured service level (TVB eq. 7)")
-    within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
+    within_budget = flag("hazardous time within the time allowed (in time); null where unknown", nullable=True)
 
 
 class Passages(dy.Schema):
@@ -122,6 +122,12 @@ class Passages(dy.Schema):
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
     crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
+    undetected_ahead_m = real("m", "largest fault ahead of the train that no monitor would have noticed", min=0)
+    undetected_behind_m = real("m", "the same behind it; null as all of these where not computed", min=0)
+    undetected_range_ahead_m = real("m", "largest of these by one range at fault, the pseudorange monitor heard", min=0)
+    undetected_range_behind_m = real("m", "the same behind it", min=0)
+    undetected_since = instant("such a fault began after here: the last independent fix", nullable=True)
+    undetected_monitors = texts("monitors that hold it so small, first what holds most", nullable=True)
 
 
 class Alarms(dy.Schema):
@@ -190,7 +196,9 @@ class _EpochsAfterMonitors(dy.Schema):
     hpl_m = real("m", "horizontal protection level of the receiver", min=0)
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where nobody knows", nullable=True)
-    in_use = flag("fix valid, unambiguous, confident, not negated (DOMAIN section 5.2)")
+    in_use = flag("fix valid, unambiguous, confident, not blocked (DOMAIN section 5.2)")
+    undetected_ahead_m = real("m", "largest fault ahead of the train that no monitor would have noticed", min=0)
+    undetected_behind_m = real("m", "the same behind it; both null where not computed", min=0)
 
 
 def _monitor_columns(monitor: str) -> dict[str, dy.Column]:
@@ -222,7 +230,7 @@ class Runs(dy.Schema):
     status = one_of(RunStatus, "ok, partial (damaged input read up to the damage) or failed")
     error = text("what went wrong", nullable=True)
     vehicle = one_of(VehicleFigures, "where odometer scale and latency come from", nullable=True)
-    share_unknown = real("1", "share of moving time in use that the evidence cannot judge", min=0, max=1)
+    share_unknown = real("1", "share of moving time in use that could not be checked", min=0, max=1)
     odometer_contradicted = count("gaps between anchors that the odometer does not close (with a vehicle file)")
     t_start = instant("first epoch", nullable=True)
     t_end = instant("last epoch", nullable=True)
@@ -257,10 +265,10 @@ class Runs(dy.Schema):
     balises_on_path = count("virtual balises passed")
     balises_accepted = count("of these accepted")
     balises_rejected = count("of these rejected")
-    balises_missed = count("of these missed")
+    balises_missed = count("of these not found in their window")
     balises_not_available = count("of these without a position")
-    unsafe_accepted = count("VBs accepted although the evidence says that the position was wrong")
-    unproven_accepted = count("VBs accepted of which the evidence cannot say whether the position was right")
+    unsafe_accepted = count("VBs accepted despite a wrong position")
+    unproven_accepted = count("VBs accepted whose position could not be checked")
     location_error_mean_m = real("m", "mean location error of accepted VBs")
     location_error_p95_m = real("m", "95 % of |location error| of accepted VBs")
     location_error_max_m = real("m", "largest |location error| of accepted VBs")
@@ -270,8 +278,8 @@ class Runs(dy.Schema):
     hazards_shift = count("hazards VB_SHIFT")
     hazards_wrong_track = count("hazards VB_WRONG_TRACK")
     hazards_detected = count("hazards that a monitor detected")
-    hazards_within_budget = count("hazards negated within the budget")
-    missed_detections = count("hazards with a failure that no monitor found by t_failure + budget")
+    hazards_within_budget = count("hazards in use no longer than the time allowed")
+    missed_detections = count("hazards with a failure that no monitor found by t_failure + time allowed")
     time_to_detect_max_s = real("s", "largest T_D")
     time_since_failure_max_s = real("s", "largest T_dsf")
     hazardous_max_s = real("s", "longest hazardous time of a failure, whether it hit a VB or not")
@@ -303,8 +311,8 @@ class Runs(dy.Schema):
     ambiguous_stretches = count("stretches where a parallel path is as likely")
     notes = text("what reading and matching found out about the run", nullable=True)
     failures = count("faults with time judged wrong in use, whether they hit a VB or not")
-    failures_within_budget = count("of these within the budget of the configured level")
-    failures_beyond_budget = count("of these not within it; of the rest it cannot be said")
+    failures_within_budget = count("of these in time: within the allowed T_D of the configured level")
+    failures_beyond_budget = count("of these too late; of the rest it is unknown")
     failure_hazardous_s = reals("s", "hazardous time of each failure, in order of time", nullable=True)
     failure_hazardous_may_s = reals("s", "the same with the time that is unknown", nullable=True)
     service_levels = texts("service levels of the configuration, in order", nullable=True)
@@ -312,7 +320,9 @@ class Runs(dy.Schema):
     level_within = counts("failures within it, what is unknown included", nullable=True)
     level_exceeded = counts("failures beyond it, what is unknown left out", nullable=True)
     level_verdict = ones_of(
-        ThrVerdict, "kept, exceeded, no failure, or unknown where the evidence does not say", nullable=True
+        ThrVerdict,
+        "kept: in time; exceeded: too late; no failure; unknown where it could not be checked",
+        nullable=True,
     )
     held_s = real("s", "time that the epochs stand for, gaps apart", min=0)
     monitored_s = real("s", "of this with a verdict of the along-track bank", min=0)
@@ -321,6 +331,16 @@ class Runs(dy.Schema):
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
     accepted_judged = count("accepted VBs judged right or wrong")
+    undetected_median_m = real("m", "median over epochs in use of the larger of undetected ahead and behind", min=0)
+    undetected_p95_m = real("m", "95 % of them are below", min=0)
+    undetected_max_m = real("m", "the largest of them", min=0)
+    undetected_share_beyond = real("1", "share of epochs in use with one beyond the failure limit", min=0, max=1)
+    t_undetected_beyond = instant("first epoch in use with one beyond the failure limit", nullable=True)
+    undetected_beyond_path_m = real("m", "path position there")
+    physical_spacing_m = real("m", "shortest way from a physical balise at any time to one beyond the limit", min=0)
+    physical_spacing_s = real("s", "shortest time from such a balise to one beyond the limit", min=0)
+    physical_spacing_starts = count("such balises thought of; null where not computed", nullable=True)
+    physical_spacing_reached = count("of these those from which the run reaches the limit", nullable=True)
 
 
 TABLES: dict[str, type[dy.Schema]] = {

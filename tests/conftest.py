@@ -43,6 +43,7 @@ _SLOW = (
     "lds/test_outages.py",
     "matching/test_calibration.py",
     "matching/test_found_route.py",
+    "plausibility",
     "monitors/test_pseudorange.py",
     "replay/test_channels.py",
     "replay/test_evidence.py",

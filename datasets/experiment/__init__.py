@@ -1,25 +1,28 @@
-"""Published experiments at their own size, and what was added to them; `balise experiment NAME --out DIR`."""
+"""Published experiments at their own size, and what was added to them; `balise experiment NAME --out DIR`.
+
+Their names cost nothing; what an experiment needs is loaded when it is called.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-from datasets.experiment.bank import write_bank
-from datasets.experiment.catalogue import write_catalogue
-from datasets.experiment.diagnostics import write_experiment
-from datasets.experiment.false_alarms import write_thresholds
-from datasets.experiment.findings import write_findings
-from datasets.experiment.ranges import write_ranges
-from datasets.experiment.rare_tables import write_rare
-from schemas.config import Configuration
+if TYPE_CHECKING:
+    from schemas.config import Configuration
 
 
-class Experiment(Protocol):
+@dataclass(frozen=True)
+class Experiment:
     """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 
     `config` is the bank to judge, for `rare`, `bank` and `catalogue`; the published experiments refuse one.
     """
+
+    module: str
+    function: str
 
     def __call__(
         self,
@@ -28,15 +31,18 @@ class Experiment(Protocol):
         seed: int = 1,
         jobs: int = 1,
         config: Configuration | None = None,
-    ) -> list[Path]: ...
+    ) -> list[Path]:
+        write = getattr(import_module(f"datasets.experiment.{self.module}"), self.function)
+        written: list[Path] = write(out, repetitions, seed, jobs, config)
+        return written
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "diagnostics": write_experiment,
-    "findings": write_findings,
-    "pseudorange": write_ranges,
-    "thresholds": write_thresholds,
-    "rare": write_rare,
-    "bank": write_bank,
-    "catalogue": write_catalogue,
+    "diagnostics": Experiment("diagnostics", "write_experiment"),
+    "findings": Experiment("findings", "write_findings"),
+    "pseudorange": Experiment("ranges", "write_ranges"),
+    "thresholds": Experiment("false_alarms", "write_thresholds"),
+    "rare": Experiment("rare_tables", "write_rare"),
+    "bank": Experiment("bank", "write_bank"),
+    "catalogue": Experiment("catalogue", "write_catalogue"),
 }

@@ -15,6 +15,7 @@ from pipeline.ingest.clean import clean
 from pipeline.matching import match
 from pipeline.monitors.axis import error_model
 from pipeline.odometry import odometry_of
+from pipeline.plausibility.fit import fit_run, refuse_impossible
 from pipeline.stages import replay
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
@@ -64,6 +65,8 @@ def calibrate(
     """
     config, base = _uncalibrated(config or Configuration()), vehicle or Vehicle()
     _check_solution(logs, solution)
+    for log in logs:
+        _refuse_what_does_not_fit(log, site, base, config, solution)
     estimates = [(log.run_id, _estimate(log, site, base, config, solution)) for log in logs]
     found = [estimate for _, estimate in estimates if estimate is not None]
     if not found:
@@ -74,6 +77,7 @@ def calibrate(
             remedy="Calibrate on longer runs that stop and start.",
         )
     fitted = _vehicle(base, found, config.align.latency_prior_sigma_s)
+    _refuse_figures_of_no_train(fitted, logs, config)
     epochs = [replay(log, site, fitted, config).epochs.filter(pl.col("solution") == solution) for log in logs]
     factor = config.monitors.threshold_factor
     fits = regress_sigmas(epochs, factor)
@@ -106,7 +110,7 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
 
 
 def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> RunEstimate | None:
-    run, _ = clean(log)
+    run, _ = clean(log, config.ingest)
     fixes = run.gnss.filter(pl.col("solution") == solution)
     odometry = odometry_of(run.odometer, vehicle, config)
     if odometry is None or fixes.is_empty():
@@ -130,6 +134,29 @@ def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: flo
     if latency.sigma <= 0.5 * latency_unknown_s:
         measured |= {"gnss_latency_s": latency.value, "gnss_latency_sigma_s": latency.sigma}
     return base.model_copy(update=measured)
+
+
+def _refuse_what_does_not_fit(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> None:
+    """A run with a wrong unit or clock would teach its error to every other run."""
+    run, _ = clean(log, config.ingest)
+    if solution in run.solutions():
+        fit = fit_run(run, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m), config.ingest, site)
+        refuse_impossible(fit, log.run_id, config.ingest)
+
+
+def _refuse_figures_of_no_train(vehicle: Vehicle, logs: Sequence[RunLog], config: Configuration) -> None:
+    """Figures beyond what wheels and receivers can be off are another error, and a vehicle file would hide it."""
+    scale, latency_s = vehicle.odometer_scale or 1.0, vehicle.gnss_latency_s or 0.0
+    most, most_s = config.ingest.fit_scale_limit, config.ingest.fit_lag_limit_s
+    if abs(scale - 1.0) <= most and abs(latency_s) <= most_s:
+        return
+    raise InputError(
+        "give figures that no train can have",
+        place=", ".join(log.run_id for log in logs),
+        found=f"odometer_scale {scale:.4g}, gnss_latency_s {latency_s:.3g}",
+        expected=f"a scale within {most:g} of 1, and a latency within {most_s:g} s",
+        remedy="`balise inspect RUN --site SITE` says what does not fit; calibrate on fault-free runs.",
+    )
 
 
 def _run_table(estimates: Sequence[tuple[str, RunEstimate | None]]) -> pl.DataFrame:

@@ -16,7 +16,7 @@ _FIRST = "primary"
 
 def found_route_of(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> pl.DataFrame:
     """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
-    cleaned, _ = clean(run)
+    cleaned, _ = clean(run, config.ingest)
     solutions = cleaned.solutions()
     chosen = _FIRST if _FIRST in solutions else solutions[0]
     fixes = cleaned.gnss.filter(pl.col("solution") == chosen)

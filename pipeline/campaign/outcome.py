@@ -5,13 +5,14 @@ from __future__ import annotations
 import resource
 import traceback
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import polars as pl
 
 from pipeline.campaign.plan import RunJob
+from pipeline.figures.hazard_words import hazard_words
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.verdict import worst_verdict
+from pipeline.figures.verdict import verdict_reasons, worst_verdict
 from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -26,8 +27,8 @@ class RunOutcome:
     """What became of one run. `defect` is ours, with its `trace`; everything else is the input's.
 
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
-    over it; `hazards` and `missed_detections` are None where nothing could be judged. `redo`: the next call tries it
-    again; `proof`: that of `resume`.
+    over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
+    `faults`: each in words, the worst first. `redo`: the next call tries it again; `proof`: that of `resume`.
     """
 
     run_id: str
@@ -43,6 +44,8 @@ class RunOutcome:
     missed_detections: int | None = None
     peak_memory_bytes: int = 0
     attempts: int = 1
+    why: str = ""
+    faults: tuple[str, ...] = ()
     redo: bool = False
     proof: str = ""
 
@@ -105,20 +108,39 @@ def worst(runs: pl.DataFrame) -> RunStatus:
 
 
 def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) -> RunOutcome:
-    """The outcome that the rows of a run's `runs` table tell."""
+    """The outcome that the rows of a run's `runs` table tell; its faults are in another table (`with_faults`)."""
     errors = runs["error"].drop_nulls().to_list()
     judged = known_counts(runs).drop_nulls("missed_detections")
     *hazards, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
+    verdict = worst_verdict(runs["verdict"].to_list())
     return RunOutcome(
         run_id=job.run_id,
         status=worst(runs),
         error=errors[0] if errors else None,
-        verdict=worst_verdict(runs["verdict"].to_list()),
+        verdict=verdict,
         seconds=seconds,
         log_bytes=log_bytes,
         hazards=sum(hazards) if judged.height else None,
         missed_detections=missed if judged.height else None,
         peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        why=_why(runs, verdict, job.config.hazards.unknown_share_limit),
+    )
+
+
+def with_faults(outcome: RunOutcome, hazards: pl.DataFrame) -> RunOutcome:
+    """The outcome with its hazards in words, from the run's own table."""
+    return replace(outcome, faults=tuple(hazard_words(hazards)))
+
+
+def _why(runs: pl.DataFrame, verdict: RunVerdict | None, unknown_share_limit: float) -> str:
+    """What decides the verdict, of each solution that has it."""
+    if verdict is None:
+        return ""
+    rows = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value)
+    several = runs.height > 1
+    return "; ".join(
+        (f"{row['solution']}: " if several else "") + verdict_reasons(row, unknown_share_limit)
+        for row in rows.iter_rows(named=True)
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pipeline import storage
 from pipeline.results import store
+from pipeline.results.manifest import NO_FILES, SettingsFiles, listing
 from pipeline.site.read import read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
@@ -30,7 +31,8 @@ class RunJob:
 
     `previous` is the metadata of the complete run that an earlier campaign left, if any; `campaign` the name
     under which its campaign holds the output (`lock.check_held`). `route`: the file with this run's own route, and its
-    digest; `write_route`: the file to write the route that was found to. Empty where there is none.
+    digest; `write_route`: the file to write the route that was found to; `site_files`: the site's files as the manifest
+    lists them. Empty where there is none.
     """
 
     run_id: str
@@ -47,16 +49,18 @@ class RunJob:
     route: str = ""
     route_digest: str = ""
     write_route: str = ""
+    site_files: str = ""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All runs of one call, and where their results go."""
+    """All runs of one call, and where their results go; `given`: the settings files of the call."""
 
     jobs: tuple[RunJob, ...]
     out: str
     config: Configuration
     vehicle: Vehicle
+    given: SettingsFiles = NO_FILES
 
 
 def make_plan(
@@ -67,6 +71,7 @@ def make_plan(
     vehicle: Vehicle | None = None,
     routes: Address | None = None,
     write_routes: Address | None = None,
+    given: SettingsFiles | None = None,
 ) -> Plan:
     """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done.
 
@@ -78,12 +83,13 @@ def make_plan(
     except InputError as error:
         # Nobody knows which runs there are: no run failed, the command cannot be met.
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
-    site_digest = read_site(site).digest
+    ground = read_site(site)
     base = RunJob(
         run_id="",
         address="",
         site=storage.absolute(site),
-        site_digest=site_digest,
+        site_digest=ground.digest,
+        site_files=listing(ground.files),
         config=config,
         vehicle=vehicle,
         out=storage.absolute(out),
@@ -95,7 +101,7 @@ def make_plan(
     if routes is not None and not any(job.route for job in jobs):
         expected = "a route file, or a folder with RUN.csv or RUN.parquet of these runs"
         raise UsageError("holds no route of any of the runs", place=redacted(str(routes)), expected=expected)
-    return Plan(tuple(jobs), base.out, config, vehicle)
+    return Plan(tuple(jobs), base.out, config, vehicle, given or NO_FILES)
 
 
 def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | None) -> RunJob:

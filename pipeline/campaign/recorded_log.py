@@ -13,6 +13,7 @@ from pipeline.campaign import known_logs
 from pipeline.campaign.outcome import changed
 from pipeline.campaign.plan import RunJob
 from pipeline.ingest import read_run
+from pipeline.results import manifest
 from pipeline.storage.address import is_url, redacted
 from schemas.errors import BaliseError, InputError
 from schemas.run import RunLog
@@ -21,11 +22,11 @@ from schemas.run import RunLog
 class RecordedLog:
     """`digest` is empty until somebody has read the content: until then no failure is the log's own.
 
-    `state` is that of its files before anybody read them.
+    `files` lists them as the manifest does; `state` is that of its files before anybody read them.
     """
 
     def __init__(self, job: RunJob) -> None:
-        self.digest = ""
+        self.digest = self.files = ""
         self._job = job
         self._version: str | None = None
         self.state: tuple[storage.FileState, ...] = ()
@@ -71,7 +72,8 @@ class RecordedLog:
         """What the log holds, kept for the next campaign; `known`: the SHA-256 of a log of one file that was read."""
         if not self.digest:
             with _as_input_error(path):
-                self.digest = storage.content_digest(path, known)
+                listed = storage.file_digests(path, known)
+            self.digest, self.files = storage.digest_of_files(listed), manifest.listing(listed)
             known_logs.remember(self._job, self._version, self.digest)
         return self.digest
 

@@ -69,6 +69,7 @@ def _kept(out: str) -> dict[str, RunOutcome]:
                 verdict=None if outcome.verdict is None else RunVerdict(outcome.verdict),
                 seconds=0.0,
                 log_bytes=0,
+                faults=tuple(outcome.faults),
             )
             for outcome in outcomes
         }

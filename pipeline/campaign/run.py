@@ -8,7 +8,6 @@ from pathlib import Path
 
 from pipeline.campaign.cluster import DaskEngine
 from pipeline.campaign.engines import Engine
-from pipeline.campaign.finish import write_campaign
 from pipeline.campaign.interruption import Interrupted, listening
 from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
@@ -18,7 +17,9 @@ from pipeline.campaign.resume import keep, unchanged
 from pipeline.campaign.serial import SerialEngine
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
+from pipeline.results.manifest import note_settings
 from pipeline.storage.address import is_url
+from schemas.config import digest_of
 from schemas.errors import UsageError
 
 TIME_LIMIT_S = 3600.0
@@ -45,6 +46,7 @@ def run_campaign(
         known = [] if force else unchanged(plan)
         left = with_previous(plan, {outcome.run_id for outcome in known}) if not force else plan
         store.write_config(plan.out, plan.config)
+        note_settings(plan.out, digest_of(plan.config, plan.vehicle), plan.given)
         engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
         loop = CampaignLoop(held_by(left, campaign).jobs, engine, time_limit_s, watches, known)
         try:
@@ -102,6 +104,8 @@ def _tidy(plan: Plan, loop: CampaignLoop) -> None:
 
 def _finish(plan: Plan, loop: CampaignLoop, summary: Summary) -> None:
     """The tables over all runs; they too are given up when somebody asks to stop."""
+    from pipeline.campaign.finish import write_campaign  # statistics, which take long to load
+
     with listening(loop.stop, at_once=True):
         try:
             write_campaign(plan.out, plan.config)

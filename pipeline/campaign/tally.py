@@ -11,10 +11,12 @@ from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.watch import Summary
 from pipeline.figures.verdict import word_of
 from pipeline.results.terminal import duration_text
-from schemas.enums import RunStatus
+from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
 
 _SLOW_SHOWN = 2
+_FAULTS_SHOWN = 2
+_WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
 
 
 class Tally:
@@ -99,9 +101,31 @@ def summary_line(summary: Summary) -> str:
     return f"{text}; {duration_text(summary.seconds)}"
 
 
+def ending_rows(summary: Summary) -> pl.DataFrame:
+    """What a person reads when a campaign has ended: `verdict, run_id, why, faults`, the worst run first."""
+    ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
+    rows = [(word_of(outcome.verdict), outcome.run_id, _reason(outcome), _few(outcome.faults)) for outcome in ranked]
+    return pl.DataFrame(rows, schema=dict.fromkeys(("verdict", "run_id", "why", "faults"), pl.String), orient="row")
+
+
+def _reason(outcome: RunOutcome) -> str:
+    """What is wrong with the run: why its verdict is no better, and what kept it from being read whole."""
+    why = "" if outcome.verdict is RunVerdict.SAFE else outcome.why
+    cut = "" if outcome.status is RunStatus.OK else outcome.error or outcome.status.value
+    status = f"partial: {cut}" if cut and outcome.status is RunStatus.PARTIAL else cut
+    return "; ".join(text for text in (why, status) if text)
+
+
+def _few(faults: Sequence[str]) -> str:
+    if not faults:
+        return "none"
+    more = len(faults) - _FAULTS_SHOWN
+    return "; ".join(faults[:_FAULTS_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
 def outcome_rows(summary: Summary) -> pl.DataFrame:
     """A campaign as a table: one row per run that was reached, its verdict first."""
-    kinds = {
+    kinds: dict[str, type[pl.DataType] | pl.DataType] = {
         "verdict": pl.String,
         "run_id": pl.String,
         "status": pl.String,
@@ -111,9 +135,11 @@ def outcome_rows(summary: Summary) -> pl.DataFrame:
         "skipped": pl.Boolean,
         "attempts": pl.Int64,
         "error": pl.String,
+        "why": pl.String,
+        "faults": pl.List(pl.String),
     }
     rows = [
-        (word_of(outcome.verdict), *(getattr(outcome, name) for name in list(kinds)[1:]))
+        (word_of(outcome.verdict), *(getattr(outcome, name) for name in list(kinds)[1:-1]), list(outcome.faults))
         for outcome in summary.outcomes
     ]
     return pl.DataFrame(rows, schema=kinds, orient="row")

@@ -10,7 +10,15 @@ from functools import lru_cache
 from pipeline import storage
 from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
-from pipeline.campaign.outcome import Failure, RunOutcome, failed_tables, failure_of, outcome_of, worst
+from pipeline.campaign.outcome import (
+    Failure,
+    RunOutcome,
+    failed_tables,
+    failure_of,
+    outcome_of,
+    with_faults,
+    worst,
+)
 from pipeline.campaign.plan import RunJob, digests, software_digest
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
@@ -55,18 +63,19 @@ def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
         raise
     except BaseException as error:
         failure = failure_of(error, lasting=bool(log.digest))
-        return fail_run(job, failure, log.digest, time.monotonic() - begun)
-    metadata = _metadata(job, log.digest, worst(tables.runs)) | {"log_digest": run.input_digest}
+        return fail_run(job, failure, log, time.monotonic() - begun)
+    metadata = _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest}
     _write(job, tables, metadata)
-    return outcome_of(job, tables.runs, log.size_bytes, time.monotonic() - begun)
+    outcome = outcome_of(job, tables.runs, log.size_bytes, time.monotonic() - begun)
+    return with_faults(outcome, tables.hazards)
 
 
-def fail_run(job: RunJob, failure: Failure, files_digest: str = "", seconds: float = 0.0) -> RunOutcome:
+def fail_run(job: RunJob, failure: Failure, log: RecordedLog | None = None, seconds: float = 0.0) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
     Unless the reason is lasting (a worker was lost, a run took too long) the next campaign tries the run again.
     """
-    metadata = _metadata(job, files_digest, RunStatus.FAILED) | ({} if failure.lasting else {"redo": "yes"})
+    metadata = _metadata(job, log, RunStatus.FAILED) | ({} if failure.lasting else {"redo": "yes"})
     _write(job, failed_tables(job, failure.error), metadata)
     defect = failure.trace is not None
     return RunOutcome(
@@ -127,7 +136,10 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 def _earlier(job: RunJob) -> RunOutcome:
     """The outcome of a run that is complete already."""
     runs = store.read_table(job.out, "runs", job.run_id).collect()
-    return replace(outcome_of(job, runs, 0, 0.0), skipped=True)
+    outcome = replace(outcome_of(job, runs, 0, 0.0), skipped=True)
+    if not outcome.hazards:
+        return outcome
+    return with_faults(outcome, store.read_table(job.out, "hazards", job.run_id).collect())
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
@@ -145,5 +157,6 @@ def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 
-def _metadata(job: RunJob, files_digest: str, status: RunStatus) -> dict[str, str]:
-    return {**digests(job, files_digest), "status": status.value}
+def _metadata(job: RunJob, log: RecordedLog | None, status: RunStatus) -> dict[str, str]:
+    digest, listed = ("", "") if log is None else (log.digest, log.files)
+    return {**digests(job, digest), "log_files": listed, "site_files": job.site_files, "status": status.value}

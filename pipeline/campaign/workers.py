@@ -6,12 +6,14 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from multiprocessing import get_context
 from typing import TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
 
+_PROGRESS: ContextVar[Callable[[int, int], None] | None] = ContextVar("progress", default=None)
 _THREADS = (
     "POLARS_MAX_THREADS",
     "RAYON_NUM_THREADS",
@@ -23,7 +25,23 @@ _THREADS = (
 
 def mapped(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
     """`function` of every task; `jobs` processes, or this one for a single job or task."""
-    return list(each(function, tasks, jobs))
+    progress = _PROGRESS.get()
+    results = []
+    for result in each(function, tasks, jobs):
+        results.append(result)
+        if progress is not None:
+            progress(len(results), len(tasks))
+    return results
+
+
+@contextmanager
+def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
+    """Tell how many of how many tasks of each `mapped` inside are done."""
+    before = _PROGRESS.set(progress)
+    try:
+        yield
+    finally:
+        _PROGRESS.reset(before)
 
 
 def each(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:

@@ -11,6 +11,11 @@ from pipeline.diff.tables import Difference, compare_tables
 from schemas.tables import Hazards
 
 HAZARD_WINDOW_S = 2.0
+# Columns of a hazard that say what it was, whether it was seen in time and what it hit.
+_DECIDING = {
+    *("failure_mode", "timing", "evidence", "caused_by", "monitor", "detected", "within_budget"),
+    *("balise_ids", "accepted_ids"),
+}
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,18 @@ class HazardChange:
     hazard: str
     t_hazard: str
     differences: tuple[Difference, ...] = ()
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is more than other figures of the same hazard."""
+        return self.change != "changed" or bool({item.column for item in self.differences} & _DECIDING)
+
+    @property
+    def short(self) -> str:
+        """The change in one line; of changed values the columns alone."""
+        columns = ", ".join(item.column for item in self.differences if item.column in _DECIDING)
+        head = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
+        return f"{head}: {columns}" if columns else head
 
     def __str__(self) -> str:
         text = f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"

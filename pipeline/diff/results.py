@@ -9,6 +9,7 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.diff.hazards import HAZARD_WINDOW_S, HazardChange, compare_hazards
+from pipeline.diff.leading import BALISE_COUNTS, balise_counts, passage_changes, verdict_changes
 from pipeline.diff.tables import Difference, compare_tables
 from pipeline.results import store
 from pipeline.storage.address import Address, redacted
@@ -24,13 +25,20 @@ _KEYS: dict[str, tuple[str, ...]] = {
 }
 # How a result was made is told, but it is no change of the result.
 _PROVENANCE = ("config_digest", "input_digest", "software", "contract")
+_LINES_SHOWN = 20
+_COLUMNS_SHOWN = 8
 
 
 @dataclass(frozen=True)
 class RunDiff:
-    """What changed in one run. `made_otherwise`: digests and versions that differ, which is no change."""
+    """What changed in one run. `made_otherwise`: digests and versions that differ, which is no change.
+
+    `verdicts` and `balises` say in words what matters most of `differences`.
+    """
 
     run_id: str
+    verdicts: tuple[str, ...] = ()
+    balises: tuple[str, ...] = ()
     hazards: tuple[HazardChange, ...] = ()
     differences: tuple[Difference, ...] = ()
     made_otherwise: tuple[str, ...] = ()
@@ -44,6 +52,12 @@ class RunDiff:
         """All that changed, the verdict first."""
         verdicts = [item for item in self.differences if item.column == "verdict"]
         return [*verdicts, *self.hazards, *(item for item in self.differences if item not in verdicts)]
+
+    @property
+    def other_columns(self) -> set[str]:
+        """Columns that changed beside verdicts, hazards and balises."""
+        told = {"runs.verdict", "passages.status", *(f"runs.{name}" for name in BALISE_COUNTS)}
+        return {item.place for item in self.differences} - told
 
 
 @dataclass(frozen=True)
@@ -60,16 +74,38 @@ class ResultDiff:
     def same(self) -> bool:
         return not (self.only_in_a or self.only_in_b or self.runs)
 
-    def text(self) -> str:
-        """For people: one line per finding, the verdict last."""
-        lines = [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
+    def text(self, detail: bool = False) -> str:
+        """For people: how much changed, then verdicts, hazards and balises; in `detail` also every other value."""
+        lines = [self._sentence(), *(f"note: {note}" for note in self.notes)]
+        lines += [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
+        lines += _section("Verdicts", [(run.run_id, text) for run in self.runs for text in run.verdicts], detail)
+        lines += _section("Hazards", self._hazards(), detail)
+        lines += _section("Balises", [(run.run_id, text) for run in self.runs for text in run.balises], detail)
+        if not detail:
+            return "\n".join([*lines, *self._others()])
         for run in self.runs:
-            lines += [f"{run.run_id}:", *(f"  {finding}" for finding in run.findings)]
-        lines += [f"note: {note}" for note in self.notes]
+            lines += ["", f"{run.run_id}:", *(f"  {finding}" for finding in run.findings)]
+        return "\n".join(lines)
+
+    def _sentence(self) -> str:
         verdict = "all the same" if not self.runs else f"{len(self.runs)} changed"
         alone = [f"{len(runs)} only in {name}" for runs, name in ((self.only_in_a, "A"), (self.only_in_b, "B")) if runs]
-        lines.append(", ".join([f"{self.compared} runs in both: {verdict}", *alone]))
-        return "\n".join(lines)
+        return ", ".join([f"{self.compared} runs in both: {verdict}", *alone])
+
+    def _hazards(self) -> list[tuple[str, str]]:
+        """Those that came, went or were judged otherwise, and how many have other figures only."""
+        rows = [(run.run_id, item.short) for run in self.runs for item in run.hazards if item.matters]
+        figures = Counter(run.run_id for run in self.runs for item in run.hazards if not item.matters)
+        return rows + [(run_id, f"{count} with other figures only") for run_id, count in figures.items()]
+
+    def _others(self) -> list[str]:
+        """What else changed, by column; the values are in the detail."""
+        counts = Counter(column for run in self.runs for column in sorted(run.other_columns))
+        if not counts:
+            return []
+        listed = ", ".join(column for column, _ in counts.most_common(_COLUMNS_SHOWN))
+        more = f" and {len(counts) - _COLUMNS_SHOWN} more" if len(counts) > _COLUMNS_SHOWN else ""
+        return ["", f"Other columns that changed: {listed}{more}. --detail shows the values."]
 
     def as_dict(self) -> dict[str, object]:
         """For programs: plain values, as JSON holds them."""
@@ -93,6 +129,16 @@ def diff_results(out_a: Address, out_b: Address, hazard_window_s: float = HAZARD
     )
 
 
+def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]:
+    """A heading and one line per change, the run in front; not more than a screen without `detail`."""
+    if not rows:
+        return []
+    shown = rows if detail else rows[:_LINES_SHOWN]
+    width = max(len(run_id) for run_id, _ in shown)
+    more = [f"  and {len(rows) - len(shown)} more"] if len(rows) > len(shown) else []
+    return ["", title, *(f"  {run_id:<{width}}  {text}" for run_id, text in shown), *more]
+
+
 def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
     counts = Counter(column for run in runs for column in run.made_otherwise)
     return tuple(f"{column} differs in {counts[column]} runs" for column in _PROVENANCE if counts[column])
@@ -101,6 +147,8 @@ def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
 def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> RunDiff:
     hazards: list[HazardChange] = []
     differences: list[Difference] = []
+    verdicts: tuple[str, ...] = ()
+    balises: tuple[str, ...] = ()
     for table, contract in TABLES.items():
         a, b = (_content(out, table, run_id) for out in (out_a, out_b))
         if a == b:
@@ -110,10 +158,14 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> R
             found, hazards = compare_hazards(frame_a, frame_b, window_s)
         else:
             found = compare_tables(frame_a, frame_b, contract, _KEYS[table])
+        if table == "runs":
+            verdicts, balises = verdict_changes(frame_a, frame_b), balise_counts(frame_a, frame_b) + balises
+        elif table == "passages":
+            balises = passage_changes(frame_a, frame_b)
         differences += found
     made = [item for item in differences if item.kind == "values" and item.column in _PROVENANCE]
     changed = [item for item in differences if item not in made]
-    return RunDiff(run_id, tuple(hazards), tuple(changed), tuple(item.column for item in made))
+    return RunDiff(run_id, verdicts, balises, tuple(hazards), tuple(changed), tuple(item.column for item in made))
 
 
 def _frame(out: Address, table: str, run_id: str, content: bytes) -> pl.DataFrame:

@@ -25,9 +25,13 @@ class Difference:
     message: str
     rows: int = 0
 
+    @property
+    def place(self) -> str:
+        """Table and column."""
+        return f"{self.table}.{self.column}" if self.column else self.table
+
     def __str__(self) -> str:
-        place = f"{self.table}.{self.column}" if self.column else self.table
-        return f"{place}: {self.message}"
+        return f"{self.place}: {self.message}"
 
 
 def compare_tables(

@@ -67,6 +67,8 @@ def _stamps(counts: StreamCounts) -> Iterator[str]:
     """Positions that were left out for their time."""
     if counts.far_off:
         yield f"positions more than a day from the others, left out: {counts.far_off}"
+    if counts.placeholders:
+        yield f"placeholders (0/0, a default place, before the first fix), taken as no position: {counts.placeholders}"
     if counts.contradicting:
         yield (
             f"positions of a time that another position has, elsewhere: {counts.contradicting}; the first recorded one "

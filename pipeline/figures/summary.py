@@ -10,13 +10,15 @@ import polars as pl
 
 from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
+from pipeline.figures.availability_notes import availability_notes
 from pipeline.figures.evidence_notes import evidence_notes, motion_notes, undiagnosed_notes
+from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Evidence, RunStatus, VehicleFigures
+from schemas.enums import Evidence, RunStatus, RunVerdict, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 
@@ -29,6 +31,8 @@ class SolutionResults:
 
     `distance_m`: way driven, None where nobody knows; `odometer_contradicted`: gaps between anchors that the odometer
     does not close (DOMAIN section 5.1). `alignment`: latency and odometer scale at the end of the run.
+    `impossible`: misfits that no train can have, which were let pass. `spacing`: of physical balises, None where not
+    computed.
     """
 
     solution: str
@@ -46,6 +50,8 @@ class SolutionResults:
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
     notes: tuple[str, ...] = ()
+    spacing: Spacing | None = None
+    impossible: int = 0
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
@@ -67,9 +73,13 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | figures.state_shares(epochs, clock)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
+        | undetected_figures(epochs, results.spacing, config.hazards.failure_limit_m)
         | _provenance(provenance)
     )
-    return _frame(row | {"verdict": verdict_of(row, config.hazards.unknown_share_limit)})
+    verdict = verdict_of(row, config.hazards.unknown_share_limit)
+    if results.impossible and verdict is RunVerdict.SAFE:
+        verdict = RunVerdict.UNPROVEN
+    return _frame(row | {"verdict": verdict})
 
 
 def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.DataFrame:
@@ -117,12 +127,13 @@ def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config
         *evidence_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
         *undiagnosed_notes(results.epochs, results.passages),
         *motion_notes(results.epochs, clock),
+        *availability_notes(results.epochs, clock, config),
     )
     return "; ".join(found) or None
 
 
 def _ingest_remarks(ingest: IngestNotes) -> list[str]:
-    remarks = []
+    remarks = list(ingest.corrections)
     if ingest.chunks_without_crc:
         remarks.append(f"{ingest.chunks_without_crc} chunks without a checksum")
     if ingest.files_without_crc:

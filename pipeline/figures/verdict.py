@@ -22,6 +22,8 @@ def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
 def verdict_reasons(run: Row, unknown_share_limit: float) -> str:
     """Why the verdict is what it is."""
     unsafe, unproven = _reasons(run, unknown_share_limit)
+    if not unsafe + unproven and run["verdict"] == RunVerdict.UNPROVEN:
+        return "its streams do not fit each other, as the notes say"
     return "; ".join(unsafe + unproven) or "every acceptance right, every position failure within the time allowed"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from schemas.errors import InputError
+from schemas.errors import InputError, listed
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,8 @@ def refuse(breaches: Sequence[Breach]) -> None:
     if len(breaches) == 1:
         raise _as_error(breaches[0])
     remedies = list(dict.fromkeys(breach.remedy for breach in breaches if breach.remedy))
-    listed = "\n  ".join(line_of(breach) for breach in breaches)
     raise InputError(
-        f"{len(breaches)} breaches of the input contract\n  {listed}\n",
+        listed([line_of(breach) for breach in breaches]),
         place=_common_place(breaches),
         remedy=" ".join(remedies) or None,
     )

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.ingest.placeholders import without_placeholders
 from schemas.arrays import Bools
-from schemas.config import IngestConfig
+from schemas.config import IngestConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
@@ -28,13 +29,15 @@ class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
     `far_off`: dropped for a time of another day. Of GNSS also `contradicting`, how many of the doubles are of another
-    place than the one that stays.
+    place than the one that stays, and
+    `placeholders`, how many positions are none.
     """
 
     duplicates: int = 0
     out_of_order: int = 0
     contradicting: int = 0
     far_off: int = 0
+    placeholders: int = 0
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,8 @@ def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, C
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
     A few rows more than a day from the others (a receiver that did not know the date yet), and all before 1970, are
-    left out. Raises `InputError` where no solution or not the odometer has two different times, or both have no time
-    in common: nothing can be replayed.
+    left out; placeholders stay as epochs without a fix. Raises `InputError` where no solution or not the odometer has
+    two different times, or both have no time in common: nothing can be replayed.
     """
     streams: dict[str, pl.DataFrame] = {}
     counts: dict[str, StreamCounts] = {}
@@ -66,13 +69,34 @@ def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, C
         streams[name], counts[name] = kept, replace(found, far_off=int(stray.sum()))
     parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
     solutions = {part["solution"][0]: _of_solution(part, far) for part in parts}
+    streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
+    solutions = {name: replace(one, placeholders=placeholders.get(name, 0)) for name, one in solutions.items()}
     gnss, odometer = streams["gnss"], streams.get("odometer")
     _require_two_positions(run.run_id, gnss)
     if odometer is not None:
         require_two_times(odometer, f"{run.run_id}: odometer")
-        _require_common_time(run.run_id, gnss, odometer)
+        _require_common_time(run.with_streams(**streams))
     cleaned = replace(run, notes=_noted(run.notes, counts))
     return cleaned.with_streams(**streams), CleanCounts(solutions, counts)
+
+
+def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Positions without placeholders, and how many these were, by solution."""
+    if not {"fix", *_PLACE} <= set(gnss.columns):
+        return gnss, {}
+    names = gnss["solution"].unique().to_list()
+    counts: dict[str, int] = {}
+    for name in names:
+        part = gnss if len(names) == 1 else gnss.filter(pl.col("solution") == name)
+        marked, counts[name] = without_placeholders(part, config)
+        if counts[name]:
+            row = pl.int_range(pl.len()).over("solution")
+            kinds = marked.select("solution", row.alias("_row"), pl.col("fix").alias("_fix"))
+            joined = gnss.with_columns(row.alias("_row")).join(
+                kinds, on=["solution", "_row"], how="left", maintain_order="left"
+            )
+            gnss = joined.with_columns(pl.coalesce("_fix", "fix").alias("fix")).drop("_row", "_fix")
+    return gnss, counts
 
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
@@ -174,14 +198,29 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
         )
 
 
-def _require_common_time(run_id: str, gnss: pl.DataFrame, odometer: pl.DataFrame) -> None:
+def _require_common_time(run: RunLog) -> None:
     """Refuse an odometer of another time than the GNSS: not one position could be held against it."""
+    gnss, odometer = run.gnss, run.odometer
+    if gnss.is_empty() or odometer is None:
+        return
     (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
     if odometer_begin > end or odometer_end < begin:
         raise InputError(
             "has no time in common with the GNSS",
-            place=f"{run_id}: odometer, column t",
+            place=f"{run.run_id}: odometer, column t",
             found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
             expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
-            remedy="Check date and time scale of the two recorders; leave the odometer out to replay without it.",
+            remedy=_clock_remedy(run),
         )
+
+
+def _clock_remedy(run: RunLog) -> str:
+    """What makes both records one journey, if anything does."""
+    # Imported here because only such a run needs it.
+    from pipeline.plausibility.fit import fit_run, remedy_of
+
+    known = "Check date and time scale of the two recorders; leave the odometer out to replay without it."
+    if not {"fix", *_PLACE} <= set(run.gnss.columns):
+        return known
+    found = fit_run(run, run.solutions()[0], Vehicle(), IngestConfig()).impossible
+    return " ".join([known, *(f"{check.sentence}." for check in found), remedy_of(found)]).rstrip(" ")

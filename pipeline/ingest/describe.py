@@ -73,6 +73,7 @@ class LogDescription:
     notes: IngestNotes
     problems: tuple[str, ...]
     starting_config: str
+    run: RunLog | None = None
 
 
 def describe_log(path: Address, config: IngestConfig) -> LogDescription:
@@ -98,6 +99,7 @@ def describe_log(path: Address, config: IngestConfig) -> LogDescription:
         notes=notes,
         problems=problems,
         starting_config=starting_config(topics),
+        run=run,
     )
 
 

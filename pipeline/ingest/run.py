@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.ingest.correct import corrected
 from pipeline.ingest.mcap_run import read_mcap
 from pipeline.ingest.parquet import read_folder
 from pipeline.storage import files
@@ -18,8 +19,12 @@ def read_run(path: Address, config: IngestConfig, with_digest: bool = True) -> R
 
     Every stream has exactly the contract's columns and types; rows stay in recorded order, duplicates
     included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
-    damage and says so in `notes`.
+    damage and says so in `notes`. What the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
     """
+    return corrected(_recorded(path, config, with_digest), config.correct)
+
+
+def _recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:
     if name_of(path).endswith(".mcap"):
         return read_mcap(path, config, with_digest)
     if files.is_dir(path):

@@ -99,6 +99,12 @@ def _times(recorded: pl.Series, mapping: StreamMapping, path: Path) -> pl.Series
     return stamps.cast(pl.Datetime("ns", "UTC"))
 
 
+def _looks_like(count: int) -> str:
+    """The unit in which a time since 1970 lies between 1985 and 2065."""
+    near = [unit for unit, unit_s in (("milliseconds", 1e-3), ("microseconds", 1e-6)) if 5e8 < count * unit_s < 3e9]
+    return f"; looks like {near[0]}" if near else ""
+
+
 def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
     """Numbers: seconds, whole ones of 18 digits nanoseconds, and of another unit as `factors.t` says."""
     source = time_source((recorded.name,), {recorded.name: _kind(recorded.dtype)}, mapping)
@@ -106,7 +112,7 @@ def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Seri
         largest = int(np.abs(recorded.drop_nulls().to_numpy().astype(np.float64)).max(initial=0))
         if _MOST_SECONDS < largest < _LEAST_NANOSECONDS:
             raise InputError(
-                "holds times of a unit that nobody said",
+                f"time unit unknown{_looks_like(largest)}",
                 place=place,
                 found=str(largest),
                 expected="seconds or nanoseconds",

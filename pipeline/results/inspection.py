@@ -12,16 +12,13 @@ from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.results import store
-from pipeline.site.describe import describe_site
-from pipeline.site.parallels import parallel_findings
+from pipeline.results.fit_report import FitReport, fit_report
 from pipeline.site.read import is_geojson, read_site
-from pipeline.site.survey_findings import survey_findings
-from pipeline.site.windows import window_findings
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
-from schemas.config import IngestConfig, MatchingConfig
+from schemas.config import IngestConfig, MatchingConfig, Vehicle
 from schemas.errors import UsageError
-from schemas.run import STREAMS, Finding
+from schemas.run import STREAMS, Finding, Site
 
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
@@ -37,8 +34,13 @@ def inspect_path(
     config: IngestConfig | None = None,
     result: Address | None = None,
     matching: MatchingConfig | None = None,
+    site: Address | None = None,
+    vehicle: Vehicle | None = None,
 ) -> dict[str, pl.DataFrame]:
-    """Tables by title, for whatever stands at the path; `result`: runs over a site, for what they say of its survey."""
+    """Tables by title, for whatever stands at the path.
+
+    `result`: runs over a site, for what they say of its survey. `site`, `vehicle`: what a log is held against.
+    """
     if not files.exists(path):
         raise UsageError("does not exist", place=redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()
@@ -49,7 +51,7 @@ def inspect_path(
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
-        return inspect_log(path, config or IngestConfig())
+        return inspect_log(path, config or IngestConfig(), None if site is None else read_site(site), vehicle)
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
@@ -58,8 +60,10 @@ def inspect_path(
     )
 
 
-def inspect_log(path: Address, config: IngestConfig) -> dict[str, pl.DataFrame]:
-    """Streams, topics, what is mapped to what, and what keeps the log from being replayed."""
+def inspect_log(
+    path: Address, config: IngestConfig, site: Site | None = None, vehicle: Vehicle | None = None
+) -> dict[str, pl.DataFrame]:
+    """Streams, topics, what is mapped to what, what does not fit, and what keeps the log from being replayed."""
     found = describe_log(path, config)
     figures = {
         "kind": found.kind,
@@ -73,8 +77,10 @@ def inspect_log(path: Address, config: IngestConfig) -> dict[str, pl.DataFrame]:
     tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in found.streams])
     if found.topics:
         tables["Topics"] = pl.DataFrame([_topic_row(topic) for topic in found.topics])
-    if found.problems:
-        tables["Problems"] = pl.DataFrame({"problem": found.problems})
+    fitted = fit_report(found.run, config, site, vehicle) if found.run else FitReport({}, ())
+    tables |= fitted.tables
+    if problems := (*found.problems, *fitted.problems):
+        tables["Problems"] = pl.DataFrame({"problem": problems})
     if found.starting_config:
         tables["Configuration to begin with"] = pl.DataFrame({"toml": found.starting_config.splitlines()})
     return tables
@@ -105,6 +111,12 @@ def inspect_site(
 
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
+    # What they need takes long to load, and a log needs none of it.
+    from pipeline.site.describe import describe_site
+    from pipeline.site.parallels import parallel_findings
+    from pipeline.site.survey_findings import survey_findings
+    from pipeline.site.windows import window_findings
+
     site = read_site(path)
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}

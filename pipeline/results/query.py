@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import dataframely as dy
 import polars as pl
 
 from pipeline import storage
@@ -19,7 +20,9 @@ from pipeline.results.source import source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join
 from schemas.campaign import CAMPAIGN_TABLES
+from schemas.dictionary import dictionary_frame
 from schemas.errors import UsageError
+from schemas.near import did_you_mean
 from schemas.tables import TABLES
 
 # What may stand before the words that a query begins with, one piece at a time: in one expression it takes for ever.
@@ -28,24 +31,40 @@ _QUERY = re.compile(r"(select|with|explain|from|values)\b", re.IGNORECASE)
 # Functions of polars' SQL that open files; looked for in texts and comments, too, so that no quoting hides them.
 _FILES = re.compile(r"\bread_(csv|parquet|ipc|json|ndjson)\b", re.IGNORECASE)
 
+_SHOW = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
+_DESCRIBE = re.compile(r"\s*(?:describe|desc)\s+(?:table\s+)?[\"`]?(\w+)[\"`]?\s*;?\s*", re.IGNORECASE)
+# What polars says of a name that it does not know.
+_NO_COLUMN = re.compile(r"(?:unable to find column|no column named) [\"'](\w+)[\"']")
+_NO_TABLE = re.compile(r"relation '(\w+)' was not found")
+_NO_VALUE = re.compile(r"to `enum` failed for value \"([^\"]*)\"")
+
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
-_REMEDY = "`balise dictionary` lists the columns of each table."
+_REMEDY = "SHOW TABLES and DESCRIBE table list what there is."
 
 
-def run_sql(out: Address, sql: str, allow_files: bool = False) -> pl.DataFrame:
-    """The answer to one SELECT over the complete runs of a result.
+def run_sql(
+    out: Address, sql: str, allow_files: bool = False, others: Mapping[str, Address] | None = None
+) -> pl.DataFrame:
+    """The answer to one SELECT, SHOW TABLES or DESCRIBE over the complete runs of a result.
 
     Tables: `hazards`, `passages`, `alarms`, `epochs`, `runs`, each with `run_id`, and those of the
     campaign where they are written. A condition on `run_id` reads the files of these runs only.
+    `others`: more results by name; `{"old": OUT}` adds the tables `old_runs`, `old_hazards` and so on.
     `allow_files`: the query may also read other files of this machine (`read_csv` and its like).
     """
+    if _SHOW.fullmatch(sql):
+        return _tables_there_are(others or {})
+    if described := _DESCRIBE.fullmatch(sql):
+        return _columns_of(described[1], others or {})
     _check_query(sql, allow_files)
     tables = _tables(out, sql)
+    for name, address in (others or {}).items():
+        tables |= _tables(address, sql, f"{name}_")
     try:
         return pl.SQLContext(tables).execute(sql).collect()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
         raise UsageError(
-            f"cannot be answered: {_first_line(error)}",
+            f"cannot be answered: {_told(_first_line(error), tables, others or {})}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
@@ -74,14 +93,61 @@ def _check_query(sql: str, allow_files: bool) -> None:
         )
 
 
-def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
+def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]:
     """What the query may name: ten thousand addresses take their time, remote tables their transfer."""
     runs = store.complete_runs(out)
 
     def named(names: Iterable[str]) -> list[str]:
-        return [name for name in names if re.search(rf"\b{name}\b", sql, re.IGNORECASE)]
+        return [name for name in names if re.search(rf"\b{prefix}{name}\b", sql, re.IGNORECASE)]
 
-    return {name: _scan(out, name, runs) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    found = {name: _scan(out, name, runs) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    return {f"{prefix}{name}": frame for name, frame in found.items()}
+
+
+def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
+    """Every table that a query may name: the name in the dictionary, and its contract."""
+    tables = {**TABLES, **CAMPAIGN_TABLES}
+    return {
+        f"{prefix}{name}": (name, kind) for prefix in ("", *(f"{o}_" for o in others)) for name, kind in tables.items()
+    }
+
+
+def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
+    rows = [
+        (name, len(kind.columns()), " ".join((kind.__doc__ or "").split()))
+        for name, (_, kind) in _contracts(others).items()
+    ]
+    return pl.DataFrame(rows, schema={"table": pl.String, "columns": pl.Int64, "meaning": pl.String}, orient="row")
+
+
+def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
+    known = _contracts(others)
+    found = known.get(table.lower())
+    if found is None:
+        raise UsageError(
+            f"is no table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
+        )
+    columns = dictionary_frame(found[0]).drop("group", "table")
+    if found[0] not in TABLES:
+        return columns
+    own = {"column": "run_id", "dtype": "String", "unit": "", "nullable": False, "meaning": "id of the run"}
+    return pl.concat([pl.DataFrame([own], schema=columns.schema), columns])
+
+
+def _told(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> str:
+    """What polars says, of a name or a value that it does not know in our words, with the nearest that there is."""
+    contracts = _contracts(others)
+    columns = {"run_id": None} | {
+        name: kind for table in tables for name, kind in contracts[table][1].columns().items()
+    }
+    if column := _NO_COLUMN.search(said):
+        return f"no column is called `{column[1]}`{did_you_mean(column[1], columns)}"
+    if missing := _NO_TABLE.search(said):
+        return f"no table is called `{missing[1]}`{did_you_mean(missing[1], contracts)}"
+    if value := _NO_VALUE.search(said):
+        values = {word for kind in columns.values() if isinstance(kind, dy.Enum) for word in kind.categories}
+        return f"no column has the value `{value[1]}`{did_you_mean(value[1], values)}"
+    return said
 
 
 def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:

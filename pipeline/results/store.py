@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -38,11 +40,15 @@ def file_name(run_id: str) -> str:
 def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> None:
     """Write the five tables of one run; the runs table last, so that it marks the run complete.
 
-    `metadata` (digests, software) goes into every file beside the table's name and contract version.
+    `metadata` (digests, software) goes into every file beside the table's name and contract version; the runs table
+    also holds the SHA-256 of the others, so that its own digest stands for the run.
     The same tables and metadata give the same bytes. A killed process leaves either the complete
     run or one without marker, which does not count.
     """
-    contents = [(name, table_bytes(getattr(tables, name), name, metadata)) for name in TABLES]
+    others = {name: table_bytes(getattr(tables, name), name, metadata) for name in TABLES if name != _MARKER}
+    digests = json.dumps({name: hashlib.sha256(content).hexdigest() for name, content in others.items()})
+    last = table_bytes(tables.runs, _MARKER, {**metadata, "tables": digests})
+    contents = [*others.items(), (_MARKER, last)]
     marker = table_address(out, _MARKER, tables.run_id)
     if is_url(out):
         # An object store shows each object as soon as it is staged.

@@ -1,10 +1,12 @@
-"""Tables and figures for people: boxes on a terminal, aligned plain text in a pipe."""
+"""Tables and figures for people: aligned text that fits the terminal."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -12,37 +14,50 @@ from datetime import datetime
 from typing import Any
 
 import polars as pl
-from rich.console import Console
-from rich.table import Table
 
+from pipeline.results.layout import Column, fitted
 from schemas.errors import visible
 
-_SAID_EVERY_S = 5.0
+_SAID_EVERY_S, _CHANGED_EVERY_S = 5.0, 0.2
+_BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
+# Right is green, wrong red, not known grey; the word itself says it where there are no colours.
+_COLOURS = {"unsafe": "\x1b[1;31m", "failed": "\x1b[31m", "unproven": "\x1b[90m", "safe": "\x1b[32m"}
+_VERDICT_WORD = re.compile(r"(?<![\w-])(?:unsafe|failed|unproven|safe)(?![\w-])")
 # Control characters that JSON itself lets stand.
 _STEERING = re.compile("[\x7f-\x9f]")
 
 
 def show_table(frame: pl.DataFrame, title: str = "") -> None:
-    """Print a frame to standard output, whole."""
-    if sys.stdout.isatty():
-        Console().print(_boxed(frame, title))
-    else:
-        print(plain_table(frame, title))
+    """Print a frame to standard output, every row, no wider than the terminal."""
+    lines = table_lines(frame, screen_width())
+    if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
+        title, lines = f"{_BOLD}{title}{_PLAIN}" if title else "", [_coloured(line) for line in lines]
+    print("\n".join([title, *lines] if title else lines))
+    if frame.width and not frame.height:
+        print("(no rows)")
 
 
-def plain_table(frame: pl.DataFrame, title: str = "") -> str:
-    """A frame as aligned text, two blanks between columns."""
-    cells = [list(frame.columns), *([_text(value) for value in row] for row in frame.iter_rows())]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    right = [_is_number(dtype) for dtype in frame.dtypes]
-    lines = [title] if title else []
-    for row in cells:
-        parts = [
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(row, widths, right, strict=True)
-        ]
-        lines.append("  ".join(parts).rstrip())
-    return "\n".join(lines)
+def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
+    """A frame as aligned text, two blanks between columns, in lines of at most `width` characters."""
+    return fitted(_columns(frame), width) if frame.width else []
+
+
+def screen_width() -> int | None:
+    """Characters of a line: of the terminal, in a pipe what `COLUMNS` says, else without limit."""
+    if sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit():
+        return shutil.get_terminal_size().columns
+    return None
+
+
+def _columns(frame: pl.DataFrame) -> list[Column]:
+    return [
+        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric())
+        for name, dtype in frame.schema.items()
+    ]
+
+
+def _coloured(line: str) -> str:
+    return _VERDICT_WORD.sub(lambda found: f"{_COLOURS[found[0]]}{found[0]}{_PLAIN}", line)
 
 
 def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
@@ -68,19 +83,6 @@ def duration_text(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest} s"
     return f"{minutes // 60} h {minutes % 60} min"
-
-
-def _boxed(frame: pl.DataFrame, title: str) -> Table:
-    table = Table(title=title or None, title_justify="left", header_style="bold")
-    for name, dtype in frame.schema.items():
-        table.add_column(name, justify="right" if _is_number(dtype) else "left", overflow="fold")
-    for row in frame.iter_rows():
-        table.add_row(*(_text(value).replace("[", r"\[") for value in row))
-    return table
-
-
-def _is_number(dtype: pl.DataType) -> bool:
-    return dtype.is_numeric()
 
 
 def _text(value: object) -> str:
@@ -118,13 +120,17 @@ def _plain(value: Any) -> Any:
 
 
 def how_far(things: str) -> Callable[[int, int], None]:
-    """Says on standard error every few seconds how many of how many things are done."""
-    said_s = time.monotonic()
+    """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s."""
+    on_terminal = sys.stderr.isatty()
+    said_s = time.monotonic() - (_SAID_EVERY_S if on_terminal else 0.0)
 
     def progress(done: int, total: int) -> None:
         nonlocal said_s
-        if time.monotonic() - said_s >= _SAID_EVERY_S:
+        last = on_terminal and done == total
+        if last or time.monotonic() - said_s >= (_CHANGED_EVERY_S if on_terminal else _SAID_EVERY_S):
             said_s = time.monotonic()
-            print(f"{done}/{total} {things}", file=sys.stderr, flush=True)
+            text = f"{done}/{total} {things}"
+            begin, end = ("\r", "\n" if last else "") if on_terminal else ("", "\n")
+            print(f"{begin}{text}", end=end, file=sys.stderr, flush=True)
 
     return progress

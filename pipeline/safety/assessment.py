@@ -11,6 +11,8 @@ from pipeline.figures.derived_tables import derived_tables
 from pipeline.figures.map_errors import map_suspects
 from pipeline.results import catalogue, store
 from pipeline.results.terminal import tall
+from pipeline.safety.reading import figures_for_reading
+from pipeline.safety.sensitivity import Replay, sensitivity
 from pipeline.safety.sentences import (
     level_statements,
     plain_statements,
@@ -19,6 +21,7 @@ from pipeline.safety.sentences import (
     verdict_statement,
 )
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, side_by_side
+from pipeline.safety.sources import some_of, source_files
 from pipeline.safety.tally import added, architecture_figures
 from pipeline.storage.address import Address
 from schemas.config import Configuration
@@ -33,11 +36,11 @@ class Assessment:
     tables: dict[str, pl.DataFrame]
 
 
-def assess(out: Address, config: Configuration | None = None) -> Assessment:
+def assess(out: Address, config: Configuration | None = None, replay: Replay | None = None) -> Assessment:
     """Everything that `balise safety OUT` says, from the tables of all complete runs.
 
     `config`: its safety budget instead of the result's own, to judge it by other service levels. All else stays as the
-    tables were made with it: limits and the time of a negation are in them.
+    tables were made with it: limits and the time of a negation are in them. `replay`: as `sensitivity` takes it.
     """
     store.complete_runs(out)
     settings = store.read_config(out) or Configuration()
@@ -48,6 +51,8 @@ def assess(out: Address, config: Configuration | None = None) -> Assessment:
     derived = derived_tables(runs, hazards, passages, alarms, settings)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
+        "sources": source_files(out),
+        "sensitivity": sensitivity(runs, settings, replay),
         "figures": derived["figures"],
         "time_to_detect": derived["detection"],
         "levels": levels_summary(derived["levels"]),
@@ -139,8 +144,11 @@ _SHORT = {
 
 def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
     """The tables as they fit a screen: without those of single runs, wide ones in fewer columns or turned."""
+    figures = figures_for_reading(tables["figures"])
     shown = {
-        "figures": tall(tables["figures"], ("solution",)) if tables["figures"].height else tables["figures"],
+        "what this result was made from": some_of(tables["sources"]),
+        "by how much the verdict hangs on what was chosen": tables["sensitivity"],
+        **{f"figures of {name}, with exact 95 % bounds": table for name, table in figures.items()},
         "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
         "runs by verdict per service level": tables["levels"],
         "location error of accepted virtual balises": tables["accuracy"].select(_SHORT["accuracy"]),

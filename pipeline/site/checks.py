@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
-from scipy.spatial import cKDTree
 
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
+from schemas.arrays import Floats
 from schemas.enums import Navigability
 from schemas.run import Finding
 
@@ -192,12 +192,23 @@ def _check_gaps(track: Track, found: Remarks) -> None:
             found.findings.append(Finding("warning", "links", text, "Mend the heights."))
 
 
+def _near_pairs(places: Floats, reach_m: float) -> Iterator[tuple[int, int]]:
+    """Numbers of points no farther apart than this, the lower one first; in order of one axis few are compared."""
+    order = np.argsort(places[:, 0], kind="stable")
+    ordered = places[order]
+    ends = np.searchsorted(ordered[:, 0], ordered[:, 0] + reach_m, side="right")
+    for at, end in enumerate(ends.tolist()):
+        apart_m = np.linalg.norm(ordered[at + 1 : end] - ordered[at], axis=1)
+        for other in order[at + 1 : end][apart_m <= reach_m].tolist():
+            yield min(int(order[at]), other), max(int(order[at]), other)
+
+
 def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
     """Ends without any relation that lie close to another element's end."""
     ends = [(name, position) for name in track.ids for position in (0, 1)]
     joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
     places = end_places(track).reshape(-1, 3)
-    for one, other in sorted(cKDTree(places).query_pairs(NEAR_ENDS_M)):
+    for one, other in sorted(_near_pairs(places, NEAR_ENDS_M)):
         free = ends[one] not in joined or ends[other] not in joined
         if free and ends[one][0] != ends[other][0]:
             gap = float(np.linalg.norm(places[one] - places[other]))

@@ -6,8 +6,6 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.track.network import Network, network_of
 from pipeline.track.survey import Track, track_of
@@ -90,6 +88,10 @@ def _dimensions(track: Track) -> str:
 
 def _parts(network: Network) -> int:
     """Connected pieces of the network, whatever the navigability."""
+    # They take long to load, and a log needs none.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     pairs = [(start // 2, edge.to // 2) for start, edges in enumerate(network.successors) for edge in edges]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(network.count, network.count))

@@ -16,7 +16,7 @@ from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
 from pipeline.track.survey import geometric_measures_m, track_of
-from schemas.errors import InputError, SiteError
+from schemas.errors import InputError, SiteError, listed
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site
 
@@ -58,6 +58,7 @@ def read_site(path: Path | str) -> Site:
         route=None if route is None else Route.validate(route, cast=True),
         findings=tuple(notes + _without_checksums(files) + found.findings),
         digest=_digest(files),
+        files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
 
 
@@ -100,9 +101,8 @@ def _digest(files: dict[str, bytes]) -> str:
 
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
-    listed = breaches[0] if len(breaches) == 1 else "\n  ".join([f"{len(breaches)} breaches", *breaches]) + "\n"
     remedy = "Mend what is named; `balise dictionary` lists the columns of a site."
-    return SiteError(listed, place=shown(path), remedy=remedy)
+    return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:

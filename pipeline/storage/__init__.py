@@ -9,7 +9,16 @@ patience with those that fail; `objects` is what they say of an object, and whet
 """
 
 from pipeline.storage.fetching import content_of, folders_in, glob_remote, local_copy, reach, read_many
-from pipeline.storage.identity import FileState, content_digest, signature, version, versions
+from pipeline.storage.identity import (
+    FileDigest,
+    FileState,
+    content_digest,
+    digest_of_files,
+    file_digests,
+    signature,
+    version,
+    versions,
+)
 from pipeline.storage.writing import (
     UNFINISHED,
     SweptError,
@@ -28,6 +37,7 @@ from pipeline.storage.writing import (
 
 __all__ = [
     "UNFINISHED",
+    "FileDigest",
     "FileState",
     "SweptError",
     "absolute",
@@ -35,7 +45,9 @@ __all__ = [
     "commit",
     "content_digest",
     "content_of",
+    "digest_of_files",
     "discard",
+    "file_digests",
     "folders_in",
     "glob_remote",
     "local_copy",

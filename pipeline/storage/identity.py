@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,16 +44,33 @@ def _local_versions(folder: str, name: str) -> dict[str, str]:
     return found
 
 
-def content_digest(path: Path, known: str = "") -> str:
-    """SHA-256 over names and contents of a file, or of the files directly in a folder.
+class FileDigest(NamedTuple):
+    """A file by its name and content."""
+
+    name: str
+    size_bytes: int
+    sha256: str
+
+
+def file_digests(path: Path, known: str = "") -> tuple[FileDigest, ...]:
+    """A file, or the files directly in a folder, in order of their names.
 
     `known`: the SHA-256 of the file, if it has been read already; of no use for a folder.
     """
     if path.is_dir():
-        digests = {file.name: _file_digest(file) for file in sorted(path.iterdir()) if file.is_file()}
-    else:
-        digests = {path.name: known or _file_digest(path)}
-    return hashlib.sha256("".join(f"{name} {digest}\n" for name, digest in digests.items()).encode()).hexdigest()
+        files = [file for file in sorted(path.iterdir()) if file.is_file()]
+        return tuple(FileDigest(file.name, file.stat().st_size, _file_digest(file)) for file in files)
+    return (FileDigest(path.name, path.stat().st_size, known or _file_digest(path)),)
+
+
+def digest_of_files(files: Iterable[FileDigest]) -> str:
+    """SHA-256 over names and contents."""
+    return hashlib.sha256("".join(f"{file.name} {file.sha256}\n" for file in files).encode()).hexdigest()
+
+
+def content_digest(path: Path, known: str = "") -> str:
+    """SHA-256 over names and contents of a file, or of the files directly in a folder; `known` as above."""
+    return digest_of_files(file_digests(path, known))
 
 
 def _file_digest(file: Path) -> str:

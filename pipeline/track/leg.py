@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.track.geodesy import Points, points_of
 from pipeline.track.segments import (
@@ -160,6 +159,8 @@ def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -
 
 
 def _returns(line: Polyline, path_start_m: Floats) -> bool:
+    from scipy.spatial import cKDTree  # takes long to load, and a log needs none
+
     probes = np.unique(np.searchsorted(path_start_m, np.arange(path_start_m[0], path_start_m[-1], SAMPLE_SPACING_M)))
     places, path_m = line.start[probes], path_start_m[probes]
     pairs = cKDTree(places).query_pairs(SAME_PLACE_M + 2 * SAMPLE_SPACING_M, output_type="ndarray")

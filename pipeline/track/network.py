@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import polars as pl
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.track.survey import Track, end_places, gaps_m
 from schemas.arrays import Bools, Ints
@@ -151,6 +149,10 @@ def _add(edges: list[Edge], edge: Edge) -> None:
 
 def oriented_sheet(successors: list[list[Edge]]) -> tuple[list[bool], bool]:
     """Of each connected part one orientation; both where a loop lets trains come back turned round."""
+    # They take long to load, and a log needs none.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     count = len(successors)
     here = np.repeat(np.arange(count), [len(edges) for edges in successors])
     there = np.array([edge.to for edges in successors for edge in edges], dtype=np.int64)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.track.geodesy import Points
 from schemas.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree as Tree
 
 # Search points along long segments: close enough that the nearest one leads to the nearest segment.
 SAMPLE_SPACING_M = 20.0
@@ -28,8 +31,10 @@ class Polyline:
         return len(self.start)
 
     @cached_property
-    def samples(self) -> tuple[cKDTree, Ints]:
+    def samples(self) -> tuple[Tree, Ints]:
         """A search tree over points at most `SAMPLE_SPACING_M` apart, and the segment of each."""
+        from scipy.spatial import cKDTree  # takes long to load, and a log needs none
+
         way = self.end - self.start
         pieces = np.maximum(1, np.ceil(np.linalg.norm(way, axis=1) / SAMPLE_SPACING_M)).astype(np.int64)
         segment = np.repeat(np.arange(len(self)), pieces)

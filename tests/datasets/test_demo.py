@@ -12,6 +12,7 @@ import pytest
 from datasets.comparison import checks_table, compare, describe_faults
 from datasets.demo import DemoResult, demo, demo_scenario
 from datasets.trial import build_run
+from pipeline.results.terminal import table_lines
 from schemas.run import RunTables
 
 
@@ -75,8 +76,22 @@ def test_a_spoilt_result_differs(result: DemoResult, run_id: str, spoil: dict) -
     assert not checks_table(compare(spec, run, spoilt))["agrees"].all()
 
 
+def test_the_ending_is_one_line_per_run_and_a_sentence(result: DemoResult) -> None:
+    lines = result.lines
+    assert lines["run_id"].to_list() == [run.id for run in result.scenario.runs]
+    table = table_lines(lines)
+    assert (len(table), max(map(len, table)) <= 80) == (13, True)
+    of = dict(lines.select("run_id", "verdict").iter_rows())
+    assert (of["clean"], of["jump_one_no_odometer"]) == ("safe", "unsafe")
+    assert "step along +1300 m" in lines["injected"].to_list()
+    assert result.sentence == f"all {result.checks.height} checks agree"
+    wrong = replace(result, checks=result.checks.with_columns(agrees=pl.int_range(pl.len()) > 1))
+    assert wrong.sentence == f"2 of {result.checks.height} checks do not agree"
+    assert wrong.lines["checks"][0].startswith("4/6")
+
+
 def test_faults_in_words(result: DemoResult) -> None:
     words = dict(result.checks.select("run_id", "injected").unique().iter_rows())
     assert words["clean"] == "none"
-    assert words["jump_two"] == "step along +1300 for 3 s"
+    assert words["jump_two"] == "step along +1300 m for 3 s"
     assert describe_faults(None) == "none"

@@ -131,8 +131,7 @@ class TestResults:
         diff = diff_results(a, result(tmp_path / "b", tables(), tables("r2")))
         assert not diff.same
         assert (diff.only_in_a, diff.only_in_b, diff.compared) == ((), ("r2",), 1)
-        assert diff.text().splitlines()[-1] == "1 runs in both: all the same, 1 only in B"
-        assert diff.text().splitlines()[0] == "r2: only in B"
+        assert diff.text().splitlines() == ["1 runs in both: all the same, 1 only in B", "r2: only in B"]
 
     @pytest.mark.parametrize(
         ("name", "frame", "said"),
@@ -152,8 +151,26 @@ class TestResults:
     def test_a_change_in_any_table(self, name: str, frame: pl.DataFrame, said: str, a: Path, tmp_path: Path) -> None:
         diff = diff_results(a, result(tmp_path / "b", tables(**{name: frame})))
         assert not diff.same
-        assert said in diff.text()
-        assert diff.text().splitlines()[-1] == "1 runs in both: 1 changed"
+        assert said in diff.text(detail=True)
+        assert diff.text().splitlines()[0] == "1 runs in both: 1 changed"
+
+    def test_what_matters_comes_first(self, a: Path, tmp_path: Path) -> None:
+        other = tables(
+            hazards=found().tail(2),
+            passages=passages(2, solution="primary", balise_id=["VB1", "VB2"], status=["missed", "accepted"]),
+            epochs=epochs([0, 1, 2, 3], solution="primary", tvb=False),
+            runs=table(Runs, 1, solution="primary", status="ok", verdict="unsafe", balises_accepted=3, outages=2),
+        )
+        before = tables(
+            passages=passages(2, solution="primary", balise_id=["VB1", "VB2"], status="accepted"),
+            runs=table(Runs, 1, solution="primary", status="ok", verdict="safe", balises_accepted=15, outages=1),
+        )
+        diff = diff_results(result(tmp_path / "x", before), result(tmp_path / "b", other))
+        lines = [line.strip() for line in diff.text().splitlines()]
+        assert lines[:5] == ["1 runs in both: 1 changed", "", "Verdicts", "r1  safe became unsafe", ""]
+        assert lines[5:8] == ["Hazards", "r1  VB_JUMP_1A at 1970-01-01T00:01:40.000Z (primary) vanished", ""]
+        assert lines[8:11] == ["Balises", "r1  accepted 15 became 3", "r1  VB1: accepted became missed"]
+        assert lines[-1] == "Other columns that changed: epochs.tvb, runs.outages. --detail shows the values."
 
     def test_below_the_tolerance_is_no_change(self, a: Path, tmp_path: Path) -> None:
         near = passages(2, solution="primary", balise_id=["VB1", "VB2"], location_error_m=[0.5 + 4e-7, 1.5])

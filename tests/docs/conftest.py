@@ -76,8 +76,8 @@ def _replay(folder: Path, names: Sequence[str], config: Configuration) -> None:
     plan = make_plan([str(folder / "runs" / name) for name in names], str(folder / "SITE"), out, config)
     for job in plan.jobs:
         replay_one(job)
-    write_campaign(out, config)
     write_config(out, config)
+    write_campaign(out, config)
 
 
 def _with_a_clean_run(scenario: Scenario) -> Scenario:

@@ -28,7 +28,7 @@ from datasets.scenario import (
     SkySpec,
     SurveySpec,
 )
-from schemas.config import StreamMapping
+from schemas.config import StreamCorrection, StreamMapping
 from schemas.dictionary import settings_frame
 from tests.docs.blocks import ROOT
 
@@ -107,11 +107,12 @@ def test_fault_kinds() -> None:
 
 def test_configuration_keys_and_defaults() -> None:
     rows = {(file, key): default for file, key, default in settings_frame().iter_rows()}
-    *sections, mapping, vehicle = tables(CONFIGURATION)
+    *sections, mapping, correction, vehicle = tables(CONFIGURATION)
     written = {("configuration", key): default for section in sections for key, default in section.items()}
     written |= {("vehicle", key): default for key, default in vehicle.items()}
     assert written == {key: "none" if value == "()" else value for key, value in rows.items()}
     assert mapping == {**defaults(StreamMapping), "time": "auto"}
+    assert correction == defaults(StreamCorrection)
 
 
 def test_configuration_tells_reason_or_source() -> None:

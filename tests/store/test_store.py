@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import random
 import time
@@ -17,7 +18,7 @@ from pipeline import storage
 from pipeline.campaign import find_runs
 from pipeline.results import catalogue, store
 from pipeline.results.query import run_sql
-from pipeline.results.terminal import plain_table, to_json
+from pipeline.results.terminal import table_lines, to_json
 from pipeline.storage import files
 from pipeline.storage.address import Address, redacted, stem_of
 from schemas.config import Configuration
@@ -59,6 +60,10 @@ def test_layout_and_metadata(tmp_path: Path) -> None:
     assert sorted(files_in(tmp_path)) == sorted(f"{name}/run_id=r1/{name}.parquet" for name in TABLES)
     found = pq.read_metadata(tmp_path / "runs/run_id=r1/runs.parquet")
     metadata = {key.decode(): value.decode() for key, value in found.metadata.items() if key.startswith(b"balise.")}
+    others = [name for name in TABLES if name != "runs"]
+    files = {name: (tmp_path / f"{name}/run_id=r1/{name}.parquet").read_bytes() for name in others}
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    assert json.loads(metadata.pop("balise.tables")) == digests
     expected = {**METADATA, "table": "runs", "contract": CONTRACT_VERSION}
     assert metadata == {f"balise.{key}": value for key, value in expected.items()}
     assert found.row_group(0).column(0).compression == "ZSTD"
@@ -291,7 +296,7 @@ def test_configuration_of_another_build_is_one_message(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show tables", "", "-- x"]
+    "sql", ["DROP TABLE runs", "truncate table runs", "CREATE TABLE x AS SELECT * FROM runs", "show runs", "", "-- x"]
 )
 def test_results_are_only_read(tmp_path: Path, sql: str) -> None:
     store.write_run(tables_of("r1"), tmp_path, METADATA)
@@ -384,7 +389,7 @@ def test_any_query_has_an_answer_or_one_message(tmp_path: Path) -> None:
 def test_control_characters_are_shown_and_not_sent() -> None:
     title = "\x1b]0;owned\x07\x9b31m\u202e\n"
     frame = pl.DataFrame({"name": [title]})
-    for text in (plain_table(frame), to_json(frame), str(InputError("bad", place=title))):
+    for text in ("\n".join(table_lines(frame)), to_json(frame), str(InputError("bad", place=title))):
         assert not set(text) & {"\x1b", "\x07", "\x9b"}
-    assert plain_table(frame).splitlines()[-1] == r"\x1b]0;owned\x07\x9b31m\u202e\n"
+    assert table_lines(frame)[-1] == r"\x1b]0;owned\x07\x9b31m\u202e\n"
     assert json.loads(to_json(frame))[0]["name"] == title

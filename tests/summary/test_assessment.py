@@ -176,4 +176,19 @@ def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessmen
     shown = for_reading(found.tables)
     assert "places where the map is in doubt" in shown
     assert all(frame.height for frame in shown.values())
-    assert shown["figures"].columns == ["figure", "gps", "primary"]
+    figures = shown["figures of primary, with exact 95 % bounds"]
+    assert figures.columns == ["figure", "value", "low", "high", "unit", "source"]
+    by_name = {row["figure"]: row for row in figures.iter_rows(named=True)}
+    measured = found.tables["figures"].filter(pl.col("solution") == "primary").row(0, named=True)
+    for figure, low, high in (
+        ("false_alarm_rate_per_h", "false_alarm_rate_low_per_h", "false_alarm_rate_high_per_h"),
+        ("mtbf_h", "mtbf_low_h", "mtbf_high_h"),
+        ("unsafe_share", "unsafe_share_low", "unsafe_share_high"),
+    ):
+        row = by_name[figure]
+        assert (row["value"], row["low"], row["high"]) == (measured[figure], measured[low], measured[high])
+        assert row["source"]
+    assert {row["unit"] for row in by_name.values()} == {"1", "h", "1/h"}
+    assert all(row["source"] for row in by_name.values())
+    bounds = [name for name in measured if "_low" in name or "_high" in name]
+    assert len(by_name) == len(measured) - len(bounds) - 1

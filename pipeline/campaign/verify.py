@@ -1,0 +1,157 @@
+"""Whether a result is still what its manifest says, and whether the same logs give it again."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import polars as pl
+
+from pipeline import storage
+from pipeline.campaign.plan import Plan, software_digest
+from pipeline.campaign.run import run_campaign
+from pipeline.results import store
+from pipeline.results.manifest import NAME, Manifest, contents_of, own_file_names, read_manifest, write_manifest
+from pipeline.storage.address import Address, join, redacted
+from schemas.config import digest_of
+from schemas.errors import UsageError
+from schemas.tables import TABLES
+
+Progress = Callable[[int, int], None]
+_RUNS_AT_ONCE = 50
+_COLUMNS = ("what", "found", "expected")
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was compared and what differs: `what, found, expected`, digests shortened."""
+
+    compared: str
+    problems: tuple[tuple[str, str, str], ...]
+
+    @property
+    def table(self) -> pl.DataFrame:
+        return pl.DataFrame(self.problems, schema=dict.fromkeys(_COLUMNS, pl.String), orient="row")
+
+    @property
+    def sentence(self) -> str:
+        if not self.problems:
+            return f"{self.compared}: all agree"
+        return f"{self.compared}: {len(self.problems)} do not agree"
+
+
+def verify(out: Address, progress: Progress | None = None) -> Verification:
+    """Hold every table of a result, its configuration and its campaign's tables against `OUT/manifest.json`.
+
+    Raises `UsageError` where there is no manifest.
+    """
+    manifest = _manifest(out)
+    problems = list(_other_runs(store.run_ids(out), manifest))
+    own = manifest["files"]
+    for name in sorted({*own, *own_file_names(out)}):
+        problems += _difference(name, _sha256(storage.content_of(join(out, name))), own.get(name, {}).get("sha256"))
+    runs = [run for run in store.run_ids(out) if run in manifest["runs"]]
+    for first in range(0, len(runs), _RUNS_AT_ONCE):
+        for name, found, expected in _tables(out, runs[first : first + _RUNS_AT_ONCE], manifest):
+            problems += _difference(name, found, expected)
+        if progress is not None:
+            progress(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
+    files = len(own) + len(TABLES) * len(runs)
+    return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems))
+
+
+def recompute(out: Address, plan_for: Callable[[str], Plan], jobs: int = 1) -> Verification:
+    """Replay logs again, in a folder of their own, and hold logs, site and tables against the manifest.
+
+    `plan_for`: the plan of these logs for an output folder. What the manifest does not name is a problem; runs of it
+    whose logs are not given are counted.
+    """
+    manifest = _manifest(out)
+    with tempfile.TemporaryDirectory(prefix="balise-verify-") as folder:
+        plan = plan_for(folder)
+        problems = list(_other_inputs(plan, manifest))
+        plan = replace(plan, jobs=tuple(job for job in plan.jobs if job.run_id in manifest["runs"]))
+        if plan.jobs:
+            run_campaign(plan, jobs=jobs)
+        again = write_manifest(folder)["runs"]
+    for run_id, found in again.items():
+        problems += _differences_of_run(run_id, found, manifest["runs"][run_id])
+    compared = f"{len(again)} of {len(manifest['runs'])} runs replayed again"
+    return Verification(compared, tuple(problems))
+
+
+def _manifest(out: Address) -> Manifest:
+    store.complete_runs(out)
+    found = read_manifest(out)
+    if found is None:
+        remedy = "Results of an earlier version have none: replay them again."
+        raise UsageError(f"has no {NAME}", place=redacted(str(out)), remedy=remedy)
+    return found
+
+
+def _other_runs(there: Sequence[str], manifest: Manifest) -> Iterator[tuple[str, str, str]]:
+    """Runs that only one of both has; a call that was ended leaves some that the manifest does not name yet."""
+    named = manifest["runs"]
+    for run in sorted({*there, *named}):
+        if run not in named:
+            yield f"run {run}", "complete", "not in the manifest: was the call interrupted? Repeat it."
+        elif run not in there:
+            yield f"run {run}", "missing", "complete"
+
+
+def _tables(out: Address, runs: Sequence[str], manifest: Manifest) -> Iterator[tuple[str, str, str]]:
+    """Name, digest found and digest expected of each table of some runs."""
+    places = {(run, table): str(store.table_address(out, table, run)) for run in runs for table in TABLES}
+    found = contents_of(list(places.values()))
+    for (run, table), place in places.items():
+        yield f"run {run}, {table}", _sha256(found.get(place)), manifest["runs"][run]["tables"][table]
+
+
+def _other_inputs(plan: Plan, manifest: Manifest) -> Iterator[tuple[str, str, str]]:
+    """Runs that the manifest does not name, and settings, site or program that are not those of a run."""
+    for job in plan.jobs:
+        expected = manifest["runs"].get(job.run_id)
+        if expected is None:
+            yield f"run {job.run_id}", "a log", "not in the manifest"
+            continue
+        if digest_of(job.config, job.vehicle) != expected["config_digest"]:
+            yield f"run {job.run_id}, settings", "others", _settings(expected["config_digest"], manifest)
+        made = {
+            "site": (job.site_digest, expected["site"]),
+            "route": (job.route_digest or None, expected["route_sha256"]),
+            "program": (software_digest(), expected["software_digest"]),
+        }
+        for what, (found, named) in made.items():
+            yield from _difference(f"run {job.run_id}, {what}", found, named)
+
+
+def _settings(config_digest: str, manifest: Manifest) -> str:
+    """The settings files that gave this digest, as options of the command."""
+    for entry in manifest["settings"].get(config_digest, []):
+        named = {"--config": entry["configuration"], "--vehicle": entry["vehicle"]}
+        given = [f"{option} {file['name']}" for option, file in named.items() if file]
+        return " ".join(given) or "no files"
+    return _short(config_digest)
+
+
+def _differences_of_run(run_id: str, found: dict[str, Any], expected: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    logs, named = ({file["name"]: file["sha256"] for file in run["log"]} for run in (found, expected))
+    for name in sorted({*logs, *named}):
+        yield from _difference(f"run {run_id}, log {name}", logs.get(name), named.get(name))
+    for table in TABLES:
+        yield from _difference(f"run {run_id}, {table}", found["tables"][table], expected["tables"][table])
+
+
+def _difference(what: str, found: str | None, expected: str | None) -> list[tuple[str, str, str]]:
+    return [] if found == expected else [(what, _short(found), _short(expected))]
+
+
+def _short(digest: str | None) -> str:
+    return "nothing" if not digest else digest[:12]
+
+
+def _sha256(content: bytes | None) -> str:
+    return "" if content is None else hashlib.sha256(content).hexdigest()

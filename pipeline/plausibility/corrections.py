@@ -1,0 +1,33 @@
+"""Lines of configuration that mend a stream, ready to be appended to a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+def correction(
+    stream: str,
+    factors: Mapping[str, float] | None = None,
+    shift_s: float = 0.0,
+    exchange: tuple[str, str] | None = None,
+    shift_m: Mapping[str, float] | None = None,
+    solution: str | None = None,
+) -> str:
+    """One `[[ingest.correct]]` table."""
+    lines = ["[[ingest.correct]]", f'stream = "{stream}"']
+    if solution is not None:
+        lines.append(f'solution = "{solution}"')
+    if exchange is not None:
+        lines.append(f'exchange = ["{exchange[0]}", "{exchange[1]}"]')
+    if factors:
+        lines.append(f"factors = {{ {', '.join(f'{name} = {_number(value)}' for name, value in factors.items())} }}")
+    if shift_s:
+        lines.append(f"shift_s = {_number(shift_s)}")
+    lines += [f"shift_{axis}_m = {_number(value)}" for axis, value in (shift_m or {}).items()]
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    """A number as TOML has it, a float always."""
+    text = repr(round(value, 12)) if abs(value) >= 1e-3 else repr(value)
+    return text if any(sign in text for sign in ".e") else f"{text}.0"

@@ -1,0 +1,152 @@
+"""Streams as ways over time: what is compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import polars as pl
+
+from pipeline.track.geodesy import Points, earth_centred_m, points_of
+from schemas.arrays import Bools, Floats, floats, times_ns
+from schemas.enums import Fix
+
+# Two rows a second tell all that is asked here.
+_THIN_S = 0.45
+# A pause of positions or rows that is not bridged.
+_GAP_S = 5.0
+_GAP_PERIODS = 3.5
+# Speed over this time: positions that scatter by 2 m give it to 0.7 m/s.
+SPEED_S = 4.0
+
+
+@dataclass(frozen=True)
+class Places:
+    """Positions over time [s], with earth-centred coordinates [m] at the stream's median height."""
+
+    t_s: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    ecef_m: Floats
+
+    @cached_property
+    def points(self) -> Points:
+        return points_of(self.latitude_deg, self.longitude_deg)
+
+    @cached_property
+    def limit_s(self) -> float:
+        return _limit_s(self.t_s)
+
+    def at(self, t_s: Floats) -> Floats:
+        """Places by straight lines [m], shape (n, 3)."""
+        return np.column_stack([np.interp(t_s, self.t_s, self.ecef_m[:, axis]) for axis in range(3)])
+
+    def known(self, t_s: Floats) -> Bools:
+        return _known(self.t_s, t_s, self.limit_s)
+
+    def speed(self, t_s: Floats) -> Floats:
+        """Speed over ground [m/s], never negative; NaN where it is not known."""
+        begin, end = t_s - SPEED_S / 2, t_s + SPEED_S / 2
+        chord = np.linalg.norm(self.at(end) - self.at(begin), axis=1)
+        return np.where(self.known(begin) & self.known(end) & self.known(t_s), chord / SPEED_S, np.nan)
+
+    def way(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Way from some instants to others [m]: the chord, and by half of it what a curve adds; NaN where unknown."""
+        middle_s = (begin_s + end_s) / 2
+        known = self.known(begin_s) & self.known(middle_s) & self.known(end_s)
+        begin, middle, end = self.at(begin_s), self.at(middle_s), self.at(end_s)
+        chord = np.linalg.norm(end - begin, axis=1)
+        halves = np.linalg.norm(middle - begin, axis=1) + np.linalg.norm(end - middle, axis=1)
+        return np.where(known, halves + (halves - chord) / 3.0, np.nan)
+
+
+@dataclass(frozen=True)
+class Course:
+    """A counter over time [s], of any unit: speeds already summed up."""
+
+    t_s: Floats
+    way: Floats
+
+    @cached_property
+    def limit_s(self) -> float:
+        return _limit_s(self.t_s)
+
+    def known(self, t_s: Floats) -> Bools:
+        return _known(self.t_s, t_s, self.limit_s)
+
+    def speed(self, t_s: Floats) -> Floats:
+        """Signed speed in units per second; NaN where it is not known."""
+        return self.gained(t_s - SPEED_S / 2, t_s + SPEED_S / 2) / SPEED_S
+
+    def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Signed way from some instants to others; NaN where it is not known."""
+        known = self.known(begin_s) & self.known(end_s)
+        return np.where(known, np.interp(end_s, self.t_s, self.way) - np.interp(begin_s, self.t_s, self.way), np.nan)
+
+
+def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
+    """Valid positions of a cleaned stream, thinned to two a second; None below ten of them."""
+    latitude, longitude = floats(frame, "latitude_deg"), floats(frame, "longitude_deg")
+    valid = np.isfinite(latitude) & np.isfinite(longitude)
+    if "fix" in frame.columns:
+        valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
+    t_s = seconds_since(epoch_ns, frame)
+    rows = np.flatnonzero(valid)
+    rows = rows[_thinned(t_s[rows])]
+    if rows.size < 10:
+        return None
+    height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
+    level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
+    level_m = level_m if abs(level_m) < 9000.0 else 0.0
+    flat = np.full(rows.size, level_m)
+    ecef = earth_centred_m(latitude[rows], longitude[rows], flat)
+    return Places(t_s[rows], latitude[rows], longitude[rows], height, ecef)
+
+
+def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
+    """Times of a stream from an instant on [s]."""
+    return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
+
+
+def distance_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
+    """The recorded distance; None where hardly any row has one."""
+    t_s, distance = seconds_since(epoch_ns, odometer), floats(odometer, "distance_m")
+    rows = np.flatnonzero(np.isfinite(distance))
+    rows = rows[_thinned(t_s[rows])]
+    return Course(t_s[rows], distance[rows]) if rows.size >= 10 else None
+
+
+def speed_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
+    """The recorded speed, summed up; None where hardly any row has one."""
+    t_s, speed = seconds_since(epoch_ns, odometer), floats(odometer, "speed_mps")
+    rows = np.flatnonzero(np.isfinite(speed))
+    if rows.size < 10:
+        return None
+    t_s, speed = t_s[rows], speed[rows]
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t_s))])
+    kept = _thinned(t_s)
+    return Course(t_s[kept], way[kept])
+
+
+def _thinned(t_s: Floats) -> Bools:
+    """Rows that are at least some 0.45 s after the kept one before."""
+    if t_s.size < 2 or np.median(np.diff(t_s)) >= _THIN_S:
+        return np.ones(t_s.size, dtype=np.bool_)
+    slot = np.floor((t_s - t_s[0]) / 0.5 + 1e-6)
+    kept: Bools = np.diff(slot, prepend=-1.0) > 0
+    return kept
+
+
+def _limit_s(t_s: Floats) -> float:
+    return max(_GAP_S, _GAP_PERIODS * float(np.median(np.diff(t_s))))
+
+
+def _known(rows_s: Floats, t_s: Floats, limit_s: float) -> Bools:
+    """Whether instants lie between two rows that are no farther apart than the limit."""
+    after = np.searchsorted(rows_s, t_s, side="left")
+    inside = (after < rows_s.size) & (t_s >= rows_s[0])
+    after = np.clip(after, 1, rows_s.size - 1)
+    known: Bools = inside & (rows_s[after] - rows_s[after - 1] <= limit_s)
+    return known

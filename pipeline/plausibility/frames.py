@@ -1,0 +1,122 @@
+"""Ways in which latitudes and longitudes are written wrongly, and the datums that surveys forget to name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import Floats
+
+Turned = tuple[Floats, Floats]
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A way to write positions wrongly: how they are mended, and by which part of `[[ingest.correct]]`."""
+
+    cause: str
+    mended: Callable[[Floats, Floats], Turned]
+    factors: Mapping[str, float]
+    exchanged: bool = False
+    by_configuration: bool = True
+
+
+def _from_minutes(value: Floats) -> Floats:
+    """Degrees of `dd.mmmm`, minutes behind the point, as a recording of NMEA divided by 100 has them."""
+    whole = np.trunc(value)
+    return np.asarray(whole + (value - whole) * 100.0 / 60.0)
+
+
+_RADIAN_DEG = 57.29577951308232
+SLIPS = (
+    Slip("latitude and longitude are exchanged", lambda lat, lon: (lon, lat), {}, exchanged=True),
+    Slip("longitude has the wrong sign", lambda lat, lon: (lat, -lon), {"longitude_deg": -1.0}),
+    Slip("latitude has the wrong sign", lambda lat, lon: (-lat, lon), {"latitude_deg": -1.0}),
+    Slip(
+        "latitude and longitude have the wrong sign",
+        lambda lat, lon: (-lat, -lon),
+        {"latitude_deg": -1.0, "longitude_deg": -1.0},
+    ),
+    Slip(
+        "positions are in radians",
+        lambda lat, lon: (lat * _RADIAN_DEG, lon * _RADIAN_DEG),
+        {"latitude_deg": _RADIAN_DEG, "longitude_deg": _RADIAN_DEG},
+    ),
+    Slip(
+        "positions are degrees and minutes (ddmm.mm of NMEA), written as decimal degrees",
+        lambda lat, lon: (_from_minutes(lat), _from_minutes(lon)),
+        {},
+        by_configuration=False,
+    ),
+)
+
+# Geographic systems of national surveys, whose coordinates look like WGS 84 and lie 50 to 700 m from it.
+DATUMS = {
+    "DHDN (Germany)": 4314,
+    "ED50 (Europe)": 4230,
+    "Belge 1972": 4313,
+    "Amersfoort (Netherlands)": 4289,
+    "OSGB36 (Great Britain)": 4277,
+    "TM65 (Ireland)": 4299,
+    "CH1903 (Switzerland)": 4149,
+    "CH1903+ (Switzerland)": 4150,
+    "MGI (Austria)": 4312,
+    "NTF (France)": 4275,
+    "S-JTSK (Czechia, Slovakia)": 4156,
+    "Monte Mario (Italy)": 4265,
+    "Pulkovo 1942(58)": 4179,
+    "Pulkovo 1942": 4284,
+    "HD72 (Hungary)": 4237,
+    "RT90 (Sweden)": 4124,
+    "KKJ (Finland)": 4123,
+    "Lisbon (Portugal)": 4207,
+    "Datum 73 (Portugal)": 4274,
+    "GGRS87 (Greece)": 4121,
+    "NAD27 (North America)": 4267,
+    "Tokyo (Japan)": 4301,
+    "MGI 1901 (former Yugoslavia)": 3906,
+}
+_NEAR_M, _NEAR_SHARE = 12.0, 0.12
+
+
+@dataclass(frozen=True)
+class Datum:
+    """A national datum, and how far a survey in it, read as WGS 84, lies east and north of the positions here."""
+
+    name: str
+    epsg: int
+    east_m: float
+    north_m: float
+
+    def explains(self, east_m: float, north_m: float, one_heading: bool) -> bool:
+        """Whether it is this shift; of a single heading only the part across it is known."""
+        size_m = float(np.hypot(east_m, north_m))
+        apart = np.array([self.east_m - east_m, self.north_m - north_m])
+        apart_m = abs(apart @ [east_m, north_m]) / size_m if one_heading else np.hypot(*apart)
+        return bool(apart_m < max(_NEAR_M, _NEAR_SHARE * size_m))
+
+
+def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:
+    """The national datums in use around a place."""
+    # Imported here because it takes a tenth of a second, and hardly any run needs it.
+    import pyproj
+
+    found: list[Datum] = []
+    geod = pyproj.Geod(ellps="WGS84")
+    for name, code in DATUMS.items():
+        area = pyproj.CRS.from_epsg(code).area_of_use
+        if area is None or not _inside(area.bounds, latitude_deg, longitude_deg):
+            continue
+        turn = pyproj.Transformer.from_crs(code, 4326, always_xy=True)
+        longitude, latitude = turn.transform(longitude_deg, latitude_deg)
+        azimuth_deg, _, distance_m = geod.inv(longitude, latitude, longitude_deg, latitude_deg)
+        azimuth = np.radians(azimuth_deg)
+        found.append(Datum(name, code, float(distance_m * np.sin(azimuth)), float(distance_m * np.cos(azimuth))))
+    return found
+
+
+def _inside(bounds: tuple[float, float, float, float], latitude_deg: float, longitude_deg: float) -> bool:
+    west, south, east, north = bounds
+    return south <= latitude_deg <= north and west <= longitude_deg <= east

@@ -1,0 +1,105 @@
+"""Whose clock is wrong: lags of several recorders against the GNSS, and the lines that mend them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.plausibility.causes import explain_lag, leap_seconds
+from pipeline.plausibility.check import Check, State, fits, not_checked
+from pipeline.plausibility.corrections import correction
+from schemas.config import IngestConfig
+
+# Two lags are of one clock if they are so near to each other [s].
+_SAME_S = 1.5
+NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "balise reads"}
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not told.
+
+    `sure`: its noise is far below it, and no part of the run contradicts it.
+    """
+
+    stream: str
+    lag_s: float = 0.0
+    sigma_s: float = float("inf")
+    sure: bool = False
+    reason: str = ""
+
+
+def lag_checks(
+    lags: list[Lag], streams: list[str], solution: str | None, t_ns: int, config: IngestConfig
+) -> list[Check]:
+    """One check per stream; `streams`: what the run holds, `solution`: the GNSS solution if there are several.
+
+    What two recorders say against the GNSS is the GNSS's own.
+    """
+    wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > config.fit_lag_limit_s]
+    others = [lag for lag in lags if not lag.reason and lag not in wrong]
+    shared = [one for one in wrong if all(abs(one.lag_s - other.lag_s) < _SAME_S for other in wrong)]
+    gnss_is_wrong = len(shared) >= 2 and not others
+    return [_check(lag, gnss_is_wrong, bool(others), streams, solution, t_ns, config) for lag in lags]
+
+
+def _check(
+    lag: Lag,
+    gnss_is_wrong: bool,
+    contradicted: bool,
+    streams: list[str],
+    solution: str | None,
+    t_ns: int,
+    config: IngestConfig,
+) -> Check:
+    what = f"clock of the {NAMES[lag.stream]} against the GNSS"
+    if lag.reason:
+        return not_checked(what, lag.reason)
+    size_s = abs(lag.lag_s)
+    if not lag.sure or size_s <= config.fit_lag_told_s:
+        sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
+        return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
+    found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {NAMES[lag.stream]} are {_later(lag.lag_s)}"
+    if size_s <= config.fit_lag_limit_s:
+        return _small(what, found, lag)
+    explained = explain_lag(lag.lag_s, t_ns, min(3.0 * lag.sigma_s, 3.0))
+    exact_s = lag.lag_s if explained is None else explained.exact
+    cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
+    exact_s = round(exact_s, 2)
+    at_gnss = gnss_is_wrong or (not contradicted and _rather_gnss(lag.lag_s, cause, t_ns))
+    if at_gnss:
+        lines = "".join(
+            correction(stream, shift_s=exact_s, solution=solution)
+            for stream in ("gnss", "satellites")
+            if stream in streams
+        )
+        return Check(what, State.IMPOSSIBLE, found, f"{cause}, in the GNSS", "the configuration", lines)
+    lines = correction(lag.stream, shift_s=-exact_s)
+    return Check(what, State.IMPOSSIBLE, found, f"{cause}, in the {NAMES[lag.stream]}", "the configuration", lines)
+
+
+def _later(lag_s: float) -> str:
+    return "later" if lag_s > 0 else "earlier"
+
+
+def _rather_gnss(lag_s: float, cause: str, t_ns: int) -> bool:
+    """Which of two clocks it is, where nobody else tells.
+
+    GPS time is ahead of UTC, so the stream with the later stamps holds it; a week rolls over in GNSS receivers.
+    """
+    if abs(abs(lag_s) - leap_seconds(t_ns)) < _SAME_S:
+        return lag_s < 0
+    return "roll-over of the GPS week" in cause and lag_s > 0
+
+
+def _small(what: str, found: str, lag: Lag) -> Check:
+    """A lag that a train can have, and that costs availability all the same."""
+    latency_s = round(-lag.lag_s, 2)
+    if lag.stream == "odometer" and latency_s > 0:
+        lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
+        return Check(what, State.MISFIT, found, "positions arrive too old", "the vehicle file", lines)
+    cause = f"one of both is stamped {'too late' if latency_s < 0 else 'too early'}, or the positions are off"
+    if lag.stream == "reference":
+        # The judge believes the reference: nobody should shift it to where the positions want it.
+        return Check(what, State.MISFIT, found, cause, advice="Find out which clock is wrong before one is corrected.")
+    lines = correction(lag.stream, shift_s=latency_s)
+    return Check(what, State.MISFIT, found, cause, "the configuration", lines)

@@ -1,0 +1,54 @@
+"""The answer to a query as a file that other programs read: CSV, Parquet, Excel."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import polars as pl
+
+from pipeline.results.store import parquet_bytes
+from pipeline.storage import write_bytes
+from schemas.errors import UsageError
+
+# Excel has no nanoseconds and no time zones, and a sheet ends here.
+_MOST_ROWS = 1_048_575
+_TIMES = "yyyy-mm-dd hh:mm:ss.000"
+
+
+def write_csv(answer: pl.DataFrame, file: Path) -> None:
+    """Comma-separated text with a heading; lists as words with blanks between them. `-` is standard output."""
+    text = _flat(answer).write_csv(datetime_format="%Y-%m-%dT%H:%M:%S%.9fZ")
+    if str(file) == "-":
+        sys.stdout.write(text)
+    else:
+        write_bytes(file, text.encode())
+
+
+def write_parquet(answer: pl.DataFrame, file: Path) -> None:
+    """Parquet with the types of the tables."""
+    write_bytes(file, parquet_bytes(answer, {}))
+
+
+def write_xlsx(answer: pl.DataFrame, file: Path) -> None:
+    """One sheet of an Excel workbook; times are UTC. Raises `UsageError` where the library is not installed."""
+    if answer.height > _MOST_ROWS:
+        raise UsageError(
+            "is too long for Excel", place=str(file), found=f"{answer.height} rows", expected=f"at most {_MOST_ROWS}"
+        )
+    times = [name for name, dtype in answer.schema.items() if isinstance(dtype, pl.Datetime)]
+    plain = _flat(answer).with_columns(pl.col(times).dt.replace_time_zone(None).dt.cast_time_unit("ms"))
+    buffer = io.BytesIO()
+    try:
+        plain.write_excel(buffer, dtype_formats={pl.Datetime: _TIMES}, freeze_panes=(1, 0), autofit=True)
+    except ImportError:
+        remedy = "Install the extra `excel` (`pip install balise[excel]`), or take --csv."
+        raise UsageError("cannot be written without XlsxWriter", place=str(file), remedy=remedy) from None
+    write_bytes(file, buffer.getvalue())
+
+
+def _flat(answer: pl.DataFrame) -> pl.DataFrame:
+    """The answer without lists, which neither format can hold."""
+    lists = [name for name, dtype in answer.schema.items() if isinstance(dtype, pl.List)]
+    return answer.with_columns(pl.col(name).cast(pl.List(pl.String)).list.join(" ") for name in lists)

@@ -1,0 +1,73 @@
+"""What `balise inspect` and `balise convert` say of how a run fits: checks, and the lines that mend it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.ingest.clean import CleanCounts, clean
+from pipeline.plausibility.check import State
+from pipeline.plausibility.fit import Fit, fit_run, lines_of
+from schemas.config import IngestConfig, Vehicle
+from schemas.errors import InputError
+from schemas.run import RunLog, Site
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """Tables by title, and what keeps the run from being replayed."""
+
+    tables: dict[str, pl.DataFrame]
+    problems: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The same as plain lines, without what fits or could not be checked."""
+        told = [f"does not fit: {problem}" for problem in self.problems]
+        if "Fit" in self.tables:
+            misfits = self.tables["Fit"].filter(pl.col("state") == State.MISFIT.value)
+            told += [f"does not fit: {row['check']}: {row['found']} {row['cause']}".rstrip() for row in _rows(misfits)]
+        if "Lines that mend it" in self.tables:
+            told += self.tables["Lines that mend it"]["toml"].to_list()
+        return told
+
+
+def fit_report(
+    run: RunLog, config: IngestConfig, site: Site | None = None, vehicle: Vehicle | None = None
+) -> FitReport:
+    """Every check of every solution; a run that cannot be cleaned has its error as problem."""
+    try:
+        cleaned, counts = clean(run, config)
+    except InputError as error:
+        return FitReport({}, (str(error),))
+    found = {name: fit_run(cleaned, name, vehicle or Vehicle(), config, site) for name in cleaned.solutions()}
+    tables = {"Fit": _checks(found, counts)}
+    mending: dict[str, str] = {}
+    for fit in found.values():
+        for into, lines in lines_of(fit.misfits).items():
+            known = mending.setdefault(into, lines)
+            mending[into] = known if lines in known else known + "\n" + lines
+    text = "\n".join(f"# append to {into}\n{lines}" for into, lines in mending.items())
+    if text:
+        tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
+    failing = found.values() if config.plausibility == "fail" else ()
+    return FitReport(tables, tuple(dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)))
+
+
+def _checks(found: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
+    columns = ("solution", "check", "state", "found", "cause")
+    rows = [
+        (name, check.what, check.state.value, check.found, check.cause)
+        for name, fit in found.items()
+        for check in fit.checks
+    ]
+    rows += [
+        (name, "placeholders", State.MISFIT.value, f"{one.placeholders} positions are none", "0/0 or a default place")
+        for name, one in counts.solutions.items()
+        if one.placeholders
+    ]
+    return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")
+
+
+def _rows(table: pl.DataFrame) -> list[dict[str, str]]:
+    return list(table.iter_rows(named=True))

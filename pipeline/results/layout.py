@@ -1,0 +1,156 @@
+"""Tables of text that fit a width.
+
+Headings break at `_` and long texts at blanks. A table that is too wide all the same is turned, one line per column,
+where it has few rows; else columns are left out, and the last line says how many.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_GAP = 2
+_HEADING_LINES = 3
+# A text column is not folded to less than this, or than its longest word within reason.
+_NARROWEST, _LONGEST_WORD = 10, 24
+_FEW_ROWS = 5
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column as text; numbers stand to the right and are never folded."""
+
+    heading: str
+    cells: Sequence[str]
+    is_number: bool = False
+
+    @property
+    def natural(self) -> int:
+        """Characters that the column takes when nothing is folded."""
+        return max(1, *map(len, [self.heading, *self.cells]))
+
+    @property
+    def least(self) -> int:
+        """Characters below which it cannot be read."""
+        widest = max(map(len, self.cells), default=0)
+        if not self.is_number:
+            words = (len(word) for cell in self.cells for word in cell.split())
+            widest = min(widest, max(_NARROWEST, min(max(words, default=0), _LONGEST_WORD)))
+        return max(widest, self.least_heading)
+
+    @property
+    def unfolded(self) -> int:
+        """Characters that leave all but long texts in one line."""
+        widest = max(map(len, self.cells), default=0)
+        return max(widest if self.is_number else min(widest, _LONGEST_WORD), self.least_heading)
+
+    @property
+    def least_heading(self) -> int:
+        """The width at which the heading takes no more than its lines."""
+        widths = range(max(1, *map(len, _parts(self.heading))), len(self.heading) + 1)
+        fits = (width for width in widths if len(_broken_heading(self.heading, width)) <= _HEADING_LINES)
+        return next(fits, max(1, len(self.heading)))
+
+
+def fitted(columns: Sequence[Column], width: int | None) -> list[str]:
+    """The lines of a table that is no wider than `width` characters, headings first; None: as wide as it is."""
+    if width is None or _total(naturals := [column.natural for column in columns]) <= width:
+        return _lines(columns, [column.natural for column in columns], broken=False)
+    least = [column.least for column in columns]
+    if _total(least) <= width:
+        return _lines(columns, _shared_out(least, naturals, width), broken=True)
+    rows = len(columns[0].cells)
+    if 0 < rows <= _FEW_ROWS:
+        turned = _turned(columns, rows)
+        if _total([column.least for column in turned]) <= width:
+            return fitted(turned, width)
+    return _first_columns(columns, width)
+
+
+def _first_columns(columns: Sequence[Column], width: int) -> list[str]:
+    """As many columns from the left as fit, those without any value left out, and a line that says so."""
+    kept: list[Column] = []
+    for column in columns:
+        if column.cells and set(column.cells) <= {"-", ""}:
+            continue
+        if kept and _total([item.unfolded for item in kept] + [column.unfolded]) > width:
+            break
+        kept.append(column)
+    kept = kept or [columns[0]]
+    widths = _shared_out([column.unfolded for column in kept], [column.natural for column in kept], width)
+    note = (
+        f"{len(columns) - len(kept)} of {len(columns)} columns are left out: they do not fit {width} characters or hold"
+        " no value. Ask for fewer columns, or for all with --json."
+    )
+    return [*_lines(kept, widths, broken=True), *textwrap.wrap(note, width)]
+
+
+def _turned(columns: Sequence[Column], rows: int) -> list[Column]:
+    """One line per column of the table, one column per row."""
+    heads = [""] if rows == 1 else [f"row {number}" for number in range(1, rows + 1)]
+    names = Column("", [column.heading for column in columns])
+    return [names, *(Column(head, [column.cells[row] for column in columns]) for row, head in enumerate(heads))]
+
+
+def _shared_out(least: list[int], wanted: list[int], width: int) -> list[int]:
+    """Widths between `least` and `wanted`: what is left of the width goes to the narrowest wishes first."""
+    widths = list(least)
+    spare = width - _total(least)
+    wishes = sorted((want - have, at) for at, (want, have) in enumerate(zip(wanted, least, strict=True)))
+    for turn, (wish, at) in enumerate(wishes):
+        more = max(0, min(wish, spare // (len(wishes) - turn)))
+        widths[at] += more
+        spare -= more
+    return widths
+
+
+def _lines(columns: Sequence[Column], widths: list[int], broken: bool) -> list[str]:
+    rights = [column.is_number for column in columns]
+    headings = [_broken_heading(c.heading, w) if broken else [c.heading] for c, w in zip(columns, widths, strict=True)]
+    deepest = max(map(len, headings))
+    lines = _row([[""] * (deepest - len(part)) + part for part in headings], widths, rights)
+    if not any(column.heading for column in columns):
+        lines = []
+    for cells in zip(*(column.cells for column in columns), strict=True):
+        lines += _row([_folded(cell, width) for cell, width in zip(cells, widths, strict=True)], widths, rights)
+    return lines
+
+
+def _row(parts: list[list[str]], widths: list[int], rights: list[bool]) -> list[str]:
+    """One row of the table, as many lines as its deepest cell."""
+    depth = max(map(len, parts))
+    lines = []
+    for at in range(depth):
+        cells = [part[at] if at < len(part) else "" for part in parts]
+        aligned = [
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(cells, widths, rights, strict=True)
+        ]
+        lines.append((" " * _GAP).join(aligned).rstrip())
+    return lines
+
+
+def _folded(cell: str, width: int) -> list[str]:
+    if len(cell) <= width:
+        return [cell]
+    return textwrap.wrap(cell, width, break_on_hyphens=False) or [""]
+
+
+def _broken_heading(heading: str, width: int) -> list[str]:
+    """The heading in lines of at most `width`, broken behind `_` and at blanks."""
+    lines = [""]
+    for part in _parts(heading):
+        if lines[-1] and len((lines[-1] + part).rstrip()) > width:
+            lines.append("")
+        lines[-1] += part
+    return [piece for line in lines for piece in (textwrap.wrap(line, width) or [""])]
+
+
+def _parts(heading: str) -> list[str]:
+    pieces = heading.replace("_", "_\n").replace(" ", " \n").split("\n")
+    return pieces if any(pieces) else [""]
+
+
+def _total(widths: Sequence[int]) -> int:
+    return sum(widths) + _GAP * (len(widths) - 1)

@@ -1,0 +1,18 @@
+"""What somebody may have meant by a name that does not exist."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+_ALIKE = 0.6
+_SHOWN = 3
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """` (did you mean `antenna_height_m`?)` to put behind a message; empty where nothing is alike."""
+    by_lower = {item.lower(): item for item in known}
+    near = difflib.get_close_matches(name.lower(), list(by_lower), n=_SHOWN, cutoff=_ALIKE)
+    if not near:
+        near = [item for item in by_lower if len(name) > 2 and name.lower() in item][:_SHOWN]
+    return f" (did you mean {' or '.join(f'`{by_lower[item]}`' for item in near)}?)" if near else ""

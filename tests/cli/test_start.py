@@ -1,0 +1,53 @@
+"""What a command loads before it does anything."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import SmallTrial
+
+ROOT = Path(__file__).parents[2]
+
+LOADED = """
+import sys, cli
+cli._guarded(sys.argv[1:], False)
+print([name for name in ('polars', 'numpy', 'scipy', 'pyarrow', 'schemas.config') if name in sys.modules])
+"""
+
+# The worker is stopped where it would read the log; `inspect` reads it.
+OF_A_LOG = """
+import os, sys, cli
+log, site, out = sys.argv[1:]
+parts = ('scipy.spatial', 'scipy.sparse', 'scipy.linalg', 'scipy.special')
+def loaded():
+    print([name for name in parts if name in sys.modules], flush=True)
+cli._guarded(['inspect', log, '--json'], False)
+loaded()
+import pipeline.campaign.worker as worker
+def stop(*given, **named):
+    loaded()
+    os._exit(0)
+for name in ('read_run', 'RecordedLog'):
+    if hasattr(worker, name):
+        setattr(worker, name, stop)
+cli._guarded(['replay', log, '--site', site, '--out', out, '--quiet'], False)
+"""
+
+
+def said(code: str, *arguments: str | Path) -> list[str]:
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=True).stdout.splitlines()
+
+
+@pytest.mark.parametrize("arguments", [["-h"], ["replay", "--help"], ["--version"], ["experiment", "list"]])
+def test_what_needs_no_table_loads_no_tables(arguments: list[str]) -> None:
+    assert said(LOADED, *arguments)[-1] == "[]"
+
+
+def test_a_log_needs_no_search_trees_and_no_matrices(small_trial: SmallTrial, tmp_path: Path) -> None:
+    lines = said(OF_A_LOG, small_trial.paths[0], small_trial.site, tmp_path / "out")
+    assert [line for line in lines if line.startswith("[") and line.endswith("]")][-2:] == ["[]", "[]"]

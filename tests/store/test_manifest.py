@@ -1,0 +1,125 @@
+"""The manifest says what made a result, and `verify` sees what no longer agrees."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.campaign import make_plan, run_campaign
+from pipeline.campaign.verify import recompute, verify
+from pipeline.results.manifest import settings_files
+from pipeline.results.store import table_address
+from schemas.config import Vehicle, load_settings
+from schemas.errors import UsageError
+from tests.conftest import SmallTrial
+
+
+def sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def manifest_of(out: Path) -> dict[str, Any]:
+    return dict(json.loads((out / "manifest.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def train(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("train") / "train7.toml"
+    file.write_text("antenna_height_m = 4.0\n")
+    return file
+
+
+@pytest.fixture(scope="module")
+def out(small_trial: SmallTrial, train: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of two calls, and a log that cannot be read."""
+    folder = tmp_path_factory.mktemp("result")
+    bad = tmp_path_factory.mktemp("bad") / "bad.mcap"
+    bad.write_bytes(b"no log")
+    vehicle = load_settings(train, Vehicle)
+    run_campaign(make_plan([str(small_trial.paths[0]), str(bad)], small_trial.site, folder))
+    given = settings_files(None, train)
+    run_campaign(make_plan([str(small_trial.paths[1])], small_trial.site, folder, vehicle=vehicle, given=given))
+    return folder
+
+
+def test_every_source_is_named_with_size_and_digest(out: Path, small_trial: SmallTrial, train: Path) -> None:
+    manifest = manifest_of(out)
+    assert sorted(manifest["runs"]) == ["bad", "run0", "run1"]
+    files = sorted(small_trial.paths[0].iterdir())
+    assert manifest["runs"]["run0"]["log"] == [
+        {"name": file.name, "bytes": file.stat().st_size, "sha256": sha256(file)} for file in files
+    ]
+    assert manifest["runs"]["bad"]["log"] == [
+        {"name": "bad.mcap", "bytes": 6, "sha256": hashlib.sha256(b"no log").hexdigest()}
+    ]
+    (site,) = manifest["sites"].values()
+    assert {file["name"]: file["sha256"] for file in site} == {
+        file.name: sha256(file) for file in small_trial.site.iterdir()
+    }
+    (entry,) = manifest["settings"][manifest["runs"]["run1"]["config_digest"]]
+    assert entry["vehicle"] == {"name": "train7.toml", "bytes": 23, "sha256": sha256(train)}
+    for run in ("run0", "run1", "bad"):
+        tables = {name: sha256(Path(table_address(out, name, run))) for name in manifest["runs"][run]["tables"]}
+        assert manifest["runs"][run]["tables"] == tables
+    assert manifest["files"]["config.toml"]["sha256"] == sha256(out / "config.toml")
+    assert str(small_trial.site) not in json.dumps(manifest)
+
+
+def test_the_order_of_calls_changes_nothing(out: Path, small_trial: SmallTrial, train: Path, tmp_path: Path) -> None:
+    vehicle, given = load_settings(train, Vehicle), settings_files(None, train)
+    one = make_plan([str(small_trial.paths[1])], small_trial.site, tmp_path, vehicle=vehicle, given=given)
+    run_campaign(one)
+    run_campaign(make_plan([str(small_trial.paths[0])], small_trial.site, tmp_path))
+    before, after = manifest_of(out)["runs"], manifest_of(tmp_path)["runs"]
+    assert after == {run: before[run] for run in ("run0", "run1")}
+    text = (tmp_path / "manifest.json").read_bytes()
+    run_campaign(make_plan([str(small_trial.paths[0])], small_trial.site, tmp_path))
+    assert (tmp_path / "manifest.json").read_bytes() == text
+
+
+def test_verify_sees_what_changed(out: Path, tmp_path: Path) -> None:
+    assert verify(out).problems == ()
+    copy = shutil.copytree(out, tmp_path / "copy")
+    hazards = Path(table_address(copy, "hazards", "run0"))
+    hazards.write_bytes(hazards.read_bytes() + b"x")
+    shutil.rmtree(copy / "runs" / "run_id=run1")
+    (copy / "config.toml").write_text("")
+    (copy / "campaign" / "map.parquet").unlink()
+    assert [what for what, _, _ in verify(copy).problems] == [
+        *("run run1", "campaign/map.parquet", "config.toml", "run run0, hazards"),
+    ]
+
+
+def test_a_run_of_an_interrupted_call_is_named(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    manifest = manifest_of(copy)
+    del manifest["runs"]["run0"]
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    ((what, found, expected),) = verify(copy).problems
+    assert (what, found) == ("run run0", "complete")
+    assert "interrupted" in expected
+
+
+def test_no_manifest_is_one_error(out: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    (copy / "manifest.json").unlink()
+    with pytest.raises(UsageError, match=r"has no manifest\.json"):
+        verify(copy)
+    (copy / "manifest.json").write_text("{}")
+    with pytest.raises(UsageError, match="is no manifest"):
+        verify(copy)
+
+
+def test_logs_are_replayed_again_and_compared(out: Path, small_trial: SmallTrial, tmp_path: Path) -> None:
+    same = recompute(out, lambda to: make_plan([str(small_trial.paths[0])], small_trial.site, to))
+    assert (same.problems, same.compared) == ((), "1 of 3 runs replayed again")
+    other = shutil.copytree(small_trial.paths[2], tmp_path / "run1")
+    wrong = recompute(out, lambda to: make_plan([str(other)], small_trial.site, to))
+    found = {what: expected for what, _, expected in wrong.problems}
+    assert found["run run1, settings"] == "--vehicle train7.toml"
+    assert {"run run1, log gnss.parquet", "run run1, epochs", "run run1, runs"} <= set(found)
