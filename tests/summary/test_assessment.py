@@ -93,7 +93,6 @@ def test_only_runs_with_several_solutions_are_compared(found: Assessment) -> Non
         ("reactive 1oo1", "gps", None, 1),
         ("reactive 1oo1", "primary", None, 1),
         ("composite 2oo2", "gps", "primary", 1),
-        ("composite 2oo2", "primary", "gps", 1),
         ("reactive 1oo2", "gps", "primary", 1),
     ]
 
