@@ -615,6 +615,47 @@ def report(
 
 @app.command(
     epilog=_examples(
+        "balise line week12 --site line9",
+        "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
+    )
+)
+def line(
+    out: ResultFolder,
+    site: Annotated[str, typer.Option("--site", help="Site that the runs were replayed on.")],
+    criteria: Annotated[Path | None, typer.Option("--criteria", callback=_here, help="Criteria (TOML).")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", callback=_here, help="Stations and signals: CSV with name, netelement_id, measure_m."),
+    ] = None,
+    solution: Annotated[
+        str | None, typer.Option(help="Solution of the runs; `primary` where there are several.")
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option("--out", callback=_here, help="Folder to write; by default OUT/line.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say of each piece of track whether virtual balises may be placed there, and propose some."""
+    from pipeline.line import write_line
+    from pipeline.line.write import read_points
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+    from schemas.config import load_settings
+    from schemas.line import LineCriteria
+
+    given = None if points is None else read_points(points)
+    found = write_line(out, read_site(site), load_settings(criteria, LineCriteria), solution, given, to)
+    if as_json:
+        _print_json({"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)})
+        return
+    show_table(found.summary, "Pieces of track")
+    show_table(found.proposals, "Proposals")
+    print("\n".join(found.remarks))
+    print(f"{len(found.files)} files; begin with {found.files[0]}")
+
+
+@app.command(
+    epilog=_examples(
         "balise export week12 monday --to monday.mcap --site line9",
         "balise export week12 monday --to monday.geojson",
     )
