@@ -37,4 +37,4 @@ def _show_ending(summary: Summary, out: str) -> None:
         show_table(shown)
     if (more := remarkable.height - shown.height) > 0:
         print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
-    print(f"Tables are in {out}; `balise report {out}` makes pages of them.")
+    print(f"Tables are in {out}; `balise report {out}` writes pages of them.")

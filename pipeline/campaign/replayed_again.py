@@ -16,7 +16,7 @@ def again(logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int) ->
     if not logs:
         return None
     if site is None:
-        raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+        raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
     ground = site
 
     def replay_with(settings: Configuration, to: str) -> None:
