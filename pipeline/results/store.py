@@ -152,7 +152,7 @@ def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) ->
             place=f"run {run_id}, table `{table}`",
             found="; ".join(parts),
             expected=f"the columns of contract {CONTRACT_VERSION} as of this build",
-            remedy="Replay this run again into the same output; `balise replay` sees that it is due.",
+            remedy="Repeat `balise replay` with the same --out: it replays this run again.",
         )
 
 
@@ -249,7 +249,7 @@ def read_config(out: Address) -> Configuration | None:
         raise UsageError(
             f"was not written by this build of the program: {error}",
             place=shown(address),
-            remedy="Replay the runs again into the same output; `balise replay` sees which are due.",
+            remedy="Repeat `balise replay` with the same --out: it replays these runs again.",
         ) from None
 
 
