@@ -114,6 +114,9 @@ def replay(
     time_limit: Annotated[
         float, typer.Option(min=0.1, help="Seconds that one run may take; a slower run fails.")
     ] = 3600.0,
+    undetected: Annotated[
+        bool, typer.Option("--undetected", help="Also compute the largest error that no monitor would have noticed.")
+    ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
@@ -125,6 +128,9 @@ def replay(
     from pipeline.results.manifest import settings_files
 
     settings, train = _configuration(config), _vehicle(vehicle)
+    if undetected:
+        asked = settings.undetected.model_copy(update={"compute": True})
+        settings = settings.model_copy(update={"undetected": asked})
     plan = make_plan(runs, site, out, settings, train, route, write_route, settings_files(config, vehicle))
     try:
         summary = run_campaign(
@@ -267,6 +273,43 @@ def safety(
 
 @app.command(
     epilog=_examples(
+        "balise claim week12 --site line9",
+        "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
+    )
+)
+def claim(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
+    site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
+    front_ahead: Annotated[
+        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+    ] = 0.0,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    as_json: Json = False,
+) -> None:
+    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    from pipeline.claim import claim as hold
+    from pipeline.claim import for_reading, load_profile, read_areas
+    from pipeline.results.answer_files import write_csv
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+
+    wanted = load_profile(profile)
+    ground = None if site is None else read_site(site)
+    areas = None if site is None or ground is None else read_areas(site, ground)
+    found = hold(out, wanted, ground, areas, front_ahead)
+    if csv is not None:
+        write_csv(found.table, csv)
+    if as_json:
+        head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
+        _print_json({**head, "notes": found.notes, "requirements": found.table})
+    elif str(csv) != "-":
+        show_table(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
+        print("\n".join(["", *found.notes]))
+
+
+@app.command(
+    epilog=_examples(
         "balise inspect monday.mcap",
         "balise inspect line9",
         "balise inspect line9 --result week12",
@@ -323,6 +366,37 @@ def inject(
     log = read_run(run, settings.ingest, with_digest=False)
     write_run_as(inject_all(log, faults, None if site is None else read_site(site)), out)
     print(f"{len(faults)} faults injected into {run}: {out}")
+
+
+@app.command()
+def undetected(
+    run: Annotated[str, typer.Argument(help="A recorded run.")],
+    site: Site,
+    out: Annotated[Path, typer.Option("--out", callback=_here, help="Folder for the fault file and its profile.")],
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
+    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
+    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+) -> None:
+    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    from datasets.undetected import largest_fault, write_fault
+    from pipeline.ingest import read_run
+    from pipeline.site.read import read_site
+
+    settings, train = _configuration(config), _vehicle(vehicle)
+    log = read_run(run, settings.ingest, with_digest=False)
+    found = largest_fault(log, read_site(site), train, settings, solution, balise, at_s, behind)
+    one = settings.undetected.solutions_at_fault == "one"
+    file = write_fault(found, solution if one else None, out)
+    began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
+    print(
+        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most."
+    )
+    print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
+    print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
+    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @app.command(
