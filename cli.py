@@ -282,12 +282,15 @@ def claim(
     profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
     site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
     front_ahead: Annotated[
-        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+        float,
+        typer.Option("--front-ahead", metavar="METRES", help="Distance of the front end ahead of the balise antenna."),
     ] = 0.0,
-    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write all columns as CSV; `-` is standard output.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.claim import claim as hold
     from pipeline.claim import for_reading, load_profile, read_areas
     from pipeline.results.answer_files import write_csv
@@ -368,7 +371,11 @@ def inject(
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise undetected monday.mcap --site line9 --out worst --balise VB07",
+    )
+)
 def undetected(
     run: Annotated[str, typer.Argument(help="A recorded run.")],
     site: Site,
@@ -376,11 +383,13 @@ def undetected(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
-    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
-    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
-    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+    balise: Annotated[
+        str | None, typer.Option(help="Place: where the run passes this balise; default: its end.")
+    ] = None,
+    at_s: Annotated[float | None, typer.Option(help="Place: this many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
-    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
     from datasets.undetected import largest_fault, write_fault
     from pipeline.ingest import read_run
     from pipeline.site.read import read_site
@@ -396,7 +405,7 @@ def undetected(
     )
     print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
     print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
-    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @app.command(
