@@ -85,7 +85,7 @@ def read_run(out: Address, run_id: str) -> RunTables:
 def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
     """One table of all complete runs, or of one, with the column `run_id` in front."""
     if table not in TABLES:
-        raise UsageError("is no table", place=table, expected=", ".join(TABLES))
+        raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
     if run_id is not None and not exists(table_address(out, _MARKER, run_id)):
         known = ", ".join(run_ids(out)[:10]) or "no complete run"

@@ -187,7 +187,7 @@ def test_inspect_logs(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -
     (tmp_path / "bad.mcap").write_bytes(b"no log")
     bad = balise("inspect", tmp_path / "bad.mcap")
     assert bad.status == 1
-    assert "does not start as MCAP does" in bad.out
+    assert "does not start with the MCAP magic bytes" in bad.out
 
 
 def test_report(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:

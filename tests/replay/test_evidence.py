@@ -305,4 +305,4 @@ def test_an_odometer_with_a_row_every_five_seconds_raises_no_alarm():
     found = replay(sparse, site, VEHICLE)
     assert found.runs["alarms"].item() == 0
     assert found.passages["status"].unique().to_list() == ["accepted"]
-    assert "the odometer has a row every 5 s only" in found.runs["notes"].item()
+    assert "the odometer has only one row every 5 s" in found.runs["notes"].item()
