@@ -15,11 +15,9 @@ import typer
 
 if TYPE_CHECKING:
     from pipeline.campaign import Summary
-    from pipeline.safety.sensitivity import Replay
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
-_SHOWN_RUNS = 25
 
 
 def _examples(*lines: str) -> str:
@@ -110,6 +108,7 @@ def replay(
 ) -> None:
     """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
+    from pipeline.campaign.ending import show_summary
     from pipeline.campaign.progress import watches
     from pipeline.results.manifest import settings_files
 
@@ -131,10 +130,10 @@ def replay(
         # A terminal that was closed takes no more words.
         with contextlib.suppress(OSError):
             if interrupted.summary is not None:
-                _show_summary(interrupted.summary, out, quiet, as_json)
+                show_summary(interrupted.summary, out, quiet, as_json)
             print("balise: interrupted; the same command goes on from here", file=sys.stderr)
         raise typer.Exit(128 + interrupted.signum) from None
-    _show_summary(summary, out, quiet, as_json)
+    show_summary(summary, out, quiet, as_json)
     raise typer.Exit(_status_of(summary))
 
 
@@ -240,9 +239,14 @@ def safety(
     logs: with --logs and --site they are replayed once per value.
     """
     if out is not None:
-        _assess(out, config, _replay_again(logs or [], site, vehicle, jobs), as_json)
+        from pipeline.campaign.replayed_again import again
+        from pipeline.safety.assessment import assess, show
+
+        settings = None if config is None else _configuration(config)
+        replay_again = again(logs or [], site, _vehicle(vehicle), jobs or os.cpu_count() or 1)
+        show(assess(out, settings, replay_again), as_json)
         return
-    from pipeline.results.terminal import show_table
+    from pipeline.results.terminal import show_tables
     from pipeline.safety import safety_tables
 
     settings = _configuration(config)
@@ -250,9 +254,7 @@ def safety(
     if as_json:
         _print_json(tables)
         return
-    for name, table in tables.items():
-        show_table(table, name)
-        print()
+    show_tables(tables)
 
 
 @app.command(
@@ -311,16 +313,14 @@ def inspect(
 ) -> None:
     """What a log, a site or a result holds, and what is remarkable in it."""
     from pipeline.results.inspection import inspect_path
-    from pipeline.results.terminal import show_table
+    from pipeline.results.terminal import show_tables
 
     settings = _configuration(config)
     tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
     if as_json:
         _print_json(tables)
     else:
-        for name, table in tables.items():
-            show_table(table, name)
-            print()
+        show_tables(tables)
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
@@ -414,6 +414,51 @@ def convert(
         print(f"not used: {count} x {visible(reason)}")
     for line in fit_report(converted.run, settings.ingest).lines():
         print(line)
+
+
+@app.command(
+    "site",
+    epilog=_examples(
+        "balise site line.gpx --balises every 1000 --out line9",
+        "balise site railways.geojson --balises wanted.csv --out line9",
+    ),
+)
+def make_a_site(
+    surveys: Annotated[
+        list[Path],
+        typer.Argument(callback=_here, help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions."),
+    ],
+    out: OutFolder,
+    balises: Annotated[
+        str | None, typer.Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
+    ] = None,
+    epsg: Annotated[int | None, typer.Option(help="Of x and y in tables that do not say.")] = None,
+    join: Annotated[float, typer.Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    flat: Annotated[bool, typer.Option("--flat", help="Leave heights out.")] = False,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a site that is there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
+    from pipeline.report.site_page import site_page
+    from pipeline.results.inspection import findings_table
+    from pipeline.results.terminal import show_table
+    from pipeline.site.describe import elements_table
+    from pipeline.survey.make import make_site, wish_of, write_made
+
+    wish = wish_of(surveys, balises, epsg, join, flat)
+    site = make_site(wish, _vehicle(vehicle), _configuration(config))
+    write_made(site, site_page(out.resolve().name, site), out, force)
+    elements, findings = elements_table(site), findings_table(site.findings)
+    if as_json:
+        _print_json({"elements": elements, "findings": findings, "balises": site.balises})
+        return
+    show_table(elements.head(_SHOWN_RUNS), "Elements")
+    show_table(findings, "Findings")
+    count = 0 if site.balises is None else site.balises.height
+    print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
+    print(f"Look at {out / 'site.html'} before you replay on it.")
 
 
 @app.command(
@@ -527,10 +572,10 @@ def sql(
 ) -> None:
     """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
     from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
-    from pipeline.results.query import run_sql
+    from pipeline.results.query import named_results, run_sql
     from pipeline.results.terminal import show_table
 
-    answer = run_sql(out, query, allow_files, _named_results(beside or []))
+    answer = run_sql(out, query, allow_files, named_results(beside or []))
     written = [(csv, write_csv), (parquet, write_parquet), (xlsx, write_xlsx)]
     for file, write in written:
         if file is not None:
@@ -566,6 +611,47 @@ def report(
     pages = write_report(out, place, jobs, None if quiet else how_far("pages"))
     if not quiet:
         print(f"{len(pages)} files; begin with {pages[0]}")
+
+
+@app.command(
+    epilog=_examples(
+        "balise line week12 --site line9",
+        "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
+    )
+)
+def line(
+    out: ResultFolder,
+    site: Annotated[str, typer.Option("--site", help="Site that the runs were replayed on.")],
+    criteria: Annotated[Path | None, typer.Option("--criteria", callback=_here, help="Criteria (TOML).")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", callback=_here, help="Stations and signals: CSV with name, netelement_id, measure_m."),
+    ] = None,
+    solution: Annotated[
+        str | None, typer.Option(help="Solution of the runs; `primary` where there are several.")
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option("--out", callback=_here, help="Folder to write; by default OUT/line.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say of each piece of track whether virtual balises may be placed there, and propose some."""
+    from pipeline.line import write_line
+    from pipeline.line.write import read_points
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+    from schemas.config import load_settings
+    from schemas.line import LineCriteria
+
+    given = None if points is None else read_points(points)
+    found = write_line(out, read_site(site), load_settings(criteria, LineCriteria), solution, given, to)
+    if as_json:
+        _print_json({"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)})
+        return
+    show_table(found.summary, "Pieces of track")
+    show_table(found.proposals, "Proposals")
+    print("\n".join(found.remarks))
+    print(f"{len(found.files)} files; begin with {found.files[0]}")
 
 
 @app.command(
@@ -728,88 +814,12 @@ def _print_json(value: Any) -> None:
     print(to_json(value))
 
 
-def _replay_again(logs: list[str], site: str | None, vehicle: Path | None, jobs: int) -> Replay | None:
-    """How `safety` replays the logs with another configuration; none without logs."""
-    from pipeline.campaign import make_plan, run_campaign
-    from schemas.errors import UsageError
-
-    if not logs:
-        return None
-    if site is None:
-        raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
-    ground, train = site, _vehicle(vehicle)
-
-    def replay_with(settings: Configuration, to: str) -> None:
-        run_campaign(make_plan(logs, ground, to, settings, train), jobs=jobs or os.cpu_count() or 1)
-
-    return replay_with
-
-
-def _assess(out: str, config: Path | None, replay_again: Replay | None, as_json: bool) -> None:
-    from pipeline.results.terminal import show_table
-    from pipeline.safety.assessment import assess, for_reading
-
-    settings = None if config is None else _configuration(config)
-    found = assess(out, settings, replay_again)
-    if as_json:
-        _print_json({"statements": found.statements, **found.tables})
-        return
-    print(found.statements[0] + "\n")
-    for name, table in for_reading(found.tables).items():
-        show_table(table, name)
-        print()
-    print("\n".join(found.statements[1:]))
-
-
-def _named_results(given: list[str]) -> dict[str, str]:
-    """`NAME=OUT` by name."""
-    from schemas.errors import UsageError
-
-    for text in given:
-        if not re.fullmatch(r"[A-Za-z]\w*=.+", text):
-            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
-    return dict(text.split("=", 1) for text in given)
-
-
 def _status_of(summary: Summary) -> int:
     from schemas.enums import RunStatus
 
     if summary.defects:
         return DEFECT
     return OK if summary.count(RunStatus.OK) == summary.planned else RUNS_NOT_OK
-
-
-def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.tally import outcome_line, outcome_rows
-    from schemas.enums import RunStatus
-
-    if as_json:
-        told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
-        figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
-        rows = outcome_rows(summary)
-        _print_json({**told, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
-    elif quiet:
-        for outcome in summary.outcomes:
-            if outcome.status is not RunStatus.OK:
-                print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
-    else:
-        _show_ending(summary, out)
-
-
-def _show_ending(summary: Summary, out: str) -> None:
-    """The verdicts, the worst first; of many runs those that are not safe."""
-    from pipeline.campaign.tally import ending_rows, summary_line
-    from pipeline.results.terminal import show_table
-
-    print(summary_line(summary))
-    rows = ending_rows(summary)
-    remarkable = rows.filter(rows["verdict"] != "safe")
-    shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
-    if shown.height:
-        show_table(shown)
-    if (more := remarkable.height - shown.height) > 0:
-        print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
-    print(f"Tables are in {out}; `balise report {out}` makes pages of them.")
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | No
 def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
     """What is left to do of a plan without the known runs: its jobs with what earlier campaigns completed."""
     left = [job for job in plan.jobs if job.run_id not in known]
-    complete = store.completed_runs(plan.out) if left else {}
+    complete = store.completed_runs(plan.out, [job.run_id for job in left])
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 

@@ -38,6 +38,8 @@ _NO_COLUMN = re.compile(r"(?:unable to find column|no column named) [\"'](\w+)[\
 _NO_TABLE = re.compile(r"relation '(\w+)' was not found")
 _NO_VALUE = re.compile(r"to `enum` failed for value \"([^\"]*)\"")
 
+_NAMED = re.compile(r"[A-Za-z]\w*=.+")
+
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
 _REMEDY = "SHOW TABLES and DESCRIBE table list what there is."
 
@@ -69,6 +71,15 @@ def run_sql(
             expected=_EXPECTED,
             remedy=_REMEDY,
         ) from None
+
+
+def named_results(given: Iterable[str]) -> dict[str, str]:
+    """`NAME=OUT` by name, for `others`. Raises `UsageError`."""
+    named = list(given)
+    for text in named:
+        if not _NAMED.fullmatch(text):
+            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
+    return dict(text.split("=", 1) for text in named)
 
 
 def _check_query(sql: str, allow_files: bool) -> None:

@@ -183,14 +183,14 @@ def check_site(site: Site | None, replayed_digest: str | None, run_id: str) -> N
         raise UsageError("was replayed on another site", place=run_id, found=site.digest, expected=replayed)
 
 
-def completed_runs(out: Address) -> dict[str, dict[str, str]]:
-    """Metadata of each complete run, without reading any table."""
-    runs = run_ids(out)
+def completed_runs(out: Address, among: Sequence[str] | None = None) -> dict[str, dict[str, str]]:
+    """Metadata of each complete run, or of those among these, without reading any table."""
+    runs = run_ids(out) if among is None else among
+    addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
     if is_url(out):
-        addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
         contents = storage.read_many(list(addresses))
         return {run: metadata_of(contents[place]) for place, run in addresses.items() if place in contents}
-    return {run: metadata_of(Path(table_address(out, _MARKER, run))) for run in runs}
+    return {run: metadata_of(Path(place)) for place, run in addresses.items() if Path(place).exists()}
 
 
 def metadata_of(source: Path | bytes) -> dict[str, str]:
