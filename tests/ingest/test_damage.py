@@ -70,7 +70,7 @@ def test_chunk_and_loose_messages_mix(tmp_path):
         (samples.MAGIC, "cut off"),
         (samples.MAGIC[:5], "cut off"),
         (samples.MAGIC + header(), "cut off"),
-        (samples.MAGIC + data_end() + footer() + samples.MAGIC, "no Header"),
+        (samples.MAGIC + data_end() + footer() + samples.MAGIC, "not a Header"),
         (whole(), "no GNSS"),
         (whole(definitions(), some_messages()) + b"junk", "trailing"),
         (whole(definitions(), some_messages()) * 2, "two files"),
@@ -84,7 +84,7 @@ def test_chunk_and_loose_messages_mix(tmp_path):
         (whole(definitions(), schema(name="other"), some_messages()), "second time"),
         (whole(schema(schema_id=0), some_messages()), "id 0"),
         (whole(definitions(), message_index(1, [(0, 0)])), "follows no chunk"),
-        (whole(definitions(), some_messages())[:-8] + b"\x89MCAP1\r\n", "closing magic"),
+        (whole(definitions(), some_messages())[:-8] + b"\x89MCAP1\r\n", "magic bytes at the end"),
     ],
 )
 def test_structure(tmp_path, content, says):
