@@ -8,8 +8,9 @@ import re
 import signal
 import sys
 import traceback
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -257,7 +258,7 @@ def safety(
     )
 )
 def inspect(
-    path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
+    path: Annotated[str, typer.Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
     result: Annotated[
         str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
     ] = None,
@@ -267,7 +268,7 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """What a log, a site or a result holds, and what is remarkable in it."""
-    from pipeline.results.inspection import inspect_path
+    from pipeline.results.inspection import STARTING_CONFIG, inspect_path
     from pipeline.results.terminal import show_table
 
     settings = _configuration(config)
@@ -276,6 +277,9 @@ def inspect(
         _print_json(tables)
     else:
         for name, table in tables.items():
+            if name == STARTING_CONFIG:  # to be saved, so without a frame
+                print("\n".join(table["toml"]))
+                continue
             show_table(table, name)
             print()
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
@@ -312,28 +316,51 @@ def inject(
 @app.command(
     epilog=_examples(
         "balise convert receiver.ubx --to monday",
+        "balise convert rover.pos --to monday --stream reference",
+        "balise convert second.sbf.gz --to monday --solution second",
         "balise convert positions.csv --config columns.toml --to monday.mcap",
     )
 )
 def convert(
     logs: Annotated[
         list[Path],
-        typer.Argument(callback=_here, help="UBX, SBF, NMEA, CSV with a mapping in --config, or a public recording."),
+        typer.Argument(
+            callback=_here,
+            help="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, ROS bags, MCAP, CSV with a mapping in --config, or a public "
+            "recording; .gz and .zip of these.",
+        ),
     ],
-    to: Annotated[Path, typer.Option("--to", callback=_here, help=_NEW_RUN)],
+    to: Annotated[
+        Path, typer.Option("--to", callback=_here, help=_NEW_RUN + " To one that exists, streams are added.")
+    ],
     config: ConfigFile = None,
+    solution: Annotated[str | None, typer.Option(help="Name of the receiver in the run, where it has several.")] = None,
+    stream: Annotated[Literal["gnss", "reference"], typer.Option(help="What the positions are for.")] = "gnss",
+    date: Annotated[
+        datetime | None, typer.Option(formats=["%Y-%m-%d"], help="Day of an NMEA log that holds none (UTC).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a stream or solution that the run has.")] = False,
 ) -> None:
-    """Make a run of receiver logs."""
+    """Make a run of receiver logs, or add streams to one."""
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
-    from pipeline.receivers import convert as convert_logs
+    from pipeline.ingest import read_run
+    from pipeline.receivers import Purpose, as_run, extended, gather
     from pipeline.results.fit_report import fit_report
+    from schemas.config import IngestConfig
     from schemas.errors import visible
 
-    settings = _configuration(config)
-    converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
-    if converted is None:
-        converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
+    settings, purpose = _configuration(config), Purpose(solution, stream)
+    recording = known_recording(logs[0]) if len(logs) == 1 and config is None else None
+    if recording is None:
+        found = gather(logs, settings.ingest, None if date is None else date.date())
+    else:
+        found = recording.gathered()
+    if to.is_file() or (to / "gnss.parquet").is_file():
+        run = read_run(to, IngestConfig(), with_digest=False)
+        converted = extended(run, to, found, purpose, settings.fix_sigma, force)
+    else:
+        converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
     write_run_as(converted.run, to)
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():

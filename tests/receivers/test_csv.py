@@ -87,7 +87,7 @@ def test_kinds_of_fix_by_text_number_and_word(converted):
         ("t,lat,lon\n,50,4\n2,50,4\n", {}, "column t: is not complete"),
         ("t,lat,lon\nabc,50,4\n", {}, "column t: holds no times"),
         ("t,lat,lon\n1,50,400\n", {}, "longitude_deg: is out of range; found 400"),
-        ("t;lat;lon\n1;50,5;4,5\n", {}, "column lat: cannot be latitude_deg"),
+        ("t;lat;lon\n1;50,5;4.5\n", {}, "column lat: cannot be latitude_deg"),
         ("t,lat,lon,lat\n1,50,4,51\n", {}, "a column name stands twice: lat"),
         ("t,lat,lon, lat \n1,50,4,51\n", {}, "a column name stands twice: lat"),
         ("t,lat,lon\ntrue,50,4\n", {}, "field t: is no time; found flag"),
