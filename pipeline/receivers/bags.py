@@ -14,6 +14,7 @@ from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, RunLog, Stream
 
+_HEADER = "std_msgs/msg/Header"
 _ENDINGS = (".bag", ".db3")
 
 
@@ -73,12 +74,13 @@ def _write(bag: Any, to: Path) -> dict[str, int]:
     from mcap.writer import CompressionType, Writer
 
     left: dict[str, int] = {}
+    types = bag.typestore if bag.is2 else _without_sequence(bag.typestore)
     with to.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE)
         writer.start(profile="ros2")
         channels = {}
         for connection in bag.connections:
-            definition = _definition(bag.typestore, connection.msgtype)
+            definition = _definition(types, connection.msgtype)
             if definition is None:
                 left[f"message on {connection.topic} ({connection.msgtype}), whose definition is not in the bag"] = (
                     connection.msgcount
@@ -87,10 +89,22 @@ def _write(bag: Any, to: Path) -> dict[str, int]:
             schema = writer.register_schema(connection.msgtype, "ros2msg", definition.encode())
             channels[connection.id, connection.owner] = writer.register_channel(connection.topic, "cdr", schema)
         for connection, t_ns, raw in bag.messages([c for c in bag.connections if (c.id, c.owner) in channels]):
-            data = bytes(raw) if bag.is2 else bytes(bag.typestore.ros1_to_cdr(raw, connection.msgtype))
+            data = bytes(raw) if bag.is2 else bytes(types.ros1_to_cdr(raw, connection.msgtype))
             writer.add_message(channels[connection.id, connection.owner], t_ns, data, t_ns)
         writer.finish()
     return left
+
+
+def _without_sequence(known: Any) -> Any:
+    """The types of a ROS 1 bag with the header of ROS 2, which has no sequence number: so they are transcribed."""
+    from rosbags.typesys import Stores, get_typestore
+
+    types = dict(known.fielddefs)
+    constants, fields = types.get(_HEADER, ([], []))
+    types |= {_HEADER: (constants, [field for field in fields if field[0] != "seq"])} if _HEADER in types else {}
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
 
 
 def _definition(types: Any, name: str) -> str | None:

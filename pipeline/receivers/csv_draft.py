@@ -20,7 +20,7 @@ _NAMES: dict[Stream, dict[str, str]] = {
     "gnss": {
         "latitude_deg": r"(gps|gnss)?(lat|latitude|breite|breitengrad|geobreite)(deg|wgs84)?",
         "longitude_deg": r"(gps|gnss)?(lon|long|lng|longitude|laenge|länge|längengrad)(deg|wgs84)?",
-        "height_m": r"(ellipsoidal|ell|ellips|hae)(height|h|hgt|alt|altitude)?|(height|h|alt)(ell|ellipsoidal|ellips|hae)",
+        "height_m": r"(ellipsoidal|ell|ellips|hae)(height|h|hgt|alt|altitude)?|(height|h|alt)(ell|ellipsoidal|hae)",
         "vel_e_mps": r"(ve|vel?e|east(vel|velocity|speed)|vel(ocity)?east)",
         "vel_n_mps": r"(vn|vel?n|north(vel|velocity|speed)|vel(ocity)?north)",
         "vel_u_mps": r"(vu|vel?u|up(vel|velocity|speed)|vel(ocity)?up)",
