@@ -101,8 +101,11 @@ def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
 
 
 def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
-    """Height over the ellipsoid; NovAtel's heights are those over the geoid but in INSPVA."""
-    height = m.height if hasattr(m, "height") else m.orthometric_height + m.undulation
+    """Height over the ellipsoid: with the undulation, where the message has one; INSPVA gives it as it is.
+
+    The field of the height has one name in old definitions of a message, and another in new ones.
+    """
+    height = (m.height if hasattr(m, "height") else m.orthometric_height) + getattr(m, "undulation", 0.0)
     epoch.tell("fix", rank, {"fix": fix.value})
     epoch.tell("place", rank, {"latitude_deg": m.latitude, "longitude_deg": m.longitude, "height_m": height})
     if hasattr(m, "latitude_std_dev"):
