@@ -101,6 +101,9 @@ def replay(
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
+    undetected: Annotated[
+        bool, typer.Option("--undetected", help="Also the largest error that no monitor would have noticed.")
+    ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
@@ -112,6 +115,9 @@ def replay(
     from pipeline.results.manifest import settings_files
 
     settings, train = _configuration(config), _vehicle(vehicle)
+    if undetected:
+        asked = settings.undetected.model_copy(update={"compute": True})
+        settings = settings.model_copy(update={"undetected": asked})
     plan = make_plan(runs, site, out, settings, train, route, write_route, settings_files(config, vehicle))
     try:
         summary = run_campaign(
@@ -252,6 +258,43 @@ def safety(
 
 @app.command(
     epilog=_examples(
+        "balise claim week12 --site line9",
+        "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
+    )
+)
+def claim(
+    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
+    site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
+    front_ahead: Annotated[
+        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+    ] = 0.0,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    as_json: Json = False,
+) -> None:
+    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    from pipeline.claim import claim as hold
+    from pipeline.claim import for_reading, load_profile, read_areas
+    from pipeline.results.answer_files import write_csv
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+
+    wanted = load_profile(profile)
+    ground = None if site is None else read_site(site)
+    areas = None if site is None or ground is None else read_areas(site, ground)
+    found = hold(out, wanted, ground, areas, front_ahead)
+    if csv is not None:
+        write_csv(found.table, csv)
+    if as_json:
+        head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
+        _print_json({**head, "notes": found.notes, "requirements": found.table})
+    elif str(csv) != "-":
+        show_table(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
+        print("\n".join(["", *found.notes]))
+
+
+@app.command(
+    epilog=_examples(
         "balise inspect monday.mcap",
         "balise inspect line9",
         "balise inspect line9 --result week12",
@@ -313,6 +356,37 @@ def inject(
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
+@app.command()
+def undetected(
+    run: Annotated[str, typer.Argument(help="A recorded run.")],
+    site: Site,
+    out: Annotated[Path, typer.Option("--out", callback=_here, help="Folder for the fault file and its profile.")],
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
+    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
+    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+) -> None:
+    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    from datasets.undetected import largest_fault, write_fault
+    from pipeline.ingest import read_run
+    from pipeline.site.read import read_site
+
+    settings, train = _configuration(config), _vehicle(vehicle)
+    log = read_run(run, settings.ingest, with_digest=False)
+    found = largest_fault(log, read_site(site), train, settings, solution, balise, at_s, behind)
+    one = settings.undetected.solutions_at_fault == "one"
+    file = write_fault(found, solution if one else None, out)
+    began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
+    print(
+        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most."
+    )
+    print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
+    print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
+    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+
+
 @app.command(
     epilog=_examples(
         "balise convert receiver.ubx --to monday",
@@ -367,6 +441,51 @@ def convert(
         print(f"not used: {count} x {visible(reason)}")
     for line in fit_report(converted.run, settings.ingest).lines():
         print(line)
+
+
+@app.command(
+    "site",
+    epilog=_examples(
+        "balise site line.gpx --balises every 1000 --out line9",
+        "balise site railways.geojson --balises wanted.csv --out line9",
+    ),
+)
+def make_a_site(
+    surveys: Annotated[
+        list[Path],
+        typer.Argument(callback=_here, help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions."),
+    ],
+    out: OutFolder,
+    balises: Annotated[
+        str | None, typer.Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
+    ] = None,
+    epsg: Annotated[int | None, typer.Option(help="Of x and y in tables that do not say.")] = None,
+    join: Annotated[float, typer.Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    flat: Annotated[bool, typer.Option("--flat", help="Leave heights out.")] = False,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a site that is there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
+    from pipeline.report.site_page import site_page
+    from pipeline.results.inspection import findings_table
+    from pipeline.results.terminal import show_table
+    from pipeline.site.describe import elements_table
+    from pipeline.survey.make import make_site, wish_of, write_made
+
+    wish = wish_of(surveys, balises, epsg, join, flat)
+    site = make_site(wish, _vehicle(vehicle), _configuration(config))
+    write_made(site, site_page(out.resolve().name, site), out, force)
+    elements, findings = elements_table(site), findings_table(site.findings)
+    if as_json:
+        _print_json({"elements": elements, "findings": findings, "balises": site.balises})
+        return
+    show_table(elements.head(_SHOWN_RUNS), "Elements")
+    show_table(findings, "Findings")
+    count = 0 if site.balises is None else site.balises.height
+    print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
+    print(f"Look at {out / 'site.html'} before you replay on it.")
 
 
 @app.command(
@@ -519,6 +638,47 @@ def report(
     pages = write_report(out, place, jobs, None if quiet else how_far("pages"))
     if not quiet:
         print(f"{len(pages)} files; begin with {pages[0]}")
+
+
+@app.command(
+    epilog=_examples(
+        "balise line week12 --site line9",
+        "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
+    )
+)
+def line(
+    out: ResultFolder,
+    site: Annotated[str, typer.Option("--site", help="Site that the runs were replayed on.")],
+    criteria: Annotated[Path | None, typer.Option("--criteria", callback=_here, help="Criteria (TOML).")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", callback=_here, help="Stations and signals: CSV with name, netelement_id, measure_m."),
+    ] = None,
+    solution: Annotated[
+        str | None, typer.Option(help="Solution of the runs; `primary` where there are several.")
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option("--out", callback=_here, help="Folder to write; by default OUT/line.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say of each piece of track whether virtual balises may be placed there, and propose some."""
+    from pipeline.line import write_line
+    from pipeline.line.write import read_points
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+    from schemas.config import load_settings
+    from schemas.line import LineCriteria
+
+    given = None if points is None else read_points(points)
+    found = write_line(out, read_site(site), load_settings(criteria, LineCriteria), solution, given, to)
+    if as_json:
+        _print_json({"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)})
+        return
+    show_table(found.summary, "Pieces of track")
+    show_table(found.proposals, "Proposals")
+    print("\n".join(found.remarks))
+    print(f"{len(found.files)} files; begin with {found.files[0]}")
 
 
 @app.command(

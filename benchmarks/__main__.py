@@ -23,6 +23,8 @@ MODULES = (
     "interruptions",
     "experiment",
     "relink",
+    "line",
+    "undetected",
 )
 
 

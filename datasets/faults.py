@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from schemas.arrays import Bools, Floats
 from schemas.config import NonNegative, Positive, Settings
+from schemas.errors import ConfigError
 from schemas.inputs import Faults
 
 NS_PER_S = 1_000_000_000
@@ -26,6 +27,7 @@ class FaultKind(StrEnum):
     BIAS = "bias"
     RAMP = "ramp"
     NOISE = "noise"
+    PROFILE = "profile"
     OUTAGE = "outage"
     LATENCY = "latency"
     SLIP = "slip"
@@ -38,13 +40,14 @@ _NEEDS = {
     FaultKind.BIAS: "size_m",
     FaultKind.RAMP: "rate_mps",
     FaultKind.NOISE: "sigma_m",
+    FaultKind.PROFILE: "profile",
     FaultKind.OUTAGE: None,
     FaultKind.LATENCY: "latency_s",
     FaultKind.SLIP: "rate_mps",
     FaultKind.SLIDE: "rate_mps",
     FaultKind.SCALE: "scale",
 }
-_QUANTITIES = ("size_m", "rate_mps", "sigma_m", "latency_s", "scale")
+_QUANTITIES = ("size_m", "rate_mps", "sigma_m", "latency_s", "scale", "profile")
 _ON_ODOMETER = (FaultKind.SLIP, FaultKind.SLIDE, FaultKind.SCALE)
 _GROUPS = ("satellites", "gps", "galileo")
 _TARGET = r"^(along|cross|up|east|north|position|odometer|satellites|gps|galileo|[A-Z][0-9]{2})$"
@@ -57,7 +60,9 @@ class FaultSpec(Settings):
     spoofer does), `position` serves outage and latency, `odometer` slip, slide, scale and outage; a satellite
     (`G08`), a constellation (`gps`, `galileo`) or all `satellites` are hit in their ranges, those of groups only
     below `below_deg` of elevation and between two azimuths, clockwise, where these are given.
-    A ramp grows by `rate_mps` for its duration and then stays, unless it `returns`.
+    A ramp grows by `rate_mps` for its duration and then stays, unless it `returns`. A profile is a CSV file with
+    `t_s` (seconds after the first epoch, growing) and `size_m`: zero before its first row, a straight line from row to
+    row, and its last size from there on.
     Slip adds `rate_mps` to the odometer's speed, slide takes it off (wheels never turn backwards);
     `scale` multiplies the odometer's increments. `solution` limits the fault to one solution.
     """
@@ -71,6 +76,7 @@ class FaultSpec(Settings):
     sigma_m: Positive | None = None
     latency_s: Positive | None = None
     scale: Positive | None = None
+    profile: str | None = None
     returns: bool = False
     solution: str | None = None
     below_deg: Annotated[float, Field(gt=0, le=90)] | None = None
@@ -157,9 +163,25 @@ def offset_m(fault: FaultSpec, t_s: Floats, rng: np.random.Generator) -> Floats:
         limit = np.inf if fault.duration_s is None else fault.duration_s
         grown = (fault.rate_mps or 0.0) * np.clip(t_s - fault.begins_s(), 0.0, limit)
         return np.where(now, grown, 0.0) if fault.returns else grown
+    if fault.kind is FaultKind.PROFILE:
+        at_s, size = read_profile(fault.profile or "")
+        return np.interp(t_s, at_s, size, left=0.0)
     if fault.kind is FaultKind.NOISE:
         return np.where(now, (fault.sigma_m or 0.0) * rng.standard_normal(t_s.size), 0.0)
     return np.where(now, fault.size_m or 0.0, 0.0)
+
+
+def read_profile(path: str) -> tuple[Floats, Floats]:
+    """Times [s] and sizes [m] of a profile; raises `ConfigError` where the file is none."""
+    expected = "CSV with columns t_s (growing) and size_m, numbers in each row"
+    try:
+        table = pl.read_csv(path, columns=["t_s", "size_m"], schema_overrides={"t_s": pl.Float64, "size_m": pl.Float64})
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise ConfigError("cannot be read as a profile", place=path, found=str(error), expected=expected) from None
+    values = table.to_numpy()
+    if not values.size or not np.isfinite(values).all() or (np.diff(values[:, 0]) <= 0.0).any():
+        raise ConfigError("is no profile", place=path, expected=expected)
+    return values[:, 0], values[:, 1]
 
 
 def active(fault: FaultSpec, t_s: Floats) -> Bools:
@@ -240,6 +262,9 @@ def _size(fault: FaultSpec, to_end_s: float) -> float | None:
     """The quantity of the kind; of a ramp, slip or slide what it has grown to at its end [m]."""
     if fault.rate_mps is not None:
         return fault.rate_mps * (to_end_s if fault.duration_s is None else min(fault.duration_s, to_end_s))
+    if fault.kind is FaultKind.PROFILE:
+        _, sizes = read_profile(fault.profile or "")
+        return float(sizes[np.argmax(np.abs(sizes))])
     needed = _NEEDS[fault.kind]
     value: float | None = getattr(fault, needed) if needed else None
     return value

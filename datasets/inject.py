@@ -46,7 +46,12 @@ def load_faults(path: Path) -> tuple[FaultSpec, ...]:
     found = settings_from(read_toml(path), FaultFile, str(path), "docs/scenarios.md lists every key.").faults
     if not found:
         raise ConfigError("holds no fault", place=str(path), expected="[[faults]] tables")
-    return found
+    return tuple(_with_profile_beside(fault, path.parent) for fault in found)
+
+
+def _with_profile_beside(fault: FaultSpec, folder: Path) -> FaultSpec:
+    """A profile is named as seen from its fault file."""
+    return fault if fault.profile is None else fault.model_copy(update={"profile": str(folder / fault.profile)})
 
 
 def inject_all(run: RunLog, faults: Iterable[FaultSpec], site: Site | None = None) -> RunLog:

@@ -10,8 +10,8 @@ import polars as pl
 from pipeline.ingest.clean import clean
 from pipeline.matching import match
 from pipeline.odometry import odometry_of
-from pipeline.track.geodesy import curvature_radii_m, distances_m
-from schemas.arrays import Floats, Ints
+from pipeline.track.geodesy import curvature_radii_m, distances_m, moved_deg
+from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -23,10 +23,16 @@ _OUTER_CELLS = 3
 
 @dataclass(frozen=True)
 class _Way:
-    """Where the train was along its own way at some instants, and the way itself by the distance along it."""
+    """Where positions were along their own way and left of it at some instants, and the way by the distance along it.
+
+    `own_height_m`: of the positions. `course_m`: over so much of it, to both sides, its course is taken.
+    """
 
     t_ns: Ints
     s_m: Floats
+    left_m: Floats
+    own_height_m: Floats
+    course_m: float
     axis_m: Floats
     latitude_deg: Floats
     longitude_deg: Floats
@@ -48,13 +54,23 @@ def displacement_m(
     what the run's own positions show, averaged over 10 m.
     """
     way = _own_way(run, solution) if site is None else _site_way(run, solution, site)
-    s_m = np.interp(t_ns.astype(np.float64), way.t_ns.astype(np.float64), way.s_m)
+    now, known = t_ns.astype(np.float64), way.t_ns.astype(np.float64)
+    s_m, beside_m, own_m = (np.interp(now, known, at) for at in (way.s_m, way.left_m, way.own_height_m))
     here, there = way.places(s_m), way.places(s_m + ahead_m)
-    ahead, behind = way.places(s_m + _BIN_M), way.places(s_m - _BIN_M)
-    east, north, up = _local_m(here, there)
-    course_e, course_n, _ = _local_m(behind, ahead)
+    east_here, north_here = _left_of(way, s_m)
+    # A position beside the track stays as far beside it where the track has turned.
+    begin = moved_deg(*here, beside_m * east_here, beside_m * north_here)
+    east_there, north_there = _left_of(way, s_m + ahead_m)
+    end = moved_deg(*there, beside_m * east_there, beside_m * north_there)
+    east, north, _ = _local_m((*begin, own_m), (*end, own_m))
+    return np.column_stack([east + left_m * east_here, north + left_m * north_here, there[2] - here[2]])
+
+
+def _left_of(way: _Way, s_m: Floats) -> tuple[Floats, Floats]:
+    """East and north of the unit vector to the left of the way at these distances."""
+    course_e, course_n, _ = _local_m(way.places(s_m - way.course_m), way.places(s_m + way.course_m))
     norm = np.hypot(course_e, course_n)
-    return np.column_stack([east - left_m * course_n / norm, north + left_m * course_e / norm, up])
+    return -course_n / norm, course_e / norm
 
 
 def _own_way(run: RunLog, solution: str) -> _Way:
@@ -72,7 +88,7 @@ def _own_way(run: RunLog, solution: str) -> _Way:
         raise InputError("the train moves too little to know its track", place=run.run_id, expected="30 m or more")
     count = np.bincount(of_epoch)
     means = [np.bincount(of_epoch, weights=values) / count for values in (s_m, *places)]
-    return _Way(t_ns, s_m, *means)
+    return _Way(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
 
 
 def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
@@ -85,13 +101,19 @@ def _site_way(run: RunLog, solution: str, site: Site) -> _Way:
     if epochs["leg"].n_unique() != 1:
         raise InputError("the path changes direction at a switch", place=run.run_id, remedy="Inject without --site.")
     s_m = epochs["path_m"].to_numpy()
-    axis = np.arange(s_m.min() - _BEYOND_M, s_m.max() + _BEYOND_M, _BIN_M / 2.0)
+    points_m = found.path.legs[epochs["leg"][0]].path_start_m
+    axis = np.union1d(np.arange(s_m.min() - _BEYOND_M, s_m.max() + _BEYOND_M, _BIN_M / 2.0), points_m)
     leg = np.full(axis.size, epochs["leg"][0], dtype=np.int64)
     elements, measures = found.path.locate(leg, axis)
     places = _on_track(site.track, elements.tolist(), measures)
-    return _Way(epochs["t"].to_physical().to_numpy(), s_m, axis, *places)
+    left_m = epochs["cross_track_m"].to_numpy()
+    own = fixes.join(epochs.select("t"), on="t", how="right", maintain_order="right")
+    own_m = np.nan_to_num(floats(own, "height_m"))
+    return _Way(epochs["t"].to_physical().to_numpy(), s_m, left_m, own_m, _AT_POINT_M, axis, *places)
 
 
+# The survey is straight from point to point, so its course at a place is that of the segment there.
+_AT_POINT_M = 0.05
 # How far a position may be displaced beyond the ends of the run and still follow the track.
 _BEYOND_M = 5000.0
 

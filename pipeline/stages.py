@@ -14,6 +14,7 @@ from pipeline.figures.evidence_notes import reading_notes, reference_notes
 from pipeline.figures.fit_notes import fit_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
+from pipeline.figures.undetected import Spacing
 from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
 from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
@@ -30,6 +31,8 @@ from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network
 from pipeline.track.route import site_network
+from pipeline.undetected.columns import Diagnosis, undetected_of
+from pipeline.undetected.windows import fixes_ns
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
@@ -71,6 +74,17 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
         for name in context.run.solutions()
     ]
     return _tables(run.run_id, parts)
+
+
+def diagnosed(
+    run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str
+) -> tuple[Diagnosis, pl.DataFrame, pl.DataFrame]:
+    """What watched one solution of a run, with its passages and crossings as the LDS made them."""
+    if solution not in run.solutions():
+        raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
+    context = _context(run, site, vehicle, config)
+    ride = _ride(context, solution, _matches(context)[0])
+    return ride.diagnosis, ride.lds.passages, ride.lds.crossings
 
 
 def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> _Context:
@@ -167,6 +181,8 @@ class _Ride:
     aligned: pl.DataFrame
     lds: LdsResult
     odometry: Odometry | None
+    diagnosis: Diagnosis
+    spacing: Spacing | None
 
 
 def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
@@ -175,13 +191,27 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     fixes = run.gnss.filter(pl.col("solution") == solution)
     odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, odometry, context.vehicle, config)
-    bank = MonitorBank(aligned, _single_monitors(context, solution, aligned, matches), config)
+    compared = _compared(context, solution, aligned, matches)
+    singles = _single_monitors(context, solution, aligned, compared)
+    bank = MonitorBank(aligned, singles, config)
     reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
     scale_sigma = None if odometry is None else odometry.scale_sigma
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
-    monitored = pl.concat([aligned, pl.DataFrame(bank.columns()), lds.epochs.drop("t")], how="horizontal")
-    seen = Solution(solution, fixes, monitored, lds.crossings, lds.passages, balises, found.path)
-    return _Ride(seen, found, aligned, lds, odometry)
+    seen = pl.concat([aligned, lds.epochs.drop("t")], how="horizontal")
+    diagnosis = Diagnosis(
+        epochs=seen,
+        bank=bank.along(),
+        held=lds.held,
+        channel=singles["channel"],
+        other=compared,
+        satellites=_ranges(context, solution),
+        fixes_ns=fixes_ns(run, lds.crossings, config.lds.starts_of_mission, config.undetected),
+    )
+    unnoticed = undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
+    monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
+    passages = lds.passages.with_columns(unnoticed.passages)
+    taken = Solution(solution, fixes, monitored, lds.crossings, passages, balises, found.path)
+    return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
 
 
 def _reads_on_odometer(
@@ -225,6 +255,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
+        spacing=ride.spacing,
         impossible=len(fit.impossible),
     )
 
@@ -242,19 +273,31 @@ def _figures_from(context: _Context) -> VehicleFigures:
 
 
 def _single_monitors(
-    context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
+    context: _Context, solution: str, aligned: pl.DataFrame, compared: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
-    satellites = context.run.satellites
-    ranges = None if satellites is None else satellites.filter(pl.col("solution") == solution)
-    named = other in matches and other != solution
-    compared = on_path_of(aligned, matches[other].epochs) if other is not None and named else None
+    ranges = _ranges(context, solution)
     absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
         "along_doppler": doppler_monitor(aligned, context.config),
         "channel": channel_monitor(aligned, compared, context.config, absent),
         "pseudorange": pseudorange_monitor(aligned, ranges, context.config),
     }
+
+
+def _compared(
+    context: _Context, solution: str, aligned: pl.DataFrame, matches: dict[str, Match]
+) -> pl.DataFrame | None:
+    """The solution to compare with, on this one's path; none where none is named or the run has it not."""
+    other = context.config.monitors.channel_reference
+    if other is None or other == solution or other not in matches:
+        return None
+    return on_path_of(aligned, matches[other].epochs)
+
+
+def _ranges(context: _Context, solution: str) -> pl.DataFrame | None:
+    satellites = context.run.satellites
+    return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
 
 def _tables(run_id: str, parts: list[Tables]) -> RunTables:

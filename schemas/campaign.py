@@ -89,6 +89,10 @@ def _campaign_balises_schema() -> type[dy.Schema]:
         "suspect_after_the_fact": count("accepted between a fault's onset and its detection"),
         "location_error_count": count("acceptances whose location error is known to 5 m: what follows is of these"),
         **_spread("location_error", "location error of acceptances"),
+        "undetected_count": count("passages with an unnoticed error computed: what follows is of these"),
+        "undetected_median_m": real("m", "median of the larger unnoticed error, ahead or behind", min=0),
+        "undetected_p95_m": real("m", "95 % of them are below", min=0),
+        "undetected_max_m": real("m", "the largest of them", min=0),
     }
     doc = "One row per balise and solution over all runs of the campaign."
     return type("CampaignBalises", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})
@@ -183,6 +187,17 @@ def _figures_schema() -> type[dy.Schema]:
             f"stanford_hpl_{kind}": count(f"epochs of these runs: {kind}, by the receiver's HPL", nullable=True)
             for kind in STANFORD
         },
+        "undetected_max_m": real(
+            "m", "largest unnoticed error at any epoch of any run; null where not computed", min=0
+        ),
+        "physical_spacing_runs": count("runs with a spacing of physical balises computed"),
+        "physical_spacing_m": real(
+            "m", "shortest way from a physical balise at any time to one beyond the limit", min=0
+        ),
+        "physical_spacing_median_m": real("m", "median over the runs that reach the limit", min=0),
+        "physical_spacing_share_low": real(
+            "1", "share of runs in which the shortest spacing suffices: one-sided 95 % bound from below", min=0, max=1
+        ),
         "thr_vb_per_h": real("1/h", "tolerable hazard rate of a virtual balise", tolerance=0.0, min=0),
         "hours_needed": real(
             "h",

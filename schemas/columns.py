@@ -16,6 +16,7 @@ _TOLERANCE_BY_UNIT = {
     "m2": 1e-6,
     "m2/s": 1e-9,
     "m/s": 1e-6,
+    "km/h": 1e-6,
     "s": 1e-6,
     "deg": 1e-10,
     "h": 1e-6,

@@ -395,6 +395,21 @@ class HazardConfig(Settings):
     service_level: str = "lpv200"
 
 
+class UndetectedConfig(Settings):
+    """The largest error that no monitor would have noticed (DOMAIN section 5.6)."""
+
+    # A second or so for an hour of run: asked for, as `replay --undetected`.
+    compute: bool = False
+    # The fastest fault of DIAG's simulation; only where nothing looks on does it decide.
+    max_rate_mps: Positive = 5.0
+    # What says, independently of GNSS, that the position was right; a fault began after the last of them.
+    fixes: tuple[Literal["read", "reference"], ...] = ("read",)
+    # `all`: the fault is in every solution, and comparing two of them shows nothing. `one`: in this one alone.
+    solutions_at_fault: Literal["all", "one"] = "all"
+    # Physical balises are thought of at epochs so far apart, to find their largest spacing.
+    spacing_step_s: Positive = 60.0
+
+
 class ServiceLevel(Settings):
     """Hazard rate of a signal-in-space service: `integrity_risk` per `exposure_s`."""
 
@@ -440,6 +455,7 @@ class Configuration(Settings):
     lds: LdsConfig = LdsConfig()
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
+    undetected: UndetectedConfig = UndetectedConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:

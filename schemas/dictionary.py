@@ -12,6 +12,7 @@ from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
+from schemas.line import LINE_TABLES
 from schemas.tables import CONTRACT_VERSION, TABLES
 
 _INTRODUCTION = f"""# Data dictionary
@@ -37,6 +38,7 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
         "Site": SITE_SCHEMAS,
         "Output tables": TABLES,
         "Campaign tables": CAMPAIGN_TABLES,
+        "Line tables": LINE_TABLES,
     }
 
 

@@ -27,6 +27,15 @@ class BaliseKind(StrEnum):
     PHYSICAL = "physical"
 
 
+class AreaType(StrEnum):
+    """Types of area of 22E126: traffic on a main line, on a dense line, in a node, and precise positioning."""
+
+    MAINLINE = "mainline"
+    DENSE_LINE = "dense_line"
+    NODE = "node"
+    PRECISE = "precise"
+
+
 class Reaction(StrEnum):
     NONE = "none"
     SERVICE_BRAKE = "service_brake"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Fix, Navigability, Reaction
+from schemas.enums import AreaType, BaliseKind, Fix, Navigability, Reaction
 from schemas.run import Stream
 
 
@@ -129,6 +129,16 @@ class Route(dy.Schema):
     direction = text("AB (from start to end) or BA")
 
 
+class Areas(dy.Schema):
+    """Types of area along net elements, for `balise claim`; a site need not have it, and a replay does not read it."""
+
+    netelement_id = text("net element")
+    from_m = real("m", "measure where the area begins", nullable=False)
+    to_m = real("m", "measure where it ends", nullable=False)
+    area_type = one_of(AreaType, "what of the requirements applies")
+    track_speed_kmh = real("km/h", "track speed; null: not known", min_exclusive=0)
+
+
 STREAM_SCHEMAS: dict[Stream, type[dy.Schema]] = {
     "gnss": Gnss,
     "odometer": Odometer,
@@ -142,4 +152,5 @@ SITE_SCHEMAS: dict[str, type[dy.Schema]] = {
     "links": Links,
     "balises": Balises,
     "route": Route,
+    "areas": Areas,
 }

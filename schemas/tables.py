@@ -122,6 +122,12 @@ class Passages(dy.Schema):
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
     crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
+    undetected_ahead_m = real("m", "largest fault ahead of the train that no monitor would have noticed", min=0)
+    undetected_behind_m = real("m", "the same behind it; null as all of these where not computed", min=0)
+    undetected_range_ahead_m = real("m", "largest of these by one range at fault, the pseudorange monitor heard", min=0)
+    undetected_range_behind_m = real("m", "the same behind it", min=0)
+    undetected_since = instant("such a fault began after here: the last independent fix", nullable=True)
+    undetected_monitors = texts("monitors that hold it so small, first what holds most", nullable=True)
 
 
 class Alarms(dy.Schema):
@@ -191,6 +197,8 @@ class _EpochsAfterMonitors(dy.Schema):
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where nobody knows", nullable=True)
     in_use = flag("fix valid, unambiguous, confident, not blocked (DOMAIN section 5.2)")
+    undetected_ahead_m = real("m", "largest fault ahead of the train that no monitor would have noticed", min=0)
+    undetected_behind_m = real("m", "the same behind it; both null where not computed", min=0)
 
 
 def _monitor_columns(monitor: str) -> dict[str, dy.Column]:
@@ -323,6 +331,16 @@ class Runs(dy.Schema):
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
     accepted_judged = count("accepted VBs judged right or wrong")
+    undetected_median_m = real("m", "median over epochs in use of the larger of undetected ahead and behind", min=0)
+    undetected_p95_m = real("m", "95 % of them are below", min=0)
+    undetected_max_m = real("m", "the largest of them", min=0)
+    undetected_share_beyond = real("1", "share of epochs in use with one beyond the failure limit", min=0, max=1)
+    t_undetected_beyond = instant("first epoch in use with one beyond the failure limit", nullable=True)
+    undetected_beyond_path_m = real("m", "path position there")
+    physical_spacing_m = real("m", "shortest way from a physical balise at any time to one beyond the limit", min=0)
+    physical_spacing_s = real("s", "shortest time from such a balise to one beyond the limit", min=0)
+    physical_spacing_starts = count("such balises thought of; null where not computed", nullable=True)
+    physical_spacing_reached = count("of these those from which the run reaches the limit", nullable=True)
 
 
 TABLES: dict[str, type[dy.Schema]] = {

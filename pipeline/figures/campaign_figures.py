@@ -17,6 +17,7 @@ from pipeline.figures.campaign_tables import RATES, counted_runs
 from pipeline.figures.estimates import Estimator, columns_of, continuity_15s, mtbf, with_estimates
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.levels import level_counts
+from pipeline.figures.undetected import spacing_of_runs
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import SafetyConfig
 from schemas.conform import conform, dtypes
@@ -58,7 +59,7 @@ def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyCo
     is not shown to be within the budget.
     """
     done = counted_runs(runs, hazards).filter(pl.col("status") != RunStatus.FAILED)
-    sums = done.sort("run_id").group_by("solution").agg(**_sums(), **_shares()).sort("solution")
+    sums = done.sort("run_id").group_by("solution").agg(**_sums(), **_shares(), **spacing_of_runs()).sort("solution")
     thr = config.thr_vb_per_h
     against_thr: dict[str, Sequence[float | None]] = {
         "runs_failed": [failed_runs(runs, name) for name in sums["solution"]],

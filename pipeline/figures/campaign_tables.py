@@ -12,6 +12,7 @@ from pipeline.figures.estimates import Estimator, with_estimates
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.levels import level_rows
 from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
+from pipeline.figures.undetected import undetected_spread
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
@@ -150,6 +151,7 @@ def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
             runs=pl.col("run_id").n_unique().cast(pl.Int64),
             **_counts(),
             **_spread(),
+            **undetected_spread(),
         )
         .pipe(
             with_estimates,

@@ -12,6 +12,7 @@ from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
 from pipeline.figures.availability_notes import availability_notes
 from pipeline.figures.evidence_notes import evidence_notes, motion_notes, undiagnosed_notes
+from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
 from pipeline.results.provenance import Provenance
@@ -30,7 +31,8 @@ class SolutionResults:
 
     `distance_m`: way driven, None where nobody knows; `odometer_contradicted`: gaps between anchors that the odometer
     does not close (DOMAIN section 5.1). `alignment`: latency and odometer scale at the end of the run.
-    `impossible`: misfits that no train can have, which were let pass.
+    `impossible`: misfits that no train can have, which were let pass. `spacing`: of physical balises, None where not
+    computed.
     """
 
     solution: str
@@ -48,6 +50,7 @@ class SolutionResults:
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
     notes: tuple[str, ...] = ()
+    spacing: Spacing | None = None
     impossible: int = 0
 
 
@@ -70,6 +73,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | figures.state_shares(epochs, clock)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
         | figures.stanford_of_receiver(epochs, config.lds.ci_limit_m)
+        | undetected_figures(epochs, results.spacing, config.hazards.failure_limit_m)
         | _provenance(provenance)
     )
     verdict = verdict_of(row, config.hazards.unknown_share_limit)

@@ -15,7 +15,7 @@ from pipeline.lds.detection import BaliseDetection
 from pipeline.lds.journey import Journey, mission_epochs, segment_epochs
 from pipeline.lds.link_monitors import LinkDistance
 from pipeline.lds.linking import LrvbChange
-from pipeline.lds.relink import Anchor, Recovery, Relink, breaks
+from pipeline.lds.relink import Anchor, Held, Recovery, Relink, breaks
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
@@ -53,6 +53,11 @@ class LocationSystem:
         self._chain_from: int | None = None  # validated positions after this epoch are TVBs
         self._consistent_since_ns: int | None = None
         self._consistent_at_ns = 0
+
+    @property
+    def held(self) -> list[Held]:
+        """The re-links that held, in order."""
+        return self._relink.held
 
     def run(self) -> None:
         """Walk along all epochs."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,6 +76,15 @@ class Comparison:
         return self.reason is None and abs(self.moved_m) <= self.bound_m
 
 
+class Held(NamedTuple):
+    """A re-link that held: at which epoch, against the position of which one (None: a telegram)."""
+
+    epoch: int
+    anchor_epoch: int | None
+    moved_m: float
+    bound_m: float
+
+
 class Relink:
     """The anchor of one solution, and the comparison with it. `tvb`: flags of the epochs, as far as they are known."""
 
@@ -84,6 +94,7 @@ class Relink:
         self._anchor: Anchor | None = None
         self._alarmed = False
         self._mission_from = 0
+        self.held: list[Held] = []
 
     def begin_mission(self, k: int) -> None:
         """What was before epoch `k` does not count."""
@@ -122,7 +133,10 @@ class Relink:
         if self._journey.scale_sigma is None and not (anchor.is_read and anchor.epoch == k):
             return Comparison(reason=NO_VEHICLE)
         offset_m = float(self._journey.path_m[k] - self._journey.odometer_m[k])
-        return Comparison(offset_m - anchor.offset_m, self._bound_m(anchor, k))
+        found = Comparison(offset_m - anchor.offset_m, self._bound_m(anchor, k))
+        if found.holds:
+            self.held.append(Held(k, None if anchor.is_read else anchor.epoch, found.moved_m, found.bound_m))
+        return found
 
     def _bound_m(self, anchor: Anchor, k: int) -> float:
         """min(failure limit / 2, k_T sqrt(2 sigma_x^2 + sigma_odo^2 t + (sigma_scale d)^2)) (DOMAIN section 4).

@@ -13,6 +13,7 @@ from pipeline.lds.journey import journey_of
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
 from pipeline.lds.reads import reads_of
+from pipeline.lds.relink import Held
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
 
@@ -24,13 +25,14 @@ class LdsResult:
     `epochs`: `t` and the LDS columns, row for row with the input. `crossings`: as in `schemas.stages.Crossings`, each
     balise crossed or read. `passages`: as in the contract, in order of time, joined to crossings by `crossing_id`;
     what needs a truth is null or `none`; beside it `t_reckoned`: when the train passes a balise that was not offered,
-    by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path.
+    by LRVB and odometer. `unknown_reads`: telegrams of balises not on the path. `held`: re-links that held.
     """
 
     epochs: pl.DataFrame
     crossings: pl.DataFrame
     passages: pl.DataFrame
     unknown_reads: pl.DataFrame
+    held: tuple[Held, ...]
 
 
 def run_lds(
@@ -64,4 +66,5 @@ def run_lds(
         crossings=crossing_rows(crossings, journey),
         passages=passage_rows(passages, crossings, journey, solution),
         unknown_reads=unknown,
+        held=tuple(system.held),
     )

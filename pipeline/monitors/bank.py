@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import AxisState
 from pipeline.monitors.series import DISABLED, FIRST_EPOCH, Axis, axes_of
 from pipeline.monitors.single import blind_monitor
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import SCALES
@@ -21,6 +21,20 @@ STATES = [state.value for state in MonitorState]
 _PASS, _FAIL, _NOT_EVALUATED = (STATES.index(state) for state in ("pass", "fail", "not_evaluated"))
 # Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
 _FIRST_BLOCK, _BLOCK = 2048, 8192
+
+
+@dataclass(frozen=True)
+class AxisRecord:
+    """What one axis of the bank saw over a whole run, restarts included.
+
+    `series`: its increments, `fresh` where a restart was too. `value`, `threshold`: per epoch and monitor (raw, then
+    the EWMAs) [m/s], NaN where not evaluated. `enabled`: which of the monitors are.
+    """
+
+    series: AxisSeries
+    value: Floats
+    threshold: Floats
+    enabled: Bools
 
 
 class _AxisBank:
@@ -68,6 +82,9 @@ class _AxisBank:
         self._done = row
         self._carry = None
         self._block = _FIRST_BLOCK
+
+    def record(self) -> AxisRecord:
+        return AxisRecord(self._series, self.value, self.threshold, self._enabled)
 
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
@@ -157,6 +174,12 @@ class MonitorBank:
         for axis in self._axes:
             axis.restart(epoch)
         self._known_to = epoch - 1
+
+    def along(self) -> AxisRecord:
+        """What the monitors along the track saw, once the LDS has walked to the end of the run."""
+        if self._any.size:
+            self._look(self._any.size - 1)
+        return self._axes[0].record()
 
     def columns(self) -> list[pl.Series]:
         """All monitor columns of the epochs table but those of the linking monitors."""

@@ -9,6 +9,7 @@ no increment shows, stays in it for as long as it lasts.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,10 +41,8 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
     ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     track = _track_of(epochs, config)
     value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
-    chosen = np.flatnonzero(track.usable)[np.isin(np.flatnonzero(track.usable), ranges.epoch)]
-    for begin in range(0, chosen.size, _CHUNK):
-        part = chosen[begin : begin + _CHUNK]
-        value[part], freedom[part] = _sums_of_squares(ranges, track, part)
+    for part in _chunks(ranges, track):
+        value[part.epoch], freedom[part.epoch] = _left_over(part), part.freedom
     tested = freedom > 0
     threshold = np.full(epochs.height, np.nan)
     threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
@@ -123,8 +122,41 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     )
 
 
-def _sums_of_squares(ranges: _Ranges, track: _Track, epochs: Ints) -> tuple[Floats, Ints]:
-    """Weighted sum of squares and degrees of freedom of these epochs, which all have satellites."""
+@dataclass(frozen=True)
+class Equations:
+    """The ranges of some epochs against a position on the track; shapes (epochs, satellites, ...).
+
+    `epoch`: which of them. `rows`: change of range per metre east, north, up; `clocks`: whose clock counts. `design`:
+    what may be wrong (along, across, up, clocks) with `prior` as precision. `along` (epochs, 3): the track's direction.
+    """
+
+    epoch: Ints
+    held: Bools
+    rows: Floats
+    clocks: Floats
+    weight: Floats
+    residual_m: Floats
+    design: Floats
+    prior: Floats
+    freedom: Ints
+    along: Floats
+
+
+def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Iterator[Equations]:
+    """The equations that the monitor tests, some thousand epochs at once; arguments as of `pseudorange_monitor`."""
+    ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
+    return _chunks(ranges, _track_of(epochs, config))
+
+
+def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
+    usable = np.flatnonzero(track.usable)
+    chosen = usable[np.isin(usable, ranges.epoch)]
+    for begin in range(0, chosen.size, _CHUNK):
+        yield _equations(ranges, track, chosen[begin : begin + _CHUNK])
+
+
+def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
+    """Of these epochs, which all have satellites."""
     first = np.searchsorted(ranges.epoch, epochs)
     count = np.searchsorted(ranges.epoch, epochs, side="right") - first
     slot = np.arange(int(count.max()))
@@ -138,7 +170,7 @@ def _sums_of_squares(ranges: _Ranges, track: _Track, epochs: Ints) -> tuple[Floa
     cross = np.einsum("eni,ei->en", rows, track.cross[epochs])
     design = np.concatenate([along[..., None], cross[..., None], rows[..., 2:], clocks], axis=-1)
     prior, free = _priors(track, epochs, (clocks * held[..., None]).any(axis=1))
-    return _left_over(design, weight, residual, prior), count - free
+    return Equations(epochs, held, rows, clocks, weight, residual, design, prior, count - free, track.along[epochs])
 
 
 def _priors(track: _Track, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
@@ -155,18 +187,22 @@ def _priors(track: _Track, epochs: Ints, present: Bools) -> tuple[Floats, Ints]:
     return prior, free
 
 
-def _left_over(design: Floats, weight: Floats, residual: Floats, prior: Floats) -> Floats:
+def _left_over(part: Equations) -> Floats:
     """Least weighted sum of squares over the unknowns, priors included."""
-    weighted = design * weight[..., None]
-    normal = np.einsum("eni,enj->eij", weighted, design)
+    right = np.einsum("eni,en->ei", part.design * part.weight[..., None], part.residual_m)
+    solution = np.linalg.solve(normal_of(part.design, part.weight, part.prior), right[..., None])[..., 0]
+    total = np.einsum("en,en->e", part.weight, part.residual_m**2) - np.einsum("ei,ei->e", solution, right)
+    return np.asarray(np.maximum(total, 0.0))
+
+
+def normal_of(design: Floats, weight: Floats, prior: Floats) -> Floats:
+    """Normal equations of each epoch, priors on the diagonal."""
+    normal = np.einsum("eni,enj->eij", design * weight[..., None], design)
     index = np.arange(prior.shape[1])
     normal[:, index, index] += prior
-    right = np.einsum("eni,en->ei", weighted, residual)
     # Badly placed satellites may leave a direction open; the ridge is far below any information in a range.
     normal[:, index, index] += _RIDGE * normal[:, index, index].max(axis=1, keepdims=True)
-    solution = np.linalg.solve(normal, right[..., None])[..., 0]
-    total = np.einsum("en,en->e", weight, residual**2) - np.einsum("ei,ei->e", solution, right)
-    return np.asarray(np.maximum(total, 0.0))
+    return np.asarray(normal)
 
 
 def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Bools) -> pl.Series:

@@ -222,12 +222,19 @@
     return [upper, { ...upper, name: "", y: upper.y.map((value) => (value === null ? null : -value)) }];
   }
 
+  // How far the position may have been carried ahead and behind without an alarm.
+  function unnoticed(now) {
+    const ahead = line(now, "undetected_ahead_m", "unnoticed", "c");
+    const behind = line(now, "undetected_behind_m", "", "c");
+    return behind ? [ahead, { ...behind, y: behind.y.map((value) => (value === null ? null : -value)) }] : [];
+  }
+
   function timePlots(now) {
     const limit = data.limits.failure_limit_m;
     bandPlot(now, "bands", "lds");
     timePlot(now, "speed", "km/h", [line(now, "speed_mps", "speed", "a", KMH)], 180, { least: 5 });
     const along = line(now, "error_along_m", "error", "a") ?? line(now, "residual_m", "GNSS minus odometer", "a");
-    timePlot(now, "along", "m", [...confidence(now), along], 250, { levels: along ? [-limit, limit] : [] });
+    timePlot(now, "along", "m", [...confidence(now), ...unnoticed(now), along], 250, { levels: along ? [-limit, limit] : [] });
     timePlot(now, "across", "m", [
       line(now, "error_cross_m", "across", "a") ?? line(now, "cross_track_m", "across, residual", "a"),
       line(now, "error_up_m", "height", "b") ?? line(now, "vertical_m", "height, residual", "b"),

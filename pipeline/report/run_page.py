@@ -61,7 +61,8 @@ _PLOTS = (
      "chosen one the dotted line is the begin of the fault, the dashed one the failure, the solid one the detection."),
     ("speed", "Speed", ""),
     ("along", "Error along the track", "Positive: ahead of the train. Drawn where it is known to 5 m, else GNSS minus "
-     "odometer. Dashed: the confidence interval, and the limit beyond which a position is wrong."),
+     "odometer. Dashed: the confidence interval, and the limit beyond which a position is wrong. Dotted, where it was "
+     "computed: the largest fault that no monitor would have noticed."),
     ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
     ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
      "in odometer distance; marks are the offers."),

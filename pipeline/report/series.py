@@ -25,6 +25,8 @@ SERIES = (
     "exposure_s",
     "distance_from_lrvb_m",
     "path_m",
+    "undetected_ahead_m",
+    "undetected_behind_m",
 )
 NO_EPOCH, UNKNOWN = "no epoch", "not known"
 MONITOR_CODES = (NO_EPOCH, MonitorState.PASS.value, MonitorState.NOT_EVALUATED.value, MonitorState.FAIL.value)

@@ -122,7 +122,7 @@ def inspect_site(
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
-    from pipeline.site.describe import describe_site
+    from pipeline.site.describe import describe_site, elements_table, without_balises
     from pipeline.site.parallels import parallel_findings
     from pipeline.site.survey_findings import survey_findings
     from pipeline.site.windows import window_findings
@@ -131,7 +131,8 @@ def inspect_site(
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
     alike = (*window_findings(site), *parallel_findings(site, matching or MatchingConfig()))
-    tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *alike))}
+    found = (*description.findings, *without_balises(site.balises), *alike)
+    tables = {"Site": _figures(figures), "Elements": elements_table(site), "Findings": findings_table(found)}
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
@@ -149,7 +150,8 @@ def _figures(figures: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame({"figure": list(figures), "value": [_value(value) for value in figures.values()]})
 
 
-def _findings(findings: tuple[Finding, ...]) -> pl.DataFrame:
+def findings_table(findings: tuple[Finding, ...]) -> pl.DataFrame:
+    """Findings as they are shown."""
     columns = ("severity", "place", "message", "remedy")
     rows = [tuple(getattr(finding, name) for name in columns) for finding in findings]
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")

@@ -96,10 +96,10 @@ def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.Dat
     """No train gets round a corner of less than a right angle: such a relation, as between the two branches of a
     switch, is not navigable, whatever it says.
     """
-    outward = _outward(track)
+    directions = outward(track)
     back = [
         way != Navigability.NONE.value
-        and bool(outward[track.index[a], position_a] @ outward[track.index[b], position_b] > 0.0)
+        and bool(directions[track.index[a], position_a] @ directions[track.index[b], position_b] > 0.0)
         for a, position_a, b, position_b, way in links.iter_rows()
     ]
     findings = [
@@ -116,7 +116,7 @@ def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.Dat
     return links.with_columns(closed.otherwise("navigability").alias("navigability")), findings
 
 
-def _outward(track: Track) -> np.ndarray:
+def outward(track: Track) -> np.ndarray:
     """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
     directions = np.zeros((len(track.ids), 2, 3))
     for element, _, part in track.elements():

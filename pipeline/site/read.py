@@ -130,7 +130,7 @@ def _read_track(
     if frame.is_empty():
         breaches.append(f"{raw.file}: holds no point of any net element")
         return None, network, []
-    frame = _to_wgs84(raw, frame, breaches)
+    frame = to_wgs84(raw, frame, breaches)
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
     if network and network.ignored:
         notes.append(Finding("note", raw.file, f"{network.ignored} features are neither element nor relation"))
@@ -155,7 +155,7 @@ def _read_route(files: dict[str, bytes], breaches: list[str]) -> pl.DataFrame | 
 
 
 def _in_degrees(raw: RawTable) -> RawTable:
-    """Plane coordinates under the names of the contract; `_to_wgs84` makes degrees of them."""
+    """Plane coordinates under the names of the contract; `to_wgs84` makes degrees of them."""
     names = {"x_m": "longitude_deg", "y_m": "latitude_deg"}
     given = {old: new for old, new in names.items() if old in raw.frame.columns}
     if any(new in raw.frame.columns for new in given.values()):
@@ -163,7 +163,7 @@ def _in_degrees(raw: RawTable) -> RawTable:
     return RawTable(raw.file, raw.frame.rename(given), raw.epsg)
 
 
-def _to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
+def to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
     """Positions in WGS 84, checked for range."""
     if raw.epsg not in _SAME_AS_WGS84:
         frame = _transformed(raw, frame, breaches)

@@ -1,0 +1,45 @@
+"""The largest unnoticed fault of a run as a fault file: inject it, and no monitor says a word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tomli_w
+
+from pipeline.stages import diagnosed
+from pipeline.undetected.profile import Profile, epoch_of, profile_at
+from schemas.config import Configuration, Vehicle
+from schemas.errors import OutputError
+from schemas.run import RunLog, Site
+
+FAULT, PROFILE = "fault.toml", "profile.csv"
+
+
+def largest_fault(
+    run: RunLog,
+    site: Site,
+    vehicle: Vehicle,
+    config: Configuration,
+    solution: str,
+    balise: str | None = None,
+    at_s: float | None = None,
+    behind: bool = False,
+) -> Profile:
+    """The largest fault that no monitor would have noticed, at a balise, a time after the first epoch, or the end."""
+    diagnosis, passages, crossings = diagnosed(run, site, vehicle, config, solution)
+    epoch = epoch_of(diagnosis, passages, crossings, vehicle, config, balise, at_s)
+    return profile_at(diagnosis, epoch, behind, vehicle, config)
+
+
+def write_fault(profile: Profile, solution: str | None, out: Path) -> Path:
+    """`fault.toml` and its `profile.csv` in a folder; `solution`: the only one that is hit, None for all."""
+    fault = {"kind": "profile", "target": "along", "profile": PROFILE}
+    if solution is not None:
+        fault["solution"] = solution
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        profile.fault.write_csv(out / PROFILE)
+        (out / FAULT).write_text(tomli_w.dumps({"faults": [fault]}), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"cannot be written: {error.strerror}", place=str(error.filename or out)) from None
+    return out / FAULT

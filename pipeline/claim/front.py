@@ -1,0 +1,164 @@
+"""Estimated and safe front end of a train at each epoch, and what the judge knows of their errors.
+
+A position in use gives the estimate, with its confidence. Where none is in use it is the report of ETCS: the last
+relevant balise and the odometer's way since then, with its over- and under-reading amounts. Uncertain latency widens
+both at speed. Else there is no estimate. Errors do not depend on where on the train the front end is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from pipeline.claim.areas import Placed, placed
+from pipeline.claim.tally import codes
+from pipeline.epochs.clock import Clock
+from schemas.arrays import Bools, Floats, Ints, flags, floats
+from schemas.config import Configuration
+from schemas.enums import Judgement, PassageStatus, VehicleFigures
+
+# A front end farther than this from every epoch's place has no known place on the net elements.
+_REACH_M = 50.0
+
+
+@dataclass(frozen=True)
+class Front:
+    """Of one solution of one run, per epoch; NaN is not known.
+
+    `path_m`: estimate of the balise antenna, `front_m`: estimated front end, both path positions. `over_m`: estimate
+    minus min safe front end, `under_m`: max safe front end minus estimate. `low_m`, `high_m`: error of the estimate in
+    the direction of travel, as an interval. `proved`: the interval is complete and the track is right; `judged`: it may
+    show an exceedance; `wrong_track`: the track is wrong for certain.
+    """
+
+    clock: Clock
+    path_m: Floats
+    front_m: Floats
+    over_m: Floats
+    under_m: Floats
+    low_m: Floats
+    high_m: Floats
+    proved: Bools
+    judged: Bools
+    wrong_track: Bools
+    speed_mps: Floats
+    direction: Floats
+    where: Placed
+
+    @property
+    def output(self) -> Bools:
+        """The unit says where the train is."""
+        return np.isfinite(self.path_m)
+
+    @property
+    def least_m(self) -> Floats:
+        """The smallest size that the error of the estimate may have."""
+        return np.maximum(np.maximum(self.low_m, -self.high_m), 0.0)
+
+    def within(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
+        """Whether the estimate is at most so far ahead of the train and so far behind it (`codes`)."""
+        with np.errstate(invalid="ignore"):
+            beyond = (self.low_m > over_m) | (self.high_m < -np.asarray(under_m))
+            inside = (self.high_m <= over_m) & (self.low_m >= -np.asarray(under_m))
+        asked = np.isfinite(over_m) | np.isfinite(under_m)
+        return codes(asked & self.proved & inside, asked & ((self.judged & beyond) | self.wrong_track))
+
+
+def front_of(
+    epochs: pl.DataFrame,
+    passages: pl.DataFrame,
+    run: dict[str, Any],
+    config: Configuration,
+    areas: pl.DataFrame | None = None,
+    ahead_m: float = 0.0,
+) -> Front:
+    """From the tables of one solution of one run; `ahead_m`: front end ahead of the balise antenna."""
+    path, direction, speed = (floats(epochs, name) for name in ("path_m", "direction", "speed_mps"))
+    gnss = flags(epochs, "in_use") & np.isfinite(path)
+    reported = _reported_m(epochs, passages)
+    estimate = np.where(gnss, path, reported)
+    over, under = (np.where(gnss, floats(epochs, "confidence_m"), floats(epochs, name)) for name in _DOUBTS)
+    late_over, late_under = _latency_s(epochs, run, config)
+    shift = np.where(gnss, 0.0, direction * (estimate - path))
+    low, high = floats(epochs, "error_low_m") + shift, floats(epochs, "error_high_m") + shift
+    right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
+    there, known = np.isfinite(estimate), np.isfinite(low) & np.isfinite(high)
+    # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
+    front = estimate + np.nan_to_num(direction) * ahead_m
+    return Front(
+        clock=Clock.of(epochs, config),
+        path_m=estimate,
+        front_m=front,
+        over_m=over + np.abs(speed) * late_over,
+        under_m=under + np.abs(speed) * late_under,
+        low_m=low,
+        high_m=high,
+        proved=there & known & right,
+        judged=there & known & (right | (wrong & ~elsewhere)),
+        wrong_track=gnss & elsewhere,
+        speed_mps=speed,
+        direction=direction,
+        where=_areas_at(front, path, epochs, areas),
+    )
+
+
+_DOUBTS = ("doubt_over_m", "doubt_under_m")
+
+
+def _judged(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
+    """Right; wrong; wrong for the track, since the place along it does not make it so."""
+    judgement = epochs["judgement"].cast(pl.String)
+    right, wrong = ((judgement == word).to_numpy() for word in (Judgement.RIGHT.value, Judgement.WRONG.value))
+    with np.errstate(invalid="ignore"):
+        along = (floats(epochs, "error_low_m") > limit_m) | (floats(epochs, "error_high_m") < -limit_m)
+    return right, wrong, wrong & ~along
+
+
+def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration) -> tuple[Floats, Floats]:
+    """By how much latency widens the interval behind and ahead of the estimate [s]; what is not known widens nothing.
+
+    A learned latency is not taken out of positions (DOMAIN 5.1), so the train may be ahead by it.
+    """
+    spread = config.lds.ci_factor * (run["latency_sigma_s"] or 0.0)
+    learned = run["vehicle"] == VehicleFigures.LEARNED.value
+    late = np.nan_to_num(floats(epochs, "latency_s")) if learned else np.zeros(epochs.height)
+    return np.maximum(spread - late, 0.0), np.maximum(spread + late, 0.0)
+
+
+def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
+    """Path position by the last relevant balise and the odometer's way since then."""
+    accepted = passages.filter(pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value).drop_nulls("path_m")
+    odometer, distance = floats(epochs, "odometer_m"), floats(epochs, "distance_from_lrvb_m")
+    origin_m = odometer - floats(epochs, "direction") * distance
+    path, names = floats(epochs, "path_m"), epochs["lrvb_id"]
+    changed = np.flatnonzero((names.is_not_null() & names.ne_missing(names.shift())).to_numpy())
+    base = np.full(epochs.height, np.nan)
+    for first, last in pairwise([*changed.tolist(), epochs.height]):
+        places = accepted.filter(pl.col("balise_id") == names[first])["path_m"].to_numpy()
+        if places.size:
+            near = places if not np.isfinite(path[first]) else places[[np.abs(places - path[first]).argmin()]]
+            base[first:last] = near[0] - origin_m[first]
+    base[names.is_null().to_numpy()] = np.nan
+    return base + odometer
+
+
+def _areas_at(front_m: Floats, path_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None) -> Placed:
+    """The area of each front end: that of the run's epoch that is nearest on the path."""
+    there = np.flatnonzero(np.isfinite(path_m) & epochs["netelement_id"].is_not_null().to_numpy())
+    row = np.full(front_m.size, -1)
+    if there.size:
+        order = there[np.argsort(path_m[there], kind="stable")]
+        ways = path_m[order]
+        after = np.searchsorted(ways, np.nan_to_num(front_m)).clip(1, max(ways.size - 1, 1)).clip(0, ways.size - 1)
+        before = np.maximum(after - 1, 0)
+        near = np.where(np.abs(ways[before] - front_m) <= np.abs(ways[after] - front_m), before, after)
+        reached = np.abs(ways[near] - front_m) <= _REACH_M
+        row = np.where(reached, order[near], -1)
+    found = epochs.select("netelement_id", "measure_m").with_row_index("row")
+    at = pl.DataFrame({"row": row}).with_columns(pl.col("row").cast(pl.Int64))
+    places = at.join(found.with_columns(pl.col("row").cast(pl.Int64)), on="row", how="left", maintain_order="left")
+    return placed(areas, places["netelement_id"], places["measure_m"])

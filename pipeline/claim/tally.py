@@ -1,0 +1,181 @@
+"""Counts of a requirement that add up over runs, and what they show.
+
+A run is one trial of a share: of its epochs one is drawn, without a look at its error, because epochs of a run err
+together. Weaker evidence turns what is kept or broken into what is not known; that counts as broken before anything is
+called `met`, and as kept before anything is called `not met`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from pipeline.figures.bounds import (
+    UNKNOWN,
+    Estimate,
+    clopper_pearson,
+    hours_still_needed,
+    poisson_rate,
+    poisson_rate_upper,
+)
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+
+S_PER_H = 3600.0
+KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
+# Runs that a search for how many are still needed goes up to.
+_MOST_RUNS = 1 << 40
+
+
+class Finding(StrEnum):
+    """What the data say of a requirement."""
+
+    MET = "met"
+    NOT_MET = "not met"
+    NOT_SHOWN = "not shown"
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Of one run, or of many added up.
+
+    `trials`: independent ones, of which `kept` and `broken` are known. `events`: known exceedances, `possible`: how
+    many there may be at most with all that is not known. `held_s`: time that the requirement applied, `known_s`: of it
+    judged. `worst`: largest size known; `longest_s`: the longest run.
+    """
+
+    trials: int = 0
+    kept: int = 0
+    broken: int = 0
+    events: int = 0
+    possible: int = 0
+    held_s: float = 0.0
+    known_s: float = 0.0
+    worst: float | None = None
+    longest_s: float = 0.0
+
+    def __add__(self, other: Tally) -> Tally:
+        sizes = [size for size in (self.worst, other.worst) if size is not None]
+        return Tally(
+            self.trials + other.trials,
+            self.kept + other.kept,
+            self.broken + other.broken,
+            self.events + other.events,
+            self.possible + other.possible,
+            self.held_s + other.held_s,
+            self.known_s + other.known_s,
+            max(sizes, default=None),
+            max(self.longest_s, other.longest_s),
+        )
+
+
+def codes(kept: Bools, broken: Bools) -> Ints:
+    """One of `KEPT`, `NOT_KNOWN`, `BROKEN` per epoch; what is broken is not kept."""
+    return np.where(broken, BROKEN, np.where(kept, KEPT, NOT_KNOWN)).astype(np.int64)
+
+
+def tally(run: str, t_ns: Ints, held_s: Floats, code: Ints, gap_s: float, size: Floats | None = None) -> Tally:
+    """Of the epochs of one run to which a requirement applies; `run` draws the epoch that is its trial."""
+    if code.size == 0:
+        return Tally()
+    trial = int(code[drawn(run, code.size)])
+    known = code != NOT_KNOWN
+    sizes = size[known & np.isfinite(size)] if size is not None else np.empty(0)
+    return Tally(
+        trials=1,
+        kept=int(trial == KEPT),
+        broken=int(trial == BROKEN),
+        events=len(clusters_s(t_ns[code == BROKEN], gap_s)),
+        possible=sum(int(span_s // gap_s) + 1 for span_s in clusters_s(t_ns[code != KEPT], gap_s)),
+        held_s=float(held_s.sum()),
+        known_s=float(held_s[known].sum()),
+        worst=float(sizes.max()) if sizes.size else None,
+    )
+
+
+def clusters_s(t_ns: Ints, gap_s: float) -> list[float]:
+    """Lengths [s] of the groups of instants that lie no more than `gap_s` apart."""
+    if t_ns.size == 0:
+        return []
+    apart = np.flatnonzero(np.diff(t_ns) > gap_s * NS_PER_S)
+    first = t_ns[np.concatenate(([0], apart + 1))]
+    last = t_ns[np.concatenate((apart, [t_ns.size - 1]))]
+    lengths: list[float] = ((last - first) / NS_PER_S).tolist()
+    return lengths
+
+
+def drawn(run: str, size: int) -> int:
+    """One of `size` epochs by chance, always the same for the same run, whatever the epochs hold."""
+    digest = hashlib.sha256(run.encode()).digest()
+    return int.from_bytes(digest[:8], "big") * size >> 64
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A finding with its bounds; `needed_h`: hours still to be run, without a further event, to show the demand."""
+
+    finding: Finding
+    measured: Estimate = UNKNOWN
+    needed_h: float | None = None
+
+
+def of_share(found: Tally, share: float) -> Shown:
+    """At least this share, by exact bounds over runs (Clopper and Pearson)."""
+    measured = clopper_pearson(found.kept, found.kept + found.broken)
+    if found.trials == 0:
+        return Shown(Finding.NOT_SHOWN)
+    least = clopper_pearson(found.kept, found.trials).low or 0.0
+    most = clopper_pearson(found.trials - found.broken, found.trials).high
+    if least >= share:
+        return Shown(Finding.MET, measured, 0.0)
+    finding = Finding.NOT_MET if most is not None and most < share else Finding.NOT_SHOWN
+    hours = found.held_s / found.trials / S_PER_H
+    return Shown(finding, measured, runs_needed(found, share) * hours if hours > 0 else None)
+
+
+def runs_needed(found: Tally, share: float) -> int:
+    """Further runs, all kept, that show the share."""
+
+    def shown(more: int) -> bool:
+        return (clopper_pearson(found.kept + more, found.trials + more).low or 0.0) >= share
+
+    high = 1
+    while not shown(high) and high < _MOST_RUNS:
+        high *= 2
+    low = high // 2
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if shown(middle) else (middle, high)
+    return high
+
+
+def of_rate(found: Tally, rate_per_h: float) -> Shown:
+    """Below this rate [1/h], by exact Poisson bounds on events; the one-sided bound for `met`, as a THR claim needs."""
+    hours = found.held_s / S_PER_H
+    measured = poisson_rate(found.events, found.known_s / S_PER_H)
+    if hours <= 0.0:
+        return Shown(Finding.NOT_SHOWN, needed_h=hours_still_needed(rate_per_h, found.possible, 0.0))
+    low, high = poisson_rate(found.events, hours).low, poisson_rate_upper(found.possible, hours)
+    needed_h = hours_still_needed(rate_per_h, found.possible, hours)
+    if high is not None and high <= rate_per_h:
+        return Shown(Finding.MET, measured, 0.0)
+    return Shown(Finding.NOT_MET if low is not None and low > rate_per_h else Finding.NOT_SHOWN, measured, needed_h)
+
+
+def of_always(found: Tally) -> Shown:
+    """A maximum without a probability: one event breaks it, no number of hours shows it."""
+    measured = poisson_rate(found.events, found.known_s / S_PER_H)
+    return Shown(Finding.NOT_MET if found.events else Finding.NOT_SHOWN, measured)
+
+
+def of_availability(found: Tally, share: float, outside_s: float) -> Shown:
+    """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.
+
+    Never `met`: the result does not hold the confidence of speed, nor what stood in gaps of the log.
+    """
+    broken = clopper_pearson(found.broken, found.trials) if found.trials else UNKNOWN
+    lost = (broken.low or 0.0) * outside_s / found.longest_s if found.longest_s > 0 else 0.0
+    measured = Estimate(found.known_s / found.held_s, None, 1.0 - lost) if found.held_s > 0 else UNKNOWN
+    return Shown(Finding.NOT_MET if lost > 1.0 - share else Finding.NOT_SHOWN, measured)

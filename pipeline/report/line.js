@@ -1,0 +1,2 @@
+"use strict";
+// The page of a line: its drawings are there already, and tables sort themselves.

@@ -1,0 +1,179 @@
+"""The epochs of a solution as the bank along the track watched them: what a fault could do there, and what not.
+
+A fault f(t) is added to the position along growing path. From row to row the bank sees its change as a rate, on top of
+the rate u that was recorded; y = u + g df/dt is what it would have seen. Its averages are linear in y, so every
+threshold is a linear bound on y, and the fault is what y gathers beyond u.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import polars as pl
+
+from pipeline.lds.relink import Held
+from pipeline.monitors.bank import AxisRecord
+from pipeline.monitors.recursion import ewma_weight
+from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
+from schemas.config import Configuration, Vehicle
+
+NO_ROW = -1
+_BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
+# Of positions so far beside a curve, nothing along it could be said any more.
+_MOST_HIDDEN = 0.5
+
+
+@dataclass(frozen=True)
+class Watched:
+    """One row per epoch that the bank used while the position was not negated, in order; all of the same length m.
+
+    `epoch`: row among all epochs; `t_s`: seconds after the first epoch. `fresh`: nothing led here, so the fault may
+    have changed unseen, by `unseen_m` at most; `free`: the averages are not known here, only that they were silent.
+    `way_s`: metres of fault per m/s that the bank sees over the increment (its time over g, see `_share_seen`).
+    `rate_mps`: u. `least_mps`, `most_mps`: bounds of y by the raw monitor and the largest rate of a fault.
+    `weight`, `average_mps`, `threshold_mps` (m, averages): alpha(dt), what each average was, and its threshold.
+    `low_m`, `high_m`: bounds of the fault itself by monitors without memory. `anchor`: row that a re-link held this one
+    against, -1 where none, and `held_low_m`, `held_high_m`: the bounds of the difference. `learned_m`: by how much a
+    learned scale can hide the fault on the way to this row (a sum), `learned_late_m`: a learned latency at this row.
+    """
+
+    epoch: Ints
+    t_s: Floats
+    fresh: Bools
+    free: Bools
+    unseen_m: Floats
+    way_s: Floats
+    rate_mps: Floats
+    least_mps: Floats
+    most_mps: Floats
+    weight: Floats
+    average_mps: Floats
+    threshold_mps: Floats
+    low_m: Floats
+    high_m: Floats
+    anchor: Ints
+    held_low_m: Floats
+    held_high_m: Floats
+    learned_m: Floats
+    learned_late_m: Floats
+
+    @property
+    def rows(self) -> int:
+        return self.epoch.size
+
+    def mirrored(self) -> Watched:
+        """The same for errors in the other direction: what bounds them behind bounds these ahead."""
+        return replace(
+            self,
+            rate_mps=-self.rate_mps,
+            least_mps=-self.most_mps,
+            most_mps=-self.least_mps,
+            average_mps=-self.average_mps,
+            low_m=-self.high_m,
+            high_m=-self.low_m,
+            held_low_m=-self.held_high_m,
+            held_high_m=-self.held_low_m,
+        )
+
+    def between(self, low: int, high: int) -> Watched:
+        """Rows [low, high); anchors before them are lost."""
+        part = {item.name: getattr(self, item.name)[low:high] for item in fields(self)}
+        part["anchor"] = np.where(part["anchor"] >= low, part["anchor"] - low, NO_ROW)
+        return Watched(**part)
+
+
+def watched(
+    epochs: pl.DataFrame, bank: AxisRecord, held: tuple[Held, ...], vehicle: Vehicle, config: Configuration
+) -> Watched:
+    """What the bank watched of a solution; `epochs`: aligned, with `negated`; `held`: the re-links that held.
+
+    Rows under negation are left out: nobody uses the position there, and alarms add nothing. The row at which it
+    returns is fresh.
+    """
+    series = bank.series
+    kept = np.flatnonzero(~flags(epochs, "negated")[series.epoch])
+    epoch = series.epoch[kept]
+    t_ns = times_ns(epochs)
+    t_s = (t_ns[epoch] - t_ns[0]) * 1e-9
+    fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
+    largest = config.undetected.max_rate_mps
+    seen = _share_seen(epochs, epoch)
+    rate, threshold = series.rate_mps[kept], _thresholds(bank, epoch)
+    alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
+    learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
+    rows = Watched(
+        epoch=epoch,
+        t_s=t_s,
+        fresh=fresh,
+        free=np.zeros(epoch.size, dtype=np.bool_),
+        unseen_m=np.where(fresh, largest * np.diff(t_s, prepend=t_s[:1]), 0.0),
+        way_s=series.dt_s[kept] / seen,
+        rate_mps=rate,
+        least_mps=np.maximum(-threshold[:, 0], rate - largest * seen),
+        most_mps=np.minimum(threshold[:, 0], rate + largest * seen),
+        weight=np.ascontiguousarray(ewma_weight(alphas, series.dt_s[kept])),
+        average_mps=np.where(fresh[:, None], 0.0, bank.value[epoch][:, 1:][:, bank.enabled[1:]]),
+        threshold_mps=threshold[:, 1:][:, bank.enabled[1:]],
+        low_m=np.full(epoch.size, -np.inf),
+        high_m=np.full(epoch.size, np.inf),
+        anchor=np.full(epoch.size, NO_ROW),
+        held_low_m=np.full(epoch.size, -np.inf),
+        held_high_m=np.full(epoch.size, np.inf),
+        learned_m=learned_m,
+        learned_late_m=learned_late_m,
+    )
+    return _with_relinks(rows, held)
+
+
+def _thresholds(bank: AxisRecord, epoch: Ints) -> Floats:
+    """Thresholds of raw and averages [m/s]; infinite where not evaluated."""
+    threshold = bank.threshold[epoch]
+    return np.where(np.isfinite(threshold), threshold, np.inf)
+
+
+def _share_seen(epochs: pl.DataFrame, epoch: Ints) -> float:
+    """How much of a fault the increments show, at least; one on straight track.
+
+    `along_m` leaves out the way that a curve adds to a position y beside it (`pipeline.alignment.align.unrolled`). A
+    fault carries the position to where the track lies otherwise, and so hides y times the turn in between: at most y
+    times the sharpest curvature times the fault.
+    """
+    curvature, beside = (np.abs(np.nan_to_num(floats(epochs, name)[epoch])) for name in _BESIDE_CURVES)
+    return 1.0 - min(float(curvature.max(initial=0.0) * beside.max(initial=0.0)), _MOST_HIDDEN)
+
+
+def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Configuration) -> tuple[Floats, Floats]:
+    """How much of a fault a learned scale hides on the way to each row, and a learned latency at it [m].
+
+    Both learn from the positions that the fault moves. They are taken to stay within the threshold factor times their
+    prior deviation, whatever the fault; nothing holds them there.
+    """
+    factor = config.monitors.threshold_factor
+    scale = late_s = np.zeros(epoch.size)
+    if vehicle.odometer_scale is None:
+        scale = factor * config.align.scale_prior_sigma + np.abs(floats(epochs, "odometer_scale")[epoch] - 1.0)
+    if vehicle.gnss_latency_s is None:
+        late_s = factor * config.align.latency_prior_sigma_s + np.abs(floats(epochs, "latency_s")[epoch])
+    odometer_m, speed_mps = floats(epochs, "odometer_m")[epoch], np.abs(floats(epochs, "speed_mps")[epoch])
+    return scale * np.abs(np.diff(odometer_m, prepend=odometer_m[:1])), late_s * speed_mps
+
+
+def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
+    """Re-links that held: fault here minus fault at the anchor (none at a telegram) within the bound as recorded."""
+    anchor, low, high = rows.anchor.copy(), rows.low_m.copy(), rows.high_m.copy()
+    held_low, held_high, free = rows.held_low_m.copy(), rows.held_high_m.copy(), rows.free.copy()
+    for one in held:
+        row = int(np.searchsorted(rows.epoch, one.epoch))
+        if row >= rows.rows or rows.epoch[row] != one.epoch:
+            continue
+        late_m = rows.learned_late_m[row]
+        bounds = -one.bound_m - one.moved_m - late_m, one.bound_m - one.moved_m + late_m
+        if one.anchor_epoch is None:
+            low[row], high[row] = max(low[row], bounds[0]), min(high[row], bounds[1])
+        else:
+            anchor[row] = int(np.searchsorted(rows.epoch, one.anchor_epoch))
+            late_m = rows.learned_late_m[anchor[row]]
+            held_low[row], held_high[row] = bounds[0] - late_m, bounds[1] + late_m
+        free[row] = not rows.fresh[row]
+    return replace(rows, anchor=anchor, low_m=low, high_m=high, held_low_m=held_low, held_high_m=held_high, free=free)

@@ -1,0 +1,1 @@
+"""The largest error that no monitor would have noticed."""

@@ -1,0 +1,145 @@
+"""The bound and the optimum against a program written from the definition, and limits worked by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.undetected.error import largest_errors
+from pipeline.undetected.exact import largest_profile
+from pipeline.undetected.shapes import Shape, largest_of_shape
+from pipeline.undetected.stretch import paid_m, stretch_after
+from schemas.arrays import Floats
+from tests.undetected.oracle import Rows, beyond, optimum, recursions, rows, watched
+
+SIZES = [(2, 0), (3, 0), (9, 0), (30, 0), (60, 0)]
+CASES = [(seed, *SIZES[seed % len(SIZES)]) for seed in range(15)]
+RESETS = [(seed, 40, 2) for seed in range(100, 104)]
+
+
+@pytest.mark.parametrize(("seed", "size", "resets"), CASES + RESETS)
+def test_optimum_and_bound_are_those_of_the_definition(seed: int, size: int, resets: int) -> None:
+    window = rows(np.random.default_rng(seed), size, resets)
+    seen = watched(window)
+    found = largest_profile(seen, 0, size - 1)
+    most = optimum(window)
+    assert found.error_m == pytest.approx(most, abs=1e-5)
+    bound = largest_errors(seen, 0, size - 1).most_m[-1]
+    assert most - 1e-6 <= bound <= 1.1 * most
+    # The profile itself: silent by the recursion as printed, and no longer so 5 % larger.
+    assert beyond(window, found.fault_m) <= 1.0 + 1e-6
+    if not resets:
+        assert beyond(window, 1.05 * found.fault_m) > 1.0
+
+
+def test_behind_is_ahead_of_the_mirrored_record() -> None:
+    window = rows(np.random.default_rng(5), 40)
+    behind = largest_profile(watched(window).mirrored(), 0, 39).error_m
+    window.rate_mps, window.start_mps = -window.rate_mps, -window.start_mps
+    assert behind == pytest.approx(optimum(window), abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_tests_of_the_position_bound_it_there_and_after(seed: int) -> None:
+    window = rows(np.random.default_rng(seed), 50, levels=True)
+    seen, most = watched(window), optimum(window)
+    assert largest_profile(seen, 0, 49).error_m == pytest.approx(most, abs=1e-5)
+    assert most - 1e-6 <= largest_errors(seen, 0, 49).most_m[-1] <= 1.1 * most
+
+
+def constant(size: int, slope_mps: float, alpha: float) -> Rows:
+    """One average with a constant threshold and no noise; raw is so wide that it never says a word."""
+    zero, infinite = np.zeros(size), np.full(size, np.inf)
+    fresh = np.zeros(size, dtype=bool)
+    ewma = np.full((size, 1), slope_mps)
+    return Rows((alpha,), np.ones(size), zero, fresh, np.full(size, 1e3), ewma, np.zeros(1), -infinite, infinite, 1e3)
+
+
+def test_one_average_lets_pass_its_slope_times_the_time_and_its_memory() -> None:
+    # By hand: sum of y = (A_k - A_0) / alpha + sum of A_0 .. A_(k-1), so k rows at A = T give T / alpha + (k - 1) T.
+    window = constant(201, 0.01, 0.02)
+    assert largest_errors(watched(window), 0, 200).most_m[[0, 99, 199]] == pytest.approx([0.5, 1.49, 2.49], abs=1e-9)
+    assert largest_profile(watched(window), 0, 200).error_m == pytest.approx(2.49, abs=1e-6)
+
+
+def test_an_average_already_at_its_threshold_lets_pass_the_slope_alone() -> None:
+    window = constant(51, 0.01, 0.02)
+    window.start_mps = np.array([0.01])
+    assert largest_errors(watched(window), 0, 50).most_m[-1] == pytest.approx(0.50, abs=1e-9)
+
+
+def test_where_the_bank_began_anew_the_fault_may_have_changed_unseen() -> None:
+    window = constant(21, 0.01, 0.02)
+    window.largest_mps, window.fresh[10], window.dt_s[10] = 5.0, True, 90.0
+    window.raw_mps = np.full(21, 0.1)
+    # Before: raw and average, 9 rows; then 90 s at 5 m/s; then 10 rows as before with nothing remembered.
+    before, after = optimum_of(9), optimum_of(10)
+    assert largest_errors(watched(window), 0, 20).most_m[-1] == pytest.approx(before + 450.0 + after, rel=1e-3)
+
+
+def optimum_of(count: int) -> float:
+    window = constant(count + 1, 0.01, 0.02)
+    window.raw_mps = np.full(count + 1, 0.1)
+    return optimum(window)
+
+
+def test_a_relink_bounds_the_fault_against_its_anchor() -> None:
+    window = constant(31, 0.01, 0.02)
+    window.fresh[20] = True
+    anchor, high = np.full(31, -1), np.full(31, np.inf)
+    anchor[20], high[20] = 10, 3.0
+    seen = replace(watched(window), anchor=anchor, held_high_m=high, held_low_m=-high)
+    found, bound = largest_profile(seen, 0, 20).error_m, largest_errors(seen, 0, 20).most_m
+    # Ten rows by hand as above, and three metres.
+    assert found == pytest.approx(0.5 + 0.09 + 3.0, abs=1e-6)
+    assert bound[9] == pytest.approx(0.59, abs=1e-6)
+    assert bound[19] == pytest.approx(3.59, abs=1e-6)
+
+
+def test_any_split_bounds_the_growth() -> None:
+    rng = np.random.default_rng(11)
+    window = rows(rng, 40)
+    stretch, most = stretch_after(watched(window), 0, 39, known=True), optimum(window)
+    for _ in range(50):
+        shares = rng.normal(0.25, 1.0, (39, 4))
+        shares[:, 0] += 1.0 - shares.sum(axis=1)
+        assert paid_m(stretch, shares)[-1].sum() - stretch.recorded_m[-1] >= most
+
+
+def test_a_learned_scale_adds_its_way() -> None:
+    window = constant(11, 0.01, 0.02)
+    seen = replace(watched(window), learned_m=np.full(11, 2.0), learned_late_m=np.full(11, 7.0))
+    # 10 rows of 2 m, the latency once, at the end; the bank's own 0.5 + 0.09 beside.
+    assert largest_errors(seen, 0, 10).most_m[-1] == pytest.approx(0.59 + 20.0 + 7.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("shape", ["step", "ramp"])
+@pytest.mark.parametrize(("seed", "resets"), [(1, 0), (2, 0), (3, 1)])
+def test_steps_and_ramps_are_as_large_as_the_first_threshold_lets_them(seed: int, resets: int, shape: Shape) -> None:
+    window = rows(np.random.default_rng(seed), 25, resets)
+    t_s, most = np.cumsum(window.dt_s), 0.0
+    for begin in range(1, 25):
+        one = np.where(np.arange(25) >= begin, t_s - t_s[begin - 1] if shape == "ramp" else 1.0, 0.0)
+        most = max(most, _largest_scale(window, one) * one[-1])
+    found = largest_of_shape(watched(window), 0, 24, shape)
+    assert found == pytest.approx(most, rel=1e-6)
+    assert found <= optimum(window) + 1e-9
+
+
+def _largest_scale(window: Rows, one: Floats) -> float:
+    """By halving, on the recursions as printed; a fault is never faster than the largest rate."""
+    low, high = 0.0, window.largest_mps / np.abs(np.diff(one) / window.dt_s[1:]).max()
+    if beyond(window, high * one) <= 1.0:
+        return high
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if beyond(window, middle * one) <= 1.0 else (low, middle)
+    return low
+
+
+def test_recursions_of_the_oracle_by_hand() -> None:
+    window = constant(4, 1.0, 0.5)
+    # Rates 2, 0, 0 m/s of a step of 2 m: 1, 0.5, 0.25.
+    assert recursions(window, np.array([0.0, 2.0, 2.0, 2.0]))[:, 0].tolist() == [0.0, 1.0, 0.5, 0.25]

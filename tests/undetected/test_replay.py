@@ -1,0 +1,184 @@
+"""The unnoticed error of whole runs: proved by injection, and what its columns say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from benchmarks.undetected import proof
+from datasets.faults import FaultSpec
+from datasets.inject import inject
+from datasets.scenario import Scenario
+from datasets.trial import build_run, build_site
+from pipeline.stages import diagnosed, replay
+from pipeline.undetected.ranges import range_bounds
+from schemas.arrays import floats
+from schemas.config import Configuration, Vehicle
+from schemas.run import RunLog, RunTables, Site
+from tests.replay.journeys import VEHICLE, journey
+
+ONE_HZ = {"rate_hz": 1.0}
+BOTH = ("undetected_ahead_m", "undetected_behind_m")
+
+
+def config(**undetected: Any) -> Configuration:
+    return Configuration.model_validate({"undetected": {"compute": True, **undetected}})
+
+
+@pytest.fixture(scope="module")
+def tables() -> RunTables:
+    run, site = journey(gnss=ONE_HZ)
+    return replay(run, site, VEHICLE, config())
+
+
+@pytest.mark.parametrize("seed", [3, 7, 15])
+def test_the_profile_goes_unseen_and_five_percent_more_does_not(seed: int, tmp_path: Path) -> None:
+    found = proof(seed, False, tmp_path)
+    assert found is not None
+    assert found.silent
+    assert found.seen_scaled
+    assert found.judged_apart_m <= 1e-6
+    assert 1.0 <= found.closeness <= 1.1
+
+
+def test_a_read_ends_what_may_have_begun_before(tables: RunTables) -> None:
+    passages = tables.passages.filter(pl.col("undetected_since").is_not_null())
+    reads = passages.filter(kind="physical")["t_offered"].to_list()
+    begin = tables.epochs["t"][0]
+    for passage in passages.iter_rows(named=True):
+        last = max((t for t in reads if t < passage["t_offered"]), default=begin)
+        gone_s = (last - passage["undetected_since"]).total_seconds()
+        assert 0.0 <= gone_s <= 1.0 if last != begin else gone_s <= 0.0
+    errors = tables.epochs.select("t", larger=pl.max_horizontal(BOTH))
+    for t in reads:
+        before, after = errors.filter(pl.col("t") < t)["larger"][-1], errors.filter(pl.col("t") > t)["larger"][0]
+        assert after < before
+
+
+def test_who_holds_the_error_is_named(tables: RunTables) -> None:
+    named = set(tables.passages["undetected_monitors"].drop_nulls().explode())
+    assert named <= {"along_raw", "along_ewma_0p1", "along_ewma_0p01", "along_ewma_0p001"}
+    assert "along_ewma_0p001" in named
+
+
+def test_figures_of_the_run_are_those_of_its_epochs(tables: RunTables) -> None:
+    larger = tables.epochs.filter("in_use").select(pl.max_horizontal(BOTH)).to_series().drop_nulls()
+    row = tables.runs.row(0, named=True)
+    assert row["undetected_max_m"] == larger.max()
+    assert row["undetected_share_beyond"] == 0.0
+    assert row["t_undetected_beyond"] is row["physical_spacing_m"] is None
+    assert row["physical_spacing_starts"] == 6
+
+
+def test_nobody_asked_is_null() -> None:
+    run, site = journey(gnss=ONE_HZ)
+    found = replay(run, site, VEHICLE)
+    assert found.epochs.select(BOTH).null_count().sum_horizontal().item() == 2 * found.epochs.height
+    assert found.passages["undetected_monitors"].null_count() == found.passages.height
+    assert found.runs["physical_spacing_starts"].item() is None
+
+
+def test_spacing_is_the_way_to_the_limit(tables: RunTables) -> None:
+    run, site = journey(gnss=ONE_HZ)
+    settings = config(fixes=[]).model_dump() | {"hazards": {"failure_limit_m": 6.0}}
+    row = replay(run, site, VEHICLE, Configuration.model_validate(settings)).runs.row(0, named=True)
+    assert row["physical_spacing_reached"] > 0
+    # At 30 m/s after the first seconds; the train stands for the first 5 of them and then gains speed.
+    assert 0.0 < row["physical_spacing_m"] < 30.1 * row["physical_spacing_s"]
+    first_s = (row["t_undetected_beyond"] - tables.epochs["t"][0]).total_seconds()
+    assert row["physical_spacing_s"] <= first_s
+
+
+def test_no_vehicle_file_no_close_bound(tables: RunTables) -> None:
+    run, site = journey(gnss=ONE_HZ)
+    learned = replay(run, site, Vehicle(), config())
+    known, unknown = (one.epochs.select(pl.max_horizontal(BOTH)).to_series() for one in (tables, learned))
+    assert (unknown - known).drop_nulls().min() >= 0.0
+    # k_T times the prior sigma of 1 % of 6 to 8 km between the read and the end, and more.
+    assert unknown.max() > 30.0
+
+
+def test_what_is_negated_has_no_unnoticed_error() -> None:
+    run, site = journey(gnss=ONE_HZ)
+    step = FaultSpec.model_validate({"kind": "step", "start_s": 120.0, "size_m": 40.0})
+    epochs = replay(inject(run, step, site), site, VEHICLE, config()).epochs
+    negated = epochs["lds_mode"] == "fail_safe"
+    assert negated.sum() > 10
+    assert epochs.filter(negated).select(BOTH).null_count().row(0) == (negated.sum(), negated.sum())
+    assert epochs.filter(~negated)["undetected_ahead_m"].drop_nulls().len() > 100
+
+
+@pytest.fixture(scope="module")
+def sky() -> tuple[RunLog, Site]:
+    """Two minutes at 1 Hz on a straight line, GPS alone and GPS with Galileo, with ranges."""
+    scenario = Scenario.model_validate(
+        {
+            "name": "sky",
+            "seed": 3,
+            "line": {
+                "heading_deg": 0.0,
+                "sections": [{"length_m": 9000.0}],
+                "elements": [{"id": "A", "length_m": 9000.0}],
+                "balises": [{"id": "VB", "at_m": 2000.0}],
+            },
+            "runs": [
+                {
+                    "id": "run",
+                    "motion": {"start_m": 500.0, "phases": [{"speed_mps": 30.0, "hold_s": 60.0}]},
+                    "gnss": {
+                        "rate_hz": 1.0,
+                        "sky": {"solutions": {"primary": ["gps", "galileo"], "gps": ["gps"]}},
+                    },
+                }
+            ],
+        }
+    )
+    return build_run(scenario, scenario.runs[0]), build_site(scenario)
+
+
+def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[RunLog, Site]) -> None:
+    run, site = sky
+    diagnosis, _, _ = diagnosed(run, site, VEHICLE, Configuration(), "gps")
+    assert diagnosis.satellites is not None
+    low_m, high_m = range_bounds(diagnosis.epochs, diagnosis.satellites, Configuration())
+    clean, at = replay(run, site, VEHICLE), 60
+    most_m, least_m = -np.inf, np.inf
+    for name in sorted(diagnosis.satellites.filter(pl.col("used"))["sv"].unique()):
+        for size_m in (-1.0, 1.0):
+            reached = _largest_unseen(run, site, clean, name, size_m, at)
+            most_m, least_m = max(most_m, reached), min(least_m, reached)
+    assert high_m[at] == pytest.approx(most_m, abs=0.02)
+    assert low_m[at] == pytest.approx(least_m, abs=0.02)
+
+
+def _largest_unseen(run: RunLog, site: Site, clean: RunTables, sv: str, size_m: float, at: int) -> float:
+    """Where the sum of squares, a parabola through three replays, meets the threshold; what the position does there."""
+    before = clean.epochs.filter(solution="gps")
+    sums, moved = [before["pseudorange_value"][at]], [0.0]
+    for times in (1.0, 2.0):
+        fault = {"kind": "step", "target": sv, "start_s": float(at), "duration_s": 0.5, "size_m": times * size_m}
+        spec = FaultSpec.model_validate(fault | {"solution": "gps"})
+        after = replay(inject(run, spec, site), site, VEHICLE).epochs.filter(solution="gps")
+        sums.append(after["pseudorange_value"][at])
+        moved.append(after["path_m"][at] - before["path_m"][at])
+    a, b, c = np.polyfit([0.0, 1.0, 2.0], sums, 2)
+    c -= before["pseudorange_threshold"][at]
+    return float((-b + np.sqrt(b * b - 4.0 * a * c)) / (2.0 * a) * moved[1])
+
+
+def test_a_second_solution_without_the_fault_holds_it(sky: tuple[RunLog, Site]) -> None:
+    run, site = sky
+    # A bank that forgets within seconds holds little by itself.
+    chosen = {"monitors": {"channel_reference": "gps", "disabled": ["along_ewma_0p01", "along_ewma_0p001"]}}
+    one = Configuration.model_validate(config(solutions_at_fault="one").model_dump() | chosen)
+    both = Configuration.model_validate(config().model_dump() | chosen)
+    held, free = (replay(run, site, VEHICLE, each).epochs.filter(solution="primary") for each in (one, both))
+    value, threshold = floats(held, "channel_value"), floats(held, "channel_threshold")
+    ahead = floats(held, "undetected_ahead_m")[1:]
+    assert (ahead <= (threshold - value)[1:] + 1e-9).all()
+    assert (ahead <= floats(free, "undetected_ahead_m")[1:] + 1e-9).all()
+    assert (ahead < floats(free, "undetected_ahead_m")[1:] - 0.5).any()
