@@ -8,8 +8,9 @@ import re
 import signal
 import sys
 import traceback
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -36,6 +37,8 @@ app = typer.Typer(
 )
 
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
+# Elements of a new site that are printed; its page shows all.
+_SHOWN_ELEMENTS = 25
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 
@@ -321,7 +324,7 @@ def claim(
     )
 )
 def inspect(
-    path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
+    path: Annotated[str, typer.Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
     result: Annotated[
         str | None, typer.Option("--result", help="Result of runs on this site, to check its survey.")
     ] = None,
@@ -331,7 +334,7 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
-    from pipeline.results.inspection import inspect_path
+    from pipeline.results.inspection import STARTING_CONFIG, inspect_path
     from pipeline.results.terminal import show_tables
 
     settings = _configuration(config)
@@ -339,7 +342,9 @@ def inspect(
     if as_json:
         _print_json(tables)
     else:
-        show_tables(tables)
+        show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
+        if STARTING_CONFIG in tables:  # to be saved, so without a frame
+            print("\n".join(tables[STARTING_CONFIG]["toml"]))
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
@@ -411,28 +416,51 @@ def undetected(
 @app.command(
     epilog=_examples(
         "balise convert receiver.ubx --to monday",
+        "balise convert rover.pos --to monday --stream reference",
+        "balise convert second.sbf.gz --to monday --solution second",
         "balise convert positions.csv --config columns.toml --to monday.mcap",
     )
 )
 def convert(
     logs: Annotated[
         list[Path],
-        typer.Argument(callback=_here, help="UBX, SBF, NMEA, CSV with a mapping in --config, or a public recording."),
+        typer.Argument(
+            callback=_here,
+            help="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, ROS bags, MCAP, CSV with a mapping in --config, or a public "
+            "recording; .gz and .zip of these.",
+        ),
     ],
-    to: Annotated[Path, typer.Option("--to", callback=_here, help=_NEW_RUN)],
+    to: Annotated[
+        Path, typer.Option("--to", callback=_here, help=_NEW_RUN + " To one that exists, streams are added.")
+    ],
     config: ConfigFile = None,
+    solution: Annotated[str | None, typer.Option(help="Name of the receiver in the run, where it has several.")] = None,
+    stream: Annotated[Literal["gnss", "reference"], typer.Option(help="What the positions are for.")] = "gnss",
+    date: Annotated[
+        datetime | None, typer.Option(formats=["%Y-%m-%d"], help="Day of an NMEA log that holds none (UTC).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a stream or solution that the run has.")] = False,
 ) -> None:
-    """Convert receiver logs to a run."""
+    """Convert receiver logs to a run, or add streams to a run."""
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
-    from pipeline.receivers import convert as convert_logs
+    from pipeline.ingest import read_run
+    from pipeline.receivers import Purpose, as_run, extended, gather
     from pipeline.results.fit_report import fit_report
+    from schemas.config import IngestConfig
     from schemas.errors import visible
 
-    settings = _configuration(config)
-    converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
-    if converted is None:
-        converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
+    settings, purpose = _configuration(config), Purpose(solution, stream)
+    recording = known_recording(logs[0]) if len(logs) == 1 and config is None else None
+    if recording is None:
+        found = gather(logs, settings.ingest, None if date is None else date.date())
+    else:
+        found = recording.gathered()
+    if to.is_file() or (to / "gnss.parquet").is_file():
+        run = read_run(to, IngestConfig(), with_digest=False)
+        converted = extended(run, to, found, purpose, settings.fix_sigma, force)
+    else:
+        converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
     write_run_as(converted.run, to)
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
@@ -479,7 +507,7 @@ def make_a_site(
     if as_json:
         _print_json({"elements": elements, "findings": findings, "balises": site.balises})
         return
-    show_table(elements.head(_SHOWN_RUNS), "Elements")
+    show_table(elements.head(_SHOWN_ELEMENTS), "Elements")
     show_table(findings, "Findings")
     count = 0 if site.balises is None else site.balises.height
     print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")

@@ -36,7 +36,9 @@ class StreamMapping(Settings):
     `fields` maps stream column to recorded field path, `factors` multiplies (unit conversion),
     `constants` fills columns that the log does not hold. `time` is `auto` (the payload's own stamp, else
     the log time), `log`, `publish` or `field:PATH`; numbers there are nanoseconds (integers) or seconds
-    (floats) unless `factors.t` gives the seconds per unit, counted from `time_epoch`.
+    (floats) unless `factors.t` gives the seconds per unit, counted from `time_epoch` (of `excel`: days). CSV files may
+    name two columns, `field:DATE + TIME`, or with epoch `gps` the week and its seconds; `date_order` says what
+    01.02.2025 means where the whole file leaves it open.
     """
 
     topic: str
@@ -46,7 +48,8 @@ class StreamMapping(Settings):
     fix_codes: dict[str, Fix] = {}
     time: str = Field(default="auto", pattern=r"^(auto|log|publish|field:.+)$")
     time_scale: Literal["utc", "gps"] = "utc"
-    time_epoch: Literal["unix", "gps"] = "unix"
+    time_epoch: Literal["unix", "gps", "excel"] = "unix"
+    date_order: Literal["auto", "day_first", "month_first"] = "auto"
     solution: str = "primary"
 
 

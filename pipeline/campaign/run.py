@@ -46,6 +46,7 @@ def run_campaign(
         known = [] if force else unchanged(plan)
         left = with_previous(plan, {outcome.run_id for outcome in known}) if not force else plan
         store.write_config(plan.out, plan.config)
+        store.write_vehicle(plan.out, plan.vehicle)
         note_settings(plan.out, digest_of(plan.config, plan.vehicle), plan.given)
         engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
         loop = CampaignLoop(held_by(left, campaign).jobs, engine, time_limit_s, watches, known)

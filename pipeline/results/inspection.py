@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import UTC, datetime
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
+from pipeline.receivers.csv_draft import draft_mapping
 from pipeline.results import store
 from pipeline.results.fit_report import FitReport, fit_report
 from pipeline.site.read import is_geojson, read_site
@@ -20,6 +22,7 @@ from schemas.config import IngestConfig, MatchingConfig, Vehicle
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding, Site
 
+STARTING_CONFIG = "Configuration to begin with"
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
     *("verdict", "run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability"),
@@ -52,12 +55,19 @@ def inspect_path(
         return inspect_result(path)
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
         return inspect_log(path, config or IngestConfig(), None if site is None else read_site(site), vehicle)
+    if name_of(path).lower().endswith(".csv"):
+        return inspect_csv(Path(path))
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
         expected="RUN.mcap, SITE.geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
+
+
+def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
+    """A mapping to begin with; the columns stand in it."""
+    return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
 
 
 def inspect_log(
@@ -82,7 +92,7 @@ def inspect_log(
     if problems := (*found.problems, *fitted.problems):
         tables["Problems"] = pl.DataFrame({"problem": problems})
     if found.starting_config:
-        tables["Configuration to begin with"] = pl.DataFrame({"toml": found.starting_config.splitlines()})
+        tables[STARTING_CONFIG] = pl.DataFrame({"toml": found.starting_config.splitlines()})
     return tables
 
 

@@ -15,7 +15,7 @@ from pipeline.results.source import conjuncts, source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.files import exists, read_bytes
-from schemas.config import Configuration, Settings, settings_from, to_toml, toml_of
+from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
 from schemas.conform import conform, dtypes
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
@@ -256,6 +256,15 @@ def read_config(out: Address) -> Configuration | None:
 def write_config(out: Address, settings: Settings) -> None:
     """`OUT/config.toml`: the resolved configuration."""
     storage.write_bytes(join(out, "config.toml"), to_toml(settings).encode())
+
+
+def write_vehicle(out: Address, vehicle: Vehicle) -> None:
+    """`OUT/vehicle.toml`: what was known of the train; a result without a vehicle file has none."""
+    address = join(out, "vehicle.toml")
+    if vehicle != Vehicle():
+        storage.write_bytes(address, to_toml(vehicle).encode())
+    elif exists(address):
+        storage.remove(address)
 
 
 def _partition(run_id: str) -> str:
