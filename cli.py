@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
+_SHOWN_ELEMENTS = 25
 
 
 def _examples(*lines: str) -> str:
@@ -479,7 +480,7 @@ def make_a_site(
     if as_json:
         _print_json({"elements": elements, "findings": findings, "balises": site.balises})
         return
-    show_table(elements.head(_SHOWN_RUNS), "Elements")
+    show_table(elements.head(_SHOWN_ELEMENTS), "Elements")
     show_table(findings, "Findings")
     count = 0 if site.balises is None else site.balises.height
     print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
