@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
+_SHOWN_ELEMENTS = 25
 
 
 def _examples(*lines: str) -> str:
