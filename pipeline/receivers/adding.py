@@ -106,8 +106,8 @@ def _refuse_other_times(run: RunLog, name: Stream, new: pl.DataFrame, place: Pat
         raise InputError(
             f"is of another time than the {name} to add",
             place=str(place),
-            found=f"{name} from {told.min()} to {told.max()}",
-            expected=f"times between {have.min()} and {have.max()}",
+            found=f"{name} from {told.min()!s} to {told.max()!s}",
+            expected=f"times between {have.min()!s} and {have.max()!s}",
             remedy="Check the date and the time scale of the log, or name another run.",
         )
 

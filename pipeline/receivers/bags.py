@@ -91,7 +91,7 @@ def _write(bag: Any, to: Path) -> dict[str, int]:
         for connection, t_ns, raw in bag.messages([c for c in bag.connections if (c.id, c.owner) in channels]):
             data = bytes(raw) if bag.is2 else bytes(types.ros1_to_cdr(raw, connection.msgtype))
             writer.add_message(channels[connection.id, connection.owner], t_ns, data, t_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     return left
 
 

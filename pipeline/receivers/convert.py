@@ -160,7 +160,7 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[St
 
 def _of_topics(config: IngestConfig) -> IngestConfig:
     """Without the mappings of tables, whose names are no topics of a bag."""
-    kept = {
+    kept: dict[str, object] = {
         stream: tuple(m for m in mappings_of(config, stream) if not m.topic.lower().endswith(TABLES))
         for stream in STREAMS
         if stream != "faults"

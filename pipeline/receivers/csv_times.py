@@ -42,7 +42,7 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
     place = f"{path}: column {' + '.join(column.name for column in columns)}"
     is_text = [column.dtype == pl.String for column in columns]
     if len(columns) == 2 and mapping.time_epoch == "gps" and not any(is_text):
-        return _week_and_seconds(*columns, mapping, place)
+        return _week_and_seconds(columns[0], columns[1], mapping, place)
     if mapping.time_epoch == "excel" and not any(is_text):
         return _days(columns, mapping, place)
     if all(is_text):
