@@ -38,8 +38,6 @@ app = typer.Typer(
 )
 
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
-# Elements of a new site that are printed; its page shows all.
-_SHOWN_ELEMENTS = 25
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 
