@@ -22,6 +22,8 @@ _MOST_WINDOWS = 800
 # Velocities fit if they differ from the displacement by a smaller share of it; another arrangement explains them if
 # it leaves so much less.
 _FITS, _EXPLAINS = 0.3, 0.35
+# On a run of one heading exchanged axes turn the velocity by less; beyond this share of it that is told, and no more.
+_TURNED = 0.1
 # Reflections and latency never change the unit by so much.
 _UNIT_LIMIT = 0.12
 # Enough climbing to tell up from down: correlation, and the way climbed in the windows [m/s].
@@ -104,6 +106,10 @@ def _horizontal(moved: Floats, recorded: Floats) -> Check:
             return fits(WHAT, "they agree in one half of the run")
         found = f"they point elsewhere, by {misfits[0]:.0%} of the speed"
         return Check(WHAT, State.MISFIT, found, "latitude and longitude may be exchanged, or the axes are of the train")
+    if _TURNED < misfits[0] <= _FITS and misfits[best] <= _EXPLAINS * misfits[0]:
+        found = f"they point elsewhere, by {misfits[0]:.0%} of the speed; the run has hardly more than one heading"
+        advice = "Look at a run with curves before the velocity is corrected."
+        return Check(WHAT, State.MISFIT, found, f"{ARRANGEMENTS[best].words}, it seems", advice=advice)
     arrangement = (
         ARRANGEMENTS[0] if misfits[0] <= _FITS or misfits[best] > _EXPLAINS * misfits[0] else ARRANGEMENTS[best]
     )

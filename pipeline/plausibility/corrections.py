@@ -27,6 +27,15 @@ def correction(
     return "\n".join(lines) + "\n"
 
 
+def inline(lines: str) -> str:
+    """The same lines as they can stand on one line of a message."""
+    head, *tables = lines.split("[[ingest.correct]]\n")
+    entries = [f"{{ {', '.join(filter(None, table.splitlines()))} }}" for table in tables]
+    plain = "; ".join(filter(None, head.splitlines()))
+    corrections = f"[ingest] correct = [{', '.join(entries)}]" if entries else ""
+    return "; ".join(part for part in (plain, corrections) if part)
+
+
 def _number(value: float) -> str:
     """A number as TOML has it, a float always."""
     text = repr(round(value, 12)) if abs(value) >= 1e-3 else repr(value)

@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.plausibility.axes import velocity_checks
 from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, fits, not_checked
-from pipeline.plausibility.corrections import correction
+from pipeline.plausibility.corrections import correction, inline
 from pipeline.plausibility.counter import sign_check, turn_check
 from pipeline.plausibility.course import Course, Places, distance_course, places_of, speed_course
 from pipeline.plausibility.pairs import PairFit, fit_pair
@@ -22,6 +22,7 @@ from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
 _POSITIONS = "positions"
+_LATENCY = "GNSS latency of the vehicle file"
 # So many windows agree on a factor that is a unit's; a factor that no unit explains has to be clearer, and far from 1.
 _CONSTANT, _CLEARLY, _UNEXPLAINED = 0.6, 0.8, 1.5
 # The vehicle file may differ from the run by so many of its own sigmas, and by this much at least.
@@ -92,11 +93,13 @@ def _odometer(
     if usable and counter is not None:
         checks.append(turn_check(gnss, counter, main.factor, main.lag_s))
         checks += _vehicle_checks(main, lambda: _by_reference(run, counter, reference, epoch_ns), reference, vehicle)
+    if any(check.what == _LATENCY and check.state is State.MISFIT for check in checks):
+        return checks, [Lag("odometer", reason="the latency of the vehicle file does not fit")]
     return checks, [_odometer_lag(main, vehicle, config)]
 
 
 def _odometer_lag(pair: PairFit, vehicle: Vehicle, config: IngestConfig) -> Lag:
-    """The clock of the odometer; a latency that the vehicle file tells is no lag."""
+    """The clock of the odometer, beyond the latency that the vehicle file tells."""
     if not pair.told:
         return Lag("odometer", reason=pair.reason)
     if pair.shifted:
@@ -104,9 +107,9 @@ def _odometer_lag(pair: PairFit, vehicle: Vehicle, config: IngestConfig) -> Lag:
     if pair.clock_reason or not pair.lag_told:
         return Lag("odometer", reason=pair.clock_reason or "the speed changes too little")
     from_file_s = -(vehicle.gnss_latency_s or 0.0)
-    told = vehicle.gnss_latency_s is None and pair.other_lag(0.0, config.fit_lag_told_s)
-    within = abs(pair.lag_s - from_file_s) <= config.fit_lag_limit_s
-    return Lag("odometer", pair.lag_s, pair.lag_sigma_s, sure=told and within)
+    rest_s = pair.lag_s - from_file_s
+    sure = pair.other_lag(from_file_s, config.fit_lag_told_s) and abs(rest_s) <= config.fit_lag_limit_s
+    return Lag("odometer", rest_s, pair.lag_sigma_s, sure, latency_known=vehicle.gnss_latency_s is not None)
 
 
 def _base(name: str, fitted: Mapping[str, PairFit], config: IngestConfig) -> float:
@@ -172,10 +175,9 @@ def _vehicle_checks(
             checks.append(_wrong_file(what, found, lines))
         else:
             checks.append(fits(what, found))
-    if vehicle.gnss_latency_s is not None:
-        what = "GNSS latency of the vehicle file"
+    if vehicle.gnss_latency_s is not None and not pair.shifted:
         if not pair.lag_told:
-            return [*checks, not_checked(what, "the speed changes too little")]
+            return [*checks, not_checked(_LATENCY, "the speed changes too little")]
         least_s = max(_FILE_LATENCY_S, _FILE_SIGMAS * (vehicle.gnss_latency_sigma_s or 0.0))
         found = f"{vehicle.gnss_latency_s:.2f} s, the run shows {-pair.lag_s:.2f} s (sigma {pair.lag_sigma_s:.2f} s)"
         known = reference is not None and not reference.reason and abs(reference.lag_s) < 10.0
@@ -183,9 +185,11 @@ def _vehicle_checks(
         if pair.other_lag(-vehicle.gnss_latency_s, least_s) and not agrees:
             sigma_s = max(2 * pair.lag_sigma_s, 0.02)
             lines = f"gnss_latency_s = {-pair.lag_s:.2f}\ngnss_latency_sigma_s = {sigma_s:.2f}\n"
-            checks.append(_wrong_file(what, found, lines))
+            checks.append(_wrong_file(_LATENCY, found, lines))
+        elif agrees and reference is not None:
+            checks.append(fits(_LATENCY, f"{vehicle.gnss_latency_s:.2f} s, by the reference {-reference.lag_s:.2f} s"))
         else:
-            checks.append(fits(what, found))
+            checks.append(fits(_LATENCY, found))
     return checks
 
 
@@ -210,7 +214,7 @@ def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:
 def remedy_of(checks: Sequence[Check]) -> str:
     """What mends all of these: advice, then for each file its lines, which can be appended as they are."""
     advice = list(dict.fromkeys(check.advice for check in checks if check.advice))
-    return " ".join([*advice, *(f"Append to {into}:\n{lines}" for into, lines in lines_of(checks).items())])
+    return " ".join([*advice, *(f"In {into}: {inline(lines)}." for into, lines in lines_of(checks).items())])
 
 
 def lines_of(checks: Sequence[Check]) -> dict[str, str]:

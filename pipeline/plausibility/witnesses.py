@@ -18,7 +18,8 @@ NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "bali
 class Lag:
     """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not told.
 
-    `sure`: its noise is far below it, and no part of the run contradicts it.
+    `sure`: its noise is far below it, and no part of the run contradicts it. `latency_known`: of the odometer, what is
+    left beyond the latency of the vehicle file.
     """
 
     stream: str
@@ -26,6 +27,7 @@ class Lag:
     sigma_s: float = float("inf")
     sure: bool = False
     reason: str = ""
+    latency_known: bool = False
 
 
 def lag_checks(
@@ -55,6 +57,8 @@ def _check(
     if lag.reason:
         return not_checked(what, lag.reason)
     size_s = abs(lag.lag_s)
+    if not lag.sure and size_s > max(config.fit_lag_told_s, 5.0 * lag.sigma_s):
+        return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
     if not lag.sure or size_s <= config.fit_lag_told_s:
         sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
         return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
@@ -94,7 +98,7 @@ def _rather_gnss(lag_s: float, cause: str, t_ns: int) -> bool:
 def _small(what: str, found: str, lag: Lag) -> Check:
     """A lag that a train can have, and that costs availability all the same."""
     latency_s = round(-lag.lag_s, 2)
-    if lag.stream == "odometer" and latency_s > 0:
+    if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
         return Check(what, State.MISFIT, found, "positions arrive too old", "the vehicle file", lines)
     cause = f"one of both is stamped {'too late' if latency_s < 0 else 'too early'}, or the positions are off"
