@@ -130,7 +130,9 @@ class LineProposals(dy.Schema):
 
     proposal = text("name, and folder of its `balises.csv`")
     spacing_m = real("m", "distance of balises that it aims at", nullable=False, min=0)
-    directions = text("directions of travel that its virtual balises are suitable in")
+    directions = text(
+        "both, or ahead or back along the ways of the travelled elements: where its virtual balises are suitable"
+    )
     virtual = count("virtual balises")
     physical = count("physical balises that bridge the rest")
     longest_distance_m = real("m", "longest distance between balises in a row", min=0)

@@ -42,6 +42,7 @@ _SLOW = (
     "ingest/test_json.py",
     "judge/test_ladder.py",
     "lds/test_outages.py",
+    "line",
     "matching/test_calibration.py",
     "matching/test_found_route.py",
     "plausibility",

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.figures.bounds import clopper_pearson
-from pipeline.line.classes import classes_array
+from pipeline.line.classes import KEYS, classes_array
 from pipeline.line.pieces import Pieces
 from pipeline.line.spans import FIRST_LOSS, State
 from pipeline.site.windows import window_findings
@@ -18,10 +18,11 @@ from schemas.arrays import Bools, Floats, floats
 from schemas.config import LdsConfig
 from schemas.conform import conform
 from schemas.enums import BaliseKind, Reaction
-from schemas.line import LineBalises, LineCriteria, LineProposals, PieceClass
+from schemas.line import LineBalises, LineCriteria, LineDirection, LineProposals, PieceClass
 from schemas.run import Site
 
-MODES = {"both": (True, False), "growing": (True,), "falling": (False,)}
+# Directions of travel, ahead along the ways that the elements form or against it.
+MODES = {"both": (True, False), "ahead": (True,), "back": (False,)}
 # Of 2.5 km between balises DOMAIN section 4 knows no more.
 LONGEST_M = 2500.0
 
@@ -41,10 +42,11 @@ class Line:
 
 @dataclass(frozen=True)
 class _Place:
-    """A piece on a way, its middle `at_m` from the begin of the way."""
+    """A piece on a way, its middle `at_m` from the begin of the way; `growing`: the way runs with its measure."""
 
     piece: int
     at_m: float
+    growing: bool
 
 
 @dataclass(frozen=True)
@@ -62,15 +64,18 @@ def proposals(line: Line) -> tuple[pl.DataFrame, pl.DataFrame]:
     """`LineProposals` and `LineBalises`; none where no piece is suitable."""
     rows, balises = [], []
     ways = _ways(line)
+    growing = np.ones(len(line.pieces.element), dtype=np.bool_)
+    for place in (place for way in ways for place in way):
+        growing[place.piece] = place.growing
     for mode, sides in MODES.items():
-        allowed = _allowed(line, sides)
+        allowed = _allowed(line, sides, growing)
         if not allowed.any():
             continue
         for spacing_m in line.criteria.spacings_m:
             name = f"{mode}-{spacing_m:g}m"
             placed = _disjoint(line, [one for way in ways for one in _walk(line, way, allowed, spacing_m)])
             balises.append(_balises(line, name, placed))
-            rows.append(_figures(line, name, spacing_m, mode, placed))
+            rows.append(_figures(line, name, spacing_m, mode, placed, growing))
     empty = {name: pl.Series([], dtype=column.dtype) for name, column in LineBalises.columns().items()}
     table = pl.concat(balises) if balises else pl.DataFrame(empty)
     return _conformed(rows), conform(table, LineBalises)
@@ -102,10 +107,11 @@ def _travelled(line: Line) -> Bools:
     return seen
 
 
-def _allowed(line: Line, sides: Sequence[bool]) -> Bools:
-    """Pieces suitable in every one of these directions."""
-    good = [classes_array(line.table, growing) == PieceClass.SUITABLE.value for growing in sides]
-    allowed: Bools = np.logical_and.reduce(good)
+def _allowed(line: Line, sides: Sequence[bool], growing: Bools) -> Bools:
+    """Pieces suitable in every one of these directions along their ways."""
+    rising, falling = (classes_array(line.table, side) == PieceClass.SUITABLE.value for side in (True, False))
+    good = {True: np.where(growing, rising, falling), False: np.where(growing, falling, rising)}
+    allowed: Bools = np.logical_and.reduce([good[ahead] for ahead in sides])
     return allowed
 
 
@@ -137,7 +143,8 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
         begin_m, end_m = float(pieces.from_m[numbers[0]]), float(pieces.to_m[numbers[-1]])
         for number in numbers if oriented % 2 == 0 else reversed(numbers):
             middle_m = 0.5 * float(pieces.from_m[number] + pieces.to_m[number])
-            yield _Place(number, entry_m + (middle_m - begin_m if oriented % 2 == 0 else end_m - middle_m))
+            at_m = middle_m - begin_m if oriented % 2 == 0 else end_m - middle_m
+            yield _Place(number, entry_m + at_m, oriented % 2 == 0)
         edges = [edge for edge in network.successors[oriented] if edge.to // 2 in wanted]
         entry_m += network.length_m(oriented) + (edges[0].gap_m if edges else 0.0)
         oriented = edges[0].to if edges else None
@@ -222,7 +229,7 @@ def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
         .agg(pl.col("piece_class").cast(pl.String), pl.col("cause").cast(pl.String))
         .iter_rows()
     }
-    proved = _allowed(line, (True, False))
+    proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
     errors = dict(line.table.group_by("piece").agg(pl.col("largest_undetected_m").max()).iter_rows())
     distance = pl.Series([one.distance_m for one in placed], dtype=pl.Float64)
     numbers = {True: 0, False: 0}
@@ -251,14 +258,17 @@ def _largest(errors: dict[int, float | None], one: _Set) -> float | None:
     return max((error for error in known if error is not None), default=None)
 
 
-def _figures(line: Line, name: str, spacing_m: float, mode: str, placed: Sequence[_Set]) -> dict[str, object]:
+def _figures(
+    line: Line, name: str, spacing_m: float, mode: str, placed: Sequence[_Set], growing: Bools
+) -> dict[str, object]:
     virtual = [one.piece for one in placed if one.virtual]
-    sides = ["growing" if growing else "falling" for growing in MODES[mode]]
-    chosen = line.table.filter(pl.col("piece").is_in(virtual) & pl.col("direction").cast(pl.String).is_in(sides))
-    lost = chosen.group_by("direction").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
-    judged = line.passes.filter(
-        pl.col("piece").is_in(virtual) & ((pl.col("state") >= int(FIRST_LOSS)) | (pl.col("state") == int(State.RIGHT)))
-    ).filter(pl.col("growing").is_in(list(MODES[mode])))
+    sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual for ahead in MODES[mode]]
+    schema = {"piece": pl.Int64, "growing": pl.Boolean, "ahead": pl.Boolean}
+    wanted = pl.DataFrame(sides, schema=schema, orient="row")
+    told = line.table.with_columns(growing=pl.col("direction").cast(pl.String) == LineDirection.GROWING.value)
+    lost = wanted.join(told, on=KEYS).group_by("ahead").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
+    decided = (pl.col("state") >= int(FIRST_LOSS)) | (pl.col("state") == int(State.RIGHT))
+    judged = line.passes.filter(decided).join(wanted, on=KEYS)
     journeys = judged.group_by("run_id").agg(wrong=(pl.col("state") == int(State.WRONG_IN_USE)).any())
     distances: Floats = np.array([one.distance_m for one in placed if one.distance_m is not None])
     longest_m = float(distances.max()) if len(distances) else None

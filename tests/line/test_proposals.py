@@ -110,6 +110,16 @@ def test_bad_stretches_are_bridged_with_the_odometers_confidence(found: LineResu
     assert found.balises["largest_undetected_m"].null_count() == found.balises.height
 
 
+def test_one_direction_alone_is_a_direction_of_travel(found: LineResult) -> None:
+    """Ahead is north: with the measure of A, against that of B."""
+    side = pl.when(pl.col("netelement_id") == "A").then(pl.lit("growing")).otherwise(pl.lit("falling"))
+    good = found.pieces.filter((pl.col("piece_class") == "suitable") & (pl.col("direction").cast(pl.String) == side))
+    ahead = found.balises.filter((pl.col("proposal") == "ahead-400m") & (pl.col("kind") == "virtual"))
+    held = ahead.join(good, on="netelement_id").filter(pl.col("measure_m").is_between("from_m", "to_m"))
+    assert set(ahead["netelement_id"]) == {"A", "B"}
+    assert held.height == ahead.height
+
+
 def test_windows_are_disjoint_on_each_way(found: LineResult, site: Site) -> None:
     for _, balises in found.balises.group_by("proposal"):
         table = Balises.validate(site_balises(balises, CRITERIA).with_columns(kind=pl.lit("virtual")), cast=True)
