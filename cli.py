@@ -8,8 +8,9 @@ import re
 import signal
 import sys
 import traceback
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
+_SHOWN_ELEMENTS = 25
 
 
 def _examples(*lines: str) -> str:
@@ -27,15 +29,17 @@ def _examples(*lines: str) -> str:
 
 app = typer.Typer(
     name="balise",
-    help="Replays recorded train journeys and says whether satellite positioning could have replaced balises.",
-    epilog="Exit status: 0 all runs ok; 1 some run failed or partial; 2 bad usage, configuration or site; "
-    "3 a defect of the program; 129, 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
+    help="Replay recorded train journeys and judge whether satellite positioning could have replaced balises.",
+    epilog="Exit status: 0 ok; 1 a run failed or is partial, or results differ; 2 wrong usage, configuration or site; "
+    "3 defect of the program; 129, 130, 143 interrupted. --debug shows the traceback of an error.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
+# Elements of a new site that are printed; its page shows all.
+_SHOWN_ELEMENTS = 25
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 
@@ -51,27 +55,37 @@ def _here(value: Any) -> Any:
     return value
 
 
-Site = Annotated[str, typer.Option("--site", help="Folder with track, links, balises, route.")]
-Out = Annotated[str, typer.Option("--out", help="Where the tables go: a folder or an address.")]
+Site = Annotated[
+    str, typer.Option("--site", help="Site: a folder with track, links, balises and route, or a GeoJSON file.")
+]
+Out = Annotated[str, typer.Option("--out", help="Result to write: a folder or an address.")]
 OutFolder = Annotated[Path, typer.Option("--out", callback=_here, help="Folder to write.")]
 VehicleFile = Annotated[Path | None, typer.Option("--vehicle", callback=_here, help="Vehicle file (TOML).")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", callback=_here, help="Configuration file (TOML).")]
 RouteFiles = Annotated[
     Path | None,
-    typer.Option("--route", callback=_here, help="A route for all runs, or a folder with RUN.csv or RUN.parquet."),
+    typer.Option(
+        "--route", callback=_here, help="Known route: a file for all runs, or a folder with RUN.csv or RUN.parquet."
+    ),
 ]
 FoundRoutes = Annotated[
     Path | None,
-    typer.Option("--write-route", callback=_here, help="Folder for the routes found, doubtful elements marked."),
+    typer.Option(
+        "--write-route",
+        callback=_here,
+        help="Folder for the route found of each run; doubtful net elements are marked.",
+    ),
 ]
 ResultFolder = Annotated[Path, typer.Argument(callback=_here, help="A result of `balise replay`.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")]
-Json = Annotated[bool, typer.Option("--json", help="The result as JSON on standard output.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @app.callback(invoke_without_command=True)
 def _about(
-    version: Annotated[bool, typer.Option("--version", help="Version of the program and of its tables.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version of the program and of its tables.")
+    ] = False,
 ) -> None:
     if version:
         from schemas.version import SOFTWARE
@@ -87,26 +101,30 @@ def _about(
     )
 )
 def replay(
-    runs: Annotated[list[str], typer.Argument(help="Logs, run folders, folders of runs, globs, addresses.")],
+    runs: Annotated[
+        list[str], typer.Argument(help="Runs: logs, run folders, folders of runs, glob patterns or addresses.")
+    ],
     site: Site,
     out: Out,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
     write_route: FoundRoutes = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
-    scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
-    time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
+    scheduler: Annotated[str | None, typer.Option(help="Run on this Dask cluster (tcp://host:port).")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Also replay runs that are already complete.")] = False,
+    time_limit: Annotated[
+        float, typer.Option(min=0.1, help="Seconds that one run may take; a slower run fails.")
+    ] = 3600.0,
     undetected: Annotated[
-        bool, typer.Option("--undetected", help="Also the largest error that no monitor would have noticed.")
+        bool, typer.Option("--undetected", help="Also compute the largest error that no monitor would have noticed.")
     ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
     ] = False,
 ) -> None:
-    """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
+    """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
     from pipeline.campaign.ending import show_summary
     from pipeline.campaign.progress import watches
@@ -131,7 +149,7 @@ def replay(
         with contextlib.suppress(OSError):
             if interrupted.summary is not None:
                 show_summary(interrupted.summary, out, quiet, as_json)
-            print("balise: interrupted; the same command goes on from here", file=sys.stderr)
+            print("balise: interrupted; repeat the command to continue", file=sys.stderr)
         raise typer.Exit(128 + interrupted.signum) from None
     show_summary(summary, out, quiet, as_json)
     raise typer.Exit(_status_of(summary))
@@ -145,10 +163,10 @@ def replay(
 )
 def dictionary(
     as_json: Json = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="As one Markdown page.")] = False,
-    table: Annotated[str | None, typer.Option(help="One table only.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print as one Markdown page.")] = False,
+    table: Annotated[str | None, typer.Option(help="Show this table only.")] = None,
 ) -> None:
-    """Every table with its columns, units and meaning, and every key of the configuration."""
+    """List every table with its columns, units and meaning, and every key of the configuration."""
     from schemas.dictionary import dictionary_frame, dictionary_markdown, settings_frame
 
     if markdown:
@@ -175,7 +193,7 @@ def dictionary(
 )
 def demo(
     out: OutFolder = Path("demo-out"),
-    seed: Annotated[int | None, typer.Option(help="Another trial than the usual one.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the trial; another seed gives other noise.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
@@ -222,7 +240,9 @@ def synth(
     )
 )
 def safety(
-    out: Annotated[str | None, typer.Argument(help="A result of `balise replay`, for what it measured.")] = None,
+    out: Annotated[
+        str | None, typer.Argument(help="Result of `balise replay` to assess; without it: the budget only.")
+    ] = None,
     config: ConfigFile = None,
     logs: Annotated[
         list[str] | None,
@@ -230,13 +250,13 @@ def safety(
     ] = None,
     site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
     vehicle: VehicleFile = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Safety budget with its errata; of a result, what it was made from and what it measured, each figure with bounds.
+    """Print the safety budget and its errata; for a result also its sources and each measured figure with bounds.
 
-    The sensitivity to service levels comes from the tables. That to `failure_limit_m` and `evidence_factor` needs the
-    logs: with --logs and --site they are replayed once per value.
+    How the verdict depends on the service level is read from the tables. With --logs and --site the logs are replayed
+    once per value of `failure_limit_m` and `evidence_factor`, to show how the verdict depends on these.
     """
     if out is not None:
         from pipeline.campaign.replayed_again import again
@@ -268,12 +288,15 @@ def claim(
     profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
     site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
     front_ahead: Annotated[
-        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+        float,
+        typer.Option("--front-ahead", metavar="METRES", help="Distance of the front end ahead of the balise antenna."),
     ] = 0.0,
-    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write all columns as CSV; `-` is standard output.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.claim import claim as hold
     from pipeline.claim import for_reading, load_profile, read_areas
     from pipeline.results.answer_files import write_csv
@@ -302,17 +325,17 @@ def claim(
     )
 )
 def inspect(
-    path: Annotated[str, typer.Argument(help="A log, a site, or a result of `balise replay`.")],
+    path: Annotated[str, typer.Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
     result: Annotated[
-        str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
+        str | None, typer.Option("--result", help="Result of runs on this site, to check its survey.")
     ] = None,
-    site: Annotated[str | None, typer.Option("--site", help="Site to hold a log against.")] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site to compare a log with.")] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """What a log, a site or a result holds, and what is remarkable in it."""
-    from pipeline.results.inspection import inspect_path
+    """Describe a log, a site or a result, and list what needs attention."""
+    from pipeline.results.inspection import STARTING_CONFIG, inspect_path
     from pipeline.results.terminal import show_tables
 
     settings = _configuration(config)
@@ -320,7 +343,9 @@ def inspect(
     if as_json:
         _print_json(tables)
     else:
-        show_tables(tables)
+        show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
+        if STARTING_CONFIG in tables:  # to be saved, so without a frame
+            print("\n".join(tables[STARTING_CONFIG]["toml"]))
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
@@ -336,7 +361,7 @@ def inject(
     site: Annotated[str | None, typer.Option("--site", help="Site, for faults along its track.")] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Add a known fault to a recorded run, so that detection is measured on real noise."""
+    """Add a known fault to a recorded run, to measure detection on real noise."""
     from datasets.inject import inject_all, load_faults
     from datasets.trial import write_run_as
     from pipeline.ingest import read_run
@@ -352,7 +377,11 @@ def inject(
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise undetected monday.mcap --site line9 --out worst --balise VB07",
+    )
+)
 def undetected(
     run: Annotated[str, typer.Argument(help="A recorded run.")],
     site: Site,
@@ -360,11 +389,13 @@ def undetected(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
-    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
-    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
-    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+    balise: Annotated[
+        str | None, typer.Option(help="Place: where the run passes this balise; default: its end.")
+    ] = None,
+    at_s: Annotated[float | None, typer.Option(help="Place: this many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
-    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
     from datasets.undetected import largest_fault, write_fault
     from pipeline.ingest import read_run
     from pipeline.site.read import read_site
@@ -380,34 +411,57 @@ def undetected(
     )
     print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
     print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
-    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @app.command(
     epilog=_examples(
         "balise convert receiver.ubx --to monday",
+        "balise convert rover.pos --to monday --stream reference",
+        "balise convert second.sbf.gz --to monday --solution second",
         "balise convert positions.csv --config columns.toml --to monday.mcap",
     )
 )
 def convert(
     logs: Annotated[
         list[Path],
-        typer.Argument(callback=_here, help="UBX, SBF, NMEA, CSV with a mapping in --config, or a public recording."),
+        typer.Argument(
+            callback=_here,
+            help="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, ROS bags, MCAP, CSV with a mapping in --config, or a public "
+            "recording; .gz and .zip of these.",
+        ),
     ],
-    to: Annotated[Path, typer.Option("--to", callback=_here, help=_NEW_RUN)],
+    to: Annotated[
+        Path, typer.Option("--to", callback=_here, help=_NEW_RUN + " To one that exists, streams are added.")
+    ],
     config: ConfigFile = None,
+    solution: Annotated[str | None, typer.Option(help="Name of the receiver in the run, where it has several.")] = None,
+    stream: Annotated[Literal["gnss", "reference"], typer.Option(help="What the positions are for.")] = "gnss",
+    date: Annotated[
+        datetime | None, typer.Option(formats=["%Y-%m-%d"], help="Day of an NMEA log that holds none (UTC).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a stream or solution that the run has.")] = False,
 ) -> None:
-    """Make a run of receiver logs."""
+    """Convert receiver logs to a run, or add streams to a run."""
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
-    from pipeline.receivers import convert as convert_logs
+    from pipeline.ingest import read_run
+    from pipeline.receivers import Purpose, as_run, extended, gather
     from pipeline.results.fit_report import fit_report
+    from schemas.config import IngestConfig
     from schemas.errors import visible
 
-    settings = _configuration(config)
-    converted = known_recording(logs[0]) if len(logs) == 1 and config is None else None
-    if converted is None:
-        converted = convert_logs(logs, to.name.removesuffix(".mcap"), settings.ingest)
+    settings, purpose = _configuration(config), Purpose(solution, stream)
+    recording = known_recording(logs[0]) if len(logs) == 1 and config is None else None
+    if recording is None:
+        found = gather(logs, settings.ingest, None if date is None else date.date())
+    else:
+        found = recording.gathered()
+    if to.is_file() or (to / "gnss.parquet").is_file():
+        run = read_run(to, IngestConfig(), with_digest=False)
+        converted = extended(run, to, found, purpose, settings.fix_sigma, force)
+    else:
+        converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
     write_run_as(converted.run, to)
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
@@ -417,12 +471,57 @@ def convert(
 
 
 @app.command(
+    "site",
+    epilog=_examples(
+        "balise site line.gpx --balises every 1000 --out line9",
+        "balise site railways.geojson --balises wanted.csv --out line9",
+    ),
+)
+def make_a_site(
+    surveys: Annotated[
+        list[Path],
+        typer.Argument(callback=_here, help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions."),
+    ],
+    out: OutFolder,
+    balises: Annotated[
+        str | None, typer.Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
+    ] = None,
+    epsg: Annotated[int | None, typer.Option(help="Of x and y in tables that do not say.")] = None,
+    join: Annotated[float, typer.Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    flat: Annotated[bool, typer.Option("--flat", help="Leave heights out.")] = False,
+    vehicle: VehicleFile = None,
+    config: ConfigFile = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a site that is there.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
+    from pipeline.report.site_page import site_page
+    from pipeline.results.inspection import findings_table
+    from pipeline.results.terminal import show_table
+    from pipeline.site.describe import elements_table
+    from pipeline.survey.make import make_site, wish_of, write_made
+
+    wish = wish_of(surveys, balises, epsg, join, flat)
+    site = make_site(wish, _vehicle(vehicle), _configuration(config))
+    write_made(site, site_page(out.resolve().name, site), out, force)
+    elements, findings = elements_table(site), findings_table(site.findings)
+    if as_json:
+        _print_json({"elements": elements, "findings": findings, "balises": site.balises})
+        return
+    show_table(elements.head(_SHOWN_ELEMENTS), "Elements")
+    show_table(findings, "Findings")
+    count = 0 if site.balises is None else site.balises.height
+    print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
+    print(f"Look at {out / 'site.html'} before you replay on it.")
+
+
+@app.command(
     epilog=_examples(
         "balise calibrate good/*.mcap --site line9 --out train7.toml",
     )
 )
 def calibrate(
-    runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, globs.")],
+    runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, glob patterns.")],
     site: Site,
     out: Annotated[Path, typer.Option("--out", callback=_here, help="Vehicle file to write.")],
     vehicle: VehicleFile = None,
@@ -450,7 +549,7 @@ def calibrate(
     show_table(found.runs, "Scale and latency")
     show_table(found.sigmas, "Sigma of the monitors")
     if found.vehicle.gnss_latency_s is None:
-        print("\nNo latency in the vehicle file: the runs hardly change their speed, which alone tells it.")
+        print("\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few.")
     print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
 
 
@@ -461,18 +560,20 @@ def calibrate(
     )
 )
 def experiment(
-    name: Annotated[str, typer.Argument(help="`list` shows the names.")],
+    name: Annotated[str, typer.Argument(help="Name of the experiment; `list` prints all names.")],
     out: OutFolder = Path("experiment-out"),
-    repetitions: Annotated[int | None, typer.Option(min=1, help="Instead of the published number.")] = None,
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 1,
-    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0 takes one per core.")] = 0,
+    repetitions: Annotated[
+        int | None, typer.Option(min=1, help="Number of repetitions; default: the published number.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of processes; 0: one per core.")] = 0,
     config: Annotated[
         Path | None,
-        typer.Option("--config", callback=_here, help="The bank to judge: `rare`, `bank`, `catalogue`."),
+        typer.Option("--config", callback=_here, help="Monitor bank to assess (`rare`, `bank`, `catalogue` only)."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Run a published experiment again, at its own size."""
+    """Repeat a published experiment, by default with its own number of runs."""
     from datasets.experiment import EXPERIMENTS
     from schemas.errors import UsageError
 
@@ -483,7 +584,7 @@ def experiment(
         from schemas.near import did_you_mean
 
         raise UsageError(
-            f"is no experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
+            f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
         )
     from pipeline.campaign.workers import watched
     from pipeline.results.terminal import how_far
@@ -522,10 +623,10 @@ def sql(
     ] = None,
     as_json: Json = False,
     allow_files: Annotated[
-        bool, typer.Option("--allow-files", help="The query may read files beside the result (`read_csv`).")
+        bool, typer.Option("--allow-files", help="Let the query read other files (`read_csv`).")
     ] = False,
 ) -> None:
-    """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
+    """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
     from pipeline.results.query import named_results, run_sql
     from pipeline.results.terminal import show_table
@@ -551,10 +652,10 @@ def sql(
 def report(
     out: ResultFolder,
     site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Pages at once; 0 takes one per core where there are many.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Write HTML pages, for the campaign and each run, that open offline.
+    """Write HTML pages for the campaign and each run. They open offline.
 
     Pages of runs that have not changed since the last report are left as they are.
     """
@@ -566,6 +667,47 @@ def report(
     pages = write_report(out, place, jobs, None if quiet else how_far("pages"))
     if not quiet:
         print(f"{len(pages)} files; begin with {pages[0]}")
+
+
+@app.command(
+    epilog=_examples(
+        "balise line week12 --site line9",
+        "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
+    )
+)
+def line(
+    out: ResultFolder,
+    site: Annotated[str, typer.Option("--site", help="Site that the runs were replayed on.")],
+    criteria: Annotated[Path | None, typer.Option("--criteria", callback=_here, help="Criteria (TOML).")] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", callback=_here, help="Stations and signals: CSV with name, netelement_id, measure_m."),
+    ] = None,
+    solution: Annotated[
+        str | None, typer.Option(help="Solution of the runs; `primary` where there are several.")
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option("--out", callback=_here, help="Folder to write; by default OUT/line.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say of each piece of track whether virtual balises may be placed there, and propose some."""
+    from pipeline.line import write_line
+    from pipeline.line.write import read_points
+    from pipeline.results.terminal import show_table
+    from pipeline.site.read import read_site
+    from schemas.config import load_settings
+    from schemas.line import LineCriteria
+
+    given = None if points is None else read_points(points)
+    found = write_line(out, read_site(site), load_settings(criteria, LineCriteria), solution, given, to)
+    if as_json:
+        _print_json({"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)})
+        return
+    show_table(found.summary, "Pieces of track")
+    show_table(found.proposals, "Proposals")
+    print("\n".join(found.remarks))
+    print(f"{len(found.files)} files; begin with {found.files[0]}")
 
 
 @app.command(
@@ -608,13 +750,14 @@ def export(
 def verify(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     logs: Annotated[
-        list[str] | None, typer.Option("--logs", help="Logs to replay again and compare: paths, folders, globs.")
+        list[str] | None,
+        typer.Option("--logs", help="Logs to replay again and compare: paths, folders, glob patterns."),
     ] = None,
     site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -629,7 +772,7 @@ def verify(
     found = [compare(out, None if quiet else how_far("runs"))]
     if logs:
         if site is None:
-            raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+            raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
         settings = _configuration(config) if config else read_config(out)
         train = _vehicle(vehicle)
         found.append(
@@ -653,11 +796,11 @@ def verify(
 )
 def diff(
     out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    out_b: Annotated[str, typer.Argument(help="Another one.")],
-    detail: Annotated[bool, typer.Option("--detail", help="Every value that changed, too.")] = False,
+    out_b: Annotated[str, typer.Argument(help="The result to compare it with.")],
+    detail: Annotated[bool, typer.Option("--detail", help="Also list every changed value.")] = False,
     as_json: Json = False,
 ) -> None:
-    """What changed between two results; exit status 1 on a difference."""
+    """Compare two results; exit status 1 if they differ."""
     from pipeline.diff.results import diff_results
 
     found = diff_results(out_a, out_b)

@@ -23,7 +23,7 @@ from datasets.experiment.passage import BLOCK_EPOCHS, first_passages
 from datasets.experiment.plan import Plan, bank_forms, failure_forms
 from datasets.experiment.ranges import RangePlan, run_ranges
 from datasets.experiment.rare import Probability, missed_detection_probability
-from datasets.experiment.rare_ranges import missed_by_ranges, range_system
+from datasets.experiment.rare_ranges import range_system
 from datasets.experiment.workers import generator
 from pipeline.campaign.workers import mapped
 
@@ -84,7 +84,7 @@ def _rare_figures() -> list[Figure]:
         figures += _rare(f"rare miss, {name}", rare, watch.seconds)
     system = range_system(RangePlan(default_geometry("gps_galileo"), period_s=10.0), 0.0)
     with stopwatch() as watch:
-        rare = missed_by_ranges(system, _RANGE_EPOCHS, 0.1, _RARE_RUNS, jobs=_JOBS)
+        rare = missed_detection_probability(system, _RANGE_EPOCHS, 0.1, _RARE_RUNS, jobs=_JOBS)
     return figures + _rare("rare miss, pseudorange", rare, watch.seconds)
 
 

@@ -40,7 +40,8 @@ def infrabel_recording(log: Path) -> Converted:
     Its naive local times are taken as UTC, and NovAtel's position types (each with any number behind) as kinds of fix;
     without a computed solution, or without a type, there is none. Half a row at the end is left out.
     """
-    table, cut = read_log_table(log, infer=False)
+    whole = read_log_table(log, infer=False)
+    table, cut = whole.table, whole.cut
     missing = set(COLUMNS) - set(table.columns)
     if missing:
         raise InputError("lacks columns of an Infrabel log", place=str(log), found=f"no {', '.join(sorted(missing))}")

@@ -12,6 +12,7 @@ from schemas.campaign import CAMPAIGN_TABLES
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
+from schemas.line import LINE_TABLES
 from schemas.tables import CONTRACT_VERSION, TABLES
 
 _INTRODUCTION = f"""# Data dictionary
@@ -37,6 +38,7 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
         "Site": SITE_SCHEMAS,
         "Output tables": TABLES,
         "Campaign tables": CAMPAIGN_TABLES,
+        "Line tables": LINE_TABLES,
     }
 
 
@@ -44,7 +46,7 @@ def dictionary_frame(only: str | None = None) -> pl.DataFrame:
     """One row per column, of all tables or `only` one: `group, table, column, dtype, unit, nullable, meaning`."""
     known = [table for tables in groups().values() for table in tables]
     if only is not None and only not in known:
-        raise UsageError("is no table", place=only, expected=", ".join(known))
+        raise UsageError("is not a table", place=only, expected=", ".join(known))
     rows = [
         {
             "group": group,

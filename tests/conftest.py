@@ -38,6 +38,7 @@ _SLOW = (
     "golden",
     "ingest/test_damage.py",
     "ingest/test_fuzz.py",
+    "ingest/test_hostile.py",
     "ingest/test_json.py",
     "judge/test_ladder.py",
     "lds/test_outages.py",

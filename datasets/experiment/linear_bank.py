@@ -7,16 +7,19 @@ two epochs follows from powers of A.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
+from scipy.special import log_ndtr, ndtri_exp
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
 from datasets.experiment.plan import BANKS, Reading, Sensors
-from schemas.arrays import Floats
+from datasets.experiment.splitting import Limits
+from schemas.arrays import Bools, Floats
 from schemas.config import MonitorConfig, threshold_factor
 
 AXES: tuple[str, ...] = ("along", "cross", "up")
@@ -57,7 +60,7 @@ class BankSpec:
 
 @dataclass(frozen=True)
 class LinearBank:
-    """Monitors along, and with track across and up; stationary, unless the bank has an age.
+    """Monitors along, and with track across and up, as a `System`; stationary, unless the bank has an age.
 
     `advance` A and `noise` B as above; `sources` is the number of error states before the monitors; `slope`
     (monitors,) final response to a range ramp of 1 m/s; `alpha` (monitors,) weight of one epoch.
@@ -71,6 +74,14 @@ class LinearBank:
     alpha: Floats
     names: tuple[str, ...]
     along_error: Floats = field(repr=False)
+
+    streams: ClassVar[tuple[int, int]] = (31, 32)
+    margins: ClassVar[tuple[float, ...]] = (0.4, 1.0, 1.5, 2.0, 2.5)
+    runs_per_block: ClassVar[int] = 250
+
+    @property
+    def size(self) -> int:
+        return int(self.slope.size)
 
     @cached_property
     def covariance(self) -> Floats:
@@ -120,13 +131,30 @@ class LinearBank:
         k = np.arange(1, epochs + 1)[:, None]
         return np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
 
+    def ramp(self, epochs: int, rate_mps: float) -> Floats:
+        return rate_mps * self.response(epochs)
+
+    def limits(self, epochs: int, rate_mps: float) -> Limits:
+        towards = np.where(self.slope < 0, -1.0, 1.0)
+        return Limits(self.ramp(epochs, rate_mps), self.thresholds(epochs), self.sigmas(epochs), towards)
+
+    def seen(self, values: Floats) -> Floats:
+        return values
+
+    def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
+        return partial(self.covariance_with, covariances=self.covariances(epochs))
+
+    def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
+        threshold = self.thresholds(epochs)
+        return lambda k, values: np.asarray((np.abs(values) <= threshold[k][:, None]).all(axis=0))
+
     def covariance_with(self, monitor: int, epoch: int, covariances: Floats) -> Floats:
         """Covariance of all monitors at epochs 1 .. n with one monitor at one epoch (1-based), (epochs, monitors).
 
         `covariances` (n + 1, states, states): those of the state, as above.
         """
         P, A, epochs = covariances, self.advance, len(covariances) - 1
-        result = np.empty((epochs, self.slope.size))
+        result = np.empty((epochs, self.size))
         place = self.sources + monitor
         later = P[epoch, :, place].copy()
         for k in range(epoch, epochs + 1):
@@ -139,10 +167,10 @@ class LinearBank:
             earlier = A.T @ earlier
         return result
 
-    def covariances_by_lag(self, epochs: int) -> Floats:
-        """Covariance of monitor j at epoch k + lag with monitor i at k, lags -(n-1) .. n-1; (lags, i, j)."""
-        size = self.slope.size
-        result = np.empty((2 * epochs - 1, size, size))
+    def by_lag(self, epochs: int) -> Floats:
+        if self.spec.age_s is not None:
+            raise ValueError("false alarms are sampled of a stationary bank")
+        result = np.empty((2 * epochs - 1, self.size, self.size))
         later = self.covariance[:, self.sources :].copy()
         for lag in range(epochs):
             result[epochs - 1 + lag] = later[self.sources :].T
@@ -150,25 +178,42 @@ class LinearBank:
             later = self.advance @ later
         return result
 
+    def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
+        """A monitor drawn at random beyond its threshold; the tail in logarithms does not underflow at 1e-15."""
+        runs, sigma = len(values), self.sigma
+        monitor = rng.integers(0, self.size, runs)
+        log_tail = float(log_ndtr(-self.threshold[0] / sigma[0]))
+        target = -ndtri_exp(log_tail + np.log(rng.random(runs))) * sigma[monitor]
+        target *= rng.choice([-1.0, 1.0], runs)
+        each = np.arange(runs)
+        pull = np.zeros((runs, self.size))
+        pull[each, monitor] = (target - values[each, monitor]) / sigma[monitor] ** 2
+        return pull, self.size * 2.0 * float(np.exp(log_tail))
+
+    def fails(self, path: Floats) -> int:
+        return int((np.abs(path) > self.threshold).sum())
+
     def start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the fault's onset, shape (states, runs)."""
         values, vectors = np.linalg.eigh(self.covariances(0)[0])
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ rng.standard_normal((values.size, runs)))
 
+    def following(self, state: Floats, rng: np.random.Generator) -> Floats:
+        """States at the next epoch."""
+        following = self.advance @ state
+        following += self.noise @ rng.standard_normal((self.noise.shape[1], state.shape[1]))
+        return np.asarray(following)
+
+    def values(self, state: Floats) -> Floats:
+        return state[self.sources :]
+
     def paths(self, epochs: int, runs: int, rng: np.random.Generator) -> Iterator[Floats]:
-        """Noise of all monitors epoch by epoch, each (monitors, runs); the same array is used again."""
+        """Noise of all monitors epoch by epoch, each (monitors, runs)."""
         state = self.start(runs, rng)
-        normals = np.empty((self.noise.shape[1], runs))
-        following = np.empty_like(state)
-        pushed = np.empty_like(state)
         for _ in range(epochs):
-            rng.standard_normal(out=normals)
-            np.matmul(self.advance, state, out=following)
-            np.matmul(self.noise, normals, out=pushed)
-            following += pushed
-            state, following = following, state
-            yield state[self.sources :]
+            state = self.following(state, rng)
+            yield self.values(state)
 
 
 def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> LinearBank:

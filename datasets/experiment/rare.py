@@ -1,4 +1,4 @@
-"""Probabilities down to 1e-9 and below: missed detection and false alarm of any linear bank, and the same by counting.
+"""Probabilities down to 1e-9 and below: missed detection and false alarm of any linear system.
 
 False alarm within a horizon (Adler, Blanchet and Liu 2012): an exceedance is forced at a monitor and epoch drawn
 at random, the rest of the path follows by conditioning, and the expected number of exceedances over the number seen is
@@ -12,18 +12,15 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri_exp
 
-from datasets.experiment.linear_bank import LinearBank
-from datasets.experiment.splitting import Shift, miss_estimate, most_probable_miss
+from datasets.experiment.splitting import Shift, System, miss_estimate, most_probable_miss
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.campaign.workers import mapped
 from schemas.arrays import Floats
 
 W = TypeVar("W")
 
-# Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
-_RUNS_PER_BLOCK = 250
+# Paths of all monitors must fit into some 64 MB.
 _LARGEST_BLOCK = 8_000_000
 # Independent populations of a split estimate: their scatter is its error.
 _POPULATIONS = 20
@@ -41,7 +38,7 @@ class Probability(NamedTuple):
 
 @dataclass(frozen=True)
 class _Work:
-    bank: LinearBank
+    system: System
     epochs: int
     rate_mps: float
     shift: Shift | None
@@ -49,22 +46,25 @@ class _Work:
     runs: int
 
 
-def false_alarm_probability(
-    bank: LinearBank, epochs: int, runs: int = 4000, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """Probability that a fault-free bank, long after its restart, fails at least once in this many epochs."""
-    if bank.spec.age_s is not None:
-        raise ValueError("false alarms are sampled of a stationary bank")
-    return pooled(_false_alarm_block, _works(bank, epochs, 0.0, (seed, 31), runs), runs, jobs)
+def false_alarm_probability(system: System, epochs: int, runs: int = 4000, seed: int = 1, jobs: int = 1) -> Probability:
+    """Probability that healthy monitors, long after their restart, fail at least once in this many epochs."""
+    # Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
+    size = max(1, min(system.runs_per_block, _LARGEST_BLOCK // (epochs * system.size)))
+    works = [
+        _Work(system, epochs, 0.0, None, (seed, system.streams[0], number), block)
+        for number, block in enumerate(in_blocks(runs, size))
+    ]
+    return pooled(_alarm_block, works, runs, jobs)
 
 
 def missed_detection_probability(
-    bank: LinearBank, epochs: int, rate_mps: float, runs: int = 20_000, seed: int = 1, jobs: int = 1
+    system: System, epochs: int, rate_mps: float, runs: int = 20_000, seed: int = 1, jobs: int = 1
 ) -> Probability:
     """Probability that no monitor fails at epochs 1 .. n of a range ramp of `rate_mps`."""
-    shift = most_probable_miss(bank, epochs, rate_mps)
+    shift = most_probable_miss(system, epochs, rate_mps)
     works = [
-        _Work(bank, epochs, rate_mps, shift, (seed, 32, number), size) for number, size in enumerate(populations(runs))
+        _Work(system, epochs, rate_mps, shift, (seed, system.streams[1], number), size)
+        for number, size in enumerate(populations(runs))
     ]
     return pooled(_miss_block, works, runs, jobs)
 
@@ -72,30 +72,6 @@ def missed_detection_probability(
 def populations(runs: int) -> list[int]:
     """Sizes of the independent populations that share the runs; too small ones would lose all of theirs."""
     return in_blocks(runs, min(max(runs // _POPULATIONS, _SMALLEST_POPULATION), _LARGEST_POPULATION))
-
-
-def plain_false_alarm(bank: LinearBank, epochs: int, runs: int, seed: int = 1, jobs: int = 1) -> Probability:
-    """The same by counting, to verify where counting can reach."""
-    return pooled(_plain_alarm_block, _works(bank, epochs, 0.0, (seed, 33), runs), runs, jobs)
-
-
-def plain_missed_detection(
-    bank: LinearBank, epochs: int, rate_mps: float, runs: int, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """The same by counting, to verify where counting can reach."""
-    return pooled(_plain_miss_block, _works(bank, epochs, rate_mps, (seed, 34), runs), runs, jobs)
-
-
-def _works(bank: LinearBank, epochs: int, rate_mps: float, key: tuple[int, ...], runs: int) -> list[_Work]:
-    return [
-        _Work(bank, epochs, rate_mps, None, (*key, number), size)
-        for number, size in enumerate(in_blocks(runs, _block_size(bank, epochs)))
-    ]
-
-
-def _block_size(bank: LinearBank, epochs: int) -> int:
-    """Runs that are simulated together; paths of all monitors must fit into some 64 MB."""
-    return max(1, min(_RUNS_PER_BLOCK, _LARGEST_BLOCK // (epochs * bank.slope.size)))
 
 
 def pooled(block: Callable[[W], Floats], works: list[W], runs: int, jobs: int) -> Probability:
@@ -112,31 +88,24 @@ def pooled(block: Callable[[W], Floats], works: list[W], runs: int, jobs: int) -
     return Probability(mean, error, gain, runs)
 
 
-def _false_alarm_block(work: _Work) -> Floats:
-    bank, rng = work.bank, generator(*work.key)
-    monitors = bank.slope.size
-    paths = np.empty((work.epochs, monitors, work.runs))
-    for path, noise in zip(paths, bank.paths(work.epochs, work.runs, rng), strict=True):
-        path[:] = noise
-    epoch = rng.integers(1, work.epochs + 1, work.runs)
-    monitor = rng.integers(0, monitors, work.runs)
-    factor = bank.threshold / bank.sigma
-    log_tail = float(log_ndtr(-factor[0]))
-    # A normal beyond its threshold, by inversion of the tail in logarithms: no underflow at 1e-15.
-    target = -ndtri_exp(log_tail + np.log(rng.random(work.runs))) * bank.sigma[monitor]
-    target *= rng.choice([-1.0, 1.0], work.runs)
-    expected_count = work.epochs * monitors * 2.0 * np.exp(log_tail)
+def _alarm_block(work: _Work) -> Floats:
+    system, epochs, rng = work.system, work.epochs, generator(*work.key)
+    # Stationary: the covariance depends on the lag alone, and lag zero is in the middle.
+    by_lag = system.by_lag(epochs)
+    paths = np.empty((epochs, system.size, work.runs))
+    state = system.start(work.runs, rng)
+    for path in paths:
+        state = system.following(state, rng)
+        path[:] = system.values(state)
+    at = rng.integers(0, epochs, work.runs)
+    pulls, per_epoch = system.forced(paths[at, :, np.arange(work.runs)], rng)
     estimates = np.empty(work.runs)
-    by_lag = bank.covariances_by_lag(work.epochs)
-    for run in range(work.runs):
-        at, which = int(epoch[run]), int(monitor[run])
-        # Stationary: the covariance depends on the lag alone, and lag zero is in the middle.
-        together = by_lag[work.epochs - at : 2 * work.epochs - at, which]
-        lacking = target[run] - paths[at - 1, which, run]
-        path = paths[:, :, run] + together * (lacking / bank.sigma[which] ** 2)
+    for run, (place, pull) in enumerate(zip(at, pulls, strict=True)):
+        pulled = np.flatnonzero(pull)
+        together = by_lag[epochs - 1 - place : 2 * epochs - 1 - place, pulled]
         # The forced one counts, whatever rounding does to it.
-        count = int((np.abs(path) > bank.threshold).sum())
-        estimates[run] = expected_count / max(count, 1)
+        count = max(system.fails(paths[:, :, run] + pull[pulled] @ together), 1)
+        estimates[run] = epochs * per_epoch / count
     return estimates
 
 
@@ -144,22 +113,4 @@ def _miss_block(work: _Work) -> Floats:
     if work.shift is None:
         raise ValueError("missed detection is sampled around the most probable miss")
     rng = generator(*work.key)
-    return np.array([miss_estimate(work.bank, work.epochs, work.rate_mps, work.shift, work.runs, rng)])
-
-
-def _plain_alarm_block(work: _Work) -> Floats:
-    alarm = np.zeros(work.runs, dtype=np.bool_)
-    for noise in work.bank.paths(work.epochs, work.runs, generator(*work.key)):
-        alarm |= (np.abs(noise) > work.bank.threshold[:, None]).any(axis=0)
-    return alarm.astype(np.float64)
-
-
-def _plain_miss_block(work: _Work) -> Floats:
-    bank = work.bank
-    ramp, threshold = work.rate_mps * bank.response(work.epochs), bank.thresholds(work.epochs)
-    alive = np.ones(work.runs, dtype=np.bool_)
-    for k, noise in enumerate(bank.paths(work.epochs, work.runs, generator(*work.key))):
-        alive &= (np.abs(noise + ramp[k][:, None]) <= threshold[k][:, None]).all(axis=0)
-        if not alive.any():
-            break
-    return alive.astype(np.float64)
+    return np.array([miss_estimate(work.system, work.epochs, work.rate_mps, work.shift, work.runs, rng)])

@@ -6,17 +6,9 @@ import polars as pl
 
 from datasets.experiment.geometry import CONSTELLATIONS, default_geometry
 from datasets.experiment.ranges import RangePlan
-from datasets.experiment.rare import Probability
-from datasets.experiment.rare_ranges import (
-    RangeSystem,
-    false_alarm_by_ranges,
-    miss_at_one_epoch,
-    missed_by_ranges,
-    plain_alarm_by_ranges,
-    plain_missed_by_ranges,
-    range_system,
-)
-from datasets.experiment.rare_rows import agreement_row, figures, first_below
+from datasets.experiment.rare import Probability, false_alarm_probability, missed_detection_probability
+from datasets.experiment.rare_ranges import RangeSystem, miss_at_one_epoch, range_system
+from datasets.experiment.rare_rows import SMALLEST, figures, first_below
 from schemas.config import Configuration
 
 TARGETS: tuple[float, ...] = (1e-4, 1e-9)
@@ -26,8 +18,6 @@ _LONGEST_S = 10_000.0
 _HOUR_S = 3_600.0
 _SEARCH_RUNS = 500
 _HEADING_DEG = 0.0
-_COUNTED_EVENTS = 40
-_COUNTED_MPS = 0.05
 _ALARM_SHARE = 20
 
 
@@ -42,11 +32,11 @@ def range_table(runs: int, seed: int, jobs: int, config: Configuration | None = 
             slope = abs(float(plan.geometry.axes(_HEADING_DEG)[0] @ plan.geometry.ramp_direction)) * rate
             failure = min(plan.failure_limit_m / slope, _LONGEST_S)
             for reason, epochs in _times(system, rate, failure, seed, jobs):
-                result = missed_by_ranges(system, epochs, rate, runs, seed, jobs)
+                result = missed_detection_probability(system, epochs, rate, runs, seed, jobs)
                 rows.append(labels | _missed(system, rate, reason, epochs, failure, result))
             if rate == _ASKED[0][0] or period_s == _ASKED[2][1]:
                 epochs = int(_HOUR_S / period_s)
-                alarm = false_alarm_by_ranges(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs)
+                alarm = false_alarm_probability(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs)
                 rows.append(labels | {"event": "false_alarm", "time_s": _HOUR_S, **figures(alarm)})
     return pl.DataFrame(rows, infer_schema_length=None)
 
@@ -61,7 +51,7 @@ def _plan(constellation: str, period_s: float, config: Configuration | None) -> 
 def _times(system: RangeSystem, rate: float, failure_s: float, seed: int, jobs: int) -> list[tuple[str, int]]:
     times = [("failure", int(failure_s / system.period_s))]
     found = first_below(
-        lambda n: missed_by_ranges(system, n, rate, _SEARCH_RUNS, seed, jobs).value,
+        lambda n: missed_detection_probability(system, n, rate, _SEARCH_RUNS, seed, jobs).value,
         TARGETS,
         int(_LONGEST_S / system.period_s),
     )
@@ -79,28 +69,6 @@ def _missed(
         "chosen_for": reason,
         "time_s": time_s,
         "mean_failure_s": failure_s,
-        "at_one_epoch": miss_at_one_epoch(system, rate * time_s),
+        "at_most": max(miss_at_one_epoch(system, rate * time_s), SMALLEST),
         **figures(result),
     }
-
-
-def range_agreement(runs: int, most_plain_runs: int, seed: int, jobs: int) -> list[dict[str, object]]:
-    """Sampling against counting at 1e-3 to 1e-5: residuals every 10 s, ramp of 0.05 m/s; alarms within 100 epochs."""
-    rows = []
-    system = range_system(RangePlan(default_geometry("gps"), period_s=10.0), _HEADING_DEG)
-    for target in (1e-3, 1e-4, 1e-5):
-        plain_runs = min(int(_COUNTED_EVENTS / target), most_plain_runs)
-        (epochs,) = first_below(
-            lambda n: missed_by_ranges(system, n, _COUNTED_MPS, _SEARCH_RUNS, seed, jobs).value, (target,), 1_000
-        )
-        if epochs is not None:
-            clever = missed_by_ranges(system, epochs, _COUNTED_MPS, runs, seed, jobs)
-            plain = plain_missed_by_ranges(system, epochs, _COUNTED_MPS, plain_runs, seed, jobs)
-            rows.append(agreement_row("missed_detection", "pseudorange", epochs, clever, plain))
-        tight = range_system(
-            RangePlan(default_geometry("gps"), period_s=10.0, false_alarm_probability=target / 50), _HEADING_DEG
-        )
-        clever = false_alarm_by_ranges(tight, 100, max(runs // _ALARM_SHARE, 20), seed, jobs)
-        plain = plain_alarm_by_ranges(tight, 100, plain_runs, seed, jobs)
-        rows.append(agreement_row("false_alarm", "pseudorange", 100, clever, plain))
-    return rows

@@ -7,51 +7,49 @@ twisted population serves (`splitting`). Alarms: an exceedance is forced at an e
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtr, chdtri
 from scipy.stats import ncx2
 
 from datasets.experiment.geometry import TAUS_S
 from datasets.experiment.ranges import RangePlan, held_rows, statistic
-from datasets.experiment.rare import Probability, pooled, populations
-from datasets.experiment.splitting import least_norm, log_survival
-from datasets.experiment.workers import generator, in_blocks
-from schemas.arrays import Floats
-
-_MOST_CONSTRAINTS = 60
-_MARGIN = 0.4
-_RUNS_PER_BLOCK = 100
+from datasets.experiment.splitting import Limits
+from schemas.arrays import Bools, Floats
 
 
 @dataclass(frozen=True)
 class RangeSystem:
-    """Whitened residuals z of a fixed sky and heading, in d dimensions.
+    """Whitened residuals z of a fixed sky and heading, in d dimensions, as a `System`.
 
     `covariance` (sources, d, d): by error source, `survey` (d, d) that of the survey; together the identity.
-    `phi` (sources,): decorrelation from one recorded epoch to the next. `ramp` (d,): of one metre of range error.
+    `phi` (sources,): decorrelation from one recorded epoch to the next. `metre` (d,): of one metre of range error.
     """
 
     covariance: Floats
     survey: Floats
     phi: Floats
-    ramp: Floats
+    metre: Floats
     threshold: float
     period_s: float
 
+    streams: ClassVar[tuple[int, int]] = (37, 35)
+    margins: ClassVar[tuple[float, ...]] = (0.4,)
+    runs_per_block: ClassVar[int] = 100
+
     @property
     def size(self) -> int:
-        return int(self.ramp.size)
+        return int(self.metre.size)
 
-    def by_lag(self, lags: npt.NDArray[np.int64]) -> Floats:
-        """Covariance of z between epochs so far apart, (lags, d, d)."""
-        share = self.phi[None, :] ** np.abs(lags)[:, None]
+    def by_lag(self, epochs: int) -> Floats:
+        share = self.phi[None, :] ** np.abs(np.arange(-epochs + 1, epochs))[:, None]
         return np.asarray(np.einsum("ls,sij->lij", share, self.covariance) + self.survey)
 
-    def paths_start(self, runs: int, rng: np.random.Generator) -> Floats:
+    def start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the onset: sources, then the survey, d rows each; (states, runs)."""
         parts = [_root(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
         return np.concatenate(parts)
@@ -74,9 +72,38 @@ class RangeSystem:
         """Whitened residuals of each run, (d, runs)."""
         return np.asarray(state.reshape(-1, self.size, state.shape[1]).sum(axis=0))
 
-    def ramp_m(self, epochs: int, rate_mps: float) -> Floats:
-        """Range error at epochs 1 .. n of a ramp that begins at 0 s [m]."""
-        return np.asarray(rate_mps * self.period_s * np.arange(1, epochs + 1))
+    def ramp(self, epochs: int, rate_mps: float) -> Floats:
+        return np.asarray((rate_mps * self.period_s * np.arange(1, epochs + 1))[:, None] * self.metre)
+
+    def limits(self, epochs: int, rate_mps: float) -> Limits:
+        """Along the ramp alone: what the other directions take of the ball on average is not there for it."""
+        radius = np.sqrt(max(self.threshold - (self.size - 1), 1.0))
+        one = np.ones((epochs, 1))
+        return Limits(self.seen(self.ramp(epochs, rate_mps)), radius * one, one, np.ones(1))
+
+    def seen(self, values: Floats) -> Floats:
+        return np.asarray(values @ self._along)[..., None]
+
+    @cached_property
+    def _along(self) -> Floats:
+        return np.asarray(self.metre / np.sqrt(self.metre @ self.metre))
+
+    def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
+        towards = self.by_lag(epochs) @ self._along
+        return lambda _, epoch: np.asarray(towards[epochs - epoch : 2 * epochs - epoch])
+
+    def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
+        return lambda _, values: np.asarray(np.square(values).sum(axis=0) <= self.threshold)
+
+    def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
+        """|z|^2 beyond the threshold by inversion of the tail; the direction of a healthy z is uniform."""
+        probability = float(1.0 - chdtr(self.size, self.threshold))
+        radius = np.sqrt(chdtri(self.size, probability * rng.random(len(values))))
+        direction = rng.standard_normal((self.size, len(values)))
+        return (radius * direction / np.sqrt(np.square(direction).sum(axis=0))).T - values, probability
+
+    def fails(self, path: Floats) -> int:
+        return int((np.square(path).sum(axis=1) > self.threshold).sum())
 
 
 def _root(covariance: Floats) -> Floats:
@@ -91,143 +118,11 @@ def range_system(plan: RangePlan, heading_deg: float) -> RangeSystem:
     scaled = one.project[:, None, :] * np.sqrt(plan.geometry.range_variance_m2).T[None]
     covariance = np.einsum("asn,bsn->sab", scaled, scaled)
     held = plan.survey_m * one.project @ held_rows(plan, heading_deg)
-    ramp = one.project[:, plan.geometry.faulty]
-    return RangeSystem(covariance, held @ held.T, np.exp(-plan.period_s / TAUS_S), ramp, one.threshold, plan.period_s)
+    metre = one.project[:, plan.geometry.faulty]
+    return RangeSystem(covariance, held @ held.T, np.exp(-plan.period_s / TAUS_S), metre, one.threshold, plan.period_s)
 
 
 def miss_at_one_epoch(system: RangeSystem, range_error_m: float) -> float:
     """Probability that one epoch with this range error passes: exact, and above that of all epochs before it."""
-    strength = range_error_m**2 * float(system.ramp @ system.ramp)
+    strength = range_error_m**2 * float(system.metre @ system.metre)
     return float(ncx2.cdf(system.threshold, system.size, strength))
-
-
-@dataclass(frozen=True)
-class _Work:
-    system: RangeSystem
-    epochs: int
-    rate_mps: float
-    key: tuple[int, ...]
-    runs: int
-
-
-def missed_by_ranges(
-    system: RangeSystem, epochs: int, rate_mps: float, runs: int = 20_000, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """Probability that the monitor passes at all recorded epochs 1 .. n of a range ramp."""
-    works = [_Work(system, epochs, rate_mps, (seed, 35, number), size) for number, size in enumerate(populations(runs))]
-    return pooled(_miss_block, works, runs, jobs)
-
-
-def plain_missed_by_ranges(
-    system: RangeSystem, epochs: int, rate_mps: float, runs: int, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """The same by counting."""
-    works = [
-        _Work(system, epochs, rate_mps, (seed, 36, number), size) for number, size in enumerate(in_blocks(runs, 1000))
-    ]
-    return pooled(_plain_miss_block, works, runs, jobs)
-
-
-def false_alarm_by_ranges(
-    system: RangeSystem, epochs: int, runs: int = 2_000, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """Probability that healthy ranges alarm at least once in this many recorded epochs."""
-    sizes = in_blocks(runs, _RUNS_PER_BLOCK)
-    works = [_Work(system, epochs, 0.0, (seed, 37, number), size) for number, size in enumerate(sizes)]
-    return pooled(_alarm_block, works, runs, jobs)
-
-
-def plain_alarm_by_ranges(system: RangeSystem, epochs: int, runs: int, seed: int = 1, jobs: int = 1) -> Probability:
-    """The same by counting."""
-    works = [_Work(system, epochs, 0.0, (seed, 38, number), size) for number, size in enumerate(in_blocks(runs, 1000))]
-    return pooled(_plain_alarm_block, works, runs, jobs)
-
-
-def _most_probable(system: RangeSystem, epochs: int, rate_mps: float) -> tuple[Floats, Floats, float]:
-    """Multiplier at each epoch of z along the ramp, the shifted mean path (epochs, d), half the squared norm."""
-    strength = float(np.sqrt(system.ramp @ system.ramp))
-    along = system.ramp / strength
-    ramp = strength * system.ramp_m(epochs, rate_mps)
-    # What the other directions take of the ball on average is not there for the ramp.
-    limit = np.sqrt(max(system.threshold - (system.size - 1), 1.0)) - _MARGIN
-    towards = system.by_lag(np.arange(-epochs + 1, epochs)) @ along
-    scalar = towards @ along
-    chosen: list[int] = []
-    multiplier, mean = np.zeros(0), np.zeros((epochs, system.size))
-    gram = np.zeros((0, 0))
-    for _ in range(_MOST_CONSTRAINTS):
-        excess = ramp + mean @ along - limit
-        worst = int(excess.argmax())
-        if excess[worst] < 0.5 * _MARGIN:
-            break
-        chosen.append(worst)
-        at = np.array(chosen)
-        gram = scalar[at[:, None] - at[None, :] + epochs - 1]
-        multiplier = least_norm(gram, ramp[at] - limit)
-        mean = -np.sum(
-            [x * towards[epochs - 1 - k : 2 * epochs - 1 - k] for x, k in zip(multiplier, chosen, strict=True)], axis=0
-        )
-    each = np.zeros(epochs)
-    if chosen:
-        each[np.array(chosen)] = multiplier
-    return each, np.asarray(mean), 0.5 * float(multiplier @ gram @ multiplier) if chosen else 0.0
-
-
-def _miss_block(work: _Work) -> Floats:
-    system, rng = work.system, generator(*work.key)
-    multiplier, mean, half = _most_probable(system, work.epochs, work.rate_mps)
-    along = system.ramp / np.sqrt(system.ramp @ system.ramp)
-    moved = mean + system.ramp_m(work.epochs, work.rate_mps)[:, None] * system.ramp
-
-    def step(k: int, state: Floats) -> tuple[Floats, Floats]:
-        following = system.following(state, rng)
-        z = system.values(following)
-        inside = np.square(z + moved[k][:, None]).sum(axis=0) <= system.threshold
-        return following, np.where(inside, multiplier[k] * (along @ z), -np.inf)
-
-    start = system.paths_start(work.runs, rng)
-    return np.array([np.exp(log_survival(start, step, work.epochs, rng) - half)])
-
-
-def _plain_miss_block(work: _Work) -> Floats:
-    system, rng = work.system, generator(*work.key)
-    state = system.paths_start(work.runs, rng)
-    alive = np.ones(work.runs, dtype=np.bool_)
-    for range_m in system.ramp_m(work.epochs, work.rate_mps):
-        state = system.following(state, rng)
-        moved = system.values(state) + range_m * system.ramp[:, None]
-        alive &= np.square(moved).sum(axis=0) <= system.threshold
-    return alive.astype(np.float64)
-
-
-def _plain_alarm_block(work: _Work) -> Floats:
-    system, rng = work.system, generator(*work.key)
-    state = system.paths_start(work.runs, rng)
-    alarm = np.zeros(work.runs, dtype=np.bool_)
-    for _ in range(work.epochs):
-        state = system.following(state, rng)
-        alarm |= np.square(system.values(state)).sum(axis=0) > system.threshold
-    return alarm.astype(np.float64)
-
-
-def _alarm_block(work: _Work) -> Floats:
-    system, rng = work.system, generator(*work.key)
-    z = np.empty((work.epochs, system.size, work.runs))
-    state = system.paths_start(work.runs, rng)
-    for k in range(work.epochs):
-        state = system.following(state, rng)
-        z[k] = system.values(state)
-    at = rng.integers(0, work.epochs, work.runs)
-    probability = float(1.0 - chdtr(system.size, system.threshold))
-    # |z|^2 beyond the threshold by inversion of the tail; the direction of a healthy z is uniform.
-    radius = np.sqrt(chdtri(system.size, probability * rng.random(work.runs)))
-    direction = rng.standard_normal((system.size, work.runs))
-    forced = radius * direction / np.sqrt(np.square(direction).sum(axis=0))
-    together = system.by_lag(np.arange(-work.epochs + 1, work.epochs))
-    estimates = np.empty(work.runs)
-    for run, place in enumerate(at):
-        lacking = forced[:, run] - z[place, :, run]
-        moved = z[:, :, run] + together[work.epochs - 1 - place : 2 * work.epochs - 1 - place] @ lacking
-        count = int((np.square(moved).sum(axis=1) > system.threshold).sum())
-        estimates[run] = work.epochs * probability / max(count, 1)
-    return estimates

@@ -1,4 +1,4 @@
-"""How an estimate of a rare event, and a count beside it, stand in a table."""
+"""How an estimate of a rare event stands in a table, and after what time it is rare enough."""
 
 from __future__ import annotations
 
@@ -6,43 +6,29 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 
 from datasets.experiment.rare import Probability
-from pipeline.figures.bounds import clopper_pearson
 
-_NORMAL_95 = 1.959963984540054
 _CLOSE_ENOUGH = 0.02
+SMALLEST = 1e-12
+"""No probability smaller than this is told, only that it is below."""
 
 
 def figures(result: Probability) -> dict[str, float | int | None]:
-    """The estimate; nulls where no run came through, which says nothing of the probability."""
-    seen = result.value > 0.0
+    """The estimate; nulls where no run came through, which says nothing of the probability.
+
+    Below `SMALLEST` it is not told: the model of the noise does not hold so far out. `below` says so in its place.
+    """
+    told = result.value >= SMALLEST
     return {
-        "probability": result.value if seen else None,
-        "relative_error": _finite(result.relative_error),
-        "variance_reduction": _finite(result.variance_reduction) if seen else None,
+        "probability": result.value if told else None,
+        "below": SMALLEST if 0.0 < result.value < SMALLEST else None,
+        "relative_error": _finite(result.relative_error) if told else None,
+        "variance_reduction": _finite(result.variance_reduction) if told else None,
         "runs": result.runs,
     }
 
 
 def _finite(value: float) -> float | None:
     return value if isfinite(value) else None
-
-
-def agreement_row(event: str, sensors: str, epochs: int, clever: Probability, plain: Probability) -> dict[str, object]:
-    """An estimate, the count beside it with exact bounds, and whether the two intervals of 95 % meet."""
-    counted = clopper_pearson(round(plain.value * plain.runs), plain.runs)
-    half = _NORMAL_95 * clever.relative_error * clever.value if clever.value > 0.0 else 0.0
-    low, high = counted.low or 0.0, 1.0 if counted.high is None else counted.high
-    return {
-        "event": event,
-        "sensors": sensors,
-        "epochs": epochs,
-        **figures(clever),
-        "counted": counted.value,
-        "counted_low": counted.low,
-        "counted_high": counted.high,
-        "counted_runs": plain.runs,
-        "agrees": clever.value - half <= high and clever.value + half >= low,
-    }
 
 
 def first_below(probability: Callable[[int], float], targets: Sequence[float], most_epochs: int) -> list[int | None]:

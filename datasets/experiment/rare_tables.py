@@ -1,4 +1,4 @@
-"""Rare events of a bank: when a missed detection has become as rare as railways ask, false alarms, and the proof."""
+"""Rare events of a bank: when a missed detection has become as rare as railways ask, and false alarms."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from datasets.experiment.plan import READINGS, SENSORS
 from datasets.experiment.rare import (
     false_alarm_probability,
     missed_detection_probability,
-    plain_false_alarm,
-    plain_missed_detection,
 )
-from datasets.experiment.rare_range_tables import range_agreement, range_table
-from datasets.experiment.rare_rows import agreement_row, figures, first_below
+from datasets.experiment.rare_range_tables import range_table
+from datasets.experiment.rare_rows import figures, first_below
 from datasets.experiment.tables import write_tables
 from schemas.config import Configuration
 
@@ -33,8 +31,6 @@ _LONGEST_S = 10_000
 _HOUR_S = 3_600
 _FAST_HZ, _SLOWEST_AT_FAST_MPS = 10.0, 0.1
 _ALARM_SHARE = 20
-# Counting is given so many events to see, as far as the runs allow.
-_COUNTED_EVENTS = 40
 # Seconds since the restart at the onset of a fault; none: long ago.
 AGES_S: tuple[float | None, ...] = (0.0, 10.0, 60.0, 300.0, None)
 
@@ -158,43 +154,15 @@ def alarm_table(runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Confi
     return pl.DataFrame(rows)
 
 
-def agreement_table(
-    runs: int = RUNS,
-    most_plain_runs: int = 5_000_000,
-    seed: int = SEED,
-    jobs: int = 1,
-    config: Configuration | None = None,
-) -> pl.DataFrame:
-    """Sampling against counting where counting reaches: 1e-3 to 1e-5, with exact bounds of the count."""
-    rows = []
-    for constellation, spec, bank in banks(config):
-        if constellation != "gps" or spec.reading != "increments":
-            continue
-        for target in (1e-3, 1e-4, 1e-5):
-            plain_runs = min(int(_COUNTED_EVENTS / target), most_plain_runs)
-            epochs = epochs_until(bank, 0.3, (target,), seed, jobs)[0]
-            if epochs is not None:
-                clever = missed_detection_probability(bank, epochs, 0.3, runs, seed, jobs)
-                plain = plain_missed_detection(bank, epochs, 0.3, plain_runs, seed, jobs)
-                rows.append(agreement_row("missed_detection", spec.sensors, epochs, clever, plain))
-            tight = linear_bank(default_geometry("gps"), 0.0, replace(spec, false_alarm_probability=target / 500))
-            clever = false_alarm_probability(tight, 100, max(runs // _ALARM_SHARE, 20), seed, jobs)
-            plain = plain_false_alarm(tight, 100, plain_runs, seed, jobs)
-            rows.append(agreement_row("false_alarm", spec.sensors, 100, clever, plain))
-    return pl.DataFrame(rows)
-
-
 def write_rare(
     out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
 ) -> list[Path]:
-    """`missed`, `transients`, `false_alarms`, `pseudorange`, `agreement`; `repetitions` are the sampled runs."""
+    """`missed`, `transients`, `false_alarms`, `pseudorange`; `repetitions` are the sampled runs."""
     runs = repetitions or RUNS
-    agreement = agreement_table(runs, 100 * runs, seed, jobs, config)
     tables = {
         "missed": missed_table(runs, seed, jobs, config),
         "transients": transient_table(runs, seed, jobs, config),
         "false_alarms": alarm_table(runs, seed, jobs, config),
         "pseudorange": range_table(runs, seed, jobs, config),
-        "agreement": pl.concat([agreement, pl.DataFrame(range_agreement(runs, 100 * runs, seed, jobs))]),
     }
     return write_tables(out, tables, {"experiment": "rare", "repetitions": runs, "seed": seed})

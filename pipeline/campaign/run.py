@@ -46,6 +46,7 @@ def run_campaign(
         known = [] if force else unchanged(plan)
         left = with_previous(plan, {outcome.run_id for outcome in known}) if not force else plan
         store.write_config(plan.out, plan.config)
+        store.write_vehicle(plan.out, plan.vehicle)
         note_settings(plan.out, digest_of(plan.config, plan.vehicle), plan.given)
         engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
         loop = CampaignLoop(held_by(left, campaign).jobs, engine, time_limit_s, watches, known)
@@ -69,7 +70,7 @@ def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:
     """Whether a cluster can write there is found out by its workers; that nothing is to do, here."""
     if not plan.jobs:
-        raise UsageError("no run is named")
+        raise UsageError("no run is given")
     if scheduler is not None and is_url(plan.out) and plan.out.startswith("memory://"):
         raise UsageError("workers cannot write into this process's memory", place=plan.out)
 

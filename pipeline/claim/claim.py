@@ -136,7 +136,7 @@ def demands(profile: Profile) -> dict[Key, Demand]:
     """The requirements of a profile in their order, each with how it is judged."""
     found: dict[Key, Demand] = {}
     for kind, area in profile.areas.items():
-        limit = f"{area.limit_m:g} m" if not area.way_s else f"max({area.limit_m:g} m, way in {area.way_s:g} s)"
+        limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
         for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu"):
             found[name, kind.value] = Demand(limit, "always", area.limit_clause, of_always)
         found["safe_front_end", kind.value] = _rate(profile.failure_rate.aim_per_h, profile)
@@ -192,7 +192,7 @@ def _share(limit: str, share: float, clause: str) -> Demand:
 
 def _rate(rate_per_h: float, profile: Profile) -> Demand:
     clause = profile.failure_rate.clause
-    return Demand("its own interval", f"< {rate_per_h:g} /h", clause, lambda counts: of_rate(counts, rate_per_h))
+    return Demand("own CI", f"< {rate_per_h:g} /h", clause, lambda counts: of_rate(counts, rate_per_h))
 
 
 # What a recording cannot say of a requirement, however long it is.
@@ -254,18 +254,16 @@ def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahe
 
 
 def for_reading(table: pl.DataFrame) -> pl.DataFrame:
-    """The rows as they fit a screen: requirement, finding, and what it rests on."""
-    trials = pl.format("{}/{}", "kept", "trials")
+    """The rows as they fit a screen: what was found of each requirement, and what it rests on."""
+    drawn = pl.when(pl.col("demanded").str.starts_with("p >=")).then(pl.format("{}/{}", "kept", "trials"))
     solution = ["solution"] if table["solution"].n_unique() > 1 else []
     return table.select(
         *solution,
-        "requirement",
-        "applies_to",
-        "limit",
-        "demanded",
-        "finding",
-        "events",
-        trials.alias("runs kept"),
-        pl.col("hours").round_sig_figs(3),
-        pl.col("hours_needed").round_sig_figs(3),
+        pl.col("requirement"),
+        pl.col("applies_to").alias("of"),
+        pl.col("finding"),
+        pl.col("events"),
+        drawn.alias("runs kept"),
+        pl.col("hours_needed").round_sig_figs(3).alias("hours needed"),
+        pl.col("limit"),
     )

@@ -8,6 +8,7 @@ both at speed. Else there is no estimate. Errors do not depend on where on the t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,12 @@ class Front:
     @property
     def output(self) -> Bools:
         """The unit says where the train is."""
-        return np.isfinite(self.front_m)
+        return np.isfinite(self.path_m)
+
+    @property
+    def least_m(self) -> Floats:
+        """The smallest size that the error of the estimate may have."""
+        return np.maximum(np.maximum(self.low_m, -self.high_m), 0.0)
 
     def within(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
         """Whether the estimate is at most so far ahead of the train and so far behind it (`codes`)."""
@@ -81,7 +87,8 @@ def front_of(
     low, high = floats(epochs, "error_low_m") + shift, floats(epochs, "error_high_m") + shift
     right, wrong, elsewhere = _judged(epochs, config.hazards.failure_limit_m)
     there, known = np.isfinite(estimate), np.isfinite(low) & np.isfinite(high)
-    front = estimate + direction * ahead_m if ahead_m else estimate
+    # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
+    front = estimate + np.nan_to_num(direction) * ahead_m
     return Front(
         clock=Clock.of(epochs, config),
         path_m=estimate,
@@ -128,21 +135,15 @@ def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     odometer, distance = floats(epochs, "odometer_m"), floats(epochs, "distance_from_lrvb_m")
     origin_m = odometer - floats(epochs, "direction") * distance
     path, names = floats(epochs, "path_m"), epochs["lrvb_id"]
-    changed = (names.is_not_null() & (names.ne_missing(names.shift()) | (pl.Series(range(len(names))) == 0))).to_numpy()
+    changed = np.flatnonzero((names.is_not_null() & names.ne_missing(names.shift())).to_numpy())
     base = np.full(epochs.height, np.nan)
-    for first, last in zip(*_spans(changed), strict=True):
+    for first, last in pairwise([*changed.tolist(), epochs.height]):
         places = accepted.filter(pl.col("balise_id") == names[first])["path_m"].to_numpy()
         if places.size:
             near = places if not np.isfinite(path[first]) else places[[np.abs(places - path[first]).argmin()]]
             base[first:last] = near[0] - origin_m[first]
     base[names.is_null().to_numpy()] = np.nan
     return base + odometer
-
-
-def _spans(changed: Bools) -> tuple[Ints, Ints]:
-    """From each change to the next."""
-    first = np.flatnonzero(changed)
-    return first, np.append(first[1:], changed.size)
 
 
 def _areas_at(front_m: Floats, path_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None) -> Placed:

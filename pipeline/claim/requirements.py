@@ -62,14 +62,13 @@ def _by_area(ride: Ride) -> Tallies:
     front, limit = ride.front, limits_m(ride.front, ride.profile)
     beyond = _beyond(ride, limit)
     safe = front.within(front.over_m, front.under_m)
-    least = np.maximum(np.maximum(front.low_m, -front.high_m), 0.0)
     found: Tallies = {}
     for kind, demanded in ride.profile.areas.items():
         here = front.output & (front.where.area == AREA_TYPES.index(kind))
         found |= {(name, kind.value): ride.tally(code, here, size) for name, (code, size) in beyond.items()}
-        found["safe_front_end", kind.value] = ride.tally(safe, here, least)
+        found["safe_front_end", kind.value] = ride.tally(safe, here, front.least_m)
         close = front.within(demanded.accuracy_m, demanded.accuracy_m)
-        found["front_accuracy", kind.value] = ride.tally(close, here, least)
+        found["front_accuracy", kind.value] = ride.tally(close, here, front.least_m)
     return found
 
 
@@ -110,8 +109,8 @@ def _safe(ride: Ride) -> Tallies:
     code = front.within(front.over_m, front.under_m)
     nowhere = front.output & (front.where.area == NO_AREA)
     return {
-        ("safe_front_end", ALL): ride.tally(code, front.output),
-        ("safe_front_end_bound", ALL): ride.tally(code, front.output),
+        ("safe_front_end", ALL): ride.tally(code, front.output, front.least_m),
+        ("safe_front_end_bound", ALL): ride.tally(code, front.output, front.least_m),
         ("no_area", ALL): ride.tally(np.full(code.size, NOT_KNOWN), nowhere),
     }
 
@@ -235,7 +234,7 @@ def _ways(ride: Ride) -> Tally:
     bounds = np.unique(np.concatenate(([0], cuts, [way.size])))
     beyond = [code for code, _ in _beyond(ride, limits_m(ride.front, ride.profile)).values()]
     broken = np.logical_or.reduce([code == BROKEN for code in beyond])
-    lengths = [float(way[last - 1] - way[first]) for first, last in pairwise(bounds)]
+    lengths = [float(way[min(last, way.size - 1)] - way[first]) for first, last in pairwise(bounds)]
     long = [number for number, length in enumerate(lengths) if length >= ride.profile.way.without_balise_m]
     bad = sum(bool(broken[bounds[number] : bounds[number + 1]].any()) for number in long)
     return Tally(trials=len(long), broken=bad, events=bad, possible=len(long), worst=max(lengths, default=None))

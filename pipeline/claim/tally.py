@@ -102,7 +102,8 @@ def clusters_s(t_ns: Ints, gap_s: float) -> list[float]:
     apart = np.flatnonzero(np.diff(t_ns) > gap_s * NS_PER_S)
     first = t_ns[np.concatenate(([0], apart + 1))]
     last = t_ns[np.concatenate((apart, [t_ns.size - 1]))]
-    return ((last - first) / NS_PER_S).tolist()
+    lengths: list[float] = ((last - first) / NS_PER_S).tolist()
+    return lengths
 
 
 def drawn(run: str, size: int) -> int:

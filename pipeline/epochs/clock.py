@@ -37,6 +37,11 @@ def met(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
     return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
 
 
+def may_move() -> pl.Expr:
+    """The train moves from this epoch to the next, or nobody knows (DOMAIN section 5.5)."""
+    return pl.col("moving").fill_null(value=True)
+
+
 def usable() -> pl.Expr:
     """An epoch with a position on the track."""
     return pl.col("path_m").is_not_null() & pl.col("on_track")

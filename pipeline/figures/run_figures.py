@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import Clock, met, trusted, usable
+from pipeline.epochs.clock import Clock, may_move, met, trusted, usable
 from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
@@ -37,7 +37,7 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
     """
     lost = outages_s(clock.t_ns, met(epochs, usable()), clock.limit_s)
     valid = met(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
-    share = availability(clock.t_ns, valid, met(epochs, _may_move()), clock.limit_s)
+    share = availability(clock.t_ns, valid, met(epochs, may_move()), clock.limit_s)
     trust = uptime(clock.t_ns, met(epochs, trusted(config)), clock.limit_s)
     mtbf_h = trust.mean_time_between_losses_h
     return {
@@ -52,10 +52,6 @@ def positions(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> Row:
     }
 
 
-def _may_move() -> pl.Expr:
-    return pl.col("moving").fill_null(value=True)
-
-
 def judged() -> pl.Expr:
     """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
     return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
@@ -63,7 +59,7 @@ def judged() -> pl.Expr:
 
 def share_unknown(epochs: pl.DataFrame, clock: Clock) -> float | None:
     """Share of the moving time in use that the evidence cannot judge; None without any such time."""
-    used = met(epochs, pl.col("in_use") & _may_move())
+    used = met(epochs, pl.col("in_use") & may_move())
     return share_of_time(clock.held_s[used], ~met(epochs, judged())[used])
 
 

@@ -26,10 +26,10 @@ class Spacing:
 
 def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: float) -> dict[str, object]:
     """Figures of the `runs` row, over the epochs whose position was in use; all null where nothing was computed."""
-    larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
-    known = epochs.filter("in_use").select("t", "path_m", larger=larger).drop_nulls("larger")
     if spacing is None:
         return {}
+    larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
+    known = epochs.filter("in_use").select("t", "path_m", larger=larger).drop_nulls("larger")
     figures: dict[str, object] = {
         "physical_spacing_m": spacing.way_m,
         "physical_spacing_s": spacing.time_s,

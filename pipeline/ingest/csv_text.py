@@ -1,11 +1,15 @@
-"""CSV as programs and spreadsheets write it: byte order marks, other separators than the comma, empty lines."""
+"""CSV as programs and spreadsheets write it: other encodings than UTF-8, other separators than the comma, empty lines,
+a row of units.
+"""
 
 from __future__ import annotations
 
 import codecs
+import csv
 import io
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import polars as pl
 
@@ -14,6 +18,19 @@ from schemas.errors import InputError
 _SEPARATORS = (",", ";", "\t")
 _MOST_COMMENTS = 50
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+# Without a byte order mark: every other byte of European text is zero.
+_UTF16_ZEROS = 0.3
+
+
+class LogTable(NamedTuple):
+    """A table of a log; `cut` rows that break off at the end (0 or 1); the row of units, if it has one."""
+
+    table: pl.DataFrame
+    cut: int
+    units: tuple[str, ...]
+    separator: str
 
 
 def read_table(data: bytes, infer: bool) -> pl.DataFrame:
@@ -25,8 +42,8 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
     return _table(_lines(data), infer)
 
 
-def read_log_table(log: Path, infer: bool) -> tuple[pl.DataFrame, int]:
-    """`read_table` of a log, without a last row that breaks off, and the number of such rows (0 or 1).
+def read_log_table(log: Path, infer: bool) -> LogTable:
+    """`read_table` of a log, without a last row that breaks off and without a row of units behind the header.
 
     A recorder that lost power leaves half a row: without a line end, and with fewer fields than the header. Raises
     `InputError` where the file cannot be read or holds no table.
@@ -39,13 +56,32 @@ def read_log_table(log: Path, infer: bool) -> tuple[pl.DataFrame, int]:
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
 
 
-def _whole_rows(data: bytes, infer: bool) -> tuple[pl.DataFrame, int]:
+def _whole_rows(data: bytes, infer: bool) -> LogTable:
     lines = _lines(data)
     separator = _separator(lines)
     header = next((line for line in lines if line.strip()), "")
     ended = data.rstrip(b" \0").endswith((b"\n", b"\r"))
     cut = len(lines) > 1 and not ended and lines[-1].count(separator) < header.count(separator)
-    return _table(lines[:-1] if cut else lines, infer), int(cut)
+    lines, units = _without_units(lines[:-1] if cut else lines, separator)
+    return LogTable(_table(lines, infer), int(cut), units, separator)
+
+
+def _without_units(lines: list[str], separator: str) -> tuple[list[str], tuple[str, ...]]:
+    """The lines without the row behind the header where that has words only, and the next one a number."""
+    rows = csv.reader([line for line in lines if line.strip()], delimiter=separator)
+    head = [row for row, _ in zip(rows, range(3), strict=False)]
+    if len(head) < 3 or len(head[1]) != len(head[0]) or not any(cell.strip() for cell in head[1]):
+        return lines, ()
+    if any(_has_number(cell) for cell in head[1]) or not any(_has_number(cell) for cell in head[2]):
+        return lines, ()
+    at = next(
+        (number for number, line in enumerate(lines) if [*csv.reader([line], delimiter=separator)] == [head[1]]), None
+    )
+    return (lines, ()) if at is None else ([*lines[:at], *lines[at + 1 :]], tuple(cell.strip() for cell in head[1]))
+
+
+def _has_number(cell: str) -> bool:
+    return re.match(r"\s*[+-]?[.,]?\d", cell) is not None
 
 
 def _lines(data: bytes) -> list[str]:
@@ -73,7 +109,7 @@ def _names(body: str, separator: str, given: list[str]) -> list[str]:
     written = [name.strip() for name in first.row(0) if name and name.strip()]
     twice = sorted({name for name in written if written.count(name) > 1})
     if twice:
-        raise ValueError(f"a column name stands twice: {', '.join(twice)}")
+        raise ValueError(f"two columns have the same name: {', '.join(twice)}")
     return [name.strip() for name in given]
 
 
@@ -88,8 +124,19 @@ def comments_of(data: bytes) -> str:
 
 
 def text_of(data: bytes) -> str:
-    """The text; UTF-8, or UTF-16 where a byte order mark says so."""
-    return data.decode("utf-16") if data.startswith(_UTF16) else data.decode("utf-8-sig")
+    """The text: UTF-8, UTF-16 by its mark or its zeros, else Windows-1252 (Latin-1 and more)."""
+    if data.startswith(_UTF16):
+        return data.decode("utf-16")
+    head = data[:1000]
+    for zeros, encoding in ((head[1::2], "utf-16-le"), (head[::2], "utf-16-be")):
+        if zeros.count(0) > _UTF16_ZEROS * max(len(head), 1):
+            return data.decode(encoding)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if re.search(rb"[\x00-\x08\x0e-\x1f]", data):
+            raise
+        return data.decode("cp1252", "strict")
 
 
 def epsg_in(comments: str) -> str | None:

@@ -14,6 +14,9 @@ from schemas.config import StreamMapping
 
 _SECOND_NS = 1_000_000_000
 _LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * _SECOND_NS  # leaves room in 64 bits for the GPS epoch
+# Spreadsheets count days from 1899-12-30.
+_DAY_S = 86_400
+_EXCEL_TO_UNIX_NS = 25_569 * _DAY_S * _SECOND_NS
 LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
 # How fields are read that may hold a time, by what their first value is.
@@ -28,7 +31,7 @@ class TimeSource:
     types: Mapping[str, pl.DataType]
     unit_s: float | None = None
     scale: Literal["utc", "gps"] = "utc"
-    epoch: Literal["unix", "gps"] = "unix"
+    epoch: Literal["unix", "gps", "excel"] = "unix"
 
     def of_field(self, path: str, other: str) -> TimeSource:
         """The same kind of stamp in another field of the message."""
@@ -44,6 +47,8 @@ class TimeSource:
         t = self._nanoseconds(frame).alias(name)
         if self.epoch == "gps":
             t = t + GPS_EPOCH_NS
+        elif self.epoch == "excel":
+            t = t - _EXCEL_TO_UNIX_NS
         if self.scale == "gps":
             utc = pl.Series(name, utc_from_gps(t.fill_null(0).to_numpy()))
             t = utc.set(t.is_null(), None) if t.null_count() else utc
@@ -81,7 +86,8 @@ def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamM
     types = {path: TIME_KINDS[kinds[path]] for path in parts if path not in records}
     if mapping is None:
         return TimeSource(tuple(parts), types)
-    return TimeSource(tuple(parts), types, mapping.factors.get("t"), mapping.time_scale, mapping.time_epoch)
+    unit_s = mapping.factors.get("t", _DAY_S if mapping.time_epoch == "excel" else None)
+    return TimeSource(tuple(parts), types, unit_s, mapping.time_scale, mapping.time_epoch)
 
 
 @dataclass(frozen=True)

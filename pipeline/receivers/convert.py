@@ -1,10 +1,11 @@
-"""Receiver logs as a run: UBX, SBF, NMEA, or CSV with a column mapping."""
+"""Receiver logs as a run: UBX, SBF, NMEA, NovAtel, RTKLIB, bags, or CSV with a column mapping."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,20 @@ import polars as pl
 
 from pipeline.ingest.breaches import Breach, refuse
 from pipeline.ingest.conform import conform
-from pipeline.receivers import nmea, sbf, ubx
-from pipeline.receivers.csv import read_csv
+from pipeline.ingest.mapping import mappings_of
+from pipeline.receivers import nmea, novatel, sbf, ubx
+from pipeline.receivers.adding import Purpose, Streams, added, assigned
+from pipeline.receivers.bags import is_bag, read_bag
+from pipeline.receivers.csv import TABLES, names_file, read_csv
 from pipeline.receivers.epochs import Epochs, Gathered
 from pipeline.receivers.frames import Frame, Protocol, frames
-from schemas.config import IngestConfig
+from pipeline.receivers.names import name_of
+from pipeline.receivers.rtklib import is_solution, read_solution
+from pipeline.receivers.unpack import unpacked
+from schemas.config import FixSigma, IngestConfig
 from schemas.errors import InputError
-from schemas.run import RunLog, Stream
+from schemas.run import STREAMS, RunLog, Stream
 
-Streams = dict[Stream, pl.DataFrame]
 Decode = Callable[[Gathered, Any, bytes], None]
 
 
@@ -31,30 +37,73 @@ class Converted:
     run: RunLog
     dropped: dict[str, int]
 
+    def gathered(self) -> Gatherings:
+        """The streams alone."""
+        frames = {name: self.run.stream(name) for name in STREAMS}
+        return Gatherings({name: frame for name, frame in frames.items() if frame is not None}, self.dropped)
+
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
-    """Receiver logs of one journey as one run.
+    """Receiver logs of one journey as one new run: `gather` and `as_run`."""
+    return as_run(gather(logs, config), run_id)
 
-    Binary logs are recognised by their content; `.csv` files by their ending, and need the mapping of `config`.
-    Raises `InputError` where no log holds a position, or where two logs tell of the same time under one solution.
+
+def as_run(found: Gatherings, run_id: str, purpose: Purpose | None = None, sigmas: FixSigma | None = None) -> Converted:
+    """A new run of what logs hold, the positions as `purpose` says; raises `InputError` where they hold none."""
+    streams = assigned(found.streams, purpose or Purpose(), sigmas or FixSigma())
+    gnss = streams.pop("gnss", None)
+    if gnss is None:
+        raise InputError(
+            "no epoch with a time and a position",
+            place=run_id,
+            found=", ".join(streams) or None,
+            expected="GNSS positions, which a new run needs",
+            remedy="Convert the log of the receiver first or in the same call." + _reasons(found.dropped),
+        )
+    return Converted(RunLog(run_id, gnss).with_streams(**streams), found.dropped)
+
+
+def extended(run: RunLog, place: Path, found: Gatherings, purpose: Purpose, sigmas: FixSigma, force: bool) -> Converted:
+    """A run that stands at a place, with what logs hold added to it."""
+    return Converted(added(run, assigned(found.streams, purpose, sigmas), force, place), found.dropped)
+
+
+@dataclass(frozen=True)
+class Gatherings:
+    """The streams of all logs, as the contract has them, and what could not be used: reason to number."""
+
+    streams: Streams
+    dropped: dict[str, int]
+
+
+def gather(logs: list[Path], config: IngestConfig | None = None, date: date | None = None) -> Gatherings:
+    """What the logs hold: positions, or whatever else a mapping or a topic makes a stream of.
+
+    `date`: the day of the first sentence, for NMEA logs that hold none. Raises `InputError` where no log of a receiver
+    holds an epoch, or where two logs tell of the same time under one solution.
     """
     dropped: Counter[str] = Counter()
     parts: list[tuple[Path, Streams]] = []
+    failures: list[NoEpochError] = []
     for log in logs:
-        streams, counts = _convert_one(log, config or IngestConfig())
-        parts.append((log, streams))
-        dropped.update(counts)
+        with unpacked(log) as inner:
+            for plain in inner:
+                try:
+                    streams, counts = _convert_one(plain, config or IngestConfig(), date)
+                except NoEpochError as error:
+                    failures.append(error)
+                    continue
+                parts.append((log if plain == log else log / plain.name, streams))
+                dropped.update(counts)
+    if failures and not any("gnss" in streams for _, streams in parts):
+        raise failures[0]
+    dropped.update({"log without an epoch": len(failures)} if failures else {})
     _refuse_overlaps(parts)
-    joined = _joined(parts)
-    if joined.get("gnss") is None or joined["gnss"].is_empty():
-        raise InputError(
-            "no epoch with a time and a position",
-            place=", ".join(str(log) for log in logs),
-            expected="UBX NAV-PVT or NAV-SOL, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
-            "or a mapped CSV",
-            remedy="Let the receiver record one of these messages." + _reasons(dropped),
-        )
-    return Converted(RunLog(run_id, joined.pop("gnss")).with_streams(**joined), dict(dropped))
+    return Gatherings(_joined(parts), dict(dropped))
+
+
+class NoEpochError(InputError):
+    """A log of a receiver whose messages tell no position with a time."""
 
 
 def _reasons(dropped: Mapping[str, int]) -> str:
@@ -89,40 +138,46 @@ def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
                         "two logs hold positions of the same time under one solution",
                         place=f"{other}, {log}",
                         found=f"solution {name} in both, from {max(start, other_start)} on",
-                        expected="one receiver per run, or a solution of its own for each",
-                        remedy="Convert the logs into runs of their own.",
+                        expected="one receiver per call",
+                        remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
                     )
             spans[name].append((start, end, log))
 
 
-def _convert_one(log: Path, config: IngestConfig) -> tuple[Streams, Mapping[str, int]]:
-    if log.suffix.lower() == ".csv":
+def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[Streams, Mapping[str, int]]:
+    if is_bag(log):
+        return read_bag(log, _of_topics(config))
+    if log.suffix.lower() == ".csv" or names_file(config, log):
         return read_csv(log, config)
     try:
         content = log.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
-    return _read(content, log)
+    if is_solution(content):
+        return read_solution(content, log)
+    return _read(content, log, date)
 
 
-def _read(content: bytes, log: Path) -> tuple[Streams, Mapping[str, int]]:
+def _of_topics(config: IngestConfig) -> IngestConfig:
+    """Without the mappings of tables, whose names are no topics of a bag."""
+    kept: dict[str, object] = {
+        stream: tuple(m for m in mappings_of(config, stream) if not m.topic.lower().endswith(TABLES))
+        for stream in STREAMS
+        if stream != "faults"
+    }
+    return config.model_copy(update=kept)
+
+
+def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mapping[str, int]]:
     """The epochs of the protocol that tells most; what is damaged or told twice is counted."""
     dropped: Counter[str] = Counter()
     decoders = {protocol: make() for protocol, (_, make) in _PROTOCOLS.items()}
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
-    met = 0
     for frame in frames(content, lambda: dropped.update(["damaged message"])):
-        met += 1
         if frame.protocol in decoders:
             _decode(frame, decoders[frame.protocol], gathered[frame.protocol])
-    if not met:
-        raise InputError(
-            "holds no message of a known receiver",
-            place=str(log),
-            expected="UBX, SBF or NMEA",
-            remedy="Convert it to CSV and give a mapping, if the receiver is another one." + _reasons(dropped),
-        )
-    nmea.settle_first_day(gathered[Protocol.NMEA])
+    nmea.settle_first_day(gathered[Protocol.NMEA], date)
+    novatel.settle_source(gathered[Protocol.NOVATEL])
     told = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
     best = max(told, key=lambda protocol: _worth(protocol, told[protocol]))
     for protocol, epochs in told.items():
@@ -130,7 +185,30 @@ def _read(content: bytes, log: Path) -> tuple[Streams, Mapping[str, int]]:
             dropped.update(gathered[protocol].dropped)
         elif epochs.positions:
             dropped[f"{protocol} position beside those of {best}"] += epochs.positions
+    if not told[best].epochs:
+        raise _no_epoch(content, log, dropped)
     return told[best].streams(), dropped
+
+
+def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
+    """What there is in place of positions tells what to change at the receiver."""
+    met = Counter(name_of(frame) for frame in frames(content, lambda: None))
+    if not met:
+        return InputError(
+            "holds no message of a known receiver",
+            place=str(log),
+            expected="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, a bag, or CSV",
+            remedy="Convert it to CSV and give a mapping, if the receiver is another one." + _reasons(dropped),
+        )
+    return NoEpochError(
+        "no epoch with a time and a position",
+        place=str(log),
+        found=", ".join(f"{name} ({count})" for name, count in met.most_common(_MOST_NAMES)),
+        expected="UBX NAV-PVT or NAV-SOL, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
+        "NovAtel BESTPOS or INSPVA",
+        remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."
+        + _reasons(dropped),
+    )
 
 
 def _worth(protocol: Protocol, epochs: Epochs) -> int:
@@ -146,7 +224,7 @@ def _decode(frame: Frame, decode: Decode, gathered: Gathered) -> None:
         raise InputError(
             f"cannot be read without the package {error.name}",
             place=f"{frame.protocol} messages",
-            remedy="Install the extra `receivers`.",
+            remedy=f"Install the extra `{'novatel' if frame.protocol is Protocol.NOVATEL else 'receivers'}`.",
         ) from None
     except Exception:
         # The parsers' own errors share no base class.
@@ -159,6 +237,7 @@ def _decode(frame: Frame, decode: Decode, gathered: Gathered) -> None:
         gathered.drop(_UNFIT)
 
 
+_MOST_NAMES = 20
 _UNFIT = "message that does not fit its definition"
 
 
@@ -166,5 +245,6 @@ _UNFIT = "message that does not fit its definition"
 _PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[], Decode]]] = {
     Protocol.UBX: (ubx.parse, lambda: ubx.UbxDecoder().decode),
     Protocol.SBF: (sbf.parse, lambda: sbf.decode),
+    Protocol.NOVATEL: (novatel.parse, lambda: novatel.decode),
     Protocol.NMEA: (nmea.parse, lambda: nmea.NmeaDecoder().decode),
 }

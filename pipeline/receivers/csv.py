@@ -4,34 +4,39 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 
 from pipeline.ingest.breaches import refuse
-from pipeline.ingest.csv_text import read_log_table
+from pipeline.ingest.csv_text import LogTable, read_log_table
 from pipeline.ingest.mapping import mappings_of
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Sample, Source, mapped_source
-from pipeline.ingest.stamps import time_source
-from pipeline.ingest.timescale import utc_from_gps
+from pipeline.receivers.csv_times import instants, time_columns
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
 from schemas.run import STREAMS, Stream
 
-# Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds. More seconds
-# than these do not fit into nanoseconds.
-_MOST_SECONDS, _LEAST_NANOSECONDS = 9 * 10**9, 10**17
-
-
 # Why a row was left out.
 CUT_ROW = "row that breaks off at the end of the file"
+TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
+_UNITS_ROW = "row of units"
+_COMMA_NUMBER = r"^\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$"
+_WHOLE_NUMBER = r"^\s*[+-]?\d+\s*$"
+_THOUSANDS = r"^\s*[+-]?\d{1,3},\d{3}\s*$"
+
+
+def names_file(config: IngestConfig, path: Path) -> bool:
+    """Whether a mapping is for this file: tables do not always end in `.csv`."""
+    named = {mapping.topic for stream in STREAMS for mapping in mappings_of(config, stream)}
+    return path.suffix.lower() in TABLES and bool(named & {path.name, path.stem})
 
 
 def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
     """Streams of a CSV file, each mapping whose `topic` is the file's name, its stem or `*` makes one; what was left
     out, reason to number.
     """
-    table, cut = read_log_table(path, infer=True)
+    log = read_log_table(path, infer=True)
+    table = with_points(log)
     streams: dict[Stream, pl.DataFrame] = {}
     for name in STREAMS:
         for mapping in mappings_of(config, name):
@@ -44,9 +49,36 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
             place=str(path),
             found="columns " + ", ".join(table.columns),
             expected=f'a table [ingest.gnss] with topic = "{path.name}"',
-            remedy='Give --config with time = "field:COLUMN" and fields = {latitude_deg = "COLUMN", ...}.',
+            remedy="Give a mapping by --config; `balise inspect` of the file prints a draft.",
         )
-    return streams, {CUT_ROW: cut} if cut else {}
+    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units))}
+    return streams, {reason: count for reason, count in left.items() if count}
+
+
+def with_points(log: LogTable) -> pl.DataFrame:
+    """The table with decimal commas read as such: where no number of the file has a decimal point.
+
+    Between commas, 1,234 in quotes is rather a thousand and more than one: such a file must have other fractions too.
+    """
+    texts = [name for name, dtype in log.table.schema.items() if dtype == pl.String]
+    fractions = [name for name in texts if _all_numbers(log.table[name])]
+    written = (
+        pl.concat([log.table[name].drop_nulls() for name in fractions]) if fractions else pl.Series(dtype=pl.String)
+    )
+    with_comma = written.filter(written.str.contains(","))
+    doubtful = log.separator == "," and with_comma.str.contains(_THOUSANDS).all()
+    if any(dtype.is_float() for dtype in log.table.schema.values()) or doubtful:
+        return log.table
+    return log.table.with_columns(
+        pl.col(fractions).replace("", None).str.replace(",", ".", literal=True).cast(pl.Float64)
+    )
+
+
+def _all_numbers(column: pl.Series) -> bool:
+    """Whether every cell is a number, some of them with a comma."""
+    cells = column.replace("", None).drop_nulls()
+    with_comma = cells.str.contains(_COMMA_NUMBER)
+    return bool(with_comma.any()) and bool((with_comma | cells.str.contains(_WHOLE_NUMBER)).all())
 
 
 def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:
@@ -54,13 +86,15 @@ def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: P
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
     kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
     sample = Sample(Channel(0, path.name, "csv", None, str(path)), kinds)
-    source = mapped_source(sample, stream, mapping)
+    absent = [name for name in time_columns(table, mapping) if name not in table.columns]
+    first = mapping.time if absent else f"field:{time_columns(table, mapping)[0]}"
+    source = mapped_source(sample, stream, mapping.model_copy(update={"time": first}))
     refuse(source.breaches)
     fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
     columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}
     if stream in ("gnss", "satellites"):
         columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns
-    times = _times(table[mapping.time.removeprefix("field:")], mapping, path)
+    times = instants(table, mapping, path)
     return pl.DataFrame({"t": times}).with_columns(fields.select(pl.lit(0).alias("t"), **columns).drop("t"))
 
 
@@ -83,40 +117,3 @@ def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
     """In a text, NaN is how programs write that they have no value."""
     is_float = fields.lazy().select(expression.alias("value")).collect_schema()["value"].is_float()
     return expression.fill_nan(None) if is_float else expression
-
-
-def _times(recorded: pl.Series, mapping: StreamMapping, path: Path) -> pl.Series:
-    """ISO 8601 text, which without a zone is taken for UTC (or GPS time if so mapped), or a number."""
-    place = f"{path}: column {recorded.name}"
-    try:
-        if recorded.dtype != pl.String:
-            return _counted(recorded, mapping, place)
-        stamps = recorded.str.to_datetime(time_unit="ns", strict=True).dt.timestamp("ns")
-    except pl.exceptions.PolarsError as error:
-        raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place) from None
-    if mapping.time_scale == "gps":
-        stamps = pl.Series(utc_from_gps(stamps.fill_null(0).to_numpy())).set(stamps.is_null(), None)
-    return stamps.cast(pl.Datetime("ns", "UTC"))
-
-
-def _looks_like(count: int) -> str:
-    """The unit in which a time since 1970 lies between 1985 and 2065."""
-    near = [unit for unit, unit_s in (("milliseconds", 1e-3), ("microseconds", 1e-6)) if 5e8 < count * unit_s < 3e9]
-    return f"; looks like {near[0]}" if near else ""
-
-
-def _counted(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
-    """Numbers: seconds, whole ones of 18 digits nanoseconds, and of another unit as `factors.t` says."""
-    source = time_source((recorded.name,), {recorded.name: _kind(recorded.dtype)}, mapping)
-    if recorded.dtype.is_integer() and source.unit_s is None:
-        largest = int(np.abs(recorded.drop_nulls().to_numpy().astype(np.float64)).max(initial=0))
-        if _MOST_SECONDS < largest < _LEAST_NANOSECONDS:
-            raise InputError(
-                f"time unit unknown{_looks_like(largest)}",
-                place=place,
-                found=str(largest),
-                expected="seconds or nanoseconds",
-                remedy="Give the seconds per unit: factors = { t = 1e-3 } for milliseconds.",
-            )
-        recorded = recorded * (1 if largest >= _LEAST_NANOSECONDS else 1_000_000_000)
-    return source.instants(recorded.to_frame(), recorded.name)

@@ -11,10 +11,16 @@ from pyproj import Transformer
 from schemas.arrays import Floats
 
 
-def geodetic(x_m: float, y_m: float, z_m: float) -> dict[str, Any]:
-    """The `gnss` columns of a place."""
+def geodetic(x_m: Any, y_m: Any, z_m: Any) -> dict[str, Any]:
+    """The `gnss` columns of a place, or of an array of places."""
     longitude, latitude, height = _transformer().transform(x_m, y_m, z_m)
     return {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
+
+
+def earth_fixed(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float, float]:
+    """Back from `geodetic` [m]."""
+    x_m, y_m, z_m = _transformer().transform(longitude_deg, latitude_deg, height_m, direction="INVERSE")
+    return x_m, y_m, z_m
 
 
 def local_velocity(
@@ -25,12 +31,12 @@ def local_velocity(
     return {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
 
 
-def east_north_up(latitude_deg: float, longitude_deg: float) -> Floats:
-    """Rotation from earth-fixed axes to east, north, up; shape (3, 3)."""
+def east_north_up(latitude_deg: Any, longitude_deg: Any) -> Floats:
+    """Rotation from earth-fixed axes to east, north, up; shape (3, 3), of n places (3, 3, n)."""
     lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
     return np.array(
         [
-            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lon), np.cos(lon), np.zeros_like(lon)],
             [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
             [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
         ]

@@ -1,4 +1,4 @@
-"""Whole messages of a receiver log: UBX, SBF, NMEA and RTCM 3, told by their start, length and checksum.
+"""Whole messages of a receiver log: UBX, SBF, NMEA, NovAtel and RTCM 3, told by their start, length and checksum.
 
 A start whose message does not prove whole counts as damaged, and the search goes on right behind that start: a
 damaged length hides nothing of what follows it.
@@ -7,7 +7,7 @@ damaged length hides nothing of what follows it.
 from __future__ import annotations
 
 import re
-from binascii import crc_hqx
+from binascii import crc32, crc_hqx
 from collections.abc import Callable, Iterator
 from enum import StrEnum
 from functools import reduce
@@ -21,6 +21,7 @@ class Protocol(StrEnum):
     SBF = "SBF"
     NMEA = "NMEA"
     RTCM = "RTCM"
+    NOVATEL = "NovAtel"
 
 
 class Frame(NamedTuple):
@@ -31,9 +32,12 @@ class Frame(NamedTuple):
 
 
 _START = re.compile(
-    rb"(?P<UBX>\xb5\x62)|(?P<SBF>\$@)|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),)|(?P<RTCM>\xd3[\x00-\x03])"
+    rb"(?P<UBX>\xb5\x62)|(?P<SBF>\$@)|(?P<NOVATEL>\xaaD[\x12\x13]|[#%][A-Z][A-Z0-9_]+A,)"
+    rb"|(?P<NMEA>\$(?:[A-Z]{2}[A-Z0-9]{3}|P[A-Z0-9]{3,6}),)|(?P<RTCM>\xd3[\x00-\x03])"
 )
 _SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
+_NOVATEL_LINE = re.compile(rb"[#%]([ -)+-~]+)\*([0-9A-Fa-f]{8})\r?\n?")
+_NOVATEL_SHORT_HEAD, _NOVATEL_CRC = 12, 4
 _UBX_OVERHEAD, _SBF_HEAD, _RTCM_OVERHEAD = 8, 8, 6
 
 
@@ -87,6 +91,28 @@ def _rtcm_end(content: bytes, start: int) -> int | None:
     return end if _crc24q(content[start : end - 3]) == int.from_bytes(content[end - 3 : end], "big") else None
 
 
+def _novatel_end(content: bytes, start: int) -> int | None:
+    """OEM7 commands and logs reference manual, "32-bit CRC": over all from the start, of ASCII without its sign."""
+    if content[start : start + 1] in (b"#", b"%"):
+        line = _NOVATEL_LINE.match(content, start)
+        return line.end() if line and _crc32(line[1]) == int(line[2], 16) else None
+    if len(content) < start + _NOVATEL_SHORT_HEAD:
+        return None
+    if content[start + 2] == 0x13:
+        end = start + _NOVATEL_SHORT_HEAD + content[start + 3] + _NOVATEL_CRC
+    else:
+        end = start + content[start + 3] + int.from_bytes(content[start + 8 : start + 10], "little") + _NOVATEL_CRC
+    crc = content[end - _NOVATEL_CRC : end]
+    return (
+        end if len(crc) == _NOVATEL_CRC and _crc32(content[start : end - 4]) == int.from_bytes(crc, "little") else None
+    )
+
+
+def _crc32(content: bytes) -> int:
+    """The CRC of zip files without its inversions at begin and end."""
+    return crc32(content, 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
 def _crc24q_table() -> list[int]:
     table = []
     for value in range(256):
@@ -112,4 +138,5 @@ _ENDS: dict[Protocol, Callable[[bytes, int], int | None]] = {
     Protocol.SBF: _sbf_end,
     Protocol.NMEA: _nmea_end,
     Protocol.RTCM: _rtcm_end,
+    Protocol.NOVATEL: _novatel_end,
 }

@@ -72,8 +72,8 @@ class NmeaDecoder:
         self._latest = message.time
 
 
-def settle_first_day(gathered: Gathered) -> None:
-    """Give the positions before the first date their day, counted back from it.
+def settle_first_day(gathered: Gathered, told: date | None = None) -> None:
+    """Give the positions before the first date their day, counted back from it; without any, on from the day `told`.
 
     Sentences of the same epoch as the first dated ones join them. A time with neither date nor position may be that of
     a receiver just switched on, whose clock is not set yet: it is dropped.
@@ -81,7 +81,11 @@ def settle_first_day(gathered: Gathered) -> None:
     undated = [epoch for epoch in gathered.epochs if _key_of(epoch)[0] is None]
     gathered.epochs = [epoch for epoch in gathered.epochs if _key_of(epoch)[0] is not None]
     if not gathered.epochs:
-        gathered.drop("time without a date", len(undated))
+        if told is None:
+            gathered.drop("time without a date", len(undated))
+        else:
+            gathered.epochs = undated
+            _count_on(undated, told)
         return
     first = gathered.epochs[0]
     day, following = _key_of(first)
@@ -97,6 +101,15 @@ def settle_first_day(gathered: Gathered) -> None:
             early.t_ns, following = _time_ns(day, moment), moment
             kept.append(early)
     gathered.epochs = kept[::-1] + gathered.epochs
+
+
+def _count_on(undated: list[Epoch], day: date) -> None:
+    """The first epoch is of this day, and past midnight comes the next."""
+    before_s = 0
+    for epoch in undated:
+        _, moment = _key_of(epoch)
+        day += timedelta(days=1) if before_s - _seconds(moment) > _HALF_DAY_S else timedelta(0)
+        epoch.t_ns, before_s = _time_ns(day, moment), _seconds(moment)
 
 
 def _join(dated: Epoch, early: Epoch) -> None:

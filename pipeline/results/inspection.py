@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import UTC, datetime
+from pathlib import Path
 
 import polars as pl
 
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
+from pipeline.receivers.csv_draft import draft_mapping
 from pipeline.results import store
 from pipeline.results.fit_report import FitReport, fit_report
 from pipeline.site.read import is_geojson, read_site
@@ -20,6 +22,7 @@ from schemas.config import IngestConfig, MatchingConfig, Vehicle
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding, Site
 
+STARTING_CONFIG = "Configuration to begin with"
 _SITE_FILES = {"track.parquet", "track.csv", "track.geojson"}
 _RUN_COLUMNS = (
     *("verdict", "run_id", "solution", "status", "duration_s", "distance_m", "gnss_rate_hz", "availability"),
@@ -47,17 +50,24 @@ def inspect_path(
     if names & _SITE_FILES or (is_geojson(path) and not names):
         return inspect_site(path, result, matching or MatchingConfig())
     if result is not None:
-        raise UsageError("is no site", place=redacted(str(path)), expected="a site, to hold a result against")
+        raise UsageError("is not a site", place=redacted(str(path)), expected="a site, to compare the result with")
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
         return inspect_log(path, config or IngestConfig(), None if site is None else read_site(site), vehicle)
+    if name_of(path).lower().endswith(".csv"):
+        return inspect_csv(Path(path))
     raise UsageError(
         "is neither a log, a site nor a result",
         place=redacted(str(path)),
         expected="RUN.mcap, SITE.geojson, or a folder with gnss.parquet (log), track.parquet (site) or runs/ (result)",
         remedy="`balise convert` makes runs of receiver logs and CSV files.",
     )
+
+
+def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
+    """A mapping to begin with; the columns stand in it."""
+    return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
 
 
 def inspect_log(
@@ -82,7 +92,7 @@ def inspect_log(
     if problems := (*found.problems, *fitted.problems):
         tables["Problems"] = pl.DataFrame({"problem": problems})
     if found.starting_config:
-        tables["Configuration to begin with"] = pl.DataFrame({"toml": found.starting_config.splitlines()})
+        tables[STARTING_CONFIG] = pl.DataFrame({"toml": found.starting_config.splitlines()})
     return tables
 
 
@@ -112,7 +122,7 @@ def inspect_site(
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
-    from pipeline.site.describe import describe_site
+    from pipeline.site.describe import describe_site, elements_table, without_balises
     from pipeline.site.parallels import parallel_findings
     from pipeline.site.survey_findings import survey_findings
     from pipeline.site.windows import window_findings
@@ -121,7 +131,8 @@ def inspect_site(
     description = describe_site(site)
     figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
     alike = (*window_findings(site), *parallel_findings(site, matching or MatchingConfig()))
-    tables = {"Site": _figures(figures), "Findings": _findings((*description.findings, *alike))}
+    found = (*description.findings, *without_balises(site.balises), *alike)
+    tables = {"Site": _figures(figures), "Elements": elements_table(site), "Findings": findings_table(found)}
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
@@ -139,7 +150,8 @@ def _figures(figures: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame({"figure": list(figures), "value": [_value(value) for value in figures.values()]})
 
 
-def _findings(findings: tuple[Finding, ...]) -> pl.DataFrame:
+def findings_table(findings: tuple[Finding, ...]) -> pl.DataFrame:
+    """Findings as they are shown."""
     columns = ("severity", "place", "message", "remedy")
     rows = [tuple(getattr(finding, name) for name in columns) for finding in findings]
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")

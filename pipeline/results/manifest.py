@@ -112,7 +112,7 @@ def read_manifest(out: Address) -> Manifest | None:
         known = False
     if not known:
         raise UsageError(
-            "is no manifest of this program", place=redacted(str(address)), remedy="`balise replay` writes it anew."
+            "is not a manifest of this program", place=redacted(str(address)), remedy="`balise replay` writes one."
         )
     return dict(found)
 

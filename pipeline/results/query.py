@@ -88,7 +88,7 @@ def _check_query(sql: str, allow_files: bool) -> None:
         begin = before.end()
     if not _QUERY.match(sql, begin):
         raise UsageError(
-            "is no query",
+            "is not a query",
             place="SQL",
             found=sql.strip()[:80] or "nothing",
             expected=f"{_EXPECTED} (WITH ... SELECT, EXPLAIN SELECT); results are only read",
@@ -96,11 +96,11 @@ def _check_query(sql: str, allow_files: bool) -> None:
         )
     if not allow_files and (found := _FILES.search(sql)):
         raise UsageError(
-            "reads files beside the result",
+            "reads files outside the result",
             place="SQL",
             found=found[0],
             expected=_EXPECTED,
-            remedy="`--allow-files` lets a query that you trust read files of this machine.",
+            remedy="If you trust the query, `--allow-files` lets it read files of this machine.",
         )
 
 
@@ -136,7 +136,7 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     found = known.get(table.lower())
     if found is None:
         raise UsageError(
-            f"is no table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
+            f"is not a table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
         )
     columns = dictionary_frame(found[0]).drop("group", "table")
     if found[0] not in TABLES:

@@ -15,7 +15,7 @@ from pipeline.results.source import conjuncts, source_of
 from pipeline.storage import parquet
 from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.files import exists, read_bytes
-from schemas.config import Configuration, Settings, settings_from, to_toml, toml_of
+from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
 from schemas.conform import conform, dtypes
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
@@ -85,7 +85,7 @@ def read_run(out: Address, run_id: str) -> RunTables:
 def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
     """One table of all complete runs, or of one, with the column `run_id` in front."""
     if table not in TABLES:
-        raise UsageError("is no table", place=table, expected=", ".join(TABLES))
+        raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
     if run_id is not None and not exists(table_address(out, _MARKER, run_id)):
         known = ", ".join(run_ids(out)[:10]) or "no complete run"
@@ -152,7 +152,7 @@ def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) ->
             place=f"run {run_id}, table `{table}`",
             found="; ".join(parts),
             expected=f"the columns of contract {CONTRACT_VERSION} as of this build",
-            remedy="Replay this run again into the same output; `balise replay` sees that it is due.",
+            remedy="Repeat `balise replay` with the same --out: it replays this run again.",
         )
 
 
@@ -249,13 +249,22 @@ def read_config(out: Address) -> Configuration | None:
         raise UsageError(
             f"was not written by this build of the program: {error}",
             place=shown(address),
-            remedy="Replay the runs again into the same output; `balise replay` sees which are due.",
+            remedy="Repeat `balise replay` with the same --out: it replays these runs again.",
         ) from None
 
 
 def write_config(out: Address, settings: Settings) -> None:
     """`OUT/config.toml`: the resolved configuration."""
     storage.write_bytes(join(out, "config.toml"), to_toml(settings).encode())
+
+
+def write_vehicle(out: Address, vehicle: Vehicle) -> None:
+    """`OUT/vehicle.toml`: what was known of the train; a result without a vehicle file has none."""
+    address = join(out, "vehicle.toml")
+    if vehicle != Vehicle():
+        storage.write_bytes(address, to_toml(vehicle).encode())
+    elif exists(address):
+        storage.remove(address)
 
 
 def _partition(run_id: str) -> str:

@@ -8,20 +8,21 @@ enough (LOC eq. 11). All are judged after the fact on the same faults, whatever 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations
 
 import polars as pl
 
-from pipeline.epochs.clock import Clock, met, trusted
+from pipeline.epochs.clock import Clock, may_move, met, trusted
 from pipeline.epochs.failure_log import FailureLog, failure_log
-from pipeline.epochs.timeline import held_s, uptime
-from pipeline.figures.independent import independent_episodes, missed_detection
+from pipeline.epochs.timeline import held_s, nominal_period_s, uptime
+from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.channels import on_path_of, paired
 from pipeline.monitors.single import channel_monitor
 from pipeline.safety.composite_alarms import Solution, verdict_of_both
+from pipeline.safety.fault_counts import fault_counts, faults_of_pair
 from pipeline.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
-from schemas.arrays import Bools
+from schemas.arrays import NS_PER_S, Bools, times_ns
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
@@ -30,10 +31,11 @@ Row = dict[str, object]
 
 COMPARISON = "channel"
 _DIAGNOSIS = tuple(name for name in MONITORS if name != COMPARISON)
+_STATES = pl.col("trusted", "known", "wrong")
 _ALONG = tuple(f"along_{scale}" for scale in SCALES)
 EPOCH_COLUMNS = (
     *("t", "solution", "netelement_id", "measure_m", "path_m", "on_track", "gate_probability", "confidence_m"),
-    *("sigma_along_m", "error_low_m", "error_high_m", "judgement"),
+    *("sigma_along_m", "error_low_m", "error_high_m", "judgement", "moving"),
     *(f"{name}_{part}" for name in _DIAGNOSIS for part in ("state", "value", "threshold")),
 )
 """Columns of the epochs that the comparison takes."""
@@ -49,6 +51,7 @@ class _Channel:
     working: Bools
     known: Bools
     wrong: Bools
+    moving: Bools
 
 
 def side_by_side(
@@ -58,7 +61,8 @@ def side_by_side(
 
     `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
     are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
-    fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right.
+    fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right. A pair has
+    one row, and the time of all rows is that of the run.
     """
     names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
@@ -67,14 +71,23 @@ def side_by_side(
     for name, channel in channels.items():
         one = solutions[name]
         verdicts = _verdicts_in_table(channel.fails, one.alarms)
-        found = _faults(one.faults, None, channel) | _alarms(channel, verdicts) | _working(channel)
+        found = fault_counts(one.faults, channel.fails) | _alarms(channel, verdicts) | _working(channel)
         rows.append({"architecture": REACTIVE, "solution": name, **found})
-    for name, other in permutations(names, 2):
+    for name, other in combinations(names, 2):
         pair = {"solution": name, "other": other}
         rows.append({"architecture": COMPOSITE, **pair, **_composite(solutions[name], solutions[other], config)})
-        if name < other:
-            rows.append({"architecture": REDUNDANT, **pair, **_redundant(channels[name], channels[other])})
-    return pl.DataFrame(rows, schema=COUNTS)
+        rows.append({"architecture": REDUNDANT, **pair, **_redundant(channels[name], channels[other])})
+    moving_s = _moving_s(epochs.filter(pl.col("solution").is_in(names)))
+    return pl.DataFrame(rows, schema=COUNTS).with_columns(moving_s=pl.lit(moving_s, pl.Float64))
+
+
+def _moving_s(epochs: pl.DataFrame) -> float | None:
+    """Time in which the train moved or nobody knows whether it did [s], gaps included, from the first epoch of any
+    solution to the last; None where it is never known to have moved (as `runs.availability`).
+    """
+    steps = epochs.group_by("t").agg(may=may_move().any(), known=pl.col("moving").any()).sort("t")
+    steps = steps.with_columns(step_s=(pl.col("t").shift(-1) - pl.col("t")).dt.total_nanoseconds() / NS_PER_S)[:-1]
+    return float(steps.filter("may")["step_s"].sum()) if steps["known"].any() else None
 
 
 def _solution(
@@ -92,47 +105,63 @@ def _solution(
 
 def _reactive(one: Solution, config: Configuration) -> _Channel:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
-    return _channel(one, one.epochs, _DIAGNOSIS, judged, trusted(config), config)
+    epochs = one.epochs.drop("moving").hstack(_states(one, trusted(config)).drop("t"))
+    return _channel(epochs, _DIAGNOSIS, judged, config)
 
 
 def _evaluated(monitor: str) -> pl.Expr:
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
-def _composite(one: Solution, other: Solution, config: Configuration) -> Row:
+def _composite(first: Solution, second: Solution, config: Configuration) -> Row:
+    """Compared at the epochs of the solution that measures less often."""
+    one, other = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
     placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     compared = channel_monitor(positioned, placed, config).select(
         pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
     )
-    met = other.epochs.select(other_trusted=trusted(config).gather(paired(one.epochs, other.epochs)["row_other"]))
-    frame = one.epochs.select("t", own_trusted=trusted(config)).hstack(compared).hstack(met)
-    trust = pl.col("own_trusted") & pl.col("other_trusted")
-    channel = _channel(one, frame, (COMPARISON,), _evaluated(COMPARISON), trust, config)
+    row_other = paired(one.epochs, other.epochs)["row_other"]
+    theirs = _states(other, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
+    own = _states(one, trusted(config))
+    wrong = own["wrong"] | theirs["wrong"]
+    both = own.with_columns(
+        trusted=own["trusted"] & theirs["trusted"], known=(own["known"] & theirs["known"]) | wrong, wrong=wrong
+    )
+    channel = _channel(both.hstack(compared), (COMPARISON,), _evaluated(COMPARISON), config)
     verdicts = [verdict_of_both(alarm, (one, other), config.hazards) for alarm in channel.fails.alarms]
-    return _faults(one.faults, other.faults, channel) | _alarms(channel, verdicts) | _working(channel)
+    faults = fault_counts(faults_of_pair(one.faults, other.faults), channel.fails)
+    return faults | _alarms(channel, verdicts) | _working(channel)
 
 
-def _channel(
-    one: Solution,
-    epochs: pl.DataFrame,
-    monitors: tuple[str, ...],
-    judged: pl.Expr,
-    position: pl.Expr,
-    config: Configuration,
-) -> _Channel:
-    """`epochs`: those of the solution, with the columns that `monitors`, `judged` and `position` take."""
+def _period_s(one: Solution) -> float:
+    return nominal_period_s(times_ns(one.epochs)) or 0.0
+
+
+def _states(one: Solution, position: pl.Expr) -> pl.DataFrame:
+    """`position` may be relied on, a truth judged it, and judged it wrong."""
+    known = judged_epoch() & pl.lit(one.with_truth)
+    return one.epochs.select(
+        "t",
+        "moving",
+        trusted=position.fill_null(value=False),
+        known=known.fill_null(value=False),
+        wrong=(known & (pl.col("judgement") == Judgement.WRONG)).fill_null(value=False),
+    )
+
+
+def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Channel:
+    """`epochs`: `_states`, with the columns of `monitors` and those that `judged` takes."""
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
     seen = met(epochs, judged)
-    working = seen & met(epochs, position)
+    working = seen & met(epochs, pl.col("trusted"))
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
-    known = met(one.epochs, judged_epoch() & pl.lit(one.with_truth))
-    wrong = known & met(one.epochs, pl.col("judgement") == Judgement.WRONG)
-    return _Channel(clock, fails, seen, working, known, wrong)
+    known, wrong, moving = (met(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
+    return _Channel(clock, fails, seen, working, known, known & wrong, moving)
 
 
 def _alarms(channel: _Channel, verdicts: list[Verdict]) -> Row:
@@ -148,8 +177,7 @@ def _working(channel: _Channel) -> Row:
     clock, held = channel.clock, channel.clock.held_s
     up = uptime(clock.t_ns, channel.working, clock.limit_s)
     return {
-        "held_s": float(held.sum()),
-        "working_s": float(held[channel.working].sum()),
+        "working_s": float(held[channel.working & channel.moving].sum()),
         "up_s": up.up_s,
         "losses": up.losses,
         "truth_s": float(held[channel.known].sum()),
@@ -159,52 +187,17 @@ def _working(channel: _Channel) -> Row:
 
 def _redundant(one: _Channel, other: _Channel) -> Row:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
-    parts = [pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working}) for channel in (one, other)]
-    merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working").any()).sort("t_ns")
-    t_ns, working = merged["t_ns"].to_numpy(), merged["working"].to_numpy()
+    parts = [
+        pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working, "moving": channel.moving})
+        for channel in (one, other)
+    ]
+    merged = pl.concat(parts).group_by("t_ns").agg(pl.col("working", "moving").any()).sort("t_ns")
+    t_ns, working, moving = (merged[name].to_numpy() for name in ("t_ns", "working", "moving"))
     limit_s = max(one.clock.limit_s, other.clock.limit_s)
-    whole_s, up = float(held_s(t_ns, limit_s).sum()), uptime(t_ns, working, limit_s)
-    return {"held_s": whole_s, "working_s": min(up.up_s, whole_s), "up_s": up.up_s, "losses": up.losses}
-
-
-def _faults(faults: pl.DataFrame, others: pl.DataFrame | None, channel: _Channel) -> Row:
-    """`others`: faults of the other solution, so that common ones can be told apart."""
-    last, kind = int(channel.clock.t_ns[-1]), faults.schema["begin"]
-    ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
-    found = [_detected_ns(channel.fails, *span) for span in ends]
-    failed, missed, common = pl.col("failed"), pl.col("missed"), pl.col("failed") & pl.col("common")
-    counts = (
-        faults.with_columns(
-            t_detected=pl.Series(found, dtype=pl.Int64).cast(kind),
-            common=pl.Series([others is not None and _overlaps(others, *span) for span in ends], dtype=pl.Boolean),
-        )
-        .with_columns(missed=missed_detection().fill_null(value=False))
-        .select(
-            hazards=pl.len(),
-            failures=failed.sum(),
-            missed=missed.sum(),
-            common_failures=common.sum(),
-            common_missed=(common & missed).sum(),
-            failures_judged=(failed & pl.col("with_truth")).sum(),
-            missed_judged=(missed & pl.col("with_truth")).sum(),
-        )
-    )
-    delays = [(moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None]
-    return counts.row(0, named=True) | {"delays_s": delays}
-
-
-def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
-    """An alarm that stands at the onset detects at once, else the first fail until the fault's end."""
-    if fails.standing_at(begin) is not None:
-        return begin
-    first = fails.first_in(begin, last + 1)
-    return None if first is None else first[0]
-
-
-def _overlaps(faults: pl.DataFrame, begin: int, last: int) -> bool:
-    end = pl.col("t_end").to_physical()
-    meets = (pl.col("begin").to_physical() <= last) & (end.is_null() | (end >= begin))
-    return faults.filter(pl.col("failed") & meets).height > 0
+    up = uptime(t_ns, working, limit_s)
+    # Held from one working epoch to the next: between them may lie epochs of the channel that does not work.
+    working_s = float(held_s(t_ns[working], limit_s)[moving[working]].sum())
+    return {"working_s": working_s, "up_s": up.up_s, "losses": up.losses}
 
 
 def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:

@@ -16,20 +16,21 @@ _WHOLE = (
     *("hazards", "failures", "missed", "failures_judged", "missed_judged", "common_failures", "common_missed"),
     *("alarms", "false_alarms", "open_alarms", "losses"),
 )
-_TIMES = ("judged_s", "held_s", "working_s", "up_s", "truth_s", "wrong_s")
+_TIMES = ("judged_s", "moving_s", "working_s", "up_s", "truth_s", "wrong_s")
 COUNTS: Mapping[str, pl.DataType] = {
     **{name: pl.String() for name in _KEYS},
     **{name: pl.Int64() for name in _WHOLE},
     **{name: pl.Float64() for name in _TIMES},
     "delays_s": pl.List(pl.Float64),
 }
-"""Per architecture and solution (`other`: of a pair).
+"""Per architecture and solution (`other`: of a pair, which has one row).
 
-Faults of the position and what became of them (`common`: the other solution had one at the same time; `judged`: by a
-reference or balise reads; `delays_s`: T_D of those detected). Alarms (`open`: nobody can tell whether false) in the
-time in which the monitors judged. Time with epochs, of this in work, and how often work was lost after it had gone on
-for `up_s`; time judged by a truth, and of this in work and judged wrong, whether it hit a virtual balise or not (the
-architecture's P1). Null what an architecture is not judged by.
+Faults of the position and what became of them (of a pair: of either solution, those that overlap as one; `common`: both
+failed at the same time; `judged`: by a reference or balise reads; `delays_s`: T_D of those detected). Alarms (`open`:
+nobody can tell whether false) in the time in which the monitors judged. Moving time of the run, gaps included (null
+where it is never known to have moved), and of this in work; how often work was lost after it had gone on, moving or
+not, for `up_s`; time judged by a truth, and of this in work and judged wrong, whether it hit a virtual balise or not
+(the architecture's P1). Null what an architecture is not judged by.
 """
 
 
@@ -42,7 +43,7 @@ def added(parts: Iterable[pl.DataFrame]) -> pl.DataFrame:
 
 def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
     """Figures with exact 95 % bounds, one row per architecture and solution or pair."""
-    delays, held, truth = pl.col("delays_s"), pl.col("held_s"), pl.col("truth_s")
+    delays, moving, truth = pl.col("delays_s"), pl.col("moving_s"), pl.col("truth_s")
     order = {name: number for number, name in enumerate((REACTIVE, COMPOSITE, REDUNDANT))}
     table = counts.with_columns(
         detected=pl.when(pl.col("hazards").is_not_null()).then(delays.list.len().cast(pl.Int64)),
@@ -51,7 +52,7 @@ def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
         judged_h=pl.col("judged_s") / 3600.0,
         up_h=pl.col("up_s") / 3600.0,
         told=pl.when(pl.col("open_alarms") == 0).then(pl.col("false_alarms")),
-        availability=pl.when(held > 0.0).then(pl.col("working_s") / held),
+        availability=pl.when(moving > 0.0).then(pl.min_horizontal(pl.col("working_s") / moving, 1.0)),
         wrong_in_use_s=pl.when(truth > 0.0).then(pl.col("wrong_s")),
         wrong_in_use_share=pl.when(truth > 0.0).then(pl.col("wrong_s") / truth),
     )

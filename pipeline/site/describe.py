@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 
 from pipeline.track.network import Network, network_of
 from pipeline.track.survey import Track, track_of
@@ -72,6 +73,38 @@ def describe_site(site: Site) -> SiteDescription:
         ),
         findings=site.findings,
     )
+
+
+def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
+    """A finding where a site has no balises, because then nothing is judged but positions."""
+    if balises is not None and balises.height:
+        return ()
+    text = "the site has none: a replay ends with matching and monitors, and says nothing of balises"
+    return (Finding("warning", "balises", text, "Add balises.csv, or make the site with --balises."),)
+
+
+def elements_table(site: Site) -> pl.DataFrame:
+    """Per net element its id, length [m], points, balises, and the elements that a train can reach from either end."""
+    track = track_of(site.track)
+    reached: dict[tuple[str, int], list[str]] = {}
+    for a, a_end, b, b_end, way in site.links.iter_rows():
+        if way != "none":
+            reached.setdefault((a, a_end), []).append(b)
+            reached.setdefault((b, b_end), []).append(a)
+    counts = Counter([] if site.balises is None else site.balises["netelement_id"].to_list())
+    rows = [
+        (
+            name,
+            round(float(track.length_m[element]), 1),
+            part.stop - part.start,
+            counts[name],
+            ", ".join(reached.get((name, 0), [])),
+            ", ".join(reached.get((name, 1), [])),
+        )
+        for element, name, part in track.elements()
+    ]
+    columns = ("netelement_id", "length_m", "points", "balises", "before_start", "after_end")
+    return pl.DataFrame(rows, schema=list(columns), orient="row")
 
 
 def _spacing_m(track: Track) -> np.ndarray:

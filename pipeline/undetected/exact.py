@@ -7,14 +7,16 @@ equations, and every quantity is counted in its own bound, so that tolerances ar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
-from scipy.optimize import linprog
 
 from pipeline.undetected.watched import Watched
 from schemas.arrays import Floats, Ints
 from schemas.errors import BaliseError
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 _TOLERANCE = 1e-9
 # A bound within this share of itself is reached.
@@ -40,6 +42,8 @@ def largest_profile(rows: Watched, start: int, end: int, margin: float = 0.0) ->
     `margin`: every threshold smaller by this share. Raises `BaliseError` where the solver finds none: no fault is a
     profile, so that is a defect.
     """
+    from scipy.optimize import linprog  # only who asks for a profile solves the whole
+
     program = _Program(rows.between(start, end + 1), margin)
     goal = np.zeros(program.width)
     goal[program.fault(program.window.rows - 1)] = -1.0
@@ -134,9 +138,13 @@ class _Program:
         entries.append((anchored, self.fault(window.anchor[rows][anchored]), -np.ones(anchored.size)))
         difference = self._matrix(entries, rows.size)
         bounds = np.concatenate([window.held_high_m[rows], -window.held_low_m[rows]])
+        from scipy import sparse
+
         return sparse.vstack([difference, -difference]).tocsr(), bounds
 
     def _matrix(self, entries: list[tuple[Ints, Ints, Floats]], height: int) -> sparse.csr_matrix:
+        from scipy import sparse
+
         row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
         return sparse.csr_matrix((value, (row, column)), shape=(height, self.width))
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-from scipy.special import chdtri
 
 from pipeline.monitors.pseudorange import Equations, equations_of, normal_of
 from schemas.arrays import Floats
@@ -23,6 +22,8 @@ def range_bounds(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configu
 
     Infinite where the monitor is not evaluated. The worst satellite of each epoch: no satellite may do more.
     """
+    from scipy.special import chdtri  # most replays have no ranges
+
     low, high = np.full(epochs.height, -np.inf), np.full(epochs.height, np.inf)
     for part in equations_of(epochs, satellites, config):
         tested = part.freedom > 0

@@ -6,14 +6,15 @@ evaluated on every row (`paid_m`), so blocks cost closeness, never validity.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.optimize import linprog
 
 from pipeline.undetected.stretch import Stretch
 from schemas.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 # Entries of a matrix: rows, columns, values.
 Entries = tuple[Ints, Ints, Floats]
@@ -46,6 +47,8 @@ class _Blocks(NamedTuple):
 
 def best_shares(stretch: Stretch) -> Floats:
     """Shares of raw and averages in each row, shape (rows, 1 + averages), that give the least bound at the last row."""
+    from scipy.optimize import linprog  # most replays solve nothing
+
     blocks, monitors = _Blocks.over(stretch.rows), 1 + stretch.weight.shape[1]
     ends = 2 * blocks.first.size
     terms, costs, linear = _program(stretch, blocks)
@@ -69,6 +72,8 @@ def best_shares(stretch: Stretch) -> Floats:
 
 def _equations(terms: list[Entries], size: int, ends: int, monitors: int) -> sparse.csr_matrix:
     """Each term is what it has above zero less what it has below; shares add up to one at both ends of each block."""
+    from scipy import sparse
+
     shares, each = monitors * ends, np.arange(size)
     ones = np.ones(size)
     whole = size + np.tile(np.arange(ends), monitors), np.arange(shares), np.ones(shares)

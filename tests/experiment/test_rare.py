@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from benchmarks.counting import agree, counted_alarms, counted_misses
 from datasets.experiment.geometry import TAUS_S, Constellation, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import BANKS
 from datasets.experiment.rare import (
+    Probability,
     false_alarm_probability,
     missed_detection_probability,
-    plain_false_alarm,
-    plain_missed_detection,
     populations,
 )
-from datasets.experiment.rare_rows import first_below
+from datasets.experiment.rare_rows import figures, first_below
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
 from datasets.experiment.splitting import most_probable_miss
 from datasets.experiment.workers import generator
@@ -57,7 +57,7 @@ def test_one_epoch_of_one_monitor_is_the_gaussian_tail() -> None:
 def test_false_alarms_agree_with_counting() -> None:
     system = bank(false_alarm_probability=1e-4, sensors="odometer_and_track")
     clever = false_alarm_probability(system, 100, runs=1000, seed=2)
-    plain = plain_false_alarm(system, 100, runs=20_000, seed=3)
+    plain = counted_alarms(system, 100, runs=20_000, seed=3)
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)
     assert clever.relative_error < 0.1
@@ -67,7 +67,7 @@ def test_missed_detections_agree_with_counting() -> None:
     for changes, rate, epochs in (({}, 0.3, 62), ({"sensors": "odometer_and_track"}, 0.3, 45)):
         system = bank(**changes)
         clever = missed_detection_probability(system, epochs, rate, runs=4000, seed=4)
-        plain = plain_missed_detection(system, epochs, rate, runs=20_000, seed=5)
+        plain = counted_misses(system, epochs, rate, runs=20_000, seed=5)
         assert 1e-4 < plain.value < 0.3
         spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
         assert clever.value == pytest.approx(plain.value, abs=4 * spread)
@@ -132,7 +132,7 @@ def test_a_miss_that_counting_sees_once_in_a_thousand_over_a_long_time() -> None
     """Dual constellation, 0.03 m/s, twelve monitors: some 1400 epochs near thresholds, where a shift alone fails."""
     system = linear_bank(default_geometry("gps_galileo"), 0.0, BankSpec(sensors="odometer_and_track"))
     clever = missed_detection_probability(system, 1_700, 0.03, runs=2_000, seed=3)
-    plain = plain_missed_detection(system, 1_700, 0.03, runs=2_000, seed=4)
+    plain = counted_misses(system, 1_700, 0.03, runs=2_000, seed=4)
     assert 0.002 < plain.value < 0.3
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)
@@ -146,7 +146,7 @@ def test_a_young_bank_has_its_own_sigmas_and_misses(age_s: float) -> None:
     exact = bank_sigmas(np.array(BANKS["increments"]), int(age_s) + 60, variances, TAUS_S, 0.05, 0.0)
     assert young.sigmas(60) == pytest.approx(exact[int(age_s) :], rel=1e-7)
     clever = missed_detection_probability(young, 60, 0.3, runs=4000, seed=9)
-    plain = plain_missed_detection(young, 60, 0.3, runs=60_000, seed=10)
+    plain = counted_misses(young, 60, 0.3, runs=60_000, seed=10)
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)
     assert clever.value != pytest.approx(missed_detection_probability(old, 60, 0.3, runs=4000, seed=9).value, rel=0.3)
@@ -165,6 +165,23 @@ def test_the_first_time_below_a_target_by_hand() -> None:
     """Halved every epoch: below 1e-3 from epoch 10 on; an estimate of zero is no proof of rarity."""
     assert first_below(lambda epochs: 0.5**epochs, (1e-3, 1e-6, 1e-40), 100) == [10, 20, None]
     assert first_below(lambda epochs: 0.0, (1e-3,), 100) == [None]
+
+
+def test_no_probability_below_1e_12_is_told() -> None:
+    """And none that came out as zero: that no run came through proves nothing."""
+    wanted = {1e-12: (1e-12, None, 0.1), 9e-13: (None, 1e-12, None), 0.0: (None, None, None)}
+    for value, expected in wanted.items():
+        row = figures(Probability(value, 0.1, 10.0, 100))
+        assert (row["probability"], row["below"], row["relative_error"]) == expected
+
+
+def test_intervals_that_meet_by_hand() -> None:
+    """10 of 1,000: Clopper-Pearson from 0.0048 to 0.0183."""
+    counted = Probability(0.010, 0.3, 1.0, 1000)
+    assert agree(Probability(0.0185, 0.02, 1.0, 100), counted)
+    assert not agree(Probability(0.0195, 0.02, 1.0, 100), counted)
+    assert not agree(Probability(0.0045, 0.02, 1.0, 100), counted)
+    assert not agree(Probability(0.0, float("inf"), 1.0, 100), counted)
 
 
 def test_runs_are_shared_by_populations_of_some_size() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import pytest
 
-from pipeline.receivers import convert
+from pipeline.receivers import convert, gather
+from pipeline.receivers.csv_draft import draft_mapping
 from schemas.config import Configuration, settings_from
 from schemas.errors import BaliseError, ConfigError, InputError
 
@@ -81,16 +84,16 @@ def test_kinds_of_fix_by_text_number_and_word(converted):
 @pytest.mark.parametrize(
     ("text", "mapping", "message"),
     [
-        ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"heigth_m": "lat"}}, "is no column of this stream.*heigth_m"),
+        ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"heigth_m": "lat"}}, "this stream does not have.*heigth_m"),
         ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"height_m": "h"}}, "no field h for column height_m"),
         ("tt,lat,lon\n1,50,4\n", {}, "no field t for column t"),
-        ("t,lat,lon\n,50,4\n2,50,4\n", {}, "column t: is not complete"),
+        ("t,lat,lon\n,50,4\n2,50,4\n", {}, "column t: has missing values"),
         ("t,lat,lon\nabc,50,4\n", {}, "column t: holds no times"),
         ("t,lat,lon\n1,50,400\n", {}, "longitude_deg: is out of range; found 400"),
-        ("t;lat;lon\n1;50,5;4,5\n", {}, "column lat: cannot be latitude_deg"),
-        ("t,lat,lon,lat\n1,50,4,51\n", {}, "a column name stands twice: lat"),
-        ("t,lat,lon, lat \n1,50,4,51\n", {}, "a column name stands twice: lat"),
-        ("t,lat,lon\ntrue,50,4\n", {}, "field t: is no time; found flag"),
+        ("t;lat;lon\n1;50,5;4.5\n", {}, "column lat: cannot be latitude_deg"),
+        ("t,lat,lon,lat\n1,50,4,51\n", {}, "two columns have the same name: lat"),
+        ("t,lat,lon, lat \n1,50,4,51\n", {}, "two columns have the same name: lat"),
+        ("t,lat,lon\ntrue,50,4\n", {}, "field t: is not a time; found flag"),
         ("t,lat,lon\n20000000000,50,4\n", {}, "time unit unknown; found 20000000000"),
         ("", {}, "is not a CSV file"),
         ("t,lat,lon\n", {}, "no epoch with a time and a position"),
@@ -120,5 +123,61 @@ def test_a_log_without_rows_or_times_beside_another_is_told(tmp_path):
     other.write_text("t,lat,lon\n")
     assert convert([other, full], "r", config.ingest).run.gnss.height == 2
     other.write_text("t,lat,lon\n,50,4\n,50,4\n")
-    with pytest.raises(InputError, match=r"b\.csv: column t: is not complete"):
+    with pytest.raises(InputError, match=r"b\.csv: column t: has missing values"):
         convert([full, other], "r", config.ingest)
+
+
+GERMAN = "Datum;Uhrzeit;Breite;Länge\n{};12:00:00,5;50,5;4,5\n{};12:00:01,5;50;4\n"
+COLUMNS = {"time": "field:Datum + Uhrzeit", "fields": {"latitude_deg": "Breite", "longitude_deg": "Länge"}}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "utf-16", "utf-16-le"])
+def test_spreadsheets_in_their_encodings_with_decimal_commas_and_two_columns(converted, encoding):
+    fixes = converted(GERMAN.format("13.06.2025", "13.06.2025").encode(encoding), **COLUMNS)
+    assert fixes["latitude_deg"].to_list() == [50.5, 50.0]
+    assert fixes["t"].dt.to_string("%FT%T%.3f").to_list() == ["2025-06-13T12:00:00.500", "2025-06-13T12:00:01.500"]
+
+
+def test_day_and_month_are_decided_over_the_whole_file_or_asked_for(converted):
+    decided = converted(GERMAN.format("01.06.2025", "13.06.2025"), **COLUMNS)
+    assert decided["t"].dt.date().cast(str).to_list() == ["2025-06-01", "2025-06-13"]
+    with pytest.raises(InputError, match=r"fit day first and month first.*date_order"):
+        converted(GERMAN.format("01.06.2025", "02.06.2025"), **COLUMNS)
+    asked = converted(GERMAN.format("01.06.2025", "02.06.2025"), **COLUMNS, date_order="month_first")
+    assert asked["t"].dt.date().cast(str).to_list() == ["2025-01-06", "2025-02-06"]
+    with pytest.raises(InputError, match="dates of two kinds"):
+        converted(GERMAN.format("13.06.2025", "06.13.2025"), **COLUMNS)
+    with pytest.raises(InputError, match="another kind than was said; found day_first"):
+        converted(GERMAN.format("13.06.2025", "13.06.2025"), **COLUMNS, date_order="month_first")
+
+
+def test_weeks_excel_days_halves_of_the_day_and_a_row_of_units(converted):
+    def times(text, **mapping):
+        return converted(text, **mapping)["t"].dt.to_string("%FT%T%.3f").to_list()
+
+    # 2025-06-01 is a Sunday, on which week 2369 begins; UTC is 18 s behind.
+    weeks = "w,s,lat,lon\n-,s,deg,deg\n2369,43218.5,50.5,4.5\n"
+    assert times(weeks, time="field:w + s", time_epoch="gps") == ["2025-06-01T12:00:00.500"]
+    with pytest.raises(InputError, match="found 321 in row 1; expected 1024"):
+        times(weeks.replace("2369", "321"), time="field:w + s", time_epoch="gps")
+    # As a spreadsheet shows 2025-06-01 06:00 as a number.
+    assert times("t,lat,lon\n45809.25,50,4\n", time_epoch="excel") == ["2025-06-01T06:00:00.000"]
+    assert times("t,lat,lon\n45809,50,4\n", time_epoch="excel") == ["2025-06-01T00:00:00.000"]
+    halves = times("t,lat,lon\n6/13/2025 1:00:00 PM,50,4\n6/13/2025 12:30 AM,50,4\n")
+    assert halves == ["2025-06-13T13:00:00.000", "2025-06-13T00:30:00.000"]
+
+
+def test_thousands_are_no_fractions(converted):
+    with pytest.raises(InputError, match="column lat: cannot be latitude_deg"):
+        converted('t,lat,lon\n1,"1,234",4\n')
+
+
+def test_a_draft_can_be_saved_and_used(tmp_path):
+    log = tmp_path / "fahrt.csv"
+    log.write_text("Datum;Zeit;Geschw.;v\n;;;km/h\n13.06.2025;12:00:00;x;36,0\n13.06.2025;12:00:01;y;37,8\n")
+    config = settings_from(tomllib.loads(draft_mapping(log)), Configuration, "x").ingest
+    assert gather([log], config).streams["odometer"]["speed_mps"].to_list() == pytest.approx([10.0, 10.5])
+    log.write_text("Datum;Zeit;v\n;;m/s\n01.06.2025;12:00:00;36,0\n01.06.2025;12:00:01;37,8\n")
+    assert "# date_order" in draft_mapping(log)
+    log.write_text("a,b\n1,2\n")
+    assert "No name tells" in draft_mapping(log)

@@ -1,0 +1,143 @@
+"""A synthetic line with known bad places, fifty runs: does `balise line` find them with their causes, and no others?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+
+from benchmarks.results import Figure
+from datasets.scenario import Scenario
+from datasets.trial import write_trial
+from pipeline.campaign import make_plan, run_campaign
+from pipeline.line.classes import piece_classes
+from pipeline.line.passes import Ground
+from pipeline.line.pieces import middles, pieces_of
+from pipeline.line.write import passes_of_runs, write_line
+from pipeline.results.store import read_table
+from pipeline.site.read import read_site
+from schemas.config import Configuration, settings_from
+from schemas.line import LineCriteria
+
+RUNS = 50
+# Chainage from, to, the causes that may be named there, and the fault that makes the place bad.
+PLACES: dict[str, tuple[float, float, tuple[str, ...], dict[str, object]]] = {
+    "tunnel mouth": (2000.0, 2300.0, ("outage",), {"kind": "outage"}),
+    "station roof": (4000.0, 4150.0, ("alarm", "wrong"), {"kind": "noise", "sigma_m": 15.0}),
+    "facade": (
+        6000.0,
+        6100.0,
+        ("wrong", "claimed_wrongly", "unsafe_acceptance", "alarm"),
+        {"kind": "step", "size_m": 35.0},
+    ),
+    "neighbour track": (
+        8000.0,
+        8400.0,
+        ("ambiguous_track", "wrong_track", "alarm"),
+        {"kind": "bias", "target": "cross", "size_m": 2.3},
+    ),
+}
+_END_M = 11000.0
+# A position that is wrong by this much says that it is elsewhere, and a span reaches from one epoch to the next.
+_REACH_M = 100.0
+
+
+def scenario(runs: int = RUNS) -> Scenario:
+    """A line of 11.5 km with a track beside it at 8 km; every other run goes the other way."""
+    faults = [{**fault, "at_m": begin, "until_m": end} for begin, end, _, fault in PLACES.values()]
+    back = [{**fault, "at_m": end, "until_m": begin} for begin, end, _, fault in PLACES.values()]
+    ahead = {"start_m": 200.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": _END_M}]}
+    home = {"start_m": _END_M, "direction": "falling", "phases": [{"speed_mps": 30.0}, {"stop_at_m": 200.0}]}
+    data = {
+        "name": "line",
+        "seed": 26,
+        "vehicle": {
+            "odometer_scale": 1.0,
+            "odometer_scale_sigma": 1e-4,
+            "gnss_latency_s": 0.0,
+            "gnss_latency_sigma_s": 0.002,
+        },
+        "line": {
+            "sections": [{"length_m": 2000.0}, {"length_m": 600.0, "radius_m": 1500.0}],
+            "elements": [{"id": "A", "length_m": 5000.0}, {"id": "B", "length_m": 6500.0, "reversed": True}],
+            "parallels": [{"id": "P", "from_m": 8000.0, "to_m": 8400.0, "left_m": 4.5}],
+            "balises": [{"id": f"VB{at}", "at_m": float(at)} for at in range(600, 11000, 800)],
+        },
+        "gnss": {"rate_hz": 2.0, "sigma_east_m": 0.7, "sigma_north_m": 0.7},
+        "odometer": {"rate_hz": 10.0},
+        "reference": {"rate_hz": 5.0},
+        "runs": [
+            {"id": f"r{number:02d}", "motion": home if number % 2 else ahead, "faults": back if number % 2 else faults}
+            for number in range(runs)
+        ],
+    }
+    return settings_from(data, Scenario, "benchmark")
+
+
+def measure(out: Path, runs: int = RUNS) -> list[Figure]:
+    """Replay the trial once and hold the classes against the places."""
+    if not (out / "trial" / "site").exists():
+        write_trial(scenario(runs), out / "trial")
+    vehicle = scenario(runs).vehicle
+    plan = make_plan(
+        [str(out / "trial" / "runs")], str(out / "trial" / "site"), str(out / "tables"), Configuration(), vehicle
+    )
+    run_campaign(plan, jobs=2)
+    found = write_line(out / "tables", read_site(out / "trial" / "site"), LineCriteria(loss_limit=0.15))
+    table = found.pieces.filter(pl.col("passes") > 0).with_columns(chainage=_chainage())
+    return [*_found(table), _invented(table), _predicted(out)]
+
+
+def _chainage() -> pl.Expr:
+    middle = 0.5 * (pl.col("from_m") + pl.col("to_m"))
+    return (
+        pl.when(pl.col("netelement_id") == "A").then(middle).when(pl.col("netelement_id") == "B").then(11500.0 - middle)
+    )
+
+
+def _found(table: pl.DataFrame) -> list[Figure]:
+    figures = []
+    for name, (begin, end, causes, _) in PLACES.items():
+        inside = table.filter(pl.col("chainage").is_between(begin, end))
+        named = inside.filter((pl.col("piece_class") == "unsuitable") & pl.col("cause").cast(pl.String).is_in(causes))
+        suitable = inside.filter(pl.col("piece_class") == "suitable").height
+        figures.append(
+            Figure(
+                f"{name}: pieces unsuitable for its cause, of {inside.height}",
+                named.height,
+                "pieces",
+                better="above",
+                target=1,
+            )
+        )
+        figures.append(Figure(f"{name}: pieces called suitable", suitable, "pieces", better="below", target=0))
+    return figures
+
+
+def _invented(table: pl.DataFrame) -> Figure:
+    clear = pl.lit(value=True)
+    for begin, end, _, _ in PLACES.values():
+        clear &= ~pl.col("chainage").is_between(begin - _REACH_M, end + _REACH_M)
+    invented = table.filter(clear & (pl.col("piece_class") == "unsuitable"))
+    return Figure("pieces unsuitable where nothing is wrong", invented.height, "pieces", better="below", target=0)
+
+
+def _predicted(out: Path) -> Figure:
+    """Pieces whose share of losses over one half of the runs lies outside the exact bounds of the other half."""
+    site, criteria = read_site(out / "trial" / "site"), LineCriteria()
+    ground_pieces = pieces_of(site, criteria.piece_m)
+    ground = Ground.of(site, ground_pieces, middles(site, ground_pieces))
+    runs = read_table(out / "tables", "runs").collect().sort("run_id")
+    passes, undetected = passes_of_runs(out / "tables", runs, ground, criteria)
+    number = pl.col("run_id").str.slice(1).cast(pl.Int64)
+    halves = [
+        piece_classes(passes.filter((number // 2) % 2 == half), undetected, ground_pieces, criteria) for half in (0, 1)
+    ]
+    both = (
+        halves[0]
+        .join(halves[1], on=["piece", "direction"], suffix="_other")
+        .filter((pl.col("passes") > 0) & (pl.col("passes_other") > 0))
+    )
+    # Both halves are samples: their bounds meet unless they are of different shares.
+    apart = (pl.col("loss_low") > pl.col("loss_high_other")) | (pl.col("loss_low_other") > pl.col("loss_high"))
+    return Figure("pieces whose halves contradict each other", both.filter(apart).height, "pieces", target=0)

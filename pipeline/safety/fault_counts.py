@@ -1,0 +1,70 @@
+"""Faults of one solution, or of a pair, and what a diagnosis made of them."""
+
+from __future__ import annotations
+
+import polars as pl
+
+from pipeline.epochs.failure_log import FailureLog
+from pipeline.figures.independent import missed_detection
+
+_OPEN_END_NS = 2**63 - 1
+
+
+def faults_of_pair(one: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
+    """Faults of either solution, as from `independent_episodes`; those that overlap are one fault of the pair.
+
+    `common`: a failure of each solution at the same time.
+    """
+    both = pl.concat([_beside(one, other), _beside(other, one)]).sort("begin")
+    end_ns, begin_ns = pl.col("t_end").to_physical().fill_null(_OPEN_END_NS), pl.col("begin").to_physical()
+    apart = begin_ns > end_ns.cum_max().shift(1)
+    return both.group_by(fault=apart.fill_null(value=False).cum_sum(), maintain_order=True).agg(
+        pl.col("begin", "t_failure").min(),
+        t_end=pl.when(pl.col("t_end").null_count() == 0).then(pl.col("t_end").max()),
+        budget_s=pl.col("budget_s").min(),
+        failed=pl.col("failed").any(),
+        with_truth=pl.col("with_truth").all(),
+        common=pl.col("common").any(),
+    )
+
+
+def _beside(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
+    """`faults`, `common` where both they and one of the others at the same time are failures."""
+    spans = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(_OPEN_END_NS)).rows()
+    met = pl.Series([_overlaps(others, *span) for span in spans], dtype=pl.Boolean)
+    return faults.with_columns(common=pl.col("failed") & met)
+
+
+def _overlaps(faults: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
+    end = pl.col("t_end").to_physical()
+    meets = (pl.col("begin").to_physical() <= last_ns) & (end.is_null() | (end >= begin_ns))
+    return faults.filter(pl.col("failed") & meets).height > 0
+
+
+def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
+    """Counts of `pipeline.safety.tally`; those of common faults only where `faults` has `common`."""
+    last, kind = int(fails.t_ns[-1]), faults.schema["begin"]
+    ends = faults.select(pl.col("begin").to_physical(), pl.col("t_end").to_physical().fill_null(last)).rows()
+    found = [_detected_ns(fails, *span) for span in ends]
+    failed, missed, judged = pl.col("failed"), pl.col("missed"), pl.col("with_truth")
+    seen = faults.with_columns(t_detected=pl.Series(found, dtype=pl.Int64).cast(kind))
+    seen = seen.with_columns(missed=missed_detection().fill_null(value=False))
+    counts = {
+        "hazards": pl.len(),
+        "failures": failed.sum(),
+        "missed": missed.sum(),
+        "failures_judged": (failed & judged).sum(),
+        "missed_judged": (missed & judged).sum(),
+    }
+    if "common" in faults.columns:
+        counts |= {"common_failures": pl.col("common").sum(), "common_missed": (pl.col("common") & missed).sum()}
+    delays = [(moment - begin) / 1e9 for moment, (begin, _) in zip(found, ends, strict=True) if moment is not None]
+    return seen.select(**counts).row(0, named=True) | {"delays_s": delays}
+
+
+def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
+    """An alarm that stands at the onset detects at once, else the first fail until the fault's end."""
+    if fails.standing_at(begin) is not None:
+        return begin
+    first = fails.first_in(begin, last + 1)
+    return None if first is None else first[0]

@@ -1,0 +1,188 @@
+"""Balises on the net elements: every so many metres, or where a list says."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from pipeline.site.tables import RawTable, typed_table
+from pipeline.survey.network import Network
+from pipeline.survey.pieces import Survey
+from pipeline.survey.sources import content_of_survey
+from pipeline.survey.tables import placed_table
+from pipeline.track.geodesy import points_of
+from pipeline.track.segments import Polyline, downhill
+from pipeline.track.survey import Track, track_of
+from schemas.errors import SiteError
+from schemas.inputs import Balises
+
+# Lists give the track's axis or the marker beside it; farther is another line, or another system of coordinates.
+_FAR_M = 10.0
+# Two tracks that differ by less in their distance cannot be told by a balise's coordinates.
+_TELLS_M = 1.5
+_SAMPLE_M = 20.0
+
+
+def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
+    """Virtual balises at whole multiples of the spacing, counted along the shortest way from the survey's start.
+
+    So the spacing holds over joints and switches; where two ways meet again it begins anew.
+    """
+    track = track_of(network.track())
+    from_start = _from_start_m(network.ends, track.length_m)
+    rows: list[dict[str, Any]] = []
+    for element, name in enumerate(track.ids):
+        at_start, at_end = from_start[network.ends[element]]
+        length = float(track.length_m[element])
+        begins = min(at_start, at_end)
+        way = np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
+        measures = way - begins if at_start <= at_end else length - (way - begins)
+        rows += [{"netelement_id": name, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
+    ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
+    return _validated(pl.DataFrame(rows, schema={"netelement_id": pl.String, "measure_m": pl.Float64}), ids)
+
+
+def _validated(table: pl.DataFrame, ids: list[str]) -> pl.DataFrame:
+    return _typed("balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual")))
+
+
+def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
+    breaches: list[str] = []
+    typed = typed_table(RawTable(place, table), "balises", breaches)
+    if typed is None:
+        raise SiteError(breaches[0])
+    return Balises.validate(typed, cast=True)
+
+
+def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
+    """Distance of each node from the start of the first element of its part of the network."""
+    count = int(ends.max()) + 1
+    pairs = np.sort(ends, axis=1)
+    order = np.lexsort((length_m, pairs[:, 1], pairs[:, 0]))
+    _, first = np.unique(pairs[order], axis=0, return_index=True)
+    kept = order[first]
+    graph = coo_array((length_m[kept], (pairs[kept, 0], pairs[kept, 1])), shape=(count, count)).tocsr()
+    found = np.full(count, np.inf)
+    for node in ends[:, 0].tolist():
+        if not np.isfinite(found[node]):
+            found = np.minimum(found, dijkstra(graph, directed=False, indices=node))
+    return found
+
+
+def balises_of_list(path: Path, network: Network, epsg: int | None, survey: Survey) -> pl.DataFrame:
+    """The balises of a table, each at its net element and measure, its coordinates, or its line kilometre.
+
+    Raises `SiteError` for a balise that no track, or more than one, can be meant for.
+    """
+    place = str(path)
+    table = placed_table(place, content_of_survey(path), epsg)
+    track = track_of(network.track())
+    if "balise_id" not in table.columns:
+        table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
+    if "kind" not in table.columns:
+        table = table.with_columns(kind=pl.lit("virtual"))
+    placer = _Placer(place, network, track, survey)
+    found = [placer.placed(row) for row in table.iter_rows(named=True)]
+    ids, measures = [one[0] for one in found], [one[1] for one in found]
+    placed = table.with_columns(
+        pl.Series("netelement_id", ids, dtype=pl.String), pl.Series("measure_m", measures, dtype=pl.Float64)
+    )
+    return _typed(place, placed)
+
+
+class _Placer:
+    """Where on the track a row of a list is."""
+
+    def __init__(self, place: str, network: Network, track: Track, survey: Survey) -> None:
+        self.place, self.network, self.track, self.survey = place, network, track, survey
+        surface = points_of(track.latitude_deg, track.longitude_deg).surface
+        inner = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:] - 1)
+        self.vertex = inner
+        self.line = Polyline(surface[inner], surface[inner + 1])
+        self.element = np.searchsorted(track.first, inner, side="right") - 1
+        self.tree, self.segment = self.line.samples
+
+    def placed(self, row: dict[str, Any]) -> tuple[str, float]:
+        given = {key for key, value in row.items() if value is not None}
+        if {"netelement_id", "measure_m"} <= given:
+            return str(row["netelement_id"]), float(row["measure_m"])
+        if {"latitude_deg", "longitude_deg"} <= given:
+            return self._at_coordinates(row)
+        if "line_km" in given:
+            return self._at_kilometre(row)
+        expected = "latitude_deg and longitude_deg (or x_m and y_m), line_km, or netelement_id and measure_m"
+        raise self._refusal(row, "has no place", expected=expected)
+
+    def _refusal(self, row: dict[str, Any], message: str, **told: str) -> SiteError:
+        return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **told)
+
+    def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
+        point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
+        near = self.tree.query_ball_point(point.surface[0], 2 * _SAMPLE_M)
+        nearest: dict[int, tuple[float, float]] = {}
+        for element in sorted({int(self.element[self.segment[sample]]) for sample in near}):
+            own = np.array([self.segment[s] for s in near if self.element[self.segment[s]] == element])
+            nearest[element] = self._foot(point, own)
+        wanted = row.get("netelement_id")
+        ranked = sorted((away, element, measure) for element, (away, measure) in nearest.items())
+        if wanted is not None:
+            ranked = [one for one in ranked if self.track.ids[one[1]] == wanted]
+        if not ranked or ranked[0][0] > _FAR_M:
+            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {_SAMPLE_M:g} m"
+            raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {_FAR_M:g} m")
+        self._tell_rival(row, ranked)
+        return self.track.ids[ranked[0][1]], ranked[0][2]
+
+    def _foot(self, point: Any, segments: np.ndarray) -> tuple[float, float]:
+        """Distance and measure of the nearest place of one element."""
+        several = point.take(np.zeros(len(segments), dtype=np.int64))
+        feet = downhill(several, self.line, segments, self.element)
+        best = int(np.argmin(feet.distance_m))
+        row = int(self.vertex[feet.segment[best]])
+        share = float(np.clip(feet.fraction[best], 0.0, 1.0))
+        low, high = self.track.measure_m[row], self.track.measure_m[row + 1]
+        return float(feet.distance_m[best]), float(low + share * (high - low))
+
+    def _tell_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
+        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + _TELLS_M]
+        nodes = set(self.network.ends[ranked[0][1]].tolist())
+        for _, other, _ in near:
+            if not nodes & set(self.network.ends[other].tolist()):
+                text = f"may as well lie on {self.track.ids[other]} as on {self.track.ids[ranked[0][1]]}"
+                self.survey.told("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
+
+    def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
+        wanted, km = row.get("netelement_id"), float(row["line_km"])
+        found = [
+            (element.name, measure)
+            for number, element in enumerate(self.network.elements)
+            if wanted in (None, element.name)
+            for measure in _measures_at(element.line_km, self.track.measure_m[self.track.vertices(number)], km)
+        ]
+        places = {name for name, _ in found}
+        if not found:
+            raise self._refusal(row, f"no track has line kilometre {km:g}", expected="a survey with line kilometres")
+        if len(places) > 1 and max(measure for _, measure in found) > 0:
+            inner = [one for one in found if one[1] > 0]
+            if len({name for name, _ in inner}) > 1:
+                remedy = "Name netelement_id in the list."
+                raise self._refusal(row, f"line kilometre {km:g} is on {', '.join(sorted(places))}", remedy=remedy)
+            found = inner
+        return found[0]
+
+
+def _measures_at(line_km: np.ndarray, measure_m: np.ndarray, km: float) -> list[float]:
+    """Where an element has a line kilometre; its first place, or none."""
+    known = np.flatnonzero(np.isfinite(line_km))
+    for low, high in itertools.pairwise(known.tolist()):
+        a, b = line_km[low], line_km[high]
+        if min(a, b) <= km <= max(a, b) and a != b:
+            share = (km - a) / (b - a)
+            return [float(measure_m[low] + share * (measure_m[high] - measure_m[low]))]
+    return []

@@ -1,0 +1,88 @@
+"""Lines of GeoJSON; of OpenStreetMap's the railways that trains run on, and where they cross without a switch."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pipeline.survey.pieces import Survey, piece_of
+from schemas.errors import SiteError
+
+# https://wiki.openstreetmap.org/wiki/Key:railway: what a train can run on today.
+_IN_USE = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "funicular", "monorail", "miniature")
+_CROSSINGS = ("railway_crossing", "tram_crossing_railway")
+_IDS = ("@id", "id", "netelement_id", "osm_id", "full_id", "name")
+
+
+def read_geojson(place: str, stem: str, data: bytes) -> Survey:
+    """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
+
+    Raises `SiteError`.
+    """
+    try:
+        features = [_feature(item) for item in json.loads(data)["features"]]
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        remedy = "Overpass exports GeoJSON under Export; its own JSON and .osm are not read."
+        told = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
+        raise SiteError(told, place=place, remedy=remedy) from None
+    survey = Survey()
+    railways = any("railway" in tags for tags, _ in features)
+    left: dict[str, int] = {}
+    for number, (tags, geometry) in enumerate(features):
+        kind = str(tags.get("railway")) if railways else "line"
+        lines = list(_lines(geometry))
+        if geometry.get("type") == "Point" and kind in (*_CROSSINGS, "switch"):
+            longitude, latitude, _ = _numbers(f"{place}: feature {number}", geometry.get("coordinates"))
+            (survey.switches_deg if kind == "switch" else survey.crossings_deg).append((latitude, longitude))
+        elif lines and (not railways or kind in _IN_USE):
+            name = next((str(tags[key]).strip() for key in _IDS if tags.get(key) not in (None, "")), stem)
+            for line in lines:
+                survey.pieces.append(_piece(f"{place}: feature {number}", name, line))
+        elif lines:
+            left[kind] = left.get(kind, 0) + 1
+    for kind, count in sorted(left.items()):
+        survey.told("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
+    return survey
+
+
+def _feature(item: Any) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Tags and geometry; some programs put tags into a property of their own. Raises TypeError."""
+    if not isinstance(item, Mapping):
+        raise TypeError("a feature is no object")
+    tags = dict(item.get("properties") or {})
+    nested = tags.get("tags")
+    tags |= nested if isinstance(nested, Mapping) else {}
+    if item.get("id") not in (None, ""):
+        tags["@id"] = item["id"]
+    geometry = item.get("geometry") or {}
+    if not isinstance(geometry, Mapping):
+        raise TypeError("a geometry is no object")
+    return tags, geometry
+
+
+def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
+    coordinates = geometry.get("coordinates")
+    if geometry.get("type") == "LineString":
+        yield coordinates
+    elif geometry.get("type") == "MultiLineString" and isinstance(coordinates, list):
+        yield from coordinates
+
+
+def _piece(place: str, name: str, line: Any) -> Any:
+    if not isinstance(line, list):
+        raise SiteError("coordinates are no list", place=place)
+    triples = [_numbers(place, point) for point in line]
+    longitude, latitude, height = zip(*triples, strict=True) if triples else ((), (), ())
+    return piece_of(place, name, {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height})
+
+
+def _numbers(place: str, point: Any) -> tuple[float, float, float | None]:
+    """Longitude, latitude and height (none where there is none)."""
+    try:
+        longitude, latitude, *height = point
+        return float(longitude), float(latitude), float(height[0]) if height and height[0] is not None else None
+    except (TypeError, ValueError):
+        raise SiteError(
+            "a coordinate cannot be read", place=place, found=repr(point)[:60], expected="[longitude, latitude]"
+        ) from None

@@ -1,0 +1,109 @@
+"""The story from surveys to a site."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipeline.site.checks import GAP_LIMIT_M, remarks
+from pipeline.site.describe import without_balises
+from pipeline.storage.writing import replace_files
+from pipeline.survey.balises import balises_every, balises_of_list
+from pipeline.survey.doubts import doubts
+from pipeline.survey.network import Network, make_network
+from pipeline.survey.pieces import Survey
+from pipeline.survey.sources import read_surveys
+from pipeline.survey.trace import clean_traces
+from schemas.config import Configuration, Vehicle
+from schemas.errors import SiteError, UsageError
+from schemas.run import Site
+
+JOIN_M = 0.05
+_FILES = ("track", "links", "balises", "route")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a site is made of: balises every so many metres or of a list; ends this near [m] meet."""
+
+    surveys: list[Path]
+    spacing_m: float | None = None
+    balise_list: Path | None = None
+    epsg: int | None = None
+    join_m: float = JOIN_M
+    flat: bool = False
+
+
+def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: float, flat: bool) -> Wish:
+    """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
+    words = [str(path) for path in surveys]
+    spacing: float | None = None
+    if balises is not None and balises.startswith("every"):
+        text = balises.removeprefix("every").strip(" =:")
+        if not text:
+            text = next((word for word in words if _number(word) is not None and not Path(word).exists()), "")
+            surveys = [path for path in surveys if str(path) != text]
+        spacing = _number(text.removesuffix("m"))
+        if spacing is None or not 1.0 <= spacing <= 1e6:
+            raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
+    if not 0.0 <= join_m <= GAP_LIMIT_M:
+        raise UsageError("is no reach", place=f"--join {join_m:g}", expected=f"0 to {GAP_LIMIT_M:g} m")
+    if not surveys:
+        raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
+    return Wish(surveys, spacing, None if spacing or balises is None else Path(balises), epsg, join_m, flat)
+
+
+def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
+    """The site of surveys, with findings of the survey and of the site itself. `track` has `line_km` besides.
+
+    Raises `SiteError`.
+    """
+    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config))
+    network = make_network(survey, wish.join_m)
+    if not network.elements:
+        raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
+    if wish.flat:
+        for element in network.elements:
+            element.height_m[:] = np.nan
+    balises = _balises(wish, network, survey)
+    track = network.track()
+    found = remarks(track, network.links, balises, None, {})
+    if found.breaches:
+        raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))
+    findings = (*survey.findings, *doubts(network), *found.findings, *without_balises(balises))
+    return Site(track, found.links, balises, None, findings)
+
+
+def _balises(wish: Wish, network: Network, survey: Survey) -> pl.DataFrame | None:
+    if wish.spacing_m is not None:
+        table = balises_every(network, wish.spacing_m)
+        return table if table.height else None
+    return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey)
+
+
+def write_made(site: Site, page: str, out: Path, force: bool) -> None:
+    """The site as Parquet and its page; a site that is there stays, unless `force`. Raises `UsageError`."""
+    there = [name for name in _FILES for suffix in ("parquet", "csv", "geojson") if (out / f"{name}.{suffix}").exists()]
+    if there and not force:
+        raise UsageError("holds a site", place=str(out), remedy="Name another folder, or replace it with --force.")
+    contents = {f"{name}.{suffix}": None for name in _FILES for suffix in ("csv", "geojson", "parquet")}
+    tables = {"track": site.track, "links": site.links, "balises": site.balises}
+    written = {f"{name}.parquet": _parquet(table) for name, table in tables.items() if table is not None}
+    replace_files(out, {**contents, **written, "site.html": page.encode()}, marker="track.parquet")
+
+
+def _parquet(table: pl.DataFrame) -> bytes:
+    buffer = io.BytesIO()
+    table.write_parquet(buffer)
+    return buffer.getvalue()
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

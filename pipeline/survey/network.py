@@ -1,0 +1,232 @@
+"""Pieces of line to net elements and net relations: cut where lines share a node, linked by the angle there."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import polars as pl
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from pipeline.site.checks import outward
+from pipeline.survey.pieces import COLUMNS, Piece, Survey
+from pipeline.track.geodesy import points_of
+from pipeline.track.survey import geometric_measures_m, track_of
+from schemas.arrays import Floats, Ints
+from schemas.enums import Navigability
+from schemas.inputs import Links
+
+# OpenStreetMap writes seven decimals of a degree: equal positions are the same node.
+_NODE_DEG = 1e-7
+_SAME_PLACE_M = 0.05
+# A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
+# tram curve of 20 m. At a switch the branches lie within some 12 degrees (1:4.5); maps draw it up to 45.
+_MOST_AT_SWITCH_DEG = 45.0
+_MOST_AT_JOINT_DEG = 90.0
+
+
+@dataclass(frozen=True)
+class Network:
+    """Net elements with the nodes at their two ends, and the links between ends."""
+
+    elements: list[Piece]
+    ends: Ints
+    links: pl.DataFrame
+
+    def track(self) -> pl.DataFrame:
+        """The track table, with `line_km` beside the contract's columns."""
+        return track_table(self.elements)
+
+
+def make_network(survey: Survey, join_m: float) -> Network:
+    """Net elements of all pieces; ends within `join_m` of a vertex of another piece meet it.
+
+    What is doubtful about it is added to the survey's findings.
+    """
+    pieces = [piece for piece in survey.pieces if len(piece) > 1]
+    if (short := len(survey.pieces) - len(pieces)) > 0:
+        survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
+    nodes = _nodes(pieces, join_m)
+    pieces, nodes = _without_doubles(pieces, nodes, survey)
+    switches = _nodes_at(pieces, nodes, survey.switches_deg)
+    crossings = _crossings(pieces, nodes, switches, survey)
+    elements, ends = _cut(pieces, nodes, crossings)
+    links = _links(elements, ends, crossings, switches, survey) if elements else Links.create_empty()
+    return Network(elements, ends, links)
+
+
+def track_table(elements: list[Piece]) -> pl.DataFrame:
+    """Points of the elements in order, measures along their geometry; null for what is not known."""
+    parts = []
+    for piece in elements:
+        measure = geometric_measures_m(piece.latitude_deg, piece.longitude_deg, piece.height_m)
+        columns = {name: pl.Series(getattr(piece, name)).fill_nan(None) for name in COLUMNS}
+        parts.append(pl.DataFrame({"netelement_id": [piece.name] * len(piece), "measure_m": measure, **columns}))
+    return pl.concat(parts)
+
+
+def _nodes(pieces: list[Piece], join_m: float) -> list[Ints]:
+    """A number per point; points that are one node have the same."""
+    if not pieces:
+        return []
+    latitude = np.concatenate([piece.latitude_deg for piece in pieces])
+    longitude = np.concatenate([piece.longitude_deg for piece in pieces])
+    last = np.cumsum([len(piece) for piece in pieces])
+    keys = np.rint(np.column_stack([latitude, longitude]) / _NODE_DEG).astype(np.int64)
+    node = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    piece_of = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    surface = points_of(latitude, longitude).surface
+    ends = np.unique(np.concatenate([last - [len(piece) for piece in pieces], last - 1]))
+    pairs = list(_near_ends(surface, piece_of, ends, join_m))
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    count = int(node.max()) + 1
+    same = coo_array((np.ones(len(rows)), (node[rows], node[columns])), shape=(count, count))
+    joined = connected_components(same, directed=False)[1][node]
+    return [np.asarray(part) for part in np.split(joined, last[:-1])]
+
+
+def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> Iterator[tuple[int, int]]:
+    """Each end with the nearest vertex of another piece within reach, or with an end of its own (a ring)."""
+    tree = cKDTree(surface)
+    at_end = np.zeros(len(surface), dtype=bool)
+    at_end[ends] = True
+    for end, near in zip(ends, tree.query_ball_point(surface[ends], join_m), strict=True):
+        others = [row for row in near if row != end and (piece_of[row] != piece_of[end] or at_end[row])]
+        if others:
+            way = np.linalg.norm(surface[others] - surface[end], axis=1)
+            yield int(end), others[int(np.argmin(way))]
+
+
+def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> tuple[list[Piece], list[Ints]]:
+    """Each stretch between two nodes once: the first line that has it keeps it."""
+    seen: set[tuple[int, int]] = set()
+    kept, kept_nodes = [], []
+    for piece, own in zip(pieces, nodes, strict=True):
+        edges = [(min(a, b), max(a, b)) for a, b in zip(own[:-1].tolist(), own[1:].tolist(), strict=True)]
+        new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
+        doubled = sum(edge in seen for edge in edges)
+        seen.update(edges)
+        if doubled:
+            text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
+            survey.told("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
+        for first, last in _runs(new):
+            kept.append(piece.take(np.arange(first, last + 1)))
+            kept_nodes.append(own[first : last + 1])
+    return kept, kept_nodes
+
+
+def _runs(wanted: np.ndarray) -> Iterator[tuple[int, int]]:
+    """First and one beyond the last of each unbroken row of true values."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(np.int64), [0]])))
+    yield from zip(turns[::2].tolist(), turns[1::2].tolist(), strict=True)
+
+
+def _crossings(pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey) -> set[int]:
+    """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
+
+    Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
+    """
+    if not pieces:
+        return set()
+    inner = np.concatenate([own[1:-1] for own in nodes])
+    at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
+    through, count = np.unique(inner, return_counts=True)
+    told = _nodes_at(pieces, nodes, survey.crossings_deg)
+    by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - switches
+    for node in sorted(by_form - told):
+        names = sorted({piece.name for piece, own in zip(pieces, nodes, strict=True) if node in own})
+        text = "cross where neither ends: taken as a crossing without a switch"
+        remedy = "Where trains turn off (a slip), name the node `railway=switch`, or end the lines there."
+        survey.told("note", f"track: {', '.join(names)}", text, remedy)
+    return told | by_form
+
+
+def _nodes_at(pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[float, float]]) -> set[int]:
+    """The nodes at places (latitude, longitude)."""
+    if not places_deg:
+        return set()
+    latitude = np.concatenate([piece.latitude_deg for piece in pieces])
+    longitude = np.concatenate([piece.longitude_deg for piece in pieces])
+    wanted = points_of(*np.array(places_deg).T).surface
+    row = cKDTree(points_of(latitude, longitude).surface).query(wanted, distance_upper_bound=_SAME_PLACE_M)[1]
+    return set(np.concatenate(nodes)[row[row < len(latitude)]].tolist())
+
+
+def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[list[Piece], Ints]:
+    """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it."""
+    count = np.bincount(np.concatenate(nodes)) if nodes else np.zeros(0, dtype=np.int64)
+    number: dict[str, int] = {}
+    parts: dict[str, int] = {}
+    found: list[tuple[Piece, int, int]] = []
+    for piece, own in zip(pieces, nodes, strict=True):
+        inner = [row for row in range(1, len(own) - 1) if count[own[row]] > 1 and int(own[row]) not in crossings]
+        cuts = [0, *inner, len(own) - 1]
+        parts[piece.name] = parts.get(piece.name, 0) + len(cuts) - 1
+        for first, last in itertools.pairwise(cuts):
+            found.append((piece.take(np.arange(first, last + 1)), int(own[first]), int(own[last])))
+    elements, ends = [], []
+    for piece, first, last in found:
+        number[piece.name] = number.get(piece.name, 0) + 1
+        name = piece.name if parts[piece.name] == 1 else f"{piece.name}.{number[piece.name]}"
+        elements.append(replace(piece, name=name))
+        ends.append((first, last))
+    return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
+
+
+def _links(elements: list[Piece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
+    """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
+    arms: dict[int, list[tuple[int, int]]] = {}
+    for element, pair in enumerate(ends.tolist()):
+        for position, node in enumerate(pair):
+            arms.setdefault(node, []).append((element, position))
+    directions = outward(track_of(track_table(elements)))
+    names = [element.name for element in elements]
+    rows: list[tuple[str, int, str, int, str]] = []
+    for node, meeting in arms.items():
+        units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
+        pairs = _navigable(units, node in crossings, node in switches)
+        for one, other in itertools.combinations(range(len(meeting)), 2):
+            way = Navigability.BOTH if (one, other) in pairs else Navigability.NONE
+            (a, a_end), (b, b_end) = meeting[one], meeting[other]
+            rows.append((names[a], a_end, names[b], b_end, way.value))
+        if node not in crossings | switches:
+            _tell_of_node([names[element] for element, _ in meeting], pairs, survey)
+    return Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
+
+
+def _navigable(units: list[Floats], crossing: bool, switch: bool) -> set[tuple[int, int]]:
+    """Pairs of arms that a train can take; at a crossing each arm goes on straight only.
+
+    Two arms that meet two are a crossing, unless the survey names a switch (a slip) there.
+    """
+    turns = {
+        (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
+        for one, other in itertools.combinations(range(len(units)), 2)
+    }
+    most = _MOST_AT_JOINT_DEG if len(units) == 2 else _MOST_AT_SWITCH_DEG
+    possible = {pair for pair, turn in turns.items() if turn <= most}
+    ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
+    two_by_two = ways == [2, 2, 2, 2]
+    if not (crossing or (two_by_two and not switch)):
+        return possible
+    straight: set[tuple[int, int]] = set()
+    for pair in sorted(possible, key=lambda pair: turns[pair]):
+        if not {arm for taken in straight for arm in taken} & set(pair):
+            straight.add(pair)
+    return straight
+
+
+def _tell_of_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+    place = f"links: {', '.join(names)}"
+    lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
+    if lonely:
+        text = f"no train gets from {', '.join(lonely)} to another of these: the corner is too sharp"
+        survey.told("warning", place, text, "Mend the survey there, or the relation.")
+    if len(names) > 3:
+        kind = "a crossing without a switch" if len(pairs) == len(names) / 2 else "switches, by their angles"
+        text = f"{len(names)} ends meet at one node, which the survey does not name: taken as {kind}"
+        survey.told("note", place, text, "Name the node `railway=switch` or `railway=railway_crossing`.")

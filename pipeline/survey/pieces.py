@@ -1,0 +1,100 @@
+"""Pieces of line as a survey holds them, before anything is cut or joined."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from schemas.arrays import Floats, Ints
+from schemas.errors import SiteError
+from schemas.run import Finding
+
+# A survey of 100 MB holds some two million points: more is no line that a person checks.
+MOST_BYTES = 100_000_000
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Points in order along one line: degrees, metres, kilometres of the line; NaN where not known.
+
+    `name` is the source's own id. `recorded`: by a vehicle that stood, came back or passed twice.
+    """
+
+    name: str
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    line_km: Floats
+    sigma_m: Floats
+    recorded: bool = False
+
+    def __len__(self) -> int:
+        return len(self.latitude_deg)
+
+    def take(self, rows: Ints) -> Piece:
+        """Some of the points."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+
+
+COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")
+
+
+@dataclass
+class Survey:
+    """What the files hold; places are latitude and longitude: `crossings_deg` where tracks cross without a switch,
+    `switches_deg` where the survey names one.
+    """
+
+    pieces: list[Piece] = field(default_factory=list)
+    crossings_deg: list[tuple[float, float]] = field(default_factory=list)
+    switches_deg: list[tuple[float, float]] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    def add(self, other: Survey) -> None:
+        self.pieces += other.pieces
+        self.crossings_deg += other.crossings_deg
+        self.switches_deg += other.switches_deg
+        self.findings += other.findings
+
+    def told(self, severity: str, place: str, message: str, remedy: str = "") -> None:
+        self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
+
+
+def piece_of(place: str, name: str, columns: Mapping[str, Iterable[float | None]], recorded: bool = False) -> Piece:
+    """A piece whose positions are places on earth, without points that repeat the one before.
+
+    Raises `SiteError` where a position is none.
+    """
+    known = {key: np.array(list(values), dtype=np.float64) for key, values in columns.items()}
+    count = len(known["latitude_deg"])
+    arrays = {key: known.get(key, np.full(count, np.nan)) for key in COLUMNS}
+    latitude, longitude = arrays["latitude_deg"], arrays["longitude_deg"]
+    height = arrays["height_m"]
+    wrong = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | (height < -1_000) | (height > 10_000)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise SiteError(
+            f"point {row + 1} of {name} is no place on earth",
+            place=place,
+            found=f"latitude {latitude[row]:g}, longitude {longitude[row]:g}, height {height[row]:g}",
+            expected="degrees of WGS 84, or x and y with their EPSG code",
+            remedy="Look whether latitude and longitude are exchanged.",
+        )
+    moved = np.append(True, (np.diff(latitude) != 0) | (np.diff(longitude) != 0)) if count else np.zeros(0, bool)
+    return Piece(name, **arrays, recorded=recorded).take(np.flatnonzero(moved))
+
+
+def with_own_names(pieces: list[Piece]) -> list[Piece]:
+    """Each name once: the second of a name gets `#2`, in the order of the files."""
+    taken: set[str] = set()
+    named = []
+    for piece in pieces:
+        name, number = piece.name, 1
+        while name in taken:
+            number += 1
+            name = f"{piece.name}#{number}"
+        taken.add(name)
+        named.append(replace(piece, name=name))
+    return named

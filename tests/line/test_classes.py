@@ -1,0 +1,167 @@
+"""Classes of pieces: known bad places are found with their causes, and nothing good is said that was not judged."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from pipeline.line.classes import passes_needed, piece_classes
+from schemas.line import LineCriteria
+from schemas.run import Site
+from tests.line.tables import (
+    CRITERIA,
+    PLACES,
+    chainage,
+    epochs_of,
+    ground_of_line,
+    line_site,
+    passes_over,
+)
+
+RUNS = 84  # 42 in each direction
+NO_ERRORS = pl.DataFrame(schema={"piece": pl.Int64, "largest_undetected_m": pl.Float64})
+
+
+def classes(passes: pl.DataFrame, site: Site, criteria: LineCriteria = CRITERIA) -> pl.DataFrame:
+    pieces = ground_of_line(site, criteria).pieces
+    return piece_classes(passes, NO_ERRORS, pieces, criteria).with_columns(
+        chainage=chainage(pieces), word=pl.col("piece_class").cast(pl.String), why=pl.col("cause").cast(pl.String)
+    )
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return line_site()
+
+
+@pytest.fixture(scope="module")
+def passes(site: Site) -> pl.DataFrame:
+    return passes_over([epochs_of(number) for number in range(RUNS)], site)
+
+
+@pytest.fixture(scope="module")
+def table(passes: pl.DataFrame, site: Site) -> pl.DataFrame:
+    return classes(passes, site)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_bad_places_are_found_with_their_causes(name: str, table: pl.DataFrame) -> None:
+    begin, end, causes = PLACES[name]
+    inner = table.filter(pl.col("chainage").is_between(begin, end) & (pl.col("netelement_id") != "P"))
+    found = inner.filter((pl.col("word") == "unsuitable") & pl.col("why").is_in(list(causes)))
+    assert inner.filter(pl.col("word") == "suitable").is_empty()
+    assert found["direction"].n_unique() == 2
+    if name != "roof":  # an alarm counts where it begins
+        assert found.height == inner.height
+
+
+def test_no_bad_place_is_invented(table: pl.DataFrame) -> None:
+    # A span reaches from one epoch to the next, 25 m, a wrong claim 30 m farther, a piece is 50 m.
+    far = pl.lit(value=True)
+    for begin, end, _ in PLACES.values():
+        far &= ~pl.col("chainage").is_between(begin - 80.0, end + 80.0)
+    clear = table.filter(far & pl.col("chainage").is_between(100.0, 5900.0))
+    assert clear.filter(pl.col("word") == "unsuitable").is_empty()
+    ringing = clear.filter(pl.col("word") != "suitable")
+    assert set(ringing["why"]) == {"after_alarm"}
+    assert ringing["chainage"].is_between(2800.0, 3250.0).all()
+
+
+def test_a_position_on_a_wrong_track_condemns_both_tracks(table: pl.DataFrame) -> None:
+    beside = table.filter((pl.col("netelement_id") == "P") & pl.col("chainage").is_between(5025.0, 5275.0))
+    assert set(beside["word"]) == {"unsuitable"}
+    assert set(beside["why"]) == {"wrong_track"}
+
+
+def test_halves_predict_each_other(passes: pl.DataFrame, site: Site) -> None:
+    number = pl.col("run_id").str.slice(1).cast(pl.Int64)
+    one, other = (classes(passes.filter((number // 2) % 2 == half), site) for half in (0, 1))
+    both = one.join(other, on=["piece", "direction"], suffix="_2").filter(pl.min_horizontal("passes", "passes_2") > 0)
+    outside = ~pl.col("loss_share").is_between("loss_low_2", "loss_high_2")
+    assert both.height > 150
+    # 95 % bounds, each piece once; edges of bad places are hit by some phases of the epochs only.
+    assert both.filter(outside).height <= 0.05 * both.height
+
+
+def test_more_passes_never_widen_a_bound(passes: pl.DataFrame, table: pl.DataFrame, site: Site) -> None:
+    twice = classes(pl.concat([passes, passes.with_columns(run_id=pl.col("run_id") + "b")]), site)
+    width = pl.col("loss_high") - pl.col("loss_low")
+    before, after = (frame.filter(pl.col("passes") > 0).select(width).to_series() for frame in (table, twice))
+    assert (after < before).all()
+
+
+def test_a_right_pass_never_raises_and_a_lost_one_never_lowers_a_bound(site: Site) -> None:
+    good = [epochs_of(number, (), falling=False) for number in range(8)]
+    bad = [epochs_of(number, ("cutting",), falling=False) for number in range(8, 12)]
+    several = [classes(passes_over(runs, site), site) for runs in (good, good + good[:1], good + bad[:1])]
+    at = (pl.col("chainage") == 625.0) & (pl.col("direction") == "growing")
+    first, more_right, more_lost = (table.row(by_predicate=at, named=True) for table in several)
+    assert more_right["loss_high"] < first["loss_high"]
+    assert more_lost["loss_low"] > first["loss_low"]
+
+
+def test_unknown_epochs_make_nothing_suitable(site: Site) -> None:
+    runs = [epochs_of(number, ()).with_columns(judgement=pl.lit("unknown")) for number in range(2)]
+    many = pl.concat(passes_over(runs, site).with_columns(run_id=pl.lit(str(number))) for number in range(RUNS))
+    table = classes(many, site)
+    assert set(table["word"]) == {"unknown"}
+    assert table["passes"].sum() == 0
+    assert "not_judged" in set(table["why"])
+
+
+def test_positions_whose_place_nobody_knows_say_nothing(site: Site) -> None:
+    lost = pl.lit(None, pl.Float64)
+    runs = [epochs_of(number).with_columns(error_low_m=lost, error_high_m=lost) for number in range(10)]
+    runs = [run.with_columns(judgement=pl.lit("unknown")) for run in runs]
+    assert passes_over(runs, site).is_empty()
+
+
+def test_one_wrong_position_in_use_is_enough(site: Site) -> None:
+    good = passes_over([epochs_of(77, (), falling=False)], site)
+    many = pl.concat(good.with_columns(run_id=pl.lit(f"good{number}")) for number in range(1000))
+    wrong = passes_over([epochs_of(77, ("facade",), falling=False)], site)
+    # B is surveyed against the line.
+    table = classes(pl.concat([many, wrong]), site).filter(pl.col("direction") == "falling")
+    inner = table.filter(pl.col("chainage").is_between(4000.0, 4100.0))
+    assert set(inner["word"]) == {"unsuitable"}
+    assert set(inner["wrong_in_use"]) == {1}
+    assert set(inner["passes"]) == {1001}
+
+
+def test_the_place_is_the_trains_not_the_positions(site: Site) -> None:
+    """A position 500 m ahead that is not in use: lost where the train was, nothing where it claimed to be."""
+    shifted = [
+        run.with_columns(
+            path_m=pl.when(at).then(pl.col("path_m") + 500.0).otherwise("path_m"),
+            error_low_m=pl.when(at).then(499.0).otherwise("error_low_m"),
+            error_high_m=pl.when(at).then(503.0).otherwise("error_high_m"),
+            judgement=pl.when(at).then(pl.lit("wrong")).otherwise("judgement"),
+            in_use=~at,
+        )
+        for run in (epochs_of(number, (), falling=False) for number in range(0, 80, 2))
+        for at in [pl.col("path_m").is_between(1000.0, 1100.0)]
+    ]
+    table = classes(passes_over(shifted, site), site).filter(pl.col("direction") == "growing")
+    there = table.filter(pl.col("chainage").is_between(1025.0, 1075.0))
+    assert there.select("word", "why").unique().rows() == [("unsuitable", "wrong")]
+    assert set(table.filter(pl.col("chainage").is_between(1400.0, 1700.0))["word"]) == {"suitable"}
+
+
+def test_passes_of_one_day_count_as_one_by_option(passes: pl.DataFrame, site: Site) -> None:
+    table = classes(passes, site, LineCriteria(independent="day"))
+    # 84 runs an hour apart lie on four days.
+    assert table["passes"].max() == 4
+    assert "suitable" not in set(table["word"])
+
+
+@pytest.mark.parametrize(("bad", "number", "needed"), [(0, 0, 36), (0, 30, 6), (0, 50, 0), (1, 0, 54)])
+def test_passes_needed(bad: int, number: int, needed: int) -> None:
+    """1 - 0.025^(1/36) = 0.0974 keeps 10 %, 1 - 0.025^(1/35) = 0.10003 does not."""
+    assert passes_needed(bad, number, CRITERIA) == needed
+
+
+def test_hours_may_be_asked_for(passes: pl.DataFrame, site: Site) -> None:
+    table = classes(passes, site, LineCriteria(hours_least=24))
+    assert "suitable" not in set(table["word"])
+    # Runs of one direction start every second hour.
+    assert set(table.filter(pl.col("why") == "few_hours")["hours"]) == {12}
