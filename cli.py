@@ -16,11 +16,10 @@ import typer
 
 if TYPE_CHECKING:
     from pipeline.campaign import Summary
-    from pipeline.safety.sensitivity import Replay
     from schemas.config import Configuration, Vehicle
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
-_SHOWN_RUNS = 25
+_SHOWN_ELEMENTS = 25
 
 
 def _examples(*lines: str) -> str:
@@ -30,9 +29,9 @@ def _examples(*lines: str) -> str:
 
 app = typer.Typer(
     name="balise",
-    help="Replays recorded train journeys and says whether satellite positioning could have replaced balises.",
-    epilog="Exit status: 0 all runs ok; 1 some run failed or partial; 2 bad usage, configuration or site; "
-    "3 a defect of the program; 129, 130 and 143 after an interruption. --debug, anywhere, shows tracebacks.",
+    help="Replay recorded train journeys and judge whether satellite positioning could have replaced balises.",
+    epilog="Exit status: 0 ok; 1 a run failed or is partial, or results differ; 2 wrong usage, configuration or site; "
+    "3 defect of the program; 129, 130, 143 interrupted. --debug shows the traceback of an error.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
@@ -54,27 +53,37 @@ def _here(value: Any) -> Any:
     return value
 
 
-Site = Annotated[str, typer.Option("--site", help="Folder with track, links, balises, route.")]
-Out = Annotated[str, typer.Option("--out", help="Where the tables go: a folder or an address.")]
+Site = Annotated[
+    str, typer.Option("--site", help="Site: a folder with track, links, balises and route, or a GeoJSON file.")
+]
+Out = Annotated[str, typer.Option("--out", help="Result to write: a folder or an address.")]
 OutFolder = Annotated[Path, typer.Option("--out", callback=_here, help="Folder to write.")]
 VehicleFile = Annotated[Path | None, typer.Option("--vehicle", callback=_here, help="Vehicle file (TOML).")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", callback=_here, help="Configuration file (TOML).")]
 RouteFiles = Annotated[
     Path | None,
-    typer.Option("--route", callback=_here, help="A route for all runs, or a folder with RUN.csv or RUN.parquet."),
+    typer.Option(
+        "--route", callback=_here, help="Known route: a file for all runs, or a folder with RUN.csv or RUN.parquet."
+    ),
 ]
 FoundRoutes = Annotated[
     Path | None,
-    typer.Option("--write-route", callback=_here, help="Folder for the routes found, doubtful elements marked."),
+    typer.Option(
+        "--write-route",
+        callback=_here,
+        help="Folder for the route found of each run; doubtful net elements are marked.",
+    ),
 ]
 ResultFolder = Annotated[Path, typer.Argument(callback=_here, help="A result of `balise replay`.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")]
-Json = Annotated[bool, typer.Option("--json", help="The result as JSON on standard output.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @app.callback(invoke_without_command=True)
 def _about(
-    version: Annotated[bool, typer.Option("--version", help="Version of the program and of its tables.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version of the program and of its tables.")
+    ] = False,
 ) -> None:
     if version:
         from schemas.version import SOFTWARE
@@ -90,27 +99,32 @@ def _about(
     )
 )
 def replay(
-    runs: Annotated[list[str], typer.Argument(help="Logs, run folders, folders of runs, globs, addresses.")],
+    runs: Annotated[
+        list[str], typer.Argument(help="Runs: logs, run folders, folders of runs, glob patterns or addresses.")
+    ],
     site: Site,
     out: Out,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
     write_route: FoundRoutes = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
-    scheduler: Annotated[str | None, typer.Option(help="Dask scheduler (tcp://host:port).")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replay complete runs again.")] = False,
-    time_limit: Annotated[float, typer.Option(min=0.1, help="Seconds after which a run is given up.")] = 3600.0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
+    scheduler: Annotated[str | None, typer.Option(help="Run on this Dask cluster (tcp://host:port).")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Also replay runs that are already complete.")] = False,
+    time_limit: Annotated[
+        float, typer.Option(min=0.1, help="Seconds that one run may take; a slower run fails.")
+    ] = 3600.0,
     undetected: Annotated[
-        bool, typer.Option("--undetected", help="Also the largest error that no monitor would have noticed.")
+        bool, typer.Option("--undetected", help="Also compute the largest error that no monitor would have noticed.")
     ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
     ] = False,
 ) -> None:
-    """Replay recorded runs on a site: hazards, passages, alarms, epochs and runs as tables."""
+    """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
+    from pipeline.campaign.ending import show_summary
     from pipeline.campaign.progress import watches
     from pipeline.results.manifest import settings_files
 
@@ -132,10 +146,10 @@ def replay(
         # A terminal that was closed takes no more words.
         with contextlib.suppress(OSError):
             if interrupted.summary is not None:
-                _show_summary(interrupted.summary, out, quiet, as_json)
-            print("balise: interrupted; the same command goes on from here", file=sys.stderr)
+                show_summary(interrupted.summary, out, quiet, as_json)
+            print("balise: interrupted; repeat the command to continue", file=sys.stderr)
         raise typer.Exit(128 + interrupted.signum) from None
-    _show_summary(summary, out, quiet, as_json)
+    show_summary(summary, out, quiet, as_json)
     raise typer.Exit(_status_of(summary))
 
 
@@ -147,10 +161,10 @@ def replay(
 )
 def dictionary(
     as_json: Json = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="As one Markdown page.")] = False,
-    table: Annotated[str | None, typer.Option(help="One table only.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print as one Markdown page.")] = False,
+    table: Annotated[str | None, typer.Option(help="Show this table only.")] = None,
 ) -> None:
-    """Every table with its columns, units and meaning, and every key of the configuration."""
+    """List every table with its columns, units and meaning, and every key of the configuration."""
     from schemas.dictionary import dictionary_frame, dictionary_markdown, settings_frame
 
     if markdown:
@@ -177,7 +191,7 @@ def dictionary(
 )
 def demo(
     out: OutFolder = Path("demo-out"),
-    seed: Annotated[int | None, typer.Option(help="Another trial than the usual one.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the trial; another seed gives other noise.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
@@ -224,7 +238,9 @@ def synth(
     )
 )
 def safety(
-    out: Annotated[str | None, typer.Argument(help="A result of `balise replay`, for what it measured.")] = None,
+    out: Annotated[
+        str | None, typer.Argument(help="Result of `balise replay` to assess; without it: the budget only.")
+    ] = None,
     config: ConfigFile = None,
     logs: Annotated[
         list[str] | None,
@@ -232,18 +248,23 @@ def safety(
     ] = None,
     site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
     vehicle: VehicleFile = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Safety budget with its errata; of a result, what it was made from and what it measured, each figure with bounds.
+    """Print the safety budget and its errata; for a result also its sources and each measured figure with bounds.
 
-    The sensitivity to service levels comes from the tables. That to `failure_limit_m` and `evidence_factor` needs the
-    logs: with --logs and --site they are replayed once per value.
+    How the verdict depends on the service level is read from the tables. With --logs and --site the logs are replayed
+    once per value of `failure_limit_m` and `evidence_factor`, to show how the verdict depends on these.
     """
     if out is not None:
-        _assess(out, config, _replay_again(logs or [], site, vehicle, jobs), as_json)
+        from pipeline.campaign.replayed_again import again
+        from pipeline.safety.assessment import assess, show
+
+        settings = None if config is None else _configuration(config)
+        replay_again = again(logs or [], site, _vehicle(vehicle), jobs or os.cpu_count() or 1)
+        show(assess(out, settings, replay_again), as_json)
         return
-    from pipeline.results.terminal import show_table
+    from pipeline.results.terminal import show_tables
     from pipeline.safety import safety_tables
 
     settings = _configuration(config)
@@ -251,9 +272,7 @@ def safety(
     if as_json:
         _print_json(tables)
         return
-    for name, table in tables.items():
-        show_table(table, name)
-        print()
+    show_tables(tables)
 
 
 @app.command(
@@ -267,12 +286,15 @@ def claim(
     profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
     site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
     front_ahead: Annotated[
-        float, typer.Option("--front-ahead", metavar="METRES", help="Front end ahead of the balise antenna.")
+        float,
+        typer.Option("--front-ahead", metavar="METRES", help="Distance of the front end ahead of the balise antenna."),
     ] = 0.0,
-    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write every column; - for output.")] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write all columns as CSV; `-` is standard output.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """What the recorded runs show of published requirements for train localisation: met, not met or not shown."""
+    """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.claim import claim as hold
     from pipeline.claim import for_reading, load_profile, read_areas
     from pipeline.results.answer_files import write_csv
@@ -303,28 +325,25 @@ def claim(
 def inspect(
     path: Annotated[str, typer.Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
     result: Annotated[
-        str | None, typer.Option("--result", help="Runs over the site, for what they say of its survey.")
+        str | None, typer.Option("--result", help="Result of runs on this site, to check its survey.")
     ] = None,
-    site: Annotated[str | None, typer.Option("--site", help="Site to hold a log against.")] = None,
+    site: Annotated[str | None, typer.Option("--site", help="Site to compare a log with.")] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """What a log, a site or a result holds, and what is remarkable in it."""
+    """Describe a log, a site or a result, and list what needs attention."""
     from pipeline.results.inspection import STARTING_CONFIG, inspect_path
-    from pipeline.results.terminal import show_table
+    from pipeline.results.terminal import show_tables
 
     settings = _configuration(config)
     tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
     if as_json:
         _print_json(tables)
     else:
-        for name, table in tables.items():
-            if name == STARTING_CONFIG:  # to be saved, so without a frame
-                print("\n".join(table["toml"]))
-                continue
-            show_table(table, name)
-            print()
+        show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
+        if STARTING_CONFIG in tables:  # to be saved, so without a frame
+            print("\n".join(tables[STARTING_CONFIG]["toml"]))
     raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
@@ -340,7 +359,7 @@ def inject(
     site: Annotated[str | None, typer.Option("--site", help="Site, for faults along its track.")] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Add a known fault to a recorded run, so that detection is measured on real noise."""
+    """Add a known fault to a recorded run, to measure detection on real noise."""
     from datasets.inject import inject_all, load_faults
     from datasets.trial import write_run_as
     from pipeline.ingest import read_run
@@ -356,7 +375,11 @@ def inject(
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "balise undetected monday.mcap --site line9 --out worst --balise VB07",
+    )
+)
 def undetected(
     run: Annotated[str, typer.Argument(help="A recorded run.")],
     site: Site,
@@ -364,11 +387,13 @@ def undetected(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
-    balise: Annotated[str | None, typer.Option(help="Where this balise is passed; not set: at the end.")] = None,
-    at_s: Annotated[float | None, typer.Option(help="So many seconds after the first epoch.")] = None,
-    behind: Annotated[bool, typer.Option("--behind", help="Behind the train, not ahead.")] = False,
+    balise: Annotated[
+        str | None, typer.Option(help="Place: where the run passes this balise; default: its end.")
+    ] = None,
+    at_s: Annotated[float | None, typer.Option(help="Place: this many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, typer.Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
-    """The largest fault that no monitor would have noticed at one place of a run, as a fault to inject."""
+    """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
     from datasets.undetected import largest_fault, write_fault
     from pipeline.ingest import read_run
     from pipeline.site.read import read_site
@@ -384,7 +409,7 @@ def undetected(
     )
     print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
     print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
-    print(f"To see for yourself: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
+    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @app.command(
@@ -415,7 +440,7 @@ def convert(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a stream or solution that the run has.")] = False,
 ) -> None:
-    """Make a run of receiver logs, or add streams to one."""
+    """Convert receiver logs to a run, or add streams to a run."""
     from datasets.recordings import known_recording
     from datasets.trial import write_run_as
     from pipeline.ingest import read_run
@@ -481,7 +506,7 @@ def make_a_site(
     if as_json:
         _print_json({"elements": elements, "findings": findings, "balises": site.balises})
         return
-    show_table(elements.head(_SHOWN_RUNS), "Elements")
+    show_table(elements.head(_SHOWN_ELEMENTS), "Elements")
     show_table(findings, "Findings")
     count = 0 if site.balises is None else site.balises.height
     print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
@@ -494,7 +519,7 @@ def make_a_site(
     )
 )
 def calibrate(
-    runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, globs.")],
+    runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, glob patterns.")],
     site: Site,
     out: Annotated[Path, typer.Option("--out", callback=_here, help="Vehicle file to write.")],
     vehicle: VehicleFile = None,
@@ -522,7 +547,7 @@ def calibrate(
     show_table(found.runs, "Scale and latency")
     show_table(found.sigmas, "Sigma of the monitors")
     if found.vehicle.gnss_latency_s is None:
-        print("\nNo latency in the vehicle file: the runs hardly change their speed, which alone tells it.")
+        print("\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few.")
     print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
 
 
@@ -533,18 +558,20 @@ def calibrate(
     )
 )
 def experiment(
-    name: Annotated[str, typer.Argument(help="`list` shows the names.")],
+    name: Annotated[str, typer.Argument(help="Name of the experiment; `list` prints all names.")],
     out: OutFolder = Path("experiment-out"),
-    repetitions: Annotated[int | None, typer.Option(min=1, help="Instead of the published number.")] = None,
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 1,
-    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0 takes one per core.")] = 0,
+    repetitions: Annotated[
+        int | None, typer.Option(min=1, help="Number of repetitions; default: the published number.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of processes; 0: one per core.")] = 0,
     config: Annotated[
         Path | None,
-        typer.Option("--config", callback=_here, help="The bank to judge: `rare`, `bank`, `catalogue`."),
+        typer.Option("--config", callback=_here, help="Monitor bank to assess (`rare`, `bank`, `catalogue` only)."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Run a published experiment again, at its own size."""
+    """Repeat a published experiment, by default with its own number of runs."""
     from datasets.experiment import EXPERIMENTS
     from schemas.errors import UsageError
 
@@ -555,7 +582,7 @@ def experiment(
         from schemas.near import did_you_mean
 
         raise UsageError(
-            f"is no experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
+            f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
         )
     from pipeline.campaign.workers import watched
     from pipeline.results.terminal import how_far
@@ -594,15 +621,15 @@ def sql(
     ] = None,
     as_json: Json = False,
     allow_files: Annotated[
-        bool, typer.Option("--allow-files", help="The query may read files beside the result (`read_csv`).")
+        bool, typer.Option("--allow-files", help="Let the query read other files (`read_csv`).")
     ] = False,
 ) -> None:
-    """SQL over hazards, passages, alarms, epochs, runs and the campaign's tables."""
+    """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
-    from pipeline.results.query import run_sql
+    from pipeline.results.query import named_results, run_sql
     from pipeline.results.terminal import show_table
 
-    answer = run_sql(out, query, allow_files, _named_results(beside or []))
+    answer = run_sql(out, query, allow_files, named_results(beside or []))
     written = [(csv, write_csv), (parquet, write_parquet), (xlsx, write_xlsx)]
     for file, write in written:
         if file is not None:
@@ -623,10 +650,10 @@ def sql(
 def report(
     out: ResultFolder,
     site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Pages at once; 0 takes one per core where there are many.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Write HTML pages, for the campaign and each run, that open offline.
+    """Write HTML pages for the campaign and each run. They open offline.
 
     Pages of runs that have not changed since the last report are left as they are.
     """
@@ -721,13 +748,14 @@ def export(
 def verify(
     out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
     logs: Annotated[
-        list[str] | None, typer.Option("--logs", help="Logs to replay again and compare: paths, folders, globs.")
+        list[str] | None,
+        typer.Option("--logs", help="Logs to replay again and compare: paths, folders, glob patterns."),
     ] = None,
     site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Runs at once; 0 takes one per core.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -742,7 +770,7 @@ def verify(
     found = [compare(out, None if quiet else how_far("runs"))]
     if logs:
         if site is None:
-            raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
+            raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
         settings = _configuration(config) if config else read_config(out)
         train = _vehicle(vehicle)
         found.append(
@@ -766,11 +794,11 @@ def verify(
 )
 def diff(
     out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    out_b: Annotated[str, typer.Argument(help="Another one.")],
-    detail: Annotated[bool, typer.Option("--detail", help="Every value that changed, too.")] = False,
+    out_b: Annotated[str, typer.Argument(help="The result to compare it with.")],
+    detail: Annotated[bool, typer.Option("--detail", help="Also list every changed value.")] = False,
     as_json: Json = False,
 ) -> None:
-    """What changed between two results; exit status 1 on a difference."""
+    """Compare two results; exit status 1 if they differ."""
     from pipeline.diff.results import diff_results
 
     found = diff_results(out_a, out_b)
@@ -841,88 +869,12 @@ def _print_json(value: Any) -> None:
     print(to_json(value))
 
 
-def _replay_again(logs: list[str], site: str | None, vehicle: Path | None, jobs: int) -> Replay | None:
-    """How `safety` replays the logs with another configuration; none without logs."""
-    from pipeline.campaign import make_plan, run_campaign
-    from schemas.errors import UsageError
-
-    if not logs:
-        return None
-    if site is None:
-        raise UsageError("needs the site", place="--logs", remedy="Name it with --site.")
-    ground, train = site, _vehicle(vehicle)
-
-    def replay_with(settings: Configuration, to: str) -> None:
-        run_campaign(make_plan(logs, ground, to, settings, train), jobs=jobs or os.cpu_count() or 1)
-
-    return replay_with
-
-
-def _assess(out: str, config: Path | None, replay_again: Replay | None, as_json: bool) -> None:
-    from pipeline.results.terminal import show_table
-    from pipeline.safety.assessment import assess, for_reading
-
-    settings = None if config is None else _configuration(config)
-    found = assess(out, settings, replay_again)
-    if as_json:
-        _print_json({"statements": found.statements, **found.tables})
-        return
-    print(found.statements[0] + "\n")
-    for name, table in for_reading(found.tables).items():
-        show_table(table, name)
-        print()
-    print("\n".join(found.statements[1:]))
-
-
-def _named_results(given: list[str]) -> dict[str, str]:
-    """`NAME=OUT` by name."""
-    from schemas.errors import UsageError
-
-    for text in given:
-        if not re.fullmatch(r"[A-Za-z]\w*=.+", text):
-            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
-    return dict(text.split("=", 1) for text in given)
-
-
 def _status_of(summary: Summary) -> int:
     from schemas.enums import RunStatus
 
     if summary.defects:
         return DEFECT
     return OK if summary.count(RunStatus.OK) == summary.planned else RUNS_NOT_OK
-
-
-def _show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
-    from pipeline.campaign.tally import outcome_line, outcome_rows
-    from schemas.enums import RunStatus
-
-    if as_json:
-        told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
-        figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
-        rows = outcome_rows(summary)
-        _print_json({**told, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": rows})
-    elif quiet:
-        for outcome in summary.outcomes:
-            if outcome.status is not RunStatus.OK:
-                print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
-    else:
-        _show_ending(summary, out)
-
-
-def _show_ending(summary: Summary, out: str) -> None:
-    """The verdicts, the worst first; of many runs those that are not safe."""
-    from pipeline.campaign.tally import ending_rows, summary_line
-    from pipeline.results.terminal import show_table
-
-    print(summary_line(summary))
-    rows = ending_rows(summary)
-    remarkable = rows.filter(rows["verdict"] != "safe")
-    shown = rows if rows.height <= _SHOWN_RUNS else remarkable.head(_SHOWN_RUNS)
-    if shown.height:
-        show_table(shown)
-    if (more := remarkable.height - shown.height) > 0:
-        print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
-    print(f"Tables are in {out}; `balise report {out}` makes pages of them.")
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ class Check:
 def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[Check]:
     """Each expectation of a run against its tables, its verdict first: hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
-        raise ConfigError("says nothing of what has to be found", place=f"scenario: run {spec.id}")
+        raise ConfigError("does not say what has to be found", place=f"scenario: run {spec.id}")
     injected = describe_faults(run.faults)
     pairs = [
         ("verdict", spec.expected.verdict.value, word_of(worst_verdict(tables.runs["verdict"].to_list()))),

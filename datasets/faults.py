@@ -94,12 +94,13 @@ class FaultSpec(Settings):
         needed = _NEEDS[self.kind]
         given = [name for name in _QUANTITIES if getattr(self, name) is not None]
         if given != ([needed] if needed else []):
-            raise ValueError(f"a fault of kind {self.kind.value} takes {needed or 'no size'}, not {given}")
+            found = ", ".join(given) or "none"
+            raise ValueError(f"a fault of kind {self.kind.value} needs {needed or 'no quantity'}; found {found}")
         allowed = _allowed_targets(self.kind)
         if self.target not in allowed and not (self.hits_ranges and "satellite" in allowed):
-            raise ValueError(f"a fault of kind {self.kind.value} has target {' or '.join(allowed)}")
+            raise ValueError(f"a fault of kind {self.kind.value} needs target {' or '.join(allowed)}")
         if (self.below_deg is not None or self.azimuth_deg is not None) and self.target not in _GROUPS:
-            raise ValueError(f"below_deg and azimuth_deg go with target {' or '.join(_GROUPS)}")
+            raise ValueError(f"below_deg and azimuth_deg are only for target {' or '.join(_GROUPS)}")
         return self
 
     @property
@@ -123,9 +124,9 @@ class PlacedFault(FaultSpec):
     @model_validator(mode="after")
     def _begins_and_ends_once(self) -> Self:
         if (self.at_m is None) == (self.start_s is None):
-            raise ValueError("a fault has either start_s or at_m")
+            raise ValueError("a fault needs either start_s or at_m")
         if self.until_m is not None and self.duration_s is not None:
-            raise ValueError("a fault has either duration_s or until_m, or lasts")
+            raise ValueError("a fault may have duration_s or until_m, not both")
         return self
 
 

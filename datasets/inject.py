@@ -71,11 +71,12 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None) -> RunLog:
     first_ns, last_ns = _span_ns(run)
     if fault.begins_s() * NS_PER_S > last_ns - first_ns:
         raise ConfigError(
-            "begins behind the end of the run", place=f"fault {fault.kind.value}", found=f"{fault.start_s} s"
+            "begins after the end of the run", place=f"fault {fault.kind.value}", found=f"{fault.start_s} s"
         )
     if fault.solution is not None and fault.solution not in run.solutions():
         known = ", ".join(run.solutions())
-        raise ConfigError("names a solution that the run has not", place=f"fault {fault.kind.value}", expected=known)
+        place = f"fault {fault.kind.value}"
+        raise ConfigError("names a solution that the run does not have", place=place, expected=known)
     rng = np.random.default_rng(zlib.crc32(json.dumps([run.run_id, fault.model_dump(mode="json")]).encode()))
     if fault.hits_odometer:
         changed = run.with_streams(odometer=_odometer(run, fault, first_ns))
@@ -174,7 +175,7 @@ def _late(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
 
 def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
     if run.odometer is None:
-        raise InputError("has no odometer to be at fault", place=run.run_id, expected="an odometer stream")
+        raise InputError("has no odometer for this fault", place=run.run_id, expected="an odometer stream")
     odometer = run.odometer.sort("t", maintain_order=True)
     t_s = _seconds(odometer, first_ns)
     if fault.kind is FaultKind.OUTAGE:

@@ -43,7 +43,7 @@ class _Ranges:
 def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.Generator) -> RunLog:
     """The run with a step, bias, ramp or noise in ranges, or without satellites (outage)."""
     if run.satellites is None or run.satellites.is_empty():
-        raise InputError("has no ranges to be at fault", place=run.run_id, expected="a satellites stream")
+        raise InputError("has no satellites stream for this fault", place=run.run_id, expected="a satellites stream")
     gnss, satellites, hit_any = [], [], False
     for solution in run.gnss["solution"].unique(maintain_order=True):
         fixes = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
@@ -54,7 +54,8 @@ def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.G
         gnss.append(fixes)
         satellites.append(rows)
     if not hit_any:
-        raise InputError("is hit by no range fault", place=run.run_id, expected=f"{fault.target} recorded at that time")
+        expected = f"{fault.target} recorded at that time"
+        raise InputError("has no satellite for this fault", place=run.run_id, expected=expected)
     others = run.satellites.with_row_index("row").filter(~pl.col("solution").is_in(run.gnss["solution"].unique()))
     return run.with_streams(
         gnss=pl.concat(gnss).sort("row").drop("row"),
@@ -117,7 +118,7 @@ def _refuse_unsolved(fixes: pl.DataFrame, ranges: _Ranges, unsolved: Bools) -> N
     bad = np.intersect1d(stamps, known)
     if bad.size:
         raise InputError(
-            "a position has too few recorded satellites to carry a range fault",
+            "too few satellites are recorded to put a range fault into a position",
             place="satellites",
             found=f"{bad.size} epochs, the first {(bad[0] - ranges.t_ns[0]) / NS_PER_S:.1f} s after the first",
             expected="at least 3 and one per constellation",

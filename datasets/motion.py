@@ -30,9 +30,9 @@ class PhaseSpec(Settings):
     @model_validator(mode="after")
     def _one_aim(self) -> Self:
         if (self.speed_mps is None) == (self.stop_at_m is None):
-            raise ValueError("a phase has either speed_mps or stop_at_m")
+            raise ValueError("a phase needs either speed_mps or stop_at_m")
         if self.hold_m and (self.hold_s or not self.speed_mps):
-            raise ValueError("hold_m goes with a speed other than zero and without hold_s")
+            raise ValueError("hold_m needs a speed_mps other than 0, and no hold_s")
         return self
 
 
@@ -83,7 +83,7 @@ class Motion:
         ahead = self.sign * (self.chainage_m(grid) - s_m)
         reached = np.flatnonzero(ahead >= 0.0)
         if reached.size == 0:
-            raise ConfigError("a fault is placed where the train never comes", place="scenario", found=f"at_m = {s_m}")
+            raise ConfigError("a fault is placed where the train does not run", place="scenario", found=f"at_m = {s_m}")
         i = int(reached[0])
         if i == 0:
             return 0.0

@@ -39,7 +39,7 @@ class SectionSpec(Settings):
     @classmethod
     def _can_be_run(cls, value: float | None) -> float | None:
         if value is not None and abs(value) < 100.0:
-            raise ValueError("radii under 100 m are no main line")
+            raise ValueError("a radius under 100 m is too small for a main line")
         return value
 
 

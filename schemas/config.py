@@ -54,7 +54,7 @@ class StreamMapping(Settings):
 
 
 class StreamCorrection(Settings):
-    """What mends a recorded stream before anything else looks at it, whatever file it came from.
+    """Corrections of a recorded stream, made right after reading, for any kind of file.
 
     First two columns are exchanged, then `factors` multiply, `shift_s` is added to the times and `shift_*_m` to the
     positions. `solution`: of GNSS and satellites only this one.
@@ -71,7 +71,7 @@ class StreamCorrection(Settings):
 
 
 class IngestConfig(Settings):
-    """Which topics feed which stream, empty: recognised by schema name; and whether what they hold can be."""
+    """Which topics feed which stream (empty: recognised by schema name), and limits of plausible values."""
 
     gnss: tuple[StreamMapping, ...] = ()
     odometer: tuple[StreamMapping, ...] = ()
@@ -80,10 +80,10 @@ class IngestConfig(Settings):
     balise_reads: tuple[StreamMapping, ...] = ()
     # A damaged length must not fill the memory; recorders write chunks of a few MiB.
     chunk_limit_mib: Positive = 128.0
-    # A receiver before its first fix, or a week that rolls over, touches some rows; more is another recording. Ours.
+    # A receiver before its first fix, or a week rollover, affects few rows; more is another recording. Ours.
     wrong_dates_share: Annotated[Number, Field(ge=0, lt=1)] = 0.1
     correct: tuple[StreamCorrection, ...] = ()
-    # What no train can have and a known cause explains fails a run (`fail`), or is told and leaves it unproven.
+    # Impossible values of a known cause fail a run (`fail`), or are reported and leave it unproven (`warn`).
     plausibility: Literal["fail", "warn"] = "fail"
     # Worn wheels count 4 % too much, bad radars 6 %; the nearest wrong unit (yards) 9 %.
     fit_scale_limit: Probability = 0.08
@@ -92,9 +92,9 @@ class IngestConfig(Settings):
     fit_lag_limit_s: Positive = 5.0
     # 0.3 s at 40 m/s is more than half the failure limit of 20 m.
     fit_lag_told_s: Positive = 0.3
-    # Positions without corrections are within 5 m of the track, 95 %; half the usual `ci_limit_m` and more is told.
+    # Positions without corrections are within 5 m of the track, 95 %; a shift above half of `ci_limit_m` is reported.
     fit_shift_told_m: Positive = 8.0
-    # Nearer, a wrong position may be a fault; a default place or 0/0 is thousands of kilometres away.
+    # A nearer wrong position may be a fault; a default place or 0/0 is thousands of kilometres away.
     placeholder_far_m: Positive = 10_000.0
 
     @model_validator(mode="before")
@@ -115,7 +115,7 @@ class FixSigma(Settings):
     rtk_float_m: Positive = 0.5
     rtk_fixed_m: Positive = 0.1
     estimated_m: Positive = 5.0
-    # Satellites stand above the horizon only.
+    # Satellites are above the horizon only.
     vertical_factor: Positive = 1.5
 
     def horizontal_m(self, fix: Fix) -> float | None:
@@ -131,22 +131,22 @@ class MatchingConfig(Settings):
     reach_m: Positive = 50.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
-    # The bias in that. Kept apart from `cross_bias_sigma_m`: an exact reference whose antenna is 0.3 m aside is on it.
+    # The bias in that. Not `cross_bias_sigma_m`: an exact reference 0.3 m off the axis is on the track.
     on_track_bias_m: NonNegative = 1.5
     # DIAG, error models: track survey 1 m.
     survey_sigma_default_m: Positive = 1.0
     # Of one run, the same on every element: antenna beside the middle of the vehicle, datum (DOMAIN section 2).
     cross_bias_sigma_m: Positive = 1.5
-    # What of a position's variance outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
+    # Part of the variance that outlasts minutes: ionosphere, troposphere, orbit and clock (DIAG Table 1 at 45°).
     slow_share: Annotated[Number, Field(ge=0, lt=1)] = 0.247
     # The truth may be so many times the stated sigma: of a receiver's own, and of a table's by kind of fix.
     sigma_doubt: Annotated[Number, Field(ge=1)] = 2.0
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
-    # DOMAIN section 2: a claim of 0.99 has to be right in 99 of 100 runs.
+    # DOMAIN section 2: a probability of 0.99 has to be right in 99 of 100 runs.
     ambiguity_probability: Probability = 0.99
     # Noise of 0.35 m/s across the track at the slowest speed that counts.
     heading_sigma_deg: Positive = 10.0
-    # Slower, the noise of the velocity decides its heading.
+    # At lower speed the heading is mostly noise of the velocity.
     heading_min_speed_mps: Positive = 2.0
     # Heights tell tracks apart that lie over each other by so much: a train needs a clearance of 4.5 m and more.
     # The bias is that of datum and antenna: one that the vehicle file does not know stands some 4 m over the rail.
@@ -157,7 +157,7 @@ class MatchingConfig(Settings):
     # Newson & Krumm 2009, eq. 2, for ways by odometer, whose scale is wrong by some percent.
     transition_scale_m: Positive = 5.0
     transition_share: NonNegative = 0.01
-    # Limited, since a position that jumps along the track must not send the path on a detour.
+    # Limited, since a position that jumps along the track must not lead the path over a detour.
     mismatch_limit: Positive = 12.0
     # Log-probability that each relation costs which is passed against its navigability.
     barred_cost: NonNegative = 20.0
@@ -170,10 +170,10 @@ class MatchingConfig(Settings):
     survey_correlation_m: Positive = 1000.0
     # A position carried on without satellites drifts aside by this share of the way (a heading wrong by 6 degrees).
     estimated_drift: NonNegative = 0.1
-    # Reflections follow no error model: one of them must not decide on the track.
+    # Reflections follow no error model: one of them must not decide the track.
     outlier_probability: Probability = 1e-4
     outlier_scale_m: Positive = 10.0
-    # Positions closer together tell the same of the path.
+    # Positions closer together give the same information on the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
     # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
@@ -183,7 +183,7 @@ class MatchingConfig(Settings):
     # twice, would be put on a track far aside. A lost position drifts by this share of its distance to the nearest.
     off_track_s: Positive = 8.0
     off_track_wander: NonNegative = 0.03
-    # A jump that no train makes decides on no track; after half a minute the odometer may be the wrong one.
+    # An impossible jump is not used to find the track; after half a minute the odometer may be the wrong one.
     jump_hold_s: Positive = 30.0
     # Farther than the odometer (or without one speed and its change; no train brakes or turns by 5 m/s²) by this share,
     # so many standard deviations and this margin.
@@ -206,18 +206,18 @@ class AlignConfig(Settings):
     # drop single rows at any rate.
     odometer_gap_s: Positive = 1.0
     odometer_gap_periods: Positive = 2.5
-    # A counter that gains more was reset, ran over or lied: the speed record on rails is 160 m/s. Rows that are stamped
+    # A counter that grows faster was reset, overflowed or is wrong: the speed record is 160 m/s. Rows that are stamped
     # in bunches seem to gain some metres in no time.
     fastest_mps: Positive = 200.0
     bunched_stamps_m: NonNegative = 20.0
-    # Speeds tell the way over such a leap if, over the whole run, they differ from the distance by a smaller share:
+    # Speeds give the distance over such a jump if, over the whole run, they differ from it by a smaller share:
     # another unit or sign differs by more than a half, slip and scale by some percent.
     speed_agreement: Probability = 0.2
     # Between rows no farther apart a straight line is within 0.5 m of a train that brakes as hard as this, which
     # is an emergency brake.
     straight_s: Positive = 1.5
     braking_mps2: Positive = 1.8
-    # A counter's step that is worth a word: a finer one scatters less than the white noise of one second.
+    # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
     # 400 pieces is within 10 % of its mean.
@@ -229,25 +229,25 @@ class AlignConfig(Settings):
     filter_period_s: Positive = 1.0
     # Stamps that scatter make no gap by themselves: the first position after one that they made is always late.
     scattered_gap_sigmas: NonNegative = 3.0
-    # Before it is seen, a position is rather thought to come back from a long break beside its place: to be sure of a
-    # wrong scale is worse than to learn it more slowly. A receiver coasts over seconds and starts anew after half a
-    # minute or so: were single missing epochs thought the same of, noisy positions would teach next to nothing.
+    # Prior probability that a position is offset after a long gap: a wrong scale with a small sigma is worse than slow
+    # learning. A receiver bridges seconds, and restarts after half a minute or so. With the same probability for single
+    # missing epochs, almost nothing would be learned from noisy positions.
     break_moved_probability: Probability = 0.8
     break_moving_s: Positive = 30.0
-    # Variance that has still to settle fades with this time constant: positions that settle over 10 to 60 s are
-    # followed; longer, and a drift that begins meanwhile would be learned as scale the sooner.
+    # Time constant with which such an offset settles: fits positions that settle over 10 to 60 s. With more, a drift
+    # that begins meanwhile would be learned as scale.
     settling_tau_s: Positive = 25.0
-    # Beyond so many standard deviations it is no noise of odometer or reference: two-sided Gaussian 1e-7, as the
-    # monitors' k_T by default, which it does not follow: how easily they alarm tells nothing of the odometer.
+    # More standard deviations than this are not noise of odometer or reference: two-sided Gaussian 1e-7, as k_T of the
+    # monitors by default. It does not follow k_T: the odometer does not depend on the alarm rate.
     sure_sigmas: Positive = 5.3267
-    # A speed is a mean over this time: the noise of single rows is no speed (DOMAIN section 2).
+    # A speed is a mean over this time: single rows are mostly noise (DOMAIN section 2).
     speed_window_s: Positive = 1.0
-    # Changes of speed tell the latency. A speed over less time before and after has noise that would pass for such
-    # changes: at constant speed the filter would grow sure of any latency.
+    # Latency is learned from changes of speed. Over less time before and after an epoch, noise looks like such changes:
+    # at constant speed the filter would become sure of any latency.
     latency_span_s: Positive = 2.0
     # Receivers show a little noise without memory beside the modelled one: this share of the variance.
     white_share: Probability = 0.01
-    # Over more periods a step of the stamps tells nothing of the receiver's clock: it may have started anew.
+    # A step of the stamps over more periods is not used for the receiver's clock: it may have restarted.
     clock_periods: Positive = 3.0
 
 
@@ -261,7 +261,7 @@ def threshold_factor(false_alarm_probability: float) -> float:
 class MonitorConfig(Settings):
     """Monitor bank (DIAG eq. 1-17; DOMAIN section 3)."""
 
-    # DIAG eq. 8; the paper's own set is lost from the text (eq. 9, 16).
+    # DIAG eq. 8; the paper's own set is missing in the text (eq. 9, 16).
     ewma_alphas: tuple[Probability, Probability, Probability] = (0.1, 0.01, 0.001)
     # Per sample and monitor, two-sided Gaussian: k_T 5.3267 (DIAG; DOMAIN section 3).
     false_alarm_probability: Probability = 1e-7
@@ -278,14 +278,14 @@ class MonitorConfig(Settings):
     odometer_sigma_mps: Positive = 0.05
     # Of plain receivers; `balise calibrate` measures it.
     doppler_sigma_mps: Positive = 0.1
-    # Velocities farther apart do not tell the way between them: one missing epoch of a log at 1 Hz is bridged.
+    # Velocities farther apart are not integrated to a distance: one missing epoch of a log at 1 Hz is bridged.
     doppler_gap_s: Positive = 2.5
     # Stamps of positions and of satellites that belong together may differ by rounding.
     satellite_stamp_s: NonNegative = 0.001
-    # A drawn line is no survey: 2-D surveys that state no sigma wander across the track.
+    # A drawn line is not a survey: 2-D surveys without a sigma wander across the track.
     survey_wander_m: NonNegative = 0.3
     survey_wander_length_m: Positive = 100.0
-    # Between two epochs a sigma that changes by more than this factor is another kind of fix, no drift of the accuracy.
+    # A sigma that changes by a larger factor between two epochs is another kind of fix, not a drift of the accuracy.
     sigma_step_factor: Positive = 1.5
     # DIAG regresses thresholds on sigma; `balise calibrate` fits both.
     sigma_intercept_m: NonNegative = 0.0
@@ -330,11 +330,11 @@ class LdsConfig(Settings):
     # SUBSET-041 5.3.1.1: 5 m + 5 % of the distance.
     odometer_fixed_m: NonNegative = 5.0
     odometer_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
-    # A crossing inside a longer gap is not seen but guessed (DOMAIN section 4).
+    # A crossing inside a longer gap is only interpolated (DOMAIN section 4).
     crossing_gap_s: Positive = 1.0
     # Insertion is the more dangerous failure there (TVB section 5).
     entry_from_unfitted_area: bool = False
-    # Instants at which the LDS begins anew, without LRVB and linking (DOMAIN section 4, initialisation).
+    # Times at which the LDS restarts, without LRVB and linking (DOMAIN section 4, initialisation).
     starts_of_mission: tuple[AwareDatetime, ...] = ()
     # Off: a negated position never returns (DOMAIN section 4).
     relink: bool = True
@@ -371,19 +371,19 @@ class HazardConfig(Settings):
     reference_aside_m: NonNegative = 0.5
     # A train that brakes by 1 m/s2 leaves a straight line by 0.5 m in 2 s.
     reference_gap_s: Positive = 2.0
-    # Two known places that the odometer's confidence does not join are joined by a way that differs from it by no more:
-    # so much may be lost in slip. A search bound: beyond it nothing is said of place or track.
+    # If no way between two known places is within the odometer's confidence, ways that differ from its distance by no
+    # more than this are taken: slip may be that large. A limit of the search: beyond it position and track are unknown.
     slip_m: NonNegative = 200.0
     slip_share: Annotated[Number, Field(ge=0, lt=1)] = 0.5
-    # More chains of net elements between two places are not weighed: nothing is said of place or track there.
+    # With more chains of net elements between two known places, position and track are unknown there.
     routes_limit: Annotated[int, Field(strict=True, gt=0)] = 64
-    # Without an odometer the train's way over this time, by the evidence, says which way it goes.
+    # Without an odometer the direction of travel is that of the evidence over this time.
     turn_s: Positive = 2.0
-    # How long before alarm or hazard the opinion on who was at fault looks.
+    # `suspect` uses the data from this long before alarm or hazard.
     suspect_lookback_s: NonNegative = 60.0
-    # A net element less probable than one in a thousand is no place of the reference (DOMAIN section 5.1).
+    # Net elements less probable than one in a thousand are not used for the reference (DOMAIN section 5.1).
     rival_probability: Probability = 0.001
-    # Of the read itself; Q of the site is the announcement's (DOMAIN section 5.1).
+    # Of the read itself; Q_LOCACC of the site belongs to the linking information (DOMAIN section 5.1).
     balise_read_sigma_m: Positive = 1.0
     # An error known less closely is not given as a number (DOMAIN section 5.2).
     known_error_m: Positive = 5.0
@@ -433,7 +433,7 @@ class SafetyConfig(Settings):
         "egnos_observed": ServiceLevel(integrity_risk=6e-8, exposure_s=150.0),
         "horizontal_sis": ServiceLevel(integrity_risk=1e-9, exposure_s=150.0),
     }
-    # The published form has one; 64 to 400 at 160 km/h (DOMAIN section 6).
+    # The published budget has one; 64 to 400 at 160 km/h (DOMAIN section 6).
     demands_per_hour: Positive = 1.0
     # None is published; SIL 4 (DOMAIN section 6).
     diagnosis_hazard_rate_per_h: Positive = 1e-9
@@ -471,7 +471,7 @@ class Configuration(Settings):
 
 
 class Vehicle(Settings):
-    """A vehicle file; what is absent is not known and estimated or taken as zero (CONTRACT section 1).
+    """A vehicle file; a value that is absent is estimated, or taken as zero (CONTRACT section 1).
 
     `odometer_scale` is true distance over odometer distance. The limits are far beyond any train: they find
     millimetres and milliseconds.

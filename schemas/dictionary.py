@@ -46,7 +46,7 @@ def dictionary_frame(only: str | None = None) -> pl.DataFrame:
     """One row per column, of all tables or `only` one: `group, table, column, dtype, unit, nullable, meaning`."""
     known = [table for tables in groups().values() for table in tables]
     if only is not None and only not in known:
-        raise UsageError("is no table", place=only, expected=", ".join(known))
+        raise UsageError("is not a table", place=only, expected=", ".join(known))
     rows = [
         {
             "group": group,

@@ -102,7 +102,7 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
     known = sorted({name for log in logs for name in log.solutions()})
     if solution not in known:
         raise InputError(
-            "is a solution of no run",
+            "no run has this solution",
             place=solution,
             found=", ".join(known),
             remedy="Name one of these with --solution.",
@@ -151,7 +151,7 @@ def _refuse_figures_of_no_train(vehicle: Vehicle, logs: Sequence[RunLog], config
     if abs(scale - 1.0) <= most and abs(latency_s) <= most_s:
         return
     raise InputError(
-        "give figures that no train can have",
+        "the runs give impossible figures",
         place=", ".join(log.run_id for log in logs),
         found=f"odometer_scale {scale:.4g}, gnss_latency_s {latency_s:.3g}",
         expected=f"a scale within {most:g} of 1, and a latency within {most_s:g} s",

@@ -117,5 +117,5 @@ def _busy(out: Address) -> OutputError:
     return OutputError(
         "another campaign is writing here",
         place=redacted(str(out)),
-        remedy="Wait for its end, or choose another --out.",
+        remedy="Wait until it ends, or choose another --out.",
     )

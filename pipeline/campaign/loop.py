@@ -116,7 +116,7 @@ class CampaignLoop:
                 return _failed(attempt, Failure(overdue(self._limit_s), lasting=False))
             if isinstance(error, CancelledError):
                 raise UsageError(
-                    "the cluster dropped the campaign", remedy="Repeat the command: complete runs are skipped."
+                    "the cluster cancelled this campaign", remedy="Repeat the command: complete runs are skipped."
                 )
             if self._engine.is_lost_worker(error):
                 return self._after_loss(attempt, self._engine.has_begun(result))

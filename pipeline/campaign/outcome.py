@@ -86,7 +86,7 @@ def lost(attempts: int) -> str:
 
 def never_begun(workers: int) -> str:
     """The reason of a run whose workers died before they could begin it."""
-    return f"{workers} workers died before they could begin it. Look at the workers' own logs."
+    return f"{workers} workers died before they started this run. See the logs of the workers."
 
 
 def failure_of(error: BaseException, lasting: bool) -> Failure:

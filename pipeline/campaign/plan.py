@@ -100,7 +100,7 @@ def make_plan(
     jobs = [_with_routes(job, routes, write_routes) for job in jobs]
     if routes is not None and not any(job.route for job in jobs):
         expected = "a route file, or a folder with RUN.csv or RUN.parquet of these runs"
-        raise UsageError("holds no route of any of the runs", place=redacted(str(routes)), expected=expected)
+        raise UsageError("has no route for any of the runs", place=redacted(str(routes)), expected=expected)
     return Plan(tuple(jobs), base.out, config, vehicle, given or NO_FILES)
 
 
@@ -122,7 +122,7 @@ def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | No
 def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
     """What is left to do of a plan without the known runs: its jobs with what earlier campaigns completed."""
     left = [job for job in plan.jobs if job.run_id not in known]
-    complete = store.completed_runs(plan.out) if left else {}
+    complete = store.completed_runs(plan.out, [job.run_id for job in left])
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 
@@ -154,7 +154,7 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
                 raise UsageError(
                     f"and {redacted(str(address))} have the same run id {run_id!r}",
                     place=redacted(other),
-                    remedy="Rename one of them: results are filed by run id.",
+                    remedy="Rename one of them: results are stored by run id.",
                 )
     return dict(sorted(found.items()))
 
@@ -163,14 +163,14 @@ def _check_name(run_id: str, address: Address) -> None:
     """Refuse what results cannot be filed under, before any work is done."""
     reason = ""
     if run_id == _NULL_OF_HIVE:
-        reason = f"a run cannot be called {run_id!r}: readers of Hive partitions take it for null"
+        reason = f"{run_id!r} cannot be a run id: readers of Hive partitions read it as null"
     elif (length := len(store.file_name(run_id))) > store.LONGEST_NAME:
         reason = (
             f"its name is too long to file results under: {length} characters where those beyond ASCII count "
             f"three per byte, and {store.LONGEST_NAME} are possible"
         )
     if reason:
-        raise UsageError(reason, place=redacted(str(address)), remedy="Rename it: results are filed by run id.")
+        raise UsageError(reason, place=redacted(str(address)), remedy="Rename it: results are stored by run id.")
 
 
 def _expand(name: str) -> list[Address]:

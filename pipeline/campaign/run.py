@@ -70,7 +70,7 @@ def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> 
 def _check_shared(plan: Plan, scheduler: str | None) -> None:
     """Whether a cluster can write there is found out by its workers; that nothing is to do, here."""
     if not plan.jobs:
-        raise UsageError("no run is named")
+        raise UsageError("no run is given")
     if scheduler is not None and is_url(plan.out) and plan.out.startswith("memory://"):
         raise UsageError("workers cannot write into this process's memory", place=plan.out)
 

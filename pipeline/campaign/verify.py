@@ -97,7 +97,7 @@ def _other_runs(there: Sequence[str], manifest: Manifest) -> Iterator[tuple[str,
     named = manifest["runs"]
     for run in sorted({*there, *named}):
         if run not in named:
-            yield f"run {run}", "complete", "not in the manifest: was the call interrupted? Repeat it."
+            yield f"run {run}", "complete", "not in the manifest: the call may have been interrupted. Repeat it."
         elif run not in there:
             yield f"run {run}", "missing", "complete"
 

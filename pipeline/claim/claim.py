@@ -136,7 +136,7 @@ def demands(profile: Profile) -> dict[Key, Demand]:
     """The requirements of a profile in their order, each with how it is judged."""
     found: dict[Key, Demand] = {}
     for kind, area in profile.areas.items():
-        limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m or {area.way_s:g} s"
+        limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
         for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu"):
             found[name, kind.value] = Demand(limit, "always", area.limit_clause, of_always)
         found["safe_front_end", kind.value] = _rate(profile.failure_rate.aim_per_h, profile)
@@ -192,7 +192,7 @@ def _share(limit: str, share: float, clause: str) -> Demand:
 
 def _rate(rate_per_h: float, profile: Profile) -> Demand:
     clause = profile.failure_rate.clause
-    return Demand("its own interval", f"< {rate_per_h:g} /h", clause, lambda counts: of_rate(counts, rate_per_h))
+    return Demand("own CI", f"< {rate_per_h:g} /h", clause, lambda counts: of_rate(counts, rate_per_h))
 
 
 # What a recording cannot say of a requirement, however long it is.

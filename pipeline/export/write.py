@@ -31,14 +31,14 @@ def export_run(
     positions and hazards and need the site. `positions` chooses foxglove.LocationFix or ROS 2 NavSatFix.
     """
     if to.suffix.lower() not in SUFFIXES:
-        raise UsageError("cannot be told by its suffix", place=str(to), expected=" or ".join(SUFFIXES))
+        raise UsageError("has an unknown suffix", place=str(to), expected=" or ".join(SUFFIXES))
     tables = read_run(out, run_id)
     _check(out, tables, site, log)
     if to.suffix.lower() == ".mcap":
         return _write_mcap(tables, to, site, log, positions)
     if site is None:
         raise UsageError(
-            "positions on the ground need the site", place=str(to), remedy="Name it with --site, as in the replay."
+            "positions on the ground need the site", place=str(to), remedy="Give the site of the replay with --site."
         )
     make = run_geojson if to.suffix.lower() == ".geojson" else run_gpx
     return [_write_text(to, make(tables, site))], []

@@ -35,7 +35,7 @@ def availability_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration
         lost &= ~applies
     shown = sorted(((share, reason) for reason, share in parts.items() if share > _LEAST_SHARE), reverse=True)[:_SHOWN]
     told = ", ".join(f"{share:.0%} {reason}" for share, reason in shown) or "many short losses"
-    return (f"available for {1.0 - lost_s / whole_s:.0%} of the moving time, as it was lost to: {told}",)
+    return (f"available for {1.0 - lost_s / whole_s:.0%} of the moving time, the rest lost to: {told}",)
 
 
 def _reasons(epochs: pl.DataFrame, config: Configuration) -> dict[str, Bools]:
@@ -47,8 +47,8 @@ def _reasons(epochs: pl.DataFrame, config: Configuration) -> dict[str, Bools]:
         "no fix": ~met(epochs, pl.col("fix_valid")),
         f"positions off the track{by}": ~met(epochs, pl.col("on_track")),
         f"a confidence interval over {limit_m:g} m": met(epochs, pl.col("confidence_m") > limit_m),
-        "positions that fit two tracks": met(epochs, pl.col("gate_probability") < ambiguous),
-        f"an alarm, or waiting for a return after one{_loudest(epochs)}": met(
+        "positions that fit more than one track": met(epochs, pl.col("gate_probability") < ambiguous),
+        f"an alarm, or the wait for re-linking after it{_loudest(epochs)}": met(
             epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value
         ),
         "no odometer": met(epochs, pl.col("odometer_reason").is_not_null()),

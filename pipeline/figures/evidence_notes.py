@@ -11,47 +11,46 @@ from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures
 
 _BALISE = (
-    "evidence balise: reads carried on by the odometer; slips, slides and scale errors that cancel each other between "
-    "two reads are not seen, and behind the last read the odometer is trusted to 5 m + 5 %"
+    "evidence balise: the true position comes from balise reads, and from the odometer between them. Slip, slide and "
+    "scale errors that cancel each other between two reads are not seen, and after the last read the odometer is "
+    "trusted to 5 m + 5 %"
 )
 _ODOMETER = (
-    "evidence odometer: carried on from the last accepted balise, it can show that a position was wrong, never that it "
+    "evidence odometer: the distance from the last accepted balise can show that a position was wrong, never that it "
     "was right"
 )
-_NOTHING = "no evidence: nothing says whether a position was right"
-_UNKNOWN = "{share:.1%} of the moving time in use cannot be judged; {proof} would prove more"
+_NOTHING = "no evidence: no stream can show whether a position was right or wrong"
+_UNKNOWN = "{share:.1%} of the moving time in use could not be judged: to judge more, record {proof}"
 _PROOF = (
-    "a reference, or balise reads every 2 km and within {end_m:.0f} m of both ends with a vehicle file that gives the "
-    "odometer's scale,"
+    "a reference, or balise reads every 2 km and within {end_m:.0f} m of both ends of the run, and give the odometer's "
+    "scale in the vehicle file"
 )
 _CONTRADICTED = (
-    "the odometer does not close {count} gaps between known places: the vehicle file or the odometer is wrong there"
+    "the odometer's distance does not fit {count} gaps between known places: odometer or vehicle file is wrong there"
 )
-_DISPUTED = (
-    "balise reads contradict the reference, {count} times: where they do, nobody knows where the train was; check the "
-    "clocks of both"
-)
+_DISPUTED = "balise reads contradict the reference {count} times: the true position is unknown there. Check both clocks"
 _LEARNED = (
-    "no vehicle file: thresholds are widened by scale and latency as learned in the run, which absorb early drifts"
+    "no odometer scale in a vehicle file: scale and latency are learned in the run and widen the thresholds, so that a "
+    "drift at its beginning may not be seen"
 )
 _UNDIAGNOSED = (
-    "virtual balises accepted without diagnosis along the track: {count} ({reason}); a jump or drift along it is not "
+    "{count} virtual balises accepted without a monitor along the track ({reason}): a jump or drift along it is not "
     "seen there"
 )
 
 _READING = (
-    "the odometer's rows scatter by {sigma_m:.2f} m (coarse counts, or stamps on receipt): the thresholds along the "
-    "track allow for it"
+    "the odometer's rows scatter by {sigma_m:.2f} m (coarse counter, or times stamped on receipt): the thresholds "
+    "along the track allow for it"
 )
 _SCATTERED = (
-    "the odometer's rows scatter by more than {most_m:.1f} m (coarse counts, or stamps on receipt): alarms along the "
-    "track may be its own, for thresholds that allow for it all would let failures pass"
+    "the odometer's rows scatter by more than {most_m:.1f} m (coarse counter, or times stamped on receipt): thresholds "
+    "wide enough for that would miss failures, so alarms along the track may come from the odometer"
 )
 _DIGITS = (
-    "positions are written down so coarsely that they scatter by {sigma_m:.2f} m (few decimals, single precision): the "
+    "positions are rounded so much that they scatter by {sigma_m:.2f} m (few decimals, or single precision): the "
     "thresholds allow for it"
 )
-_UNTOLD = "for {s:.0f} s nothing tells whether the train moved: availability counts that time as moving without a TVB"
+_UNTOLD = "for {s:.0f} s it is not known whether the train moved: availability counts this time as moving without a TVB"
 # Less than the positions themselves scatter is not worth a word.
 _WORTH_M = 0.1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.plausibility.fit import Fit
 
-_WHERE = "`balise inspect RUN --site SITE` prints the lines that mend it"
+_WHERE = "`balise inspect RUN --site SITE` prints the lines that correct it"
 
 
 def fit_notes(fit: Fit) -> tuple[str, ...]:

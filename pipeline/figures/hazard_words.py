@@ -1,4 +1,4 @@
-"""Hazards in words, the worst first: for endings, lists and heads of pages."""
+"""Hazards in words, the worst first: for endings, lists and heads of pages, which all take them from here."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def hazard_words(hazards: pl.DataFrame) -> list[str]:
 
 def hazard_phrase(row: Row) -> str:
     """`VB_JUMP_1B: VB04 502 m early, accepted; no monitor saw it`."""
-    return f"{row['hazard']}: {_what(row)}, {_accepted(row)}; {_seen(row)}"
+    return f"{row['hazard']}: {_what(row)}, {_accepted(row)}; {seen_words(row)}{_in_use(row)}"
 
 
 def _badness(row: Row) -> tuple[Any, ...]:
@@ -31,9 +31,15 @@ def _badness(row: Row) -> tuple[Any, ...]:
 
 def _what(row: Row) -> str:
     """The balises that it hit, how far off and to which side."""
-    size = "" if row["size_m"] is None else f" {abs(row['size_m']):.0f} m"
-    side = "" if row["timing"] in (None, Timing.NONE) else f" {row['timing']}"
-    return f"{_some(row['balise_ids']) or 'no balise'}{size}{side or ' off' * bool(size)}"
+    off = off_words(row["size_m"], row["timing"])
+    return " ".join(text for text in (_some(row["balise_ids"]) or "no balise", off) if text)
+
+
+def off_words(size_m: float | None, timing: Timing | str | None) -> str:
+    """`502 m early`, `3 m off` where the side is not known, `late` where the size is not; nothing where neither is."""
+    size = "" if size_m is None else f"{abs(size_m):.0f} m"
+    side = "" if timing in (None, Timing.NONE) else str(timing)
+    return " ".join(text for text in (size, side or "off" * bool(size)) if text)
 
 
 def _accepted(row: Row) -> str:
@@ -43,11 +49,19 @@ def _accepted(row: Row) -> str:
     return "accepted" if set(accepted) == set(hit) else f"{_some(accepted)} accepted"
 
 
-def _seen(row: Row) -> str:
-    seen = f"seen by {row['monitor']}" if row["detected"] else "no monitor saw it"
-    if row["within_budget"] is False:
-        seen += f", {row['hazardous_s']:.3g} s in use against {row['budget_s']:.3g} s allowed"
-    return seen
+def seen_words(row: Row) -> str:
+    """Which monitor saw it, and how late."""
+    if not row["detected"]:
+        return "no monitor saw it"
+    late_s = row["time_to_detect_s"]
+    return f"{row['monitor']} saw it" + ("" if late_s is None else f" {late_s:.3g} s after the fault began")
+
+
+def _in_use(row: Row) -> str:
+    """How long its position was in use, where that was too long."""
+    if row["within_budget"] is not False:
+        return ""
+    return f", {row['hazardous_s']:.3g} s in use against {row['budget_s']:.3g} s allowed"
 
 
 def _some(names: Iterable[str] | None) -> str:

@@ -60,19 +60,22 @@ def _off_the_track(site: Site) -> Iterator[str]:
     if names:
         more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         few = ", ".join(names[:_SHOWN]) + more
-        yield f"balises off their net element, which no run passes: {few}; `balise inspect` of the site says why"
+        yield f"balises off their net element, so that no run passes them (`balise inspect SITE` says why): {few}"
 
 
 def _stamps(counts: StreamCounts) -> Iterator[str]:
     """Positions that were left out for their time."""
     if counts.far_off:
-        yield f"positions more than a day from the others, left out: {counts.far_off}"
+        yield f"{counts.far_off} positions left out: their time is more than a day from the others"
     if counts.placeholders:
-        yield f"placeholders (0/0, a default place, before the first fix), taken as no position: {counts.placeholders}"
+        yield (
+            f"{counts.placeholders} positions are placeholders (0/0, a default place, or before the first fix): epochs "
+            "without a fix"
+        )
     if counts.contradicting:
         yield (
-            f"positions of a time that another position has, elsewhere: {counts.contradicting}; the first recorded one "
-            "counts. Receivers on one topic need a solution each"
+            f"{counts.contradicting} positions left out: another position with the same time lies elsewhere, and the "
+            "first recorded one is used. Record two receivers of one topic as two solutions"
         )
 
 
@@ -97,13 +100,13 @@ def _odometer(odometry: Odometry | None, straight_s: float) -> Iterator[str]:
     if odometry.leaps_ns:
         first = datetime.fromtimestamp(odometry.leaps_ns[0] // NS_PER_S, UTC)
         yield (
-            f"the odometer's distance leaps by more than a train can drive, {len(odometry.leaps_ns)} times, first at "
-            f"{first:%H:%M:%S}: its speed counts there, or where none agrees with the distance, the way is lost"
+            f"the odometer's distance jumps by more than a train can drive, {len(odometry.leaps_ns)} times, first at "
+            f"{first:%H:%M:%S}: its speed is used there, and without an agreeing speed the distance is unknown"
         )
     if odometry.period_s > straight_s:
         yield (
-            f"the odometer has a row every {odometry.period_s:.3g} s only: where the speed changes in between, alarms "
-            "along the track may be its own"
+            f"the odometer has only one row every {odometry.period_s:.3g} s: where the speed changes between rows, "
+            "alarms along the track may come from the odometer"
         )
 
 
@@ -114,30 +117,31 @@ def _extent_ns(stream: pl.DataFrame) -> tuple[int, int]:
 
 def _positions(fixes: pl.DataFrame, found: Match, vehicle: Vehicle) -> Iterator[str]:
     if found.antenna_ahead_m * vehicle.gnss_antenna_ahead_m < 0:
-        yield "the odometer falls at first, so the train reverses: the GNSS antenna is taken as behind it"
+        yield "the odometer counts down at first, so the train reverses: the sign of gnss_antenna_ahead_m is changed"
     contradictory = contradictory_covariances(fixes)
     if contradictory:
-        yield f"cov_en_m2 contradicts its variances at {contradictory} epochs and is not used there"
+        yield f"cov_en_m2 is impossible with its variances at {contradictory} epochs and is not used there"
 
 
 def _ambiguous(found: Match) -> Iterator[str]:
-    """Stretches on which another path is as likely."""
+    """Parts of the run where another path is nearly as likely."""
     clock = "%H:%M:%S"
     stretches = [
-        f"{one} ({probability:.2f}) or {other} from {start:{clock}} to {end:{clock}}, told apart by {told_by}"
+        f"{one} ({probability:.2f}) or {other} from {start:{clock}} to {end:{clock}} (told apart by {told_by})"
         for one, other, start, end, probability, told_by in found.ambiguous.select(
             "netelement_id", "other_netelement_id", "t_start", "t_end", "probability", "told_by"
         ).iter_rows()
     ]
     if stretches:
-        yield "ambiguous: " + "; ".join(stretches)
+        yield "net element ambiguous: " + ", ".join(stretches)
 
 
 def _linking(lds: LdsResult) -> Iterator[str]:
     reasons = lds.epochs["link_distance_reason"]
     if unlinked := int(reasons.str.starts_with(UNLINKED).sum()):
-        why = ", ".join(sorted(set(reasons.filter(reasons.str.starts_with(UNLINKED).fill_null(False)))))
-        yield f"after {unlinked} outages the position could not re-link and was not used: {why}"
+        given = set(reasons.filter(reasons.str.starts_with(UNLINKED).fill_null(False)))
+        why = ", ".join(sorted(reason.removeprefix(UNLINKED) for reason in given))
+        yield f"after {unlinked} outages the position could not be re-linked and was not used: {why}"
     if lds.unknown_reads.height:
         names = sorted(set(lds.unknown_reads["balise_id"].to_list()))
-        yield "reads of balises that are not on the path: " + ", ".join(names)
+        yield "telegrams read from balises that are not on the train's path: " + ", ".join(names)

@@ -98,21 +98,21 @@ def _may_be_left_out(part: Decoded, unknown: pl.Series, few: float, remarks: lis
     """
     source, time = part.source, part.source.times["t"]
     if source.recipe.time is not None:
-        remarks.append(f"{source.channel.topic}: {unknown.sum()} messages without valid time")
+        remarks.append(f"{source.channel.topic}: {unknown.sum()} messages without a valid time")
         return True
     wrong = part.frame.select(~pl.any_horizontal(pl.col(*time.fields).is_null())).to_series() & unknown
     if wrong.sum() > few * wrong.len():
         row = int(wrong.arg_max() or 0)
         written = ", ".join(str(part.frame[name][row]) for name in time.fields)
         raise InputError(
-            "has stamps that no trial can have",
+            "has impossible time stamps",
             place=source.channel.place,
             found=f"{wrong.sum()} of {wrong.len()}, the first in message {row} of the topic: {written}",
             expected="times from 1970 to 2200",
             remedy='Check the unit of the stamps ([ingest] factors), or map the topic with time = "log".',
         )
     if wrong.any():
-        remarks.append(f"{source.channel.topic}: {wrong.sum()} messages with a date that no trial can have")
+        remarks.append(f"{source.channel.topic}: {wrong.sum()} messages with a date before 1970 or after 2200")
     return bool((wrong == unknown).all())
 
 
@@ -155,9 +155,9 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
         raise InputError(
             "has no time of validity",
             place=source.channel.place,
-            found="stamps of 0 in all messages",
+            found="time stamp 0 in all messages",
             expected="the time at which the position was valid",
-            remedy='If the log time is near enough, map the topic with time = "log".',
+            remedy='If the time of recording is accurate enough, map the topic with time = "log".',
         )
     remarks.append(f"{source.channel.topic}: {count} messages with a stamp of 0")
     return frame.filter(~unset.fill_null(False))

@@ -102,7 +102,7 @@ def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame,
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
     """Also with the rows that were left out of streams other than GNSS, whose runs say it for each solution."""
     told = [
-        f"{name}: {found.far_off} rows more than a day from the others"
+        f"{name}: {found.far_off} rows left out: their time is more than a day from the others"
         for name, found in counts.items()
         if found.far_off and name != "gnss"
     ]
@@ -190,11 +190,11 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
     """Refuse a cleaned stream with fewer than two times."""
     if stream.height < 2:
         raise InputError(
-            f"only one time in the stream{of}",
+            f"all rows have the same time{of}",
             place=f"{place}, column t",
             found=f"{stream.height} distinct time",
             expected="at least two epochs at different times",
-            remedy="Check the recorder's time stamps, or the mapping's time source.",
+            remedy="Check the recorder's time stamps, or `time` in the [ingest] mapping.",
         )
 
 
@@ -206,7 +206,7 @@ def _require_common_time(run: RunLog) -> None:
     (begin, end), (odometer_begin, odometer_end) = (stream["t"].to_physical()[[0, -1]] for stream in (gnss, odometer))
     if odometer_begin > end or odometer_end < begin:
         raise InputError(
-            "has no time in common with the GNSS",
+            "does not overlap the GNSS in time",
             place=f"{run.run_id}: odometer, column t",
             found=f"{odometer['t'][0]} to {odometer['t'][-1]}",
             expected=f"times within {gnss['t'][0]} to {gnss['t'][-1]}",
@@ -219,7 +219,7 @@ def _clock_remedy(run: RunLog) -> str:
     # Imported here because only such a run needs it.
     from pipeline.plausibility.fit import fit_run, remedy_of
 
-    known = "Check date and time scale of the two recorders; leave the odometer out to replay without it."
+    known = "Check date and time scale (UTC or GPS) of both recorders, or leave the odometer out."
     if not {"fix", *_PLACE} <= set(run.gnss.columns):
         return known
     found = fit_run(run, run.solutions()[0], Vehicle(), IngestConfig()).impossible

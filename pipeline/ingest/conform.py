@@ -114,7 +114,7 @@ def _to_integer(series: pl.Series, target: pl.DataType) -> pl.Series | str:
     cast = series.cast(target, strict=False)
     if cast.null_count() == series.null_count() and (cast.cast(series.dtype, strict=False) == series).all():
         return cast
-    return f"{series.dtype} with values that are no 64-bit integers"
+    return f"{series.dtype} with values that are not 64-bit integers"
 
 
 def _to_instant(series: pl.Series, target: pl.DataType) -> pl.Series | str:
@@ -164,17 +164,17 @@ _CONVERSIONS: dict[type[dy.Column], Callable[[pl.Series, pl.DataType], pl.Series
 def _check_values(series: pl.Series, column: dy.Column, where: str, breaches: list[Breach]) -> None:
     if not column.nullable and series.null_count():
         rows = rows_text(series.is_null())
-        breaches.append(Breach(where, "is not complete", found=f"null in {rows}", expected="a value in every row"))
+        breaches.append(Breach(where, "has missing values", found=f"null in {rows}", expected="a value in every row"))
     if isinstance(column, dy.Float64) and not all_finite(series):
         strange = ~series.is_finite().fill_null(True)
         value = series.filter(strange)[0]
         breaches.append(
             Breach(
                 where,
-                "is not a number",
+                "has values that are not finite numbers",
                 found=f"{value} in {rows_text(strange)}",
                 expected="finite numbers, null where unknown",
-                remedy="Write nulls for unknown values.",
+                remedy="Write null where a value is not known.",
             )
         )
     elif isinstance(column, dy.Float64 | dy.Int64):

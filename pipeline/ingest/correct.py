@@ -28,9 +28,9 @@ def corrected(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
         frame = run.stream(correction.stream)
         if frame is None:
             raise ConfigError(
-                "corrects a stream that the run does not have",
+                "the run has no such stream to correct",
                 place=f"{run.run_id}: [[ingest.correct]] stream = {correction.stream!r}",
-                remedy="Remove it, or replay this run with another configuration.",
+                remedy="Remove this correction, or replay this run with another configuration.",
             )
         run = run.with_streams(**{correction.stream: _corrected(frame, correction, run.run_id)})
         notes = replace(run.notes, corrections=(*run.notes.corrections, _told(correction)))
@@ -78,7 +78,7 @@ def _refuse_unknown(correction: StreamCorrection) -> None:
     named += [*_PLACE, "height_m"] if moves else []
     if unknown := sorted(set(named) - set(numbers)):
         raise ConfigError(
-            "cannot be corrected in this stream",
+            "names columns that cannot be corrected",
             place=f"[[ingest.correct]] stream = {correction.stream!r}",
             found=", ".join(unknown),
             expected="some of " + ", ".join(numbers),
@@ -91,10 +91,10 @@ def _refuse_no_place(frame: pl.DataFrame, correction: StreamCorrection, run_id: 
     beyond = frame.filter((pl.col(_PLACE[0]).abs() > 90.0) | (pl.col(_PLACE[1]).abs() > 180.0))
     if beyond.height:
         raise InputError(
-            "has places that are none on earth, as corrected",
+            "has latitudes or longitudes out of range after correction",
             place=f"{run_id}: {correction.stream}",
             found=f"latitude {beyond[_PLACE[0]][0]:g}, longitude {beyond[_PLACE[1]][0]:g}",
-            remedy="Correct [[ingest.correct]] in the configuration.",
+            remedy="Check [[ingest.correct]] in the configuration.",
         )
 
 

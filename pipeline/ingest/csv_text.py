@@ -109,7 +109,7 @@ def _names(body: str, separator: str, given: list[str]) -> list[str]:
     written = [name.strip() for name in first.row(0) if name and name.strip()]
     twice = sorted({name for name in written if written.count(name) > 1})
     if twice:
-        raise ValueError(f"a column name stands twice: {', '.join(twice)}")
+        raise ValueError(f"two columns have the same name: {', '.join(twice)}")
     return [name.strip() for name in given]
 
 

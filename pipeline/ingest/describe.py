@@ -240,7 +240,7 @@ def starting_config(topics: Sequence[TopicSummary]) -> str:
     parts = [part for topic in topics if topic.stream is None and topic.fields for part in (_suggestion(topic),)]
     if not parts:
         return ""
-    return "# Check every line: names tell neither units nor what a height refers to.\n\n" + "\n".join(parts)
+    return "# Check every line: names tell neither units nor whether a height is ellipsoidal.\n\n" + "\n".join(parts)
 
 
 def _suggestion(topic: TopicSummary) -> str:

@@ -30,7 +30,7 @@ def decoder_for(channel: Channel) -> Decode:
     makers = {"protobuf": _protobuf_decoder, "cdr": _cdr_decoder}
     if channel.encoding not in makers:
         raise InputError(
-            "has an encoding that is not read",
+            "has an encoding that this program does not read",
             place=channel.place,
             found=channel.encoding or "none",
             expected="json, protobuf or cdr",
@@ -50,7 +50,7 @@ def _object(pairs: list[tuple[str, Value]]) -> dict[str, Value]:
     """An object; of two values under one name, nobody can say which is meant."""
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError("a name stands twice in one object")
+        raise ValueError("a name occurs twice in one object")
     return found
 
 
@@ -116,10 +116,10 @@ def _made(make: Callable[[Schema], Any], channel: Channel) -> Any:
     """What `make` makes of the schema; parsers of schemas raise whatever they stumble over."""
     if channel.schema is None or channel.schema.encoding != _SCHEMA_ENCODINGS[channel.encoding]:
         raise InputError(
-            "has no schema that fits its encoding",
+            "has a schema encoding that does not fit its message encoding",
             place=channel.place,
-            found=f"encoding {channel.encoding}, schema encoding {channel.schema_encoding or 'none'}",
-            expected="protobuf with protobuf, cdr with ros2msg",
+            found=f"message encoding {channel.encoding}, schema encoding {channel.schema_encoding or 'none'}",
+            expected="schema encoding protobuf for protobuf messages, ros2msg for cdr messages",
         )
     try:
         return make(channel.schema)
@@ -164,7 +164,7 @@ def decode_columns(
 def undecodable(channel: Channel, messages: Messages, row: int, error: UndecodableError) -> InputError:
     """The error for one message, named by the time at which it was recorded."""
     return InputError(
-        f"the message of log time {messages.times('log_time')[row]} ns cannot be decoded: {error}",
+        f"the message recorded at log time {messages.times('log_time')[row]} ns cannot be decoded: {error}",
         place=channel.place,
         remedy="Record the log again, or map other fields.",
     )
@@ -224,7 +224,7 @@ def _as_float(value: Value) -> float | None:
 def _as_int(value: Value) -> int | None:
     if value is None or (isinstance(value, int) and not isinstance(value, bool)):
         if value is not None and not -(2**63) <= value < 2**63:
-            raise UndecodableError(f"{_shown(value)} is no 64-bit integer")
+            raise UndecodableError(f"{_shown(value)} is not a 64-bit integer")
         return value
     if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
         return int(value)
@@ -234,7 +234,7 @@ def _as_int(value: Value) -> int | None:
 def _as_text(value: Value) -> str | None:
     if value is None or isinstance(value, str):
         return value
-    raise UndecodableError(f"{_shown(value)} is not a text")
+    raise UndecodableError(f"{_shown(value)} is not text")
 
 
 def _as_flag(value: Value) -> bool | None:

@@ -49,7 +49,7 @@ def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Ma
     unknown = sorted(named - set(contract))
     if unknown:
         raise ConfigError(
-            "is no column of this stream",
+            "maps columns that this stream does not have",
             place=f"[ingest.{stream}] topic {mapping.topic}",
             found=", ".join(unknown),
             expected=", ".join(contract),
@@ -78,7 +78,7 @@ def _constant(stream: Stream, mapping: StreamMapping, name: str, column: dy.Colu
         fits = isinstance(value, bool if isinstance(column, dy.Bool) else str)
     if not fits or (words is not None and value not in words):
         raise ConfigError(
-            "cannot be the constant of this column",
+            "is not a valid constant for this column",
             place=f"[ingest.{stream}] topic {mapping.topic}: constants.{name}",
             found=repr(value),
             expected=", ".join(words) if words is not None else str(column.dtype),

@@ -60,8 +60,8 @@ class McapStreams:
             raise InputError(
                 f"holds more than {_MOST_TOPICS} topics of positions, speeds or reads",
                 place=channel.file,
-                expected="those of one train",
-                remedy="Choose topics by [ingest] in the configuration, or take the others out of the log.",
+                expected="the topics of one train",
+                remedy="Select topics with [ingest] in the configuration, or remove the others from the log.",
             )
         _check_sizes(messages, channel)
         sample = sample_of(messages, channel)
@@ -72,7 +72,9 @@ def _check_sizes(messages: Messages, channel: Channel) -> None:
     largest = int(messages.length.max())
     if largest > LARGEST_MESSAGE:
         raise InputError(
-            f"has a message of {largest} bytes", place=channel.place, expected=f"at most {LARGEST_MESSAGE} for a stream"
+            f"has a message of {largest} bytes",
+            place=channel.place,
+            expected=f"at most {LARGEST_MESSAGE} bytes in a topic that feeds a stream",
         )
 
 
@@ -207,9 +209,9 @@ def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breac
     return Breach(
         str(path),
         "holds no GNSS stream",
-        found=", ".join(left_over[:40]) or "no messages of other topics",
+        found=", ".join(left_over[:40]) or "no messages",
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
-        remedy="Map a topic in the configuration; `balise inspect` prints a starting one.",
+        remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",
     )
 
 

@@ -69,7 +69,7 @@ class Summary:
             pairs.append(("times", (start_ns, told.message_end_time), met.span_ns))
         for name, expected, found in pairs:
             if expected != found:
-                raise DamageError(position, f"the statistics speak of {expected} {name}, the file holds {found}")
+                raise DamageError(position, f"the statistics record gives {expected} {name}, the file holds {found}")
 
     def finish(self, footer: memoryview, position: int, window: ByteWindow) -> int | None:
         """The footer and the end of the file; the offset of a cut through the closing magic, if there is one."""
@@ -91,7 +91,7 @@ class Summary:
         told, chunks = (np.frombuffer(entries, dtype=CHUNK_ENTRY) for entries in (self._indexed, self._met.chunks))
         told = told[np.argsort(told["offset"], kind="stable")]
         if not np.array_equal(told["offset"], chunks["offset"]):
-            kind = f"the chunk index names {len(told)} chunks, not the {len(chunks)} there are"
+            kind = f"the chunk index names {len(told)} chunks, but the file has {len(chunks)}"
             raise DamageError(position, kind)
         if (told != chunks).any():
             raise DamageError(position, "the chunk index disagrees with the chunks")
@@ -119,9 +119,9 @@ def _check_end(end: int, window: ByteWindow) -> int | None:
     left = min(len(MAGIC), window.size - end)
     closing = bytes(window.at(end, left)) if left else b""
     if not MAGIC.startswith(closing):
-        raise DamageError(end, "the closing magic is wrong")
+        raise DamageError(end, "the magic bytes at the end are wrong")
     if closing != MAGIC:
         return end
     if end + len(MAGIC) != window.size:
-        raise DamageError(end + len(MAGIC), "the file goes on after its end: trailing data, or two files in one")
+        raise DamageError(end + len(MAGIC), "there is data after the end of the file: two files may have been joined")
     return None

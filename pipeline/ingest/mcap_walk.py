@@ -119,13 +119,13 @@ class McapWalk:
             raise DamageError(0, "the file is empty")
         start = bytes(self._window.at(0, min(size, len(MAGIC))))
         if not MAGIC.startswith(start):
-            raise DamageError(0, "the file does not start as MCAP does")
+            raise DamageError(0, "the file does not start with the MCAP magic bytes")
         if size == len(start):
             self.cut_at = size
             return None
         head = self._head(len(MAGIC))
         if head is not None and head[0] != Op.HEADER:
-            raise DamageError(len(MAGIC), "the first record is no Header")
+            raise DamageError(len(MAGIC), "the first record is not a Header")
         return len(MAGIC) if head is not None else None
 
     def _head(self, position: int) -> tuple[int, int] | None:
@@ -197,11 +197,11 @@ class McapWalk:
     def _other_record(self, opcode: int, position: int) -> None:
         """Unknown opcodes are skipped, by specification; known ones stand where they must not."""
         if opcode <= max(Op):
-            raise DamageError(position, f"a {Op(opcode).name} record stands in the data section")
+            raise DamageError(position, f"a {Op(opcode).name} record is not allowed in the data section")
 
     def _header(self, body: memoryview, position: int) -> None:
         if position != len(MAGIC):
-            raise DamageError(position, "a second Header: is this two files in one?")
+            raise DamageError(position, "a second Header: two files may have been joined")
         parse(mcap.records.Header, body, position)
 
     def _schema(self, body: memoryview, position: int) -> None:
@@ -210,12 +210,12 @@ class McapWalk:
             raise DamageError(position, "a Schema record has the id 0")
         schema = Schema(record.id, record.name, record.encoding, record.data)
         if self._schemas.setdefault(schema.id, schema) != schema:
-            raise DamageError(position, f"schema {schema.id} is defined a second time, differently")
+            raise DamageError(position, f"schema {schema.id} is defined twice with different content")
 
     def _channel(self, body: memoryview, position: int) -> None:
         record = parse(mcap.records.Channel, body, position)
         if self._definitions.setdefault(record.id, record) != record:
-            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined a second time, differently")
+            raise DamageError(position, f"channel {record.id} ({record.topic}) is defined twice with different content")
         if record.schema_id and record.schema_id not in self._schemas:
             raise DamageError(position, f"schema {record.schema_id} of topic {record.topic} is missing")
         schema = self._schemas.get(record.schema_id)
@@ -235,7 +235,7 @@ class McapWalk:
 
     def _message_index(self, body: memoryview, position: int) -> None:
         if not self._pending:
-            raise DamageError(position, "a message index follows no chunk")
+            raise DamageError(position, "a message index does not follow a chunk")
         channel, entries = parse_message_index(body, position)
         if len(entries):  # recovered logs have empty ones
             self._pending[-1].indexes.append((channel, entries))
@@ -276,7 +276,7 @@ class McapWalk:
                 _HANDLERS[opcode](self, body, position)
                 self._known.add(key)
         elif opcode <= max(Op):
-            raise DamageError(position, f"a record of opcode {opcode} stands inside a chunk")
+            raise DamageError(position, f"a record of opcode {opcode} is not allowed inside a chunk")
 
     def _counted(self, block: Block, offset: int, size: int) -> Block:
         for channel_id, messages in block.items():
@@ -292,7 +292,7 @@ class McapWalk:
 
     def _summary_record(self, opcode: int, length: int, position: int, summary: Summary) -> int | None:
         if opcode in _DATA_OPS:
-            raise DamageError(position, f"a {Op(opcode).name} record stands after the end of the data")
+            raise DamageError(position, f"a {Op(opcode).name} record comes after the end of the data")
         self._check_size("summary", length, position)
         whole = self._window.at(position, HEAD_SIZE + length)
         if opcode == Op.FOOTER:

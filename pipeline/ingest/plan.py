@@ -160,7 +160,7 @@ def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: 
         channel.place,
         f"has no field {', '.join(absent)} for column {column}",
         found=", ".join(list(fields)[:40]) or None,
-        remedy="Map the column by `fields` in [ingest] of the configuration.",
+        remedy="Name the field of this column in `fields` of [ingest] in the configuration.",
     )
 
 
@@ -192,7 +192,7 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
             return time_source(parts, sample.fields, mapping)
         if unfit and named:
             place = f"{sample.channel.place}: field {candidate}"
-            breaches.append(Breach(place, "is no time", found=unfit[0], expected="numbers or text"))
+            breaches.append(Breach(place, "is not a time", found=unfit[0], expected="numbers or text"))
             return log_time
     if named:
         breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))

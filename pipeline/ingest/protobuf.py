@@ -70,7 +70,7 @@ class _Walk:
                 raise UnfitError(f"no field {step}")
             occurrences = met.get(field.number, [])
             if len(occurrences) > 1:
-                raise UnfitError("a field stands twice")
+                raise UnfitError("a field occurs twice")
             if not occurrences:
                 self._absent(field, subtree)
             elif field.is_repeated:

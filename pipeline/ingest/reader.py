@@ -105,7 +105,7 @@ class SourceReader:
         try:
             self._keep(self._template.values(joined_rows(waiting)))
         except UnfitError as error:
-            raise InputError(f"holds what cannot be decoded: {error}", place=self.source.channel.place) from None
+            raise InputError(f"a message cannot be decoded: {error}", place=self.source.channel.place) from None
 
     def _keep(self, values: Mapping[str, Any]) -> None:
         for path, dtype in self.source.types.items():
@@ -135,7 +135,7 @@ def _typed(values: Values, dtype: pl.DataType) -> Values:
     if isinstance(values, pl.Series):
         return values.cast(dtype)
     if values.dtype == np.uint64 and len(values) and values.max() >= 2**63 and dtype == pl.Int64():
-        raise InputError("holds a number beyond 64 bits with sign", found=str(values.max()))
+        raise InputError("has a number too large for a signed 64-bit integer", found=str(values.max()))
     return np.ascontiguousarray(values.astype(_KINDS[type(dtype)]))
 
 

@@ -54,7 +54,7 @@ def _location_fix() -> Recipe:
             **covariance_enu(pl.col("position_covariance_type") > 0),
         },
         types={"position_covariance_type": pl.Int64()},
-        remark="the schema has no status: every position counts as an autonomous fix",
+        remark="the message has no fix status: every position is taken as an autonomous fix",
     )
 
 

@@ -216,7 +216,7 @@ def _gps_fix() -> Recipe:
             "status.status": pl.Int64(), "status.satellites_used": pl.Int64(),
             "position_covariance_type": pl.Int64(),
         },
-        remark="the schema does not say what its altitude refers to: it is taken as over the ellipsoid",
+        remark="the message does not say what its altitude refers to: it is taken as height over the ellipsoid",
     )  # fmt: skip
 
 

@@ -64,7 +64,7 @@ def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
                 place=f"[ingest.gnss] solution {source.solution}",
                 found=f"{topics[source.solution]}, {source.channel.topic}",
                 expected="one name per topic",
-                remedy="Set solution in each [[ingest.gnss]].",
+                remedy="Give each [[ingest.gnss]] a `solution` of its own.",
             )
 
 
@@ -79,7 +79,7 @@ def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Bre
             f"several topics could be the {stream}",
             found=", ".join(topics),
             expected="one",
-            remedy=f"Choose one by [ingest.{stream}] topic in the configuration.",
+            remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration.",
         )
     ]
 

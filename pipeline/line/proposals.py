@@ -49,12 +49,13 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Set:
-    """A balise that was placed; `distance_m` from the one before on the way."""
+    """A balise that was placed; `distance_m` from the one before on the way, over the pieces `since` that one."""
 
     piece: int
     virtual: bool
     distance_m: float | None
     near: str
+    since: tuple[int, ...]
 
 
 def proposals(line: Line) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -157,7 +158,8 @@ def _walk(line: Line, way: Sequence[_Place], allowed: Bools, spacing_m: float) -
         virtual = choice is not None
         index = int(np.argmin(np.abs(at_m - last_m - spacing_m))) if choice is None else choice
         distance_m = float(at_m[index]) - last_m if begun else None
-        yield _Set(way[index].piece, virtual, distance_m, near.get(way[index].piece, ("", 0.0))[0])
+        since = tuple(place.piece for place in way if last_m < place.at_m <= at_m[index])
+        yield _Set(way[index].piece, virtual, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
         last_m, begun = max(float(at_m[index]), last_m + 0.5 * spacing_m), True
 
 
@@ -221,11 +223,7 @@ def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
         .iter_rows()
     }
     proved = _allowed(line, (True, False))
-    errors = (
-        {}
-        if "largest_undetected_m" not in line.table
-        else dict(line.table.group_by("piece").agg(pl.col("largest_undetected_m").max()).iter_rows())
-    )
+    errors = dict(line.table.group_by("piece").agg(pl.col("largest_undetected_m").max()).iter_rows())
     distance = pl.Series([one.distance_m for one in placed], dtype=pl.Float64)
     numbers = {True: 0, False: 0}
     ids = []
@@ -241,11 +239,16 @@ def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
             near=pl.Series([one.near for one in placed], dtype=pl.String),
             distance_m=distance,
             odometer_confidence_m=line.lds.odometer_fixed_m + line.lds.odometer_share * distance,
-            largest_undetected_m=pl.Series([errors.get(one.piece) for one in placed], dtype=pl.Float64),
+            largest_undetected_m=pl.Series([_largest(errors, one) for one in placed], dtype=pl.Float64),
             proved=pl.Series([bool(proved[one.piece]) and one.virtual for one in placed], dtype=pl.Boolean),
         )
         .select(*LineBalises.columns())
     )
+
+
+def _largest(errors: dict[int, float | None], one: _Set) -> float | None:
+    known = (errors.get(piece) for piece in one.since)
+    return max((error for error in known if error is not None), default=None)
 
 
 def _figures(line: Line, name: str, spacing_m: float, mode: str, placed: Sequence[_Set]) -> dict[str, object]:

@@ -69,4 +69,4 @@ def _rest(passes: pl.DataFrame, table: pl.DataFrame, figures: pl.DataFrame) -> I
     elif figures["points"].max() and (figures["points_served"] < figures["points"]).any():
         yield "Not every station or signal has a suitable piece near: see `points_served`."
     if table["largest_undetected_m"].is_null().all():
-        yield "The largest undetected error is not in these tables; bridges show the odometer's confidence alone."
+        yield "The largest undetected error is not in these tables (`balise replay --undetected` computes it)."

@@ -25,13 +25,13 @@ def off_the_network(fixes: Fixes, track: Track, config: MatchingConfig) -> Input
     if float(np.min(swapped_m)) < min(10 * config.reach_m + 1000.0, float(nearest_m[row])):
         remedy = "Latitude and longitude are swapped, in the log or in the site: exchange them."
     elif nearest_m[row] > 10_000.0:
-        remedy = "Check that it is this site, and that track file and log name their coordinate system rightly."
+        remedy = "Check that this is the right site, and that track file and log name the correct coordinate system."
     elif nearest_m[row] < 500.0:
-        remedy = "A national grid or datum taken for WGS 84 shifts by as much: check the EPSG codes of both."
+        remedy = "A national grid or datum read as WGS 84 gives such a shift: check the EPSG codes of both."
     else:
-        remedy = "Check that the site covers this run; matching.reach_m says how far off a track may be."
+        remedy = "Check that the site covers this run; matching.reach_m is the largest accepted distance from a track."
     return InputError(
-        "the run is wholly off the track",
+        "all positions of the run are off the track",
         place="gnss: columns latitude_deg, longitude_deg",
         found=f"positions {_length(float(nearest_m[row]))} or more from any track, nearest at "
         f"{latitude:.5f}, {longitude:.5f} (track at {track.latitude_deg[at]:.5f}, {track.longitude_deg[at]:.5f})",

@@ -40,40 +40,6 @@ def found_route(found: Match, sure: float) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
 
 
-def route_of_epochs(epochs: pl.DataFrame, sure: float) -> pl.DataFrame:
-    """The same of one solution's `epochs` in a result, without rivals: net elements with positions, by growing path.
-
-    Where the way turned over a switch, the rows of both legs stand beside each other and have to be put in order.
-    """
-    placed = epochs.filter(pl.col("on_track") & pl.col("netelement_id").is_not_null())
-    visit = pl.col("netelement_id").rle_id()
-    grows = (
-        (pl.col("path_m") - pl.col("path_m").mean()) * (pl.col("measure_m") - pl.col("measure_m").mean())
-    ).sum() >= 0
-    placed = placed.with_columns(forward=grows.over(visit))
-    # Where the element begins on the path tells laps apart, and is the same however often the train turns on it.
-    origin = pl.col("path_m") - pl.when("forward").then(1.0).otherwise(-1.0) * pl.col("measure_m")
-    least = pl.col("path_probability").min()
-    return (
-        placed.group_by("netelement_id", "forward", origin.round(0).alias("origin"))
-        .agg(
-            pl.col("path_m").min(),
-            (least < sure).fill_null(value=True).alias("doubtful"),
-            least.alias("probability"),
-            pl.col("cross_track_m").median().alias("cross_bias_m"),
-            pl.col("t").min().alias("t_start"),
-            pl.col("t").max().alias("t_end"),
-        )
-        .sort("path_m", "t_start")
-        .with_columns(
-            pl.when("forward").then(pl.lit("AB")).otherwise(pl.lit("BA")).alias("direction"),
-            pl.lit(None, dtype=pl.Int64).alias("leg"),
-            pl.lit("").alias("rivals"),
-        )
-        .select(pl.col(name).cast(kind) for name, kind in ROUTE_COLUMNS.items())
-    )
-
-
 def _passages(track: Track, leg: Leg) -> list[list[int]]:
     """Visits that are one passage of an element: its pieces, one after the other. Each lap of a ring is another."""
     passages: list[list[int]] = []

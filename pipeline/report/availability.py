@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import ceil
+
 import numpy as np
 import polars as pl
 
@@ -13,7 +15,9 @@ from schemas.run import Site
 
 _PIECES = 400
 _TRACK_POINTS = 3000
-_STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
+# Each a multiple of the one before, so that pieces of runs go together without their epochs.
+_STEPS_M = (10.0, 50.0, 100.0, 500.0, 1000.0, 5000.0)
+_PLACE = ("solution", "netelement_id", "from_m")
 
 
 def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
@@ -21,31 +25,48 @@ def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
 
     Where nobody knows whether the train moved, the epoch counts, and its TVB does not.
 
-    Pieces have one length in a campaign, chosen so that there are some hundred of them.
+    Pieces have one length, `step_m`, chosen so that there are some hundred of them.
     """
     moving = epochs.filter(
         pl.col("moving").fill_null(value=True)
         & pl.col("netelement_id").is_not_null()
         & pl.col("measure_m").is_not_null()
     )
-    extents = (
-        moving.group_by("netelement_id").agg(low=pl.col("measure_m").min(), high=pl.col("measure_m").max()).collect()
-    )
-    total_m = float((extents["high"] - extents["low"]).sum() or 0.0)
-    step_m = next((step for step in _STEPS_M if total_m / step <= _PIECES), max(_STEPS_M[-1], total_m / _PIECES))
+    extents = moving.group_by("netelement_id").agg(low_m=pl.col("measure_m").min(), high_m=pl.col("measure_m").max())
+    step_m = _step_m(extents.collect())
     valid = pl.col("tvb") & pl.col("moving").fill_null(value=False)
-    return (
-        moving.group_by("solution", "netelement_id", piece=(pl.col("measure_m") / step_m).floor())
-        .agg(
-            epochs=pl.len(),
-            tvb=valid.sum(),
-            alarms=pl.col("alarm").sum(),
-        )
-        .with_columns(from_m=pl.col("piece") * step_m, to_m=(pl.col("piece") + 1.0) * step_m)
-        .drop("piece")
-        .collect()
-        .sort("solution", "netelement_id", "from_m")
+    found = moving.group_by(_PLACE[:2], from_m=_piece_m(pl.col("measure_m"), step_m)).agg(
+        epochs=pl.len().cast(pl.Int64),
+        tvb=valid.sum().cast(pl.Int64),
+        alarms=pl.col("alarm").sum().cast(pl.Int64),
+        low_m=pl.col("measure_m").min(),
+        high_m=pl.col("measure_m").max(),
     )
+    return _of_length(found.collect(), step_m)
+
+
+def together(pieces: pl.DataFrame) -> pl.DataFrame:
+    """The pieces of several runs as pieces of one length, none shorter than those of any run."""
+    step_m = _step_m(pieces)
+    sums = (pl.col(name).sum() for name in ("epochs", "tvb", "alarms"))
+    found = pieces.with_columns(from_m=_piece_m(pl.col("from_m"), step_m)).group_by(_PLACE)
+    return _of_length(found.agg(*sums, pl.col("low_m").min(), pl.col("high_m").max()), step_m)
+
+
+def _step_m(extents: pl.DataFrame) -> float:
+    """Length of pieces for net elements of which these parts were ridden."""
+    found = extents.group_by("netelement_id").agg(pl.col("low_m").min(), pl.col("high_m").max())
+    total_m = float((found["high_m"] - found["low_m"]).sum() or 0.0)
+    long_m = _STEPS_M[-1]
+    return next((step for step in _STEPS_M if total_m / step <= _PIECES), long_m * ceil(total_m / _PIECES / long_m))
+
+
+def _piece_m(measure_m: pl.Expr, step_m: float) -> pl.Expr:
+    return (measure_m / step_m).floor() * step_m
+
+
+def _of_length(pieces: pl.DataFrame, step_m: float) -> pl.DataFrame:
+    return pieces.with_columns(to_m=pl.col("from_m") + step_m).sort(_PLACE)
 
 
 def availability_map(pieces: pl.DataFrame, hazards: pl.DataFrame, site: Site | None) -> Json:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.figures.hazard_words import off_words, seen_words
 from pipeline.figures.verdict import head_of, run_verdicts, verdict_reasons, word_of, worst_verdict
 from pipeline.report.columns import Row
 from pipeline.report.markup import number
 from pipeline.report.words import plural
 from schemas.config import Configuration
-from schemas.enums import BaliseKind, Hazard, Judgement, PassageStatus, RunVerdict
+from schemas.enums import BaliseKind, Hazard, Judgement, PassageStatus, RunVerdict, Timing
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
@@ -71,7 +72,8 @@ def _wrong_acceptance(wrong: pl.DataFrame, hazards: pl.DataFrame) -> str:
     others = wrong.height - 1
     more = f" ({plural(others, 'more wrong acceptance')})" if others else ""
     found = hazard.row(0, named=True) if hazard.height else None
-    return f"{first['balise_id']} accepted {_where(first['location_error_m'], found)}{more}{_seen(found)}"
+    seen = "" if found is None else f", {seen_words(found)}"
+    return f"{first['balise_id']} accepted {_where(first['location_error_m'], found)}{more}{seen}"
 
 
 def _where(error_m: float | None, hazard: Row | None) -> str:
@@ -79,17 +81,7 @@ def _where(error_m: float | None, hazard: Row | None) -> str:
         return "on the wrong track"
     if error_m is None:
         return "at a wrong place"
-    return f"{abs(error_m):.0f} m {'early' if error_m > 0 else 'late'}"
-
-
-def _seen(hazard: Row | None) -> str:
-    if hazard is None:
-        return ""
-    if not hazard["detected"]:
-        return ", no monitor saw it"
-    late_s = hazard["time_to_detect_s"]
-    by = f", {hazard['monitor']} saw it"
-    return by if late_s is None else f"{by} {number(late_s)} s after the fault began"
+    return off_words(error_m, Timing.EARLY if error_m > 0 else Timing.LATE)
 
 
 def campaign_headline(

@@ -4,47 +4,54 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import quote
 
 import polars as pl
 
+from pipeline import storage
 from pipeline.campaign.plan import software_digest
 from pipeline.campaign.workers import each
 from pipeline.figures.derived_tables import derived_tables
-from pipeline.report.availability import availability_pieces
+from pipeline.report.availability import availability_pieces, together
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, Neighbours, run_page
+from pipeline.report.shares import Share, known_shares, remember
+from pipeline.results import catalogue
 from pipeline.results.store import (
     check_site,
     complete_runs,
     file_name,
     metadata_of,
+    read_config,
     read_run,
-    read_table,
     table_address,
 )
 from pipeline.safety.side_by_side import side_by_side
 from pipeline.safety.tally import added
-from schemas.config import Configuration, read_toml, settings_from
-from schemas.errors import OutputError
-from schemas.run import Site
+from pipeline.storage import files
+from schemas.config import Configuration, to_toml
+from schemas.run import RunTables, Site
 from schemas.tables import TABLES
 
 _PAGES_PER_PROCESS = 20
+# Bytes at the end of a page that hold what it was made from.
+_MARK = "<!-- {} -->\n"
+_MARK_BYTES = 100
 
 
 @dataclass(frozen=True)
 class _Page:
-    """What the page of one run is made from."""
+    """What the page of one run is made from; `content`: digest of its tables as last read, empty if they changed."""
 
     out: Path
     run: str
     path: Path
     made: Made
     neighbours: Neighbours
+    content: str
 
 
 def write_report(
@@ -57,26 +64,34 @@ def write_report(
     from these very tables, settings and program are left as they are. `jobs` processes make the others, by
     default one per core where there are many; `progress` is told how many pages of how many are done.
     """
-    runs = complete_runs(out)
+    names = {run: page_name(run) for run in complete_runs(out)}
     made = _made(out, site)
-    names = {run: page_name(run) for run in runs}
+    states = catalogue.states(out, *TABLES) or {}
+    shares = known_shares(out, states, _settings_digest(made))
     beside = _neighbours(names)
-    pages = [_Page(out, run, out / "report" / "runs" / name, made, beside[run]) for run, name in names.items()]
-    written: list[Path] = []
-    found: dict[str, pl.DataFrame] = {}
-    for done, (page, tallies) in enumerate(
-        zip(pages, each(_written, pages, jobs or _worth(len(pages))), strict=True), start=1
-    ):
-        written.append(page.path)
-        if tallies is not None:
-            found[page.run] = tallies
+    pages = [
+        _Page(out, run, out / "report" / "runs" / name, made, beside[run], shares[run].content if run in shares else "")
+        for run, name in names.items()
+    ]
+    left = [page for page in pages if not _is_there(page)]
+    for done, share in enumerate(each(_written, left, jobs or _worth(len(left))), start=len(pages) - len(left) + 1):
+        shares[share.run] = share
         if progress is not None:
             progress(done, len(pages))
-    for leftover in sorted(set((out / "report" / "runs").glob("*.html")) - {page.path for page in pages}):
-        leftover.unlink()
+    if states == catalogue.states(out, *TABLES):
+        remember(out, states, _settings_digest(made), shares)
+    _remove_others(out / "report" / "runs", {page.path.name for page in pages})
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
-    index = _write(out / "report" / "index.html", campaign_page(_campaign(out, made, hrefs, found), made).encode())
-    return [index, *written]
+    index = out / "report" / "index.html"
+    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, shares), made).encode())
+    return [index, *(page.path for page in pages)]
+
+
+def _remove_others(folder: Path, names: Collection[str]) -> None:
+    """Remove pages of runs that are no longer in the result."""
+    for name in files.list_dir(folder):
+        if name.endswith(".html") and name not in names:
+            storage.remove(folder / name)
 
 
 def page_name(run_id: str) -> str:
@@ -95,64 +110,77 @@ def _worth(pages: int) -> int:
     return min(os.cpu_count() or 1, 1 + pages // _PAGES_PER_PROCESS)
 
 
-def _written(page: _Page) -> pl.DataFrame | None:
-    """Write the page, unless it is there already; returns the run's solutions side by side where it has several."""
-    metadata = metadata_of(Path(str(table_address(page.out, "runs", page.run))))
-    check_site(page.made.site, metadata.get("site_digest"), page.run)
-    mark = f"<!-- {_made_from(page)} -->\n".encode()
+def _is_there(page: _Page) -> bool:
+    """Whether the page was made from these very tables; one of a site without digest is never known to be."""
     known_site = page.made.site is None or page.made.site.digest
-    kept = bool(known_site) and page.path.exists() and page.path.read_bytes().endswith(mark)
-    if kept and read_table(page.out, "runs", page.run).select(pl.len()).collect().item() == 1:
-        return None
+    return bool(page.content and known_site) and _end_of(page.path).endswith(_mark(page, page.content))
+
+
+def _end_of(path: Path) -> bytes:
+    """The last bytes of a file; none of one that cannot be read, which is written anew."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - _MARK_BYTES, 0))
+            return file.read()
+    except OSError:
+        return b""
+
+
+def _written(page: _Page) -> Share:
+    """Write the page unless it is there already; returns what the run adds to the page of the campaign."""
+    contents = {name: storage.content_of(table_address(page.out, name, page.run)) for name in TABLES}
+    metadata = metadata_of(contents["runs"] or b"")
+    check_site(page.made.site, metadata.get("site_digest"), page.run)
     tables = read_run(page.out, page.run)
+    share = _share(page, tables, _digest(contents))
+    if not _is_there(replace(page, content=share.content)):
+        html = run_page(tables, metadata, page.made, share.tallies, page.neighbours)
+        storage.write_bytes(page.path, html.encode() + _mark(page, share.content))
+    return share
+
+
+def _share(page: _Page, tables: RunTables, content: str) -> Share:
     tallies = None
     if tables.runs.height > 1:
         tallies = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, page.made.config)
-    if not kept:
-        _write(page.path, run_page(tables, metadata, page.made, tallies, page.neighbours).encode() + mark)
-    return tallies
+    return Share(page.run, content, availability_pieces(tables.epochs.lazy()), tallies)
 
 
-def _made_from(page: _Page) -> str:
-    """SHA-256 over the run's tables, the settings, the site and the program: all that its page follows from."""
-    digest = hashlib.sha256(software_digest().encode())
-    for name in TABLES:
-        table = Path(str(table_address(page.out, name, page.run)))
-        digest.update(table.read_bytes() if table.exists() else b"missing")  # which reading the tables tells
-    site = page.made.site
-    beside = f"{page.run}\n{page.neighbours}"
-    digest.update(f"{beside}\n{page.made.config_text}\n{None if site is None else site.digest}".encode())
+def _digest(contents: Mapping[str, bytes | None]) -> str:
+    digest = hashlib.sha256()
+    for content in contents.values():
+        digest.update(hashlib.sha256(b"missing" if content is None else content).digest())
     return digest.hexdigest()
 
 
+def _mark(page: _Page, content: str) -> bytes:
+    """SHA-256 over the run's tables, the settings, the site and the program: all that its page follows from."""
+    site = page.made.site
+    beside = f"{page.run}\n{page.neighbours}\n{None if site is None else site.digest}"
+    digest = hashlib.sha256(f"{_settings_digest(page.made)}\n{content}\n{beside}".encode())
+    return _MARK.format(digest.hexdigest()).encode()
+
+
+def _settings_digest(made: Made) -> str:
+    """SHA-256 over the program and the configuration."""
+    return hashlib.sha256(f"{software_digest()}\n{made.config_text}".encode()).hexdigest()
+
+
 def _made(out: Path, site: Site | None) -> Made:
-    path = out / "config.toml"
-    if not path.exists():
-        return Made(Configuration(), None, site)
-    config = settings_from(read_toml(path), Configuration, str(path))
-    return Made(config, path.read_text(encoding="utf-8"), site)
+    config = read_config(out)
+    return Made(config or Configuration(), None if config is None else to_toml(config), site)
 
 
-def _campaign(out: Path, made: Made, hrefs: dict[str, str], found: dict[str, pl.DataFrame]) -> Campaign:
-    needed = ("solution", "netelement_id", "measure_m", "moving", "tvb", "alarm")
-    epochs = read_table(out, "epochs").select(pl.col(name) for name in needed)
-    small = ("runs", "hazards", "passages", "alarms")
-    runs, hazards, passages, alarms = (read_table(out, name).collect() for name in small)
+def _campaign(out: Path, made: Made, hrefs: dict[str, str], shares: Mapping[str, Share]) -> Campaign:
+    found = catalogue.gather(out)
+    runs, hazards, passages, alarms = (found[name] for name in ("runs", "hazards", "passages", "alarms"))
+    in_order = [shares[run] for run in hrefs]
     return Campaign(
         runs=runs,
         hazards=hazards,
         passages=passages,
         derived=derived_tables(runs, hazards, passages, alarms, made.config),
-        pieces=availability_pieces(epochs),
+        pieces=together(pl.concat([share.pieces for share in in_order])),
         hrefs=hrefs,
-        architectures=added(found.values()),
+        architectures=added(share.tallies for share in in_order if share.tallies is not None),
     )
-
-
-def _write(path: Path, content: bytes) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
-    return path

@@ -62,7 +62,7 @@ def _checks(found: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
         for check in fit.checks
     ]
     rows += [
-        (name, "placeholders", State.MISFIT.value, f"{one.placeholders} positions are none", "0/0 or a default place")
+        (name, "placeholders", State.MISFIT.value, f"{one.placeholders} taken as no fix", "0/0 or a default place")
         for name, one in counts.solutions.items()
         if one.placeholders
     ]

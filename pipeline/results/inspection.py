@@ -50,7 +50,7 @@ def inspect_path(
     if names & _SITE_FILES or (is_geojson(path) and not names):
         return inspect_site(path, result, matching or MatchingConfig())
     if result is not None:
-        raise UsageError("is no site", place=redacted(str(path)), expected="a site, to hold a result against")
+        raise UsageError("is not a site", place=redacted(str(path)), expected="a site, to compare the result with")
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:

@@ -11,14 +11,14 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 
 from pipeline import storage
-from pipeline.results import store
+from pipeline.results import catalogue, store
 from pipeline.storage import FileDigest, files
 from pipeline.storage.address import Address, is_url, join, redacted
 from schemas.errors import UsageError
@@ -66,24 +66,37 @@ def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> Non
 
 
 def write_manifest(out: Address) -> Manifest:
-    """Gather the manifest from all complete runs and write it."""
-    runs, sites = {}, {}
-    for run_id, content in _markers(out):
+    """Gather the manifest from all complete runs and write it; those that did not change since are not read again."""
+    states = catalogue.states(out) or {}
+    earlier = _earlier(out)
+    runs = _unchanged(out, earlier, states)
+    sites = {run["site"]: earlier["sites"].get(run["site"], []) for run in runs.values()}
+    for run_id, content in _markers(out, [run for run in store.run_ids(out) if run not in runs]):
         metadata = store.metadata_of(content)
         site = metadata.get("site_digest", "").partition(" ")[0]
         sites[site] = _files(metadata.get("site_files"))
         runs[run_id] = _run(metadata, content)
-    earlier = _earlier(out)["settings"]
     used = {run["config_digest"] for run in runs.values()}
     manifest = {
         **_frame(),
-        "settings": {digest: files for digest, files in sorted(earlier.items()) if digest in used},
+        "settings": {digest: files for digest, files in sorted(earlier["settings"].items()) if digest in used},
         "files": _own_files(out),
         "sites": dict(sorted(sites.items())),
         "runs": dict(sorted(runs.items())),
     }
     _write(out, manifest)
+    # Runs that changed while they were read must not pass for what was read.
+    if states and states == catalogue.states(out):
+        catalogue.keep(out, NAME, {"of": _sha256(_content(manifest)), "states": states})
     return manifest
+
+
+def _unchanged(out: Address, earlier: Manifest, states: Mapping[str, str]) -> dict[str, Any]:
+    """The runs of the manifest as it was gathered last whose files are as they were then."""
+    known = catalogue.kept(out, NAME)
+    if not known or known.get("of") != _sha256(storage.content_of(join(out, NAME)) or b""):
+        return {}
+    return {run: earlier["runs"][run] for run, state in states.items() if known["states"].get(run) == state}
 
 
 def read_manifest(out: Address) -> Manifest | None:
@@ -99,7 +112,7 @@ def read_manifest(out: Address) -> Manifest | None:
         known = False
     if not known:
         raise UsageError(
-            "is no manifest of this program", place=redacted(str(address)), remedy="`balise replay` writes it anew."
+            "is not a manifest of this program", place=redacted(str(address)), remedy="`balise replay` writes one."
         )
     return dict(found)
 
@@ -155,7 +168,7 @@ def _packages() -> dict[str, str]:
 
 def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
     """What one run was made from, and the digests of its tables."""
-    digests = {**json.loads(metadata.get("tables", "{}")), "runs": hashlib.sha256(marker).hexdigest()}
+    digests = {**json.loads(metadata.get("tables", "{}")), "runs": _sha256(marker)}
     site, _, route = metadata.get("site_digest", "").partition(" ")
     return {
         "status": metadata.get("status"),
@@ -182,13 +195,12 @@ def _own_files(out: Address) -> dict[str, dict[str, Any]]:
     for name in own_file_names(out):
         content = storage.content_of(join(out, name))
         if content is not None:
-            found[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            found[name] = {"bytes": len(content), "sha256": _sha256(content)}
     return found
 
 
-def _markers(out: Address) -> Iterable[tuple[str, bytes]]:
-    """The `runs` table of each complete run as it lies there, some at a time."""
-    runs = store.run_ids(out)
+def _markers(out: Address, runs: Sequence[str]) -> Iterable[tuple[str, bytes]]:
+    """The `runs` table of each of these runs as it lies there, some at a time."""
     for first in range(0, len(runs), _AT_ONCE):
         some = {str(store.table_address(out, "runs", run)): run for run in runs[first : first + _AT_ONCE]}
         contents = contents_of(list(some))
@@ -196,6 +208,14 @@ def _markers(out: Address) -> Iterable[tuple[str, bytes]]:
 
 
 def _write(out: Address, manifest: Manifest) -> None:
-    content = (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
+    content = _content(manifest)
     if storage.content_of(join(out, NAME)) != content:
         storage.write_bytes(join(out, NAME), content)
+
+
+def _content(manifest: Manifest) -> bytes:
+    return (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -38,6 +38,8 @@ _NO_COLUMN = re.compile(r"(?:unable to find column|no column named) [\"'](\w+)[\
 _NO_TABLE = re.compile(r"relation '(\w+)' was not found")
 _NO_VALUE = re.compile(r"to `enum` failed for value \"([^\"]*)\"")
 
+_NAMED = re.compile(r"[A-Za-z]\w*=.+")
+
 _EXPECTED = "a SELECT over " + ", ".join([*TABLES, *CAMPAIGN_TABLES])
 _REMEDY = "SHOW TABLES and DESCRIBE table list what there is."
 
@@ -71,13 +73,22 @@ def run_sql(
         ) from None
 
 
+def named_results(given: Iterable[str]) -> dict[str, str]:
+    """`NAME=OUT` by name, for `others`. Raises `UsageError`."""
+    named = list(given)
+    for text in named:
+        if not _NAMED.fullmatch(text):
+            raise UsageError("names no result", place=f"--with {text}", expected="NAME=OUT, for example old=OUT_OLD")
+    return dict(text.split("=", 1) for text in named)
+
+
 def _check_query(sql: str, allow_files: bool) -> None:
     begin = 0
     while before := _BEFORE.match(sql, begin):
         begin = before.end()
     if not _QUERY.match(sql, begin):
         raise UsageError(
-            "is no query",
+            "is not a query",
             place="SQL",
             found=sql.strip()[:80] or "nothing",
             expected=f"{_EXPECTED} (WITH ... SELECT, EXPLAIN SELECT); results are only read",
@@ -85,11 +96,11 @@ def _check_query(sql: str, allow_files: bool) -> None:
         )
     if not allow_files and (found := _FILES.search(sql)):
         raise UsageError(
-            "reads files beside the result",
+            "reads files outside the result",
             place="SQL",
             found=found[0],
             expected=_EXPECTED,
-            remedy="`--allow-files` lets a query that you trust read files of this machine.",
+            remedy="If you trust the query, `--allow-files` lets it read files of this machine.",
         )
 
 
@@ -125,7 +136,7 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     found = known.get(table.lower())
     if found is None:
         raise UsageError(
-            f"is no table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
+            f"is not a table{did_you_mean(table, known)}", place=table, expected=", ".join(known), remedy=_REMEDY
         )
     columns = dictionary_frame(found[0]).drop("group", "table")
     if found[0] not in TABLES:

@@ -85,7 +85,7 @@ def read_run(out: Address, run_id: str) -> RunTables:
 def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
     """One table of all complete runs, or of one, with the column `run_id` in front."""
     if table not in TABLES:
-        raise UsageError("is no table", place=table, expected=", ".join(TABLES))
+        raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
     if run_id is not None and not exists(table_address(out, _MARKER, run_id)):
         known = ", ".join(run_ids(out)[:10]) or "no complete run"
@@ -152,7 +152,7 @@ def _check_columns(table: str, run_id: str, found: Mapping[str, pl.DataType]) ->
             place=f"run {run_id}, table `{table}`",
             found="; ".join(parts),
             expected=f"the columns of contract {CONTRACT_VERSION} as of this build",
-            remedy="Replay this run again into the same output; `balise replay` sees that it is due.",
+            remedy="Repeat `balise replay` with the same --out: it replays this run again.",
         )
 
 
@@ -183,14 +183,14 @@ def check_site(site: Site | None, replayed_digest: str | None, run_id: str) -> N
         raise UsageError("was replayed on another site", place=run_id, found=site.digest, expected=replayed)
 
 
-def completed_runs(out: Address) -> dict[str, dict[str, str]]:
-    """Metadata of each complete run, without reading any table."""
-    runs = run_ids(out)
+def completed_runs(out: Address, among: Sequence[str] | None = None) -> dict[str, dict[str, str]]:
+    """Metadata of each complete run, or of those among these, without reading any table."""
+    runs = run_ids(out) if among is None else among
+    addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
     if is_url(out):
-        addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
         contents = storage.read_many(list(addresses))
         return {run: metadata_of(contents[place]) for place, run in addresses.items() if place in contents}
-    return {run: metadata_of(Path(table_address(out, _MARKER, run))) for run in runs}
+    return {run: metadata_of(Path(place)) for place, run in addresses.items() if Path(place).exists()}
 
 
 def metadata_of(source: Path | bytes) -> dict[str, str]:
@@ -249,7 +249,7 @@ def read_config(out: Address) -> Configuration | None:
         raise UsageError(
             f"was not written by this build of the program: {error}",
             place=shown(address),
-            remedy="Replay the runs again into the same output; `balise replay` sees which are due.",
+            remedy="Repeat `balise replay` with the same --out: it replays these runs again.",
         ) from None
 
 

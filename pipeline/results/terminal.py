@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
 
@@ -35,6 +35,13 @@ def show_table(frame: pl.DataFrame, title: str = "") -> None:
     print("\n".join([title, *lines] if title else lines))
     if frame.width and not frame.height:
         print("(no rows)")
+
+
+def show_tables(tables: Mapping[str, pl.DataFrame]) -> None:
+    """Print tables under their titles, with an empty line after each."""
+    for title, table in tables.items():
+        show_table(table, title)
+        print()
 
 
 def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:

@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.figures.derived_tables import derived_tables
 from pipeline.figures.map_errors import map_suspects
 from pipeline.results import catalogue, store
-from pipeline.results.terminal import tall
+from pipeline.results.terminal import show_tables, tall, to_json
 from pipeline.safety.reading import figures_for_reading
 from pipeline.safety.sensitivity import Replay, sensitivity
 from pipeline.safety.sentences import (
@@ -34,6 +34,16 @@ class Assessment:
 
     statements: list[str]
     tables: dict[str, pl.DataFrame]
+
+
+def show(found: Assessment, as_json: bool) -> None:
+    """Print it: the verdict, each table, what it means; or all of it as JSON."""
+    if as_json:
+        print(to_json({"statements": found.statements, **found.tables}))
+        return
+    print(found.statements[0] + "\n")
+    show_tables(for_reading(found.tables))
+    print("\n".join(found.statements[1:]))
 
 
 def assess(out: Address, config: Configuration | None = None, replay: Replay | None = None) -> Assessment:

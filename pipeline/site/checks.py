@@ -74,7 +74,7 @@ def drop_repeated_points(file: str, frame: pl.DataFrame, breaches: list[str]) ->
     notes = []
     for name, points, repeats in counts.iter_rows():
         if points - repeats < 2:
-            breaches.append(f"{file}: element {name} has {points - repeats} distinct point; two are needed")
+            breaches.append(f"{file}: element {name} has {points - repeats} distinct points; expected at least 2")
         if repeats:
             remedy = "Remove them from the survey." if repeats > 1 else "Remove it from the survey."
             text = f"{repeats} of {points} points repeat the one before and are left out"
@@ -86,7 +86,7 @@ def _relations_to_nowhere(track: Track, links: pl.DataFrame) -> tuple[pl.DataFra
     ids = list(track.ids)
     known = links["netelement_a"].is_in(ids) & links["netelement_b"].is_in(ids)
     findings = [
-        Finding("warning", "links", f"relation {row[0]} - {row[2]} names an element that is not in the track")
+        Finding("warning", "links", f"relation {row[0]} - {row[2]} is not used: it names an element not in the track")
         for row in links.filter(~known).iter_rows()
     ]
     return links.filter(known), findings
@@ -106,9 +106,9 @@ def _relations_that_turn_back(track: Track, links: pl.DataFrame) -> tuple[pl.Dat
         Finding(
             "warning",
             "links",
-            f"end {a_end} of {a} and end {b_end} of {b} are linked as navigable ({way}), but lie on the same side of "
-            "where they meet: taken for not navigable",
-            "Mend the relation.",
+            f"end {a_end} of {a} and end {b_end} of {b} are linked as navigable ({way}), but a train would have to "
+            "turn by more than 90 degrees there: taken as not navigable",
+            "Correct the relation.",
         )
         for a, a_end, b, b_end, way in links.filter(pl.Series(back, dtype=pl.Boolean)).iter_rows()
     ]
@@ -143,12 +143,12 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
             if abs(declared - length) > max(LENGTH_TOLERANCE_M, LENGTH_TOLERANCE * length):
-                text = f"declared {declared:.1f} m long, its geometry measures {length:.1f} m"
-                found.findings.append(Finding("warning", place, text, "Mend the measures or the geometry."))
+                text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
+                found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         error = chord_errors_m(track, part).max(initial=0.0)
         if error > CHORD_ERROR_M:
             spacing = float(np.diff(geometric).max())
-            text = f"vertices up to {spacing:.0f} m apart: its chords leave the curve by up to {error:.2f} m"
+            text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by {error:.2f} m"
             found.findings.append(Finding("note", place, text, "Survey curves with closer points."))
     _check_heights(track, found)
 
@@ -159,7 +159,8 @@ def _check_heights(track: Track, found: Remarks) -> None:
         text = (
             f"{len(flat)} of {len(track.ids)} elements lack heights and are taken as 2-D ({', '.join(flat[:3])}, ...)"
         )
-        found.findings.append(Finding("warning", "track: column height_m", text, "Survey all or none."))
+        remedy = "Give heights for all elements, or for none."
+        found.findings.append(Finding("warning", "track: column height_m", text, remedy))
 
 
 def chord_errors_m(track: Track, part: slice) -> np.ndarray:
@@ -189,7 +190,7 @@ def _check_gaps(track: Track, found: Remarks) -> None:
         step = float(np.abs(np.diff(track.height_m[ends])[0]))
         if step > HEIGHT_STEP_M:
             text = f"end {position_a} of {a} and end {position_b} of {b} differ by {step:.1f} m in height"
-            found.findings.append(Finding("warning", "links", text, "Mend the heights."))
+            found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
 def _near_pairs(places: Floats, reach_m: float) -> Iterator[tuple[int, int]]:
@@ -220,7 +221,7 @@ def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
 def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
-        found.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} stand there twice")
+        found.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} occur more than once")
     off = [
         Finding("error", f"{BALISE_PLACE}{name}", *what)
         for name, element, measure in balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
@@ -234,13 +235,13 @@ def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:
 def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, str] | None:
     """Why no run will pass a balise, and what to mend."""
     if element not in track.index:
-        return f"lies on element {element}, which is not in the track: no run will pass it", "Mend netelement_id."
+        return f"lies on element {element}, which is not in the track: no run will pass it", "Correct netelement_id."
     part = track.vertices(track.index[element])
     low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
     if low - MEASURE_TOLERANCE_M <= measure_m <= high + MEASURE_TOLERANCE_M:
         return None
     text = f"measure {measure_m:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"
-    return text, "Mend measure_m."
+    return text, "Correct measure_m."
 
 
 def route_breaches(track: Track, route: pl.DataFrame) -> list[str]:

@@ -122,7 +122,7 @@ def _add_element(
         breaches.append(f"{place} ({str(name)[:80]}): {error}")
         return
     if str(name) in lengths:
-        breaches.append(f"{place}: net element {name} stands in the file twice")
+        breaches.append(f"{place}: net element {name} occurs twice in the file")
         return
     lengths[str(name)] = float("nan") if declared_m is None else declared_m
     points["netelement_id"] += [str(name)] * len(triples)
@@ -135,10 +135,10 @@ def _axis(geometry: Mapping[str, Any]) -> list[Any]:
     """The points of a line."""
     coordinates = geometry.get("coordinates") or []
     if not isinstance(coordinates, list):
-        raise ValueError("coordinates are no list of points")
+        raise ValueError("coordinates are not a list of points")
     if geometry["type"] == "MultiLineString":
         if len(coordinates) != 1:
-            raise ValueError(f"MultiLineString of {len(coordinates)} parts; a net element has one axis")
+            raise ValueError(f"MultiLineString of {len(coordinates)} parts; a net element is one line")
         return list(coordinates[0])
     return coordinates
 

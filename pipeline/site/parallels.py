@@ -84,8 +84,8 @@ def _finding(site: Site, network: Network, stretch: _Stretch, config: MatchingCo
     name, other = network.track.ids[stretch.element], network.track.ids[stretch.other]
     claim = most_claimed(stretch.apart_m, float(_survey_m(network.track, config)[stretch.element]), config)
     text = (
-        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {other} lies {stretch.apart_m:.1f} m beside it; by positions "
-        f"alone a run right on one of them claims {claim:.2f} at most, and its virtual balises are ambiguous"
+        f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {other} lies {stretch.apart_m:.1f} m beside it; positions "
+        f"alone give one of them a probability of {claim:.2f} at most, so that virtual balises there are ambiguous"
     )
     return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
 
@@ -101,7 +101,7 @@ def _remedy(site: Site, network: Network, stretch: _Stretch) -> str:
     oriented = [2 * element + sense for element in (stretch.element, stretch.other) for sense in (0, 1)]
     if any(len(network.successors[one]) > 1 for one in oriented):
         told.append("a switch taken at its end")
-    return f"Would tell: {', '.join(told)}."
+    return f"To tell the two apart: {', '.join(told)}."
 
 
 def _places(track: Track) -> tuple[Ints, Floats]:

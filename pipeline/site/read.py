@@ -89,7 +89,7 @@ def is_geojson(address: Path | str) -> bool:
 
 
 def _without_checksums(files: dict[str, bytes]) -> list[Finding]:
-    text = "has no checksums of its pages: damage to it may stay unseen"
+    text = "has no page checksums: damage to it may not be seen"
     names = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
     return [Finding("note", name, text) for name in names]
 
@@ -101,7 +101,7 @@ def _digest(files: dict[str, bytes]) -> str:
 
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
-    remedy = "Mend what is named; `balise dictionary` lists the columns of a site."
+    remedy = "Correct what is named; `balise dictionary` lists the columns of a site."
     return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
@@ -128,12 +128,13 @@ def _read_track(
     if raw is None or frame is None:
         return None, network, []
     if frame.is_empty():
-        breaches.append(f"{raw.file}: holds no point of any net element")
+        breaches.append(f"{raw.file}: has no points of net elements")
         return None, network, []
     frame = to_wgs84(raw, frame, breaches)
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
     if network and network.ignored:
-        notes.append(Finding("note", raw.file, f"{network.ignored} features are neither element nor relation"))
+        text = f"{network.ignored} features are not used: they are neither net element nor relation"
+        notes.append(Finding("note", raw.file, text))
     return (None if breaches else _with_measures(raw.file, frame, breaches)), network, notes
 
 
@@ -172,7 +173,7 @@ def to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.Data
         row = frame.filter(outside).row(0, named=True)
         breaches.append(
             f"{raw.file}: latitude {row['latitude_deg']:g}, longitude {row['longitude_deg']:g} in EPSG:{raw.epsg} "
-            "is no place on earth; latitude and longitude may be swapped, or the file does not name its EPSG code "
+            "is not a place on earth; latitude and longitude may be swapped, or the file does not name its EPSG code "
             "(a column or Parquet metadata `epsg`, a first line `# epsg: 31370` of CSV, `crs` of GeoJSON)"
         )
     return frame
@@ -189,7 +190,7 @@ def _transformed(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.
         breaches.append(f"{raw.file}: EPSG:{raw.epsg}: {str(error).splitlines()[0]}")
         return frame
     if not np.isfinite(longitude).all():
-        breaches.append(f"{raw.file}: some positions lie outside what EPSG:{raw.epsg} describes")
+        breaches.append(f"{raw.file}: some positions are outside the area of this coordinate system")
         return frame
     return frame.with_columns(
         pl.Series("latitude_deg", np.asarray(latitude)), pl.Series("longitude_deg", np.asarray(longitude))
@@ -204,11 +205,11 @@ def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.Da
         if missing == part.height:
             part = part.with_columns(pl.Series("measure_m", _geometric(part)))
         elif missing:
-            breaches.append(f"{file}: column measure_m: element {name} has it at some points only")
+            breaches.append(f"{file}: column measure_m: element {name} has a measure at some points only")
         elif not (part["measure_m"].diff().drop_nulls() > 0).all():
             row = int((part["measure_m"].diff() <= 0).fill_null(False).arg_true()[0])
             at = part["measure_m"][row]
-            breaches.append(f"{file}: column measure_m: element {name} does not grow at point {row} ({at:g} m)")
+            breaches.append(f"{file}: column measure_m: element {name} does not increase at point {row} ({at:g} m)")
         parts.append(part)
     return pl.concat(parts)
 

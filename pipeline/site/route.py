@@ -50,7 +50,7 @@ def with_route(site: Site, address: Address) -> Site:
     if route is not None and not breaches:
         breaches = route_breaches(track_of(site.track), route)
     if route is None or breaches:
-        remedy = "Mend the route; `balise replay --write-route` writes the one that was found."
+        remedy = "Correct the route; `balise replay --write-route` writes the route that was found."
         raise InputError("; ".join(breaches), place=shown(address), remedy=remedy)
     digest = hashlib.sha256(f"{site.digest} {hashlib.sha256(data).hexdigest()}".encode()).hexdigest()
     if route["leg"].n_unique() > 1:

@@ -51,7 +51,7 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
         return _parquet(file, data) if file.endswith(".parquet") else _csv(file, data)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         kind = "Parquet" if file.endswith(".parquet") else "CSV"
-        breaches.append(f"{file}: is not readable as {kind} ({str(error).splitlines()[0]})")
+        breaches.append(f"{file}: cannot be read as {kind} ({str(error).splitlines()[0]})")
         return None
 
 
@@ -81,13 +81,13 @@ def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:
     if named is None and "epsg" in frame.columns:
         values = frame["epsg"].drop_nulls().unique().to_list()
         if len(values) > 1:
-            raise ValueError(f"column epsg: one code for the whole table, found {sorted(map(str, values))}")
+            raise ValueError(f"column epsg: found {sorted(map(str, values))}; expected one code for the whole table")
         named = str(values[0]) if values else None
     if named is None:
         return RawTable(file, frame)
     digits = named.upper().removeprefix("EPSG:").strip()
     if not digits.isdigit():
-        raise ValueError(f"epsg: a number such as 31370, found {named!r}")
+        raise ValueError(f"epsg: found {named!r}; expected a number such as 31370")
     return RawTable(file, frame, int(digits))
 
 

@@ -103,5 +103,5 @@ def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Findi
         f"balises {expected.balise_id}, {later.balise_id}",
         f"expectation windows measured from {reference.balise_id} overlap: {later_m - distance_m:.1f} m apart, "
         f"{needed_m:.1f} m needed",
-        "Linking alone cannot tell them apart; set them farther apart, or rely on the diagnosis between them.",
+        "Linking alone cannot tell them apart; place them farther apart, or rely on the monitors between them.",
     )

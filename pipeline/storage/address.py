@@ -36,7 +36,7 @@ def check_public(path: Address) -> None:
     """Refuse a bucket's address with a key in it: no store reads it there, and error messages would repeat it."""
     if _BUCKETS.match(str(path)):
         raise UsageError(
-            "holds credentials or a port, which have no place in the address of a bucket",
+            "has credentials or a port, which are not allowed in the address of a bucket",
             place=redacted(str(path)),
             expected="s3://BUCKET/...",
             remedy="Set AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL in the environment.",

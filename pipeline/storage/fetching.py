@@ -126,7 +126,7 @@ def _fetched(store: Any, path: str, folder: Path, version: str | None) -> Path:
         for place, copy in copies.items():
             check_copy(store, place, listing[place], copy)
     except FileNotFoundError as error:
-        raise AlteredError(f"is listed and does not come: {error}") from None
+        raise AlteredError(f"is listed but cannot be fetched: {error}") from None
     return target
 
 

@@ -73,7 +73,7 @@ def patience_s() -> float:
     except ValueError:
         limit_s = 0.0
     if not limit_s > 0:
-        raise UsageError("is no time", place=_PATIENCE, found=text, expected="seconds, more than 0")
+        raise UsageError("is not a time", place=_PATIENCE, found=text, expected="seconds, more than 0")
     return limit_s
 
 
@@ -186,12 +186,12 @@ def _absent(address: Address) -> InputError:
 
 
 def _failure(silent_s: float | None) -> str:
-    return "the store refused: " if silent_s is None else f"the store was asked in vain for {silent_s:g} s: "
+    return "the store refused: " if silent_s is None else f"the store gave no usable answer for {silent_s:g} s: "
 
 
 def _refused(address: Address, reason: str, kind: type[BaliseError]) -> BaliseError:
     return kind(
         redacted(reason),
         place=redacted(str(address)),
-        remedy="Check address, rights and connection; complete runs stay and are skipped next time.",
+        remedy="Check address, rights and connection; complete runs are kept, and skipped next time.",
     )

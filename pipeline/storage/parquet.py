@@ -67,7 +67,7 @@ def read_parquet(source: bytes | Path, choose: Callable[[Schema], Sequence[str]]
         file = pq.ParquetFile(place, page_checksum_verification=True)
         names = list(file.schema_arrow.names)
         if len(set(names)) < len(names):
-            raise ValueError("a column name stands twice")
+            raise ValueError("two columns have the same name")
         # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
         empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], file.schema_arrow)))
         wanted = list(names if choose is None else choose(dict(empty.schema)))

@@ -191,5 +191,5 @@ def as_output_error(address: Address) -> Iterator[None]:
         raise OutputError(
             f"cannot be written: {reason}",
             place=redacted(str(address)),
-            remedy="Free space or choose another --out; complete runs stay and are skipped next time.",
+            remedy="Free space or choose another --out; complete runs are kept, and skipped next time.",
         ) from None

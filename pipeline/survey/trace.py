@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -164,7 +165,8 @@ def _toe(lap: Piece, row: int, step: int, known: list[Piece]) -> Piece | None:
 
 def _joined(one: Piece | None, other: Piece | None) -> Piece:
     given = [piece for piece in (one, other) if piece is not None]
-    return replace(given[0], **{name: np.concatenate([getattr(piece, name) for piece in given]) for name in COLUMNS})
+    columns: dict[str, Any] = {name: np.concatenate([getattr(piece, name) for piece in given]) for name in COLUMNS}
+    return replace(given[0], **columns)
 
 
 def _length_m(piece: Piece) -> float:

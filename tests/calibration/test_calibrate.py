@@ -137,7 +137,7 @@ def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]
 def test_the_solution_is_the_one_named(fault_free: tuple[list[RunLog], Site]) -> None:
     logs, site = fault_free
     renamed = [log.with_streams(gnss=log.gnss.with_columns(solution=pl.lit("galileo"))) for log in logs]
-    with pytest.raises(InputError, match="primary: is a solution of no run; found galileo"):
+    with pytest.raises(InputError, match="primary: no run has this solution; found galileo"):
         calibrate(renamed, site)
     assert calibrate(renamed, site, solution="galileo").vehicle == calibrate(logs, site).vehicle
 

@@ -104,15 +104,15 @@ def test_damaged_catalogue_is_none(out: Path) -> None:
 
 def test_what_changes_while_it_is_read_is_not_kept(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(out / ".catalogue")
-    read = store.read_table
+    read = store.scan_runs
 
-    def read_and_touch(place: Path, table: str) -> pl.LazyFrame:
-        frame = read(place, table)
+    def read_and_touch(place: Path, table: str, runs: list[str]) -> pl.LazyFrame:
+        frame = read(place, table, runs)
         file = Path(store.table_address(out, "hazards", "run0"))
         file.write_bytes(file.read_bytes())
         return frame
 
-    monkeypatch.setattr(store, "read_table", read_and_touch)
+    monkeypatch.setattr(store, "scan_runs", read_and_touch)
     catalogue.gather(out)
     assert is_fresh(out) == [True, False, True, True]
 

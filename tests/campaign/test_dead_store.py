@@ -111,7 +111,7 @@ def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_
     assert time.monotonic() - begun_s < _SOON_S
     outcomes = by_run(summary)
     assert outcomes["far"].status is RunStatus.FAILED
-    assert "far.mcap: the store was asked in vain for 1.5 s: " in (outcomes["far"].error or "")
+    assert "far.mcap: the store gave no usable answer for 1.5 s: " in (outcomes["far"].error or "")
     assert outcomes["far"].defect is False
     assert outcomes["run0"].status is RunStatus.OK
 
@@ -120,11 +120,11 @@ def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_
 def test_dead_store_ends_the_command_soon(ill: str, small_trial: SmallTrial, tmp_path: Path) -> None:
     """Site, runs and output are asked for before any work is done."""
     begun_s = time.monotonic()
-    with pytest.raises(SiteError, match="asked in vain"):
+    with pytest.raises(SiteError, match="no usable answer"):
         make_plan([str(small_trial.runs)], f"{ill}/site", tmp_path)
-    with pytest.raises(UsageError, match="asked in vain"):
+    with pytest.raises(UsageError, match="no usable answer"):
         make_plan([f"{ill}/runs"], small_trial.site, tmp_path)
-    with pytest.raises(OutputError, match="asked in vain"):
+    with pytest.raises(OutputError, match="no usable answer"):
         run_campaign(plan_of(small_trial, f"{ill}/out", small_trial.paths[:1]))
     assert time.monotonic() - begun_s < _SOON_S
 
@@ -138,7 +138,7 @@ def test_reading_by_address_is_as_patient(
 ) -> None:
     monkeypatch.setenv("BALISE_STORE_PATIENCE_S", "0.3")
     begun_s = time.monotonic()
-    with pytest.raises(InputError, match=r"far/track.csv: the store was asked in vain for 0.3 s: "):
+    with pytest.raises(InputError, match=r"far/track.csv: the store gave no usable answer for 0.3 s: "):
         read(f"{ill}/far/track.csv")
     assert time.monotonic() - begun_s < _SOON_S
 

@@ -15,12 +15,14 @@ from pipeline.campaign import run_campaign, worker
 from pipeline.campaign.plan import RunJob
 from pipeline.export import export_run
 from pipeline.ingest import read_run
+from pipeline.report import write_report
 from pipeline.results import store
 from pipeline.site.read import read_site
 from pipeline.storage import UNFINISHED
 from schemas.config import IngestConfig
 from schemas.errors import BaliseError
 from schemas.run import RunLog, RunTables
+from schemas.tables import TABLES
 from tests.campaign.compare import plan_of, result_bytes
 from tests.campaign.disk import Disk, Killed, operations
 from tests.campaign.test_local import undisturbed
@@ -141,6 +143,35 @@ def test_export_is_written_whole_or_not_at_all(
         assert "cannot be" in error or content(to.parent) == whole, number
         assert content(to.parent).items() <= whole.items(), number
         assert unfinished(to.parent) == [], number
+
+
+def test_pages_are_written_whole_or_not_at_all(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error of the disk anywhere in a report, of short pages, so that it is all reading and writing."""
+    disk, out = Disk(tmp_path / "disk"), tmp_path / "disk/out"
+    for table in TABLES:
+        shutil.copytree(undisturbed / table / "run_id=run0", out / table / "run_id=run0")
+    shutil.copy(undisturbed / "config.toml", out)
+    monkeypatch.setattr("pipeline.report.write.run_page", lambda tables, *_: f"<p>{tables.runs.height} row</p>\n")
+    monkeypatch.setattr("pipeline.report.write.campaign_page", lambda campaign, _: f"{campaign.pieces.height} pieces")
+    count = operations(disk, lambda: write_report(out))
+    whole = content(out)
+    assert count > 40
+    for number in sorted(random.Random(5).sample(range(1, count), _MOMENTS)):
+        for folder in ("report", ".catalogue"):
+            shutil.rmtree(out / folder, ignore_errors=True)
+        error = ""
+        try:
+            with disk.failing(number):
+                write_report(out)
+        except BaliseError as raised:
+            error = str(raised)
+        assert "cannot be" in error or content(out) == whole, number
+        assert content(out).items() <= whole.items(), number
+        assert unfinished(out) == [], number
+    write_report(out)
+    assert content(out) == whole
 
 
 def test_a_reading_that_fails_is_an_error_of_the_log(small_trial: SmallTrial, tmp_path: Path) -> None:

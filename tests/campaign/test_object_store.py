@@ -16,7 +16,9 @@ from werkzeug.serving import BaseWSGIServer, make_server
 from pipeline import storage
 from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
+from pipeline.campaign.verify import verify
 from pipeline.results import catalogue, store
+from pipeline.results.manifest import read_manifest
 from pipeline.results.query import run_sql
 from pipeline.storage import files
 from schemas.enums import RunStatus
@@ -108,6 +110,10 @@ def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -
     assert remote_bytes(f"{bucket}/out") == result_bytes(undisturbed)
     again = run_campaign(plan, jobs=2)
     assert (again.skipped, again.count(RunStatus.OK)) == (4, 4)
+    remote, on_disk = (read_manifest(out) or {} for out in (f"{bucket}/out", undisturbed))
+    assert remote["runs"].keys() == {"run0", "run1", "run2", "run3"}
+    for part in ("runs", "sites", "files"):
+        assert remote[part] == on_disk[part]
     local = run_campaign(make_plan([f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
     assert local.count(RunStatus.OK) == 1
     runs = store.read_table(f"{bucket}/out", "runs").collect()
@@ -121,10 +127,14 @@ def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
         assert run_sql(out, "SELECT COUNT(*) AS n FROM runs")["n"].to_list() == [count]
         assert run_sql(out, "SELECT COUNT(DISTINCT run_id) AS n FROM campaign_runs")["n"].to_list() == [count]
         assert catalogue.fresh(out, "passages") is not None
+    assert verify(out).problems == ()
     place = str(store.table_address(out, "passages", "run0"))
     storage.write_bytes(place, storage.read_many([place])[place] + b"more")
     assert catalogue.fresh(out, "passages") is None
     assert catalogue.fresh(out, "runs") is not None
+    assert [what for what, _, _ in verify(out).problems] == ["run run0, passages"]
+    storage.remove(store.table_address(out, "runs", "run1"))
+    assert [what for what, _, _ in verify(out).problems] == ["run run1", "run run0, passages"]
 
 
 def test_what_others_write_is_seen_at_once(bucket: str) -> None:

@@ -30,7 +30,7 @@ def logs(tmp_path: Path) -> Path:
 
 def test_a_run_is_not_called_as_hive_calls_null(tmp_path: Path) -> None:
     (tmp_path / "__HIVE_DEFAULT_PARTITION__.mcap").touch()
-    with pytest.raises(UsageError, match=r"cannot be called '__HIVE_DEFAULT_PARTITION__'.*[Rr]ename"):
+    with pytest.raises(UsageError, match=r"'__HIVE_DEFAULT_PARTITION__' cannot be a run id.*[Rr]ename"):
         find_runs([str(tmp_path)])
 
 
@@ -86,11 +86,11 @@ def test_a_store_that_falls_silent_leaves_no_run_out(monkeypatch: pytest.MonkeyP
 
     def silent(folder: Address) -> list[str]:
         if str(folder).endswith("/y"):
-            raise InputError("the store was asked in vain for 45 s: no answer", place=str(folder))
+            raise InputError("the store gave no usable answer for 45 s: no answer", place=str(folder))
         return listed(folder)
 
     monkeypatch.setattr(files, "list_dir", silent)
-    with pytest.raises(InputError, match="silent/y: the store was asked in vain"):
+    with pytest.raises(InputError, match="silent/y: the store gave no usable answer"):
         find_runs(["memory://silent"])
 
 

@@ -121,13 +121,13 @@ USAGE_ERRORS: list[tuple[Sequence[str], str]] = [
     (("sql", "{tmp}", "select 1"), "no complete run"),
     (("sql", "{result}", "select nonsense from runs"), "nonsense"),
     (("diff", "{result}", "{tmp}"), "no complete run"),
-    (("experiment", "nonsense"), "is no experiment"),
+    (("experiment", "nonsense"), "is not an experiment"),
     (("convert", "{run}", "--to", "s3://key:secret@bucket/run"), "s3://bucket/run: is an address; expected a path"),
     (("convert", "s3://bucket/run.ubx", "--to", "{tmp}/out"), "s3://bucket/run.ubx: is an address"),
     (("report", "s3://bucket/out"), "s3://bucket/out: is an address"),
     (("inject", "{run}", "--fault", "{tmp}/bad.toml", "--out", "{tmp}/out"), "docs/scenarios.md lists every key"),
     (("export", "{result}", "none", "--to", "{tmp}/x.mcap"), "has no run 'none'; found run0"),
-    (("dictionary", "--table", "nonsense"), "is no table"),
+    (("dictionary", "--table", "nonsense"), "is not a table"),
     (("nonsense",), "No such command"),
 ]
 
@@ -176,7 +176,7 @@ def test_inspect_a_site_against_the_runs_over_it(balise: Balise, small_trial: Sm
     assert {row["netelement_id"] for row in found} == {"NE1"}
     assert {row["runs"] for row in found} == {2}
     wrong = balise("inspect", result, "--result", result)
-    assert (wrong.status, "is no site" in wrong.err) == (2, True)
+    assert (wrong.status, "is not a site" in wrong.err) == (2, True)
     empty = balise("inspect", small_trial.site, "--result", small_trial.site)
     assert (empty.status, "holds no complete run" in empty.err) == (2, True)
 
@@ -187,7 +187,7 @@ def test_inspect_logs(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -
     (tmp_path / "bad.mcap").write_bytes(b"no log")
     bad = balise("inspect", tmp_path / "bad.mcap")
     assert bad.status == 1
-    assert "does not start as MCAP does" in bad.out
+    assert "does not start with the MCAP magic bytes" in bad.out
 
 
 def test_report(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ def test_calibrate_names_the_solutions_there_are(balise: Balise, small_trial: Sm
         *("--out", tmp_path / "train.toml"),
     )
     assert said.status == 1
-    assert "gallileo: is a solution of no run; found primary" in said.err
+    assert "gallileo: no run has this solution; found primary" in said.err
 
 
 def test_inspect_names_balises_that_linking_cannot_tell_apart(

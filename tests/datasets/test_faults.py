@@ -134,10 +134,10 @@ def test_faults_stream() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"kind": "step"}, "takes size_m"),
-        ({"kind": "ramp", "size_m": 3.0}, "takes rate_mps"),
-        ({"kind": "step", "size_m": 3.0, "rate_mps": 1.0}, "takes size_m"),
-        ({"kind": "outage", "size_m": 3.0}, "takes no size"),
+        ({"kind": "step"}, "needs size_m"),
+        ({"kind": "ramp", "size_m": 3.0}, "needs rate_mps"),
+        ({"kind": "step", "size_m": 3.0, "rate_mps": 1.0}, "needs size_m"),
+        ({"kind": "outage", "size_m": 3.0}, "needs no quantity"),
         ({"kind": "slip", "rate_mps": 1.0, "target": "along"}, "target odometer"),
         ({"kind": "latency", "latency_s": 1.0, "target": "G01"}, "target position"),
         ({"kind": "step", "size_m": 1.0, "target": "sideways"}, "target"),

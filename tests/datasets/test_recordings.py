@@ -203,7 +203,7 @@ def test_half_a_row_at_the_end_is_left_out(tmp_path: Path, cut: int) -> None:
         ("50.5", "north", "column latitude: cannot be read.*'north' in row 0"),
         ("2022-01-14T10:45:26", "noon", "column timestamp: cannot be read.*'noon'"),
         ("2022-01-14T10:45:26", "2022-01-14T10:45", "column timestamp: cannot be read.*'2022-01-14T10:45' in row 1"),
-        ("2022-01-14T10:45:26", "", "column t: is not complete"),
+        ("2022-01-14T10:45:26", "", "column t: has missing values"),
         ("50.5", "95.5", "latitude_deg: is out of range"),
         ("NARROW_INT3", "MAGIC", "position_type: a position type is not known; found MAGIC"),
         ("latitude", "breadth", "lacks columns of an Infrabel log; found no latitude"),

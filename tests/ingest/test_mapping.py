@@ -120,7 +120,7 @@ def test_what_is_no_stamp_is_no_time(tmp_path, stamp, kind):
     path = json_log(tmp_path, {"/acme": [{**place, "stamp": stamp}, {**place, "stamp": stamp}]})
     gnss = {"topic": "/acme", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}}
     assert row(path, config(gnss=gnss))["t"] == STAMP_NS
-    with pytest.raises(InputError, match=f"/acme: field stamp: is no time; found {kind}"):
+    with pytest.raises(InputError, match=f"/acme: field stamp: is not a time; found {kind}"):
         read_run(path, config(gnss={**gnss, "time": "field:stamp"}))
 
 
@@ -288,7 +288,7 @@ def test_ublox_calendar(tmp_path):
     early = message | {"valid": 1, "year": 2016}
     log = read_run(ros_log(tmp_path, ("/navpvt", "ublox_msgs/msg/NavPVT", text, [early, message])), IngestConfig())
     assert log.gnss.height == 1
-    assert log.notes.skipped_topics == ("/navpvt: 1 messages without valid time",)
+    assert log.notes.skipped_topics == ("/navpvt: 1 messages without a valid time",)
 
 
 BESTPOS = (
@@ -355,7 +355,7 @@ def test_nan_is_null_only_where_there_is_no_fix(tmp_path):
     path = ros_log(tmp_path, ("/fix", name, DEFINITIONS[name], [message]))
     assert row(path)["latitude_deg"] is None
     path = ros_log(tmp_path, ("/fix", name, DEFINITIONS[name], [message | {"status": {"status": 0}}]))
-    with pytest.raises(InputError, match="column latitude_deg: is not a number"):
+    with pytest.raises(InputError, match="column latitude_deg: has values that are not finite"):
         read_run(path, IngestConfig())
 
 

@@ -21,7 +21,7 @@ from schemas.errors import BaliseError, UsageError
 from schemas.inputs import Balises
 from schemas.line import LineCriteria
 from schemas.run import RunTables, Site
-from schemas.tables import Alarms, Epochs, Hazards, Runs
+from schemas.tables import Alarms, Epochs, Hazards, Passages, Runs
 from tests.docs.blocks import ROOT
 from tests.line.tables import SPLIT_M, alarms_of, epochs_of, line_site, no_passages
 
@@ -46,13 +46,23 @@ def filled(frame: pl.DataFrame, table: type[dy.Schema]) -> pl.DataFrame:
 
 
 def write_tables(
-    out: Path, number: int, epochs: pl.DataFrame, digest: str = "line", evidence: str = "reference"
+    out: Path,
+    number: int,
+    epochs: pl.DataFrame,
+    digest: str = "line",
+    evidence: str = "reference",
+    passages: pl.DataFrame | None = None,
 ) -> None:
     row = {"solution": "primary", "status": "ok", "evidence": evidence, "config_digest": f"c{number % 2}"}
     alarms = filled(alarms_of(epochs).with_columns(solution=pl.lit("primary"), t_end="t_start"), Alarms)
     hazards = pl.DataFrame(schema=dtypes(Hazards))
     tables = RunTables(
-        f"r{number}", hazards, no_passages(), alarms, filled(epochs, Epochs), filled(pl.DataFrame([row]), Runs)
+        f"r{number}",
+        hazards,
+        no_passages() if passages is None else passages,
+        alarms,
+        filled(epochs, Epochs),
+        filled(pl.DataFrame([row]), Runs),
     )
     write_run(tables, out, {"site_digest": digest})
 
@@ -167,3 +177,14 @@ def test_the_page_of_criteria_names_every_key_with_its_default() -> None:
     page = (ROOT / "docs" / "line.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.+?) \| .+ \| .* \|$", page.split("## Criteria")[1], re.MULTILINE))
     assert rows == {name: str(value) for name, value in LineCriteria().model_dump().items()}
+
+
+def test_an_unsafe_acceptance_and_an_undetected_error_count_at_their_place(tmp_path: Path, site: Site) -> None:
+    offered = {"balise_id": "VB1", "kind": "virtual", "netelement_id": "A", "measure_m": 1025.0, "direction": "growing"}
+    row = {"solution": "primary", "status": "accepted", "judgement": "wrong", "undetected_ahead_m": 12.5}
+    unsafe = filled(pl.DataFrame([{**offered, **row}]), Passages)
+    write_tables(tmp_path, 0, epochs_of(0, ()), passages=unsafe)
+    table = write_line(tmp_path, site, LineCriteria(loss_limit=0.99)).pieces.filter(pl.col("netelement_id") == "A")
+    bad = table.filter((pl.col("piece_class") == "unsuitable") & (pl.col("from_m") < 2000.0))
+    assert bad.select("from_m", "direction", "cause").rows() == [(1000.0, "growing", "unsafe_acceptance")]
+    assert set(table.filter(pl.col("from_m") == 1000.0)["largest_undetected_m"]) == {12.5}

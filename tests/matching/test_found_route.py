@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.campaign import make_plan, run_campaign
-from pipeline.matching.found_route import found_route, route_of_epochs
+from pipeline.matching.found_route import found_route
 from pipeline.results import store
 from pipeline.site.read import read_site
 from pipeline.site.route import with_route
@@ -45,17 +45,16 @@ def test_the_route_says_what_is_in_doubt_and_with_what() -> None:
     assert route["t_end"][0] < route["t_start"][1]
 
 
-def test_a_ring_of_one_element_is_a_passage_per_lap_by_run_and_by_result() -> None:
+def test_a_ring_of_one_element_is_a_passage_per_lap() -> None:
     """Two and a half laps the other way round than it was surveyed, 1 m inside; then 100 m back."""
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     place = site({"r": np.column_stack([300 * np.sin(angle), 300 * np.cos(angle)])}, [("r", 1, "r", 0, "both")])
     distance = np.concatenate([np.arange(100.0, 4712.0, 10.0), np.arange(4712.0, 4612.0, -10.0)])
     angle = -distance / 300.0
-    found = matched(run(299 * np.sin(angle), 299 * np.cos(angle)), place, odometer(distance))
-    for route in (found_route(found, 0.99), route_of_epochs(found.epochs, 0.99)):
-        rows = route.select("netelement_id", "direction", "doubtful", pl.col("cross_bias_m").round(1)).rows()
-        assert rows == [("r", "BA", False, 1.0)] * 3
-        assert route["t_start"].is_sorted()
+    route = found_route(matched(run(299 * np.sin(angle), 299 * np.cos(angle)), place, odometer(distance)), 0.99)
+    rows = route.select("netelement_id", "direction", "doubtful", pl.col("cross_bias_m").round(1)).rows()
+    assert rows == [("r", "BA", False, 1.0)] * 3
+    assert route["t_start"].is_sorted()
 
 
 def test_the_route_of_a_run_without_doubt_is_marked_nowhere() -> None:

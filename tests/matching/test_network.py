@@ -287,7 +287,7 @@ def test_off_the_network_for_a_while() -> None:
     assert found.epochs["on_track"].to_list() == (~away).tolist()
     assert found.epochs["gate_probability"].is_null().to_list() == away.tolist()
     assert found.path.elements() == ["s", "m"]
-    with pytest.raises(InputError, match="wholly off the track"):
+    with pytest.raises(InputError, match="off the track"):
         matched(run(x, np.full(len(x), 400.0)), site(SWITCH, SWITCH_LINKS))
 
 

@@ -309,7 +309,7 @@ def test_a_run_somewhere_else_says_what_may_be_wrong() -> None:
     swapped = good.with_columns(latitude_deg=good["longitude_deg"], longitude_deg=good["latitude_deg"])
     with pytest.raises(InputError, match="Latitude and longitude are swapped"):
         matched(swapped, place)
-    with pytest.raises(InputError, match=r"120 m or more from any track.*datum taken for WGS 84"):
+    with pytest.raises(InputError, match=r"120 m or more from any track.*datum read as WGS 84"):
         matched(run(x, np.full(10, 120.0)), place)
     with pytest.raises(InputError, match=r"900 m or more from any track.*site covers this run"):
         matched(run(x, np.full(10, 900.0)), place)

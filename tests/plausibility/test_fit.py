@@ -145,7 +145,7 @@ def test_low_availability_has_its_reason() -> None:
     (row,) = replay(trial.run.with_streams(gnss=aside), trial.site, trial.vehicle).runs.to_dicts()
     assert row["availability"] < 0.1
     assert "positions against the survey: the survey lies" in row["notes"]
-    assert "of the moving time, as it was lost to: " in row["notes"]
+    assert "of the moving time, the rest lost to: " in row["notes"]
 
 
 def test_placeholders_are_no_positions() -> None:

@@ -84,16 +84,16 @@ def test_kinds_of_fix_by_text_number_and_word(converted):
 @pytest.mark.parametrize(
     ("text", "mapping", "message"),
     [
-        ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"heigth_m": "lat"}}, "is no column of this stream.*heigth_m"),
+        ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"heigth_m": "lat"}}, "this stream does not have.*heigth_m"),
         ("t,lat,lon\n1,50,4\n", {"fields": PLACE | {"height_m": "h"}}, "no field h for column height_m"),
         ("tt,lat,lon\n1,50,4\n", {}, "no field t for column t"),
-        ("t,lat,lon\n,50,4\n2,50,4\n", {}, "column t: is not complete"),
+        ("t,lat,lon\n,50,4\n2,50,4\n", {}, "column t: has missing values"),
         ("t,lat,lon\nabc,50,4\n", {}, "column t: holds no times"),
         ("t,lat,lon\n1,50,400\n", {}, "longitude_deg: is out of range; found 400"),
         ("t;lat;lon\n1;50,5;4.5\n", {}, "column lat: cannot be latitude_deg"),
-        ("t,lat,lon,lat\n1,50,4,51\n", {}, "a column name stands twice: lat"),
-        ("t,lat,lon, lat \n1,50,4,51\n", {}, "a column name stands twice: lat"),
-        ("t,lat,lon\ntrue,50,4\n", {}, "field t: is no time; found flag"),
+        ("t,lat,lon,lat\n1,50,4,51\n", {}, "two columns have the same name: lat"),
+        ("t,lat,lon, lat \n1,50,4,51\n", {}, "two columns have the same name: lat"),
+        ("t,lat,lon\ntrue,50,4\n", {}, "field t: is not a time; found flag"),
         ("t,lat,lon\n20000000000,50,4\n", {}, "time unit unknown; found 20000000000"),
         ("", {}, "is not a CSV file"),
         ("t,lat,lon\n", {}, "no epoch with a time and a position"),
@@ -123,7 +123,7 @@ def test_a_log_without_rows_or_times_beside_another_is_told(tmp_path):
     other.write_text("t,lat,lon\n")
     assert convert([other, full], "r", config.ingest).run.gnss.height == 2
     other.write_text("t,lat,lon\n,50,4\n,50,4\n")
-    with pytest.raises(InputError, match=r"b\.csv: column t: is not complete"):
+    with pytest.raises(InputError, match=r"b\.csv: column t: has missing values"):
         convert([full, other], "r", config.ingest)
 
 

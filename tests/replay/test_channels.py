@@ -135,7 +135,7 @@ def without_fix(run):
 
 @pytest.mark.parametrize(
     ("broken", "reason"),
-    [(without_fix, "no epoch has a position"), (lambda run: run.with_streams(gnss=run.gnss[7:8]), "only one time")],
+    [(without_fix, "no epoch has a position"), (lambda run: run.with_streams(gnss=run.gnss[7:8]), "the same time")],
 )
 def test_a_solution_that_cannot_be_replayed_leaves_the_others_alone(broken, reason, tmp_path):
     run, site = journey(OFFSET)

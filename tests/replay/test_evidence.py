@@ -71,11 +71,11 @@ def test_odometer_alone_does_not_see_an_offset_within_its_confidence_and_says_so
 
 def test_balises_accepted_while_no_odometer_could_contradict_are_told():
     run, site = journey(OFFSET)
-    undiagnosed = "virtual balises accepted without diagnosis along the track: "
+    undiagnosed = "virtual balises accepted without a monitor along the track"
     assert undiagnosed not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
     without = replay(run.with_streams(odometer=None), site, VEHICLE)
     accepted = without.passages.filter((pl.col("kind") == "virtual") & (pl.col("status") == "accepted"))
-    assert f"{undiagnosed}{accepted.height} (no odometer); a jump" in without.runs["notes"].item()
+    assert f"{accepted.height} {undiagnosed} (no odometer): a jump" in without.runs["notes"].item()
     begin = run.odometer["t"][0]
     pause = pl.col("t").is_between(begin + timedelta(seconds=135), begin + timedelta(seconds=205))
     paused = replay(run.with_streams(odometer=run.odometer.filter(~pause)), site, VEHICLE)
@@ -85,7 +85,7 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_told():
         & pl.col("t_offered").is_between(begin + timedelta(seconds=137), begin + timedelta(seconds=205))
     )
     assert inside.height > 0
-    assert f"{undiagnosed}{inside.height} (odometer interrupted or slipping); a jump" in paused.runs["notes"].item()
+    assert f"{inside.height} {undiagnosed} (odometer interrupted or slipping): a jump" in paused.runs["notes"].item()
     middle = begin + timedelta(seconds=100)
     for kept, word in ((pl.col("t") < middle, "ends before"), (pl.col("t") > middle, "begins after")):
         part = replay(run.with_streams(odometer=run.odometer.filter(kept)), site, VEHICLE)
@@ -95,7 +95,7 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_told():
         )
         assert unseen.height > 0
         notes = part.runs["notes"].item()
-        assert f"{undiagnosed}{unseen.height} (outside the odometer's time span); a jump" in notes
+        assert f"{unseen.height} {undiagnosed} (outside the odometer's time span): a jump" in notes
         assert f"the odometer {word} the GNSS" in notes
 
 
@@ -105,8 +105,8 @@ def test_positions_left_out_for_their_time_are_told():
     doubled = run.gnss[500:510].with_columns(pl.col("latitude_deg") + 0.001)
     both = run.with_streams(gnss=pl.concat([undated, run.gnss, doubled]))
     told, plain = replay(both, site, VEHICLE).runs, replay(run, site, VEHICLE).runs
-    assert "positions more than a day from the others, left out: 3" in told["notes"].item()
-    assert "positions of a time that another position has, elsewhere: 10;" in told["notes"].item()
+    assert "3 positions left out: their time is more than a day from the others" in told["notes"].item()
+    assert "10 positions left out: another position with the same time lies elsewhere" in told["notes"].item()
     assert told["duration_s"].item() == plain["duration_s"].item()
     assert told["distance_m"].item() == plain["distance_m"].item()
 
@@ -140,7 +140,7 @@ def test_slide_as_quick_as_a_jump_between_two_reads_leaves_errors_unknown():
     assert tables.runs["unsafe_accepted"].item() == 0
     assert tables.alarms["verdict"].to_list() == ["unknown"]
     assert tables.runs["odometer_contradicted"].item() == 1
-    assert "does not close 1 gaps" in tables.runs["notes"].item()
+    assert "does not fit 1 gaps" in tables.runs["notes"].item()
     unknown = tables.passages.filter(pl.col("judgement") == "unknown")
     assert unknown.height
     between = tables.epochs.filter(pl.col("t").is_between(unknown["t_offered"][0], unknown["t_offered"][-1]))
@@ -201,7 +201,7 @@ def test_a_covariance_that_contradicts_itself_stands_in_the_notes():
     run, site = journey()
     ee = pl.col("cov_ee_m2")
     broken = run.with_streams(gnss=run.gnss.with_columns(cov_en_m2=pl.when(pl.int_range(pl.len()) < 7).then(9.0 * ee)))
-    assert "cov_en_m2 contradicts its variances at 7 epochs" in replay(broken, site, VEHICLE).runs["notes"][0]
+    assert "cov_en_m2 is impossible with its variances at 7 epochs" in replay(broken, site, VEHICLE).runs["notes"][0]
 
 
 def test_windows_stand_after_a_pause_of_an_odometer_of_speed_alone():
@@ -232,9 +232,9 @@ def test_a_balise_read_inside_an_outage_is_placed_by_the_odometer_of_then():
 def test_balises_that_lie_off_their_net_element_are_told():
     run, site = journey(OFFSET)
     assert "off their net element" not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
-    finding = Finding("error", "balises: VB9", "measure 99999.0 m is off element A", "Mend measure_m.")
+    finding = Finding("error", "balises: VB9", "measure 99999.0 m is off element A", "Correct measure_m.")
     notes = replay(run, dataclasses.replace(site, findings=(finding,)), VEHICLE).runs["notes"].item()
-    assert "balises off their net element, which no run passes: VB9; `balise inspect`" in notes
+    assert "no run passes them (`balise inspect SITE` says why): VB9" in notes
 
 
 STOPPING = {
@@ -296,7 +296,7 @@ def test_a_counter_that_is_reset_costs_nothing_and_is_told():
     assert found.runs.select(same).row(0) == plain.runs.select(same).row(0)
     assert found.passages["status"].unique().to_list() == ["accepted"]
     assert found.runs["distance_m"].item() == pytest.approx(plain.runs["distance_m"].item(), abs=5.0)
-    assert "the odometer's distance leaps by more than a train can drive, 1 times" in found.runs["notes"].item()
+    assert "the odometer's distance jumps by more than a train can drive, 1 times" in found.runs["notes"].item()
 
 
 def test_an_odometer_with_a_row_every_five_seconds_raises_no_alarm():
@@ -305,4 +305,4 @@ def test_an_odometer_with_a_row_every_five_seconds_raises_no_alarm():
     found = replay(sparse, site, VEHICLE)
     assert found.runs["alarms"].item() == 0
     assert found.passages["status"].unique().to_list() == ["accepted"]
-    assert "the odometer has a row every 5 s only" in found.runs["notes"].item()
+    assert "the odometer has only one row every 5 s" in found.runs["notes"].item()

@@ -61,7 +61,7 @@ def test_without_a_reference_nobody_knows_whether_the_train_moved(form, lost):
     share = moving.is_in(tables.epochs.filter(pl.col("tvb"))["t"].implode()).mean()
     assert row(tables)["availability"] <= share + 0.01
     assert row(tables)["verdict"] != "safe"
-    assert "nothing tells whether the train moved" in row(tables)["notes"]
+    assert "it is not known whether the train moved" in row(tables)["notes"]
 
 
 def test_behind_the_last_read_a_standing_odometer_leaves_positions_unknown():

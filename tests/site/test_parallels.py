@@ -23,7 +23,7 @@ def test_double_track_is_named_once_with_its_extent_and_what_a_run_can_claim() -
     (text,) = found(4.0)
     assert text.startswith("element a: 0 to 2000 m: b lies 4.0 m beside it")
     # 4.0² / (2 · 1.5²) = 3.556; 1 / (1 + e^-3.556) = 0.972.
-    assert "claims 0.97 at most" in text
+    assert "a probability of 0.97 at most" in text
 
 
 @pytest.mark.parametrize(("spacing_m", "named"), [(3.4, True), (4.5, True), (4.6, False), (20.0, False)])

@@ -139,7 +139,7 @@ def test_findings_name_what_is_odd(tmp_path: Path) -> None:
     assert "not in the track" in said["error", "balises: v2"]
     text = "\n".join(finding.message for finding in site.findings)
     assert "end 1 of b and end 0 of c are linked but 4.0 m apart" in text
-    assert "relation c - nowhere names an element that is not in the track" in text
+    assert "relation c - nowhere is not used: it names an element not in the track" in text
     assert "end 0 of a and end 1 of n are 1.43 m apart and not linked" in text
     assert site.links.height == 4
 
@@ -155,7 +155,7 @@ def test_chords_that_leave_their_curve_are_said(tmp_path: Path) -> None:
         }
     )
     (finding,) = read_site(builders.write(tmp_path, track=frame)).findings
-    assert finding.message == "vertices up to 60 m apart: its chords leave the curve by up to 1.50 m"
+    assert finding.message == "points up to 60 m apart: straight lines between them leave the curve by 1.50 m"
     assert finding.severity == "note"
 
 
@@ -166,7 +166,7 @@ def test_declared_length_against_geometry(tmp_path: Path) -> None:
         )
     )
     site = read_site(builders.write(tmp_path, track=declared, links=builders.links()))
-    assert any("declared 120.0 m long, its geometry measures 100." in f.message for f in site.findings)
+    assert any("the declared length is 120.0 m, the geometry is 100." in f.message for f in site.findings)
     assert site.track.filter(pl.col("netelement_id") == "b")["measure_m"].to_list() == [0.0, 120.0]
 
 
@@ -184,12 +184,12 @@ def test_all_breaches_come_at_once(tmp_path: Path) -> None:
     links = builders.links().with_columns(navigability=pl.lit("sideways"), position_a=pl.lit(3))
     balises = builders.balises(kind=["virtual", "imaginary"], balise_id=["v1", None])
     text = messages(builders.write(tmp_path, track=track, links=links, balises=balises))
-    assert "track.parquet: column latitude_deg: is not a number; found nan in row 1" in text
+    assert "track.parquet: column latitude_deg: has values that are not finite numbers; found nan in row 1" in text
     assert "links.parquet: column position_a: is out of range; found 3 in 4 rows, first 0; expected at most 1" in text
     assert "links.parquet: column navigability: has the wrong type; found 'sideways'" in text
     assert "expected one of AB BA both none" in text
     assert "balises.parquet: column kind: has the wrong type; found 'imaginary'" in text
-    assert "balises.parquet: column balise_id: is not complete; found null in row 1" in text
+    assert "balises.parquet: column balise_id: has missing values; found null in row 1" in text
 
 
 def test_missing_columns_wrong_types_and_falling_measures(tmp_path: Path) -> None:
@@ -201,9 +201,9 @@ def test_missing_columns_wrong_types_and_falling_measures(tmp_path: Path) -> Non
         builders.write(tmp_path / "2", track=listed)
     )
     falling = builders.track().with_columns(measure_m=-pl.col("longitude_deg"))
-    assert "element a does not grow at point 1" in messages(builders.write(tmp_path / "3", track=falling))
+    assert "element a does not increase at point 1" in messages(builders.write(tmp_path / "3", track=falling))
     partial = builders.track().with_columns(measure_m=pl.Series([0.0, None, *[None] * 7], dtype=pl.Float64))
-    assert "element a has it at some points only" in messages(builders.write(tmp_path / "4", track=partial))
+    assert "element a has a measure at some points only" in messages(builders.write(tmp_path / "4", track=partial))
 
 
 def test_places_not_on_earth_ask_for_the_coordinate_system(tmp_path: Path) -> None:
@@ -236,14 +236,14 @@ def test_routes_must_be_one_way_through_known_elements(tmp_path: Path) -> None:
 def test_files_that_are_not_what_they_seem(tmp_path: Path) -> None:
     assert "has no track" in messages(builders.write(tmp_path / "0"))
     (builders.write(tmp_path / "1") / "track.parquet").write_bytes(b"no parquet at all")
-    assert "track.parquet: is not readable as Parquet" in messages(tmp_path / "1")
+    assert "track.parquet: cannot be read as Parquet" in messages(tmp_path / "1")
     (builders.write(tmp_path / "2") / "track.geojson").write_text("{}")
     assert "is not a GeoJSON FeatureCollection" in messages(tmp_path / "2")
     builders.write(tmp_path / "3", track=builders.track())
     builders.write(tmp_path / "3", track=builders.geojson())
     assert "only one may be there" in messages(tmp_path / "3")
     assert "is not a folder" in messages(tmp_path / "4")
-    assert "holds no point" in messages(builders.write(tmp_path / "5", track=builders.track()[:0]))
+    assert "has no points" in messages(builders.write(tmp_path / "5", track=builders.track()[:0]))
     one = builders.track().filter(pl.col("netelement_id") != "b")
     dot = pl.concat([one, builders.track()[3:4]])
     assert "element b has 1 distinct point" in messages(builders.write(tmp_path / "6", track=dot))
@@ -305,10 +305,10 @@ def test_a_relation_that_turns_back_is_not_navigable(tmp_path: Path) -> None:
     given = pl.concat([builders.links(), builders.links()[3:].with_columns(navigability=pl.lit("both"))])
     site = read_site(builders.write(tmp_path, track=builders.track(), links=given))
     assert site.links["navigability"].to_list() == ["both", "both", "AB", "none", "none"]
-    told = [finding.message for finding in site.findings if "same side" in finding.message]
+    told = [finding.message for finding in site.findings if "by more than 90" in finding.message]
     assert told == [
-        "end 0 of b and end 0 of d are linked as navigable (both), but lie on the same side of where they meet: "
-        "taken for not navigable"
+        "end 0 of b and end 0 of d are linked as navigable (both), but a train would have to turn by more than 90 "
+        "degrees there: taken as not navigable"
     ]
 
 
@@ -318,9 +318,9 @@ def test_the_wrong_relation_of_the_recorded_network_is_told(tmp_path: Path) -> N
     folder = builders.write(tmp_path)
     (folder / "track.geojson").write_bytes((INFRABEL / "network_airport.geojson").read_bytes())
     site = read_site(folder)
-    assert [finding.message for finding in site.findings if "same side" in finding.message] == [
-        "end 1 of 88_L_262 and end 1 of 88_L_11886 are linked as navigable (both), but lie on the same side of where "
-        "they meet: taken for not navigable"
+    assert [finding.message for finding in site.findings if "by more than 90" in finding.message] == [
+        "end 1 of 88_L_262 and end 1 of 88_L_11886 are linked as navigable (both), but a train would have to turn "
+        "by more than 90 degrees there: taken as not navigable"
     ]
 
 

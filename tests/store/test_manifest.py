@@ -111,7 +111,7 @@ def test_no_manifest_is_one_error(out: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"has no manifest\.json"):
         verify(copy)
     (copy / "manifest.json").write_text("{}")
-    with pytest.raises(UsageError, match="is no manifest"):
+    with pytest.raises(UsageError, match="is not a manifest"):
         verify(copy)
 
 

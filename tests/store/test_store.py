@@ -300,7 +300,7 @@ def test_configuration_of_another_build_is_one_message(tmp_path: Path) -> None:
 )
 def test_results_are_only_read(tmp_path: Path, sql: str) -> None:
     store.write_run(tables_of("r1"), tmp_path, METADATA)
-    with pytest.raises(UsageError, match=r"is no query.*found.*SELECT"):
+    with pytest.raises(UsageError, match=r"is not a query.*found.*SELECT"):
         run_sql(tmp_path, sql)
 
 
@@ -345,7 +345,7 @@ def test_sql_reads_other_files_only_when_it_may(tmp_path: Path, sql: str) -> Non
     store.write_run(tables_of("r1"), tmp_path / "out", METADATA)
     (tmp_path / "secret.csv").write_text("run_id\nsecret\n")
     query = sql.format(file=tmp_path / "secret.csv")
-    with pytest.raises(UsageError, match=r"reads files beside the result.*--allow-files"):
+    with pytest.raises(UsageError, match=r"reads files outside the result.*--allow-files"):
         run_sql(tmp_path / "out", query)
     assert "secret" in run_sql(tmp_path / "out", query, allow_files=True)["run_id"].to_list()
 
@@ -381,7 +381,7 @@ def test_any_query_has_an_answer_or_one_message(tmp_path: Path) -> None:
             assert isinstance(run_sql(tmp_path, sql), pl.DataFrame), sql
     begun_s = time.monotonic()
     assert run_sql(tmp_path, "/**/" * 2000 + "SELECT run_id FROM runs").height == 1
-    with pytest.raises(UsageError, match="is no query"):
+    with pytest.raises(UsageError, match="is not a query"):
         run_sql(tmp_path, "/**/" * 2000 + "DROP")
     assert time.monotonic() - begun_s < 2.0
 

@@ -114,7 +114,7 @@ def test_tables_and_columns_are_listed(out: Path) -> None:
     assert columns.filter(pl.col("column") == "peak_ratio").select("unit", "nullable").rows() == [("1", True)]
     assert columns["column"][0] == "run_id"
     assert run_sql(out, "describe old_runs", others={"old": out}).height == len(Runs.columns()) + 1
-    with pytest.raises(UsageError, match=r"is no table \(did you mean `alarms`"):
+    with pytest.raises(UsageError, match=r"is not a table \(did you mean `alarms`"):
         run_sql(out, "DESCRIBE alarm")
 
 

@@ -100,7 +100,7 @@ def test_what_the_evidence_cannot_see_is_said() -> None:
     assert (found["vehicle"], found["odometer_contradicted"]) == ("learned", 2)
     assert "never that it was right" in found["notes"]
     assert "balise reads every 2 km and within 300 m of both ends" in found["notes"]
-    assert "does not close 2 gaps" in found["notes"]
+    assert "does not fit 2 gaps" in found["notes"]
     assert "no vehicle file" in found["notes"]
 
 
@@ -174,7 +174,7 @@ class TestAvailability:
         """10 s of 40 s: they count as moving without a TVB."""
         found = row(epochs(seconds(41), moving=[None if 10 <= k < 20 else True for k in range(41)]))
         assert found["availability"] == pytest.approx(30 / 40)
-        assert found["notes"].startswith("for 10 s nothing tells whether the train moved")
+        assert found["notes"].startswith("for 10 s it is not known whether the train moved")
 
     def test_gap_while_moving_is_without_a_tvb(self) -> None:
         assert row(epochs([*seconds(11), *(30.0 + k for k in range(11))]))["availability"] == pytest.approx(20 / 40)
@@ -354,7 +354,7 @@ class TestVerdict:
         )
         found = row(frame, passages=passages(1, **ACCEPTED))
         assert (found["share_unknown"], found["verdict"]) == (0.04, "unproven")
-        assert "4.0% of the moving time in use cannot be judged" in found["notes"]
+        assert "4.0% of the moving time in use could not be judged" in found["notes"]
         lenient = Configuration.model_validate({"hazards": {"unknown_share_limit": 0.04}})
         assert row(frame, lenient, passages=passages(1, **ACCEPTED))["verdict"] == "safe"
 
