@@ -1,7 +1,8 @@
 """What a train localisation unit may claim: a result of `balise replay` held against published requirements.
 
 In: the tables of a result, a profile (requirements as a versioned file), the area types of the site. Out: one row per
-requirement. Touches files only to read: results, profiles, `areas`. Truth is what the judge wrote into the tables.
+requirement. Truth is what the judge wrote into the tables.
+Touches files only to read them: results, profiles, `areas`.
 """
 
 from pipeline.claim.areas import read_areas

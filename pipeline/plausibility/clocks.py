@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 
 from schemas.arrays import Floats
 
@@ -80,14 +79,14 @@ def _correlations(one: Floats, other: Floats, least: float) -> Floats:
 
     Element k pairs `one[i]` with `other[i - k + n - 1]`, n the length of `other` (Padfield 2012, masked FFT).
     """
-    size = fft.next_fast_len(one.size + other.size - 1, real=True)
+    size = 1 << (one.size + other.size - 2).bit_length()
     masks = [np.isfinite(values).astype(np.float64) for values in (one, other)]
     filled = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (one, other)]
-    spectra = [fft.rfft(array, size) for array in (masks[0], filled[0], filled[0] ** 2)]
-    turned = [fft.rfft(array[::-1], size) for array in (masks[1], filled[1], filled[1] ** 2)]
+    spectra = [np.fft.rfft(array, size) for array in (masks[0], filled[0], filled[0] ** 2)]
+    turned = [np.fft.rfft(array[::-1], size) for array in (masks[1], filled[1], filled[1] ** 2)]
 
     def sums(left: int, right: int) -> Floats:
-        whole: Floats = fft.irfft(spectra[left] * turned[right], size)[: one.size + other.size - 1]
+        whole: Floats = np.fft.irfft(spectra[left] * turned[right], size)[: one.size + other.size - 1]
         return whole
 
     count = np.maximum(np.round(sums(0, 0)), 0.0)

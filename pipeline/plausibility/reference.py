@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.plausibility.clocks import possible_lags
 from pipeline.plausibility.course import Places
@@ -61,6 +60,8 @@ class PlaceFit:
 
 def fit_places(gnss: Places, record: Places) -> PlaceFit:
     """Lag and shift of another record of the same journey."""
+    from scipy.spatial import cKDTree
+
     far_m = float(np.min(cKDTree(record.ecef_m[:: max(1, len(record.t_s) // 200)]).query(gnss.ecef_m[::20])[0]))
     if far_m > _ELSEWHERE_M:
         return PlaceFit(reason=f"it is {far_m / 1000:.0f} km from the positions")
@@ -81,6 +82,8 @@ def fit_places(gnss: Places, record: Places) -> PlaceFit:
 
 def _lag_by_place(gnss: Places, record: Places) -> float:
     """The lag at which most epochs have the record at the same place; 0 where none has."""
+    from scipy.spatial import cKDTree
+
     grid = np.linspace(record.t_s[0], record.t_s[-1], int(np.clip(record.t_s[-1] - record.t_s[0], 10, 20_000)))
     moving = record.known(grid) & (np.nan_to_num(record.speed(grid)) > _MOVES_MPS)
     rows = _sample(np.flatnonzero(np.nan_to_num(gnss.speed(gnss.t_s)) > _MOVES_MPS))

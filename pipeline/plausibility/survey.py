@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from scipy.spatial import cKDTree
 
 from pipeline.plausibility.course import Places
 from pipeline.plausibility.frames import SLIPS, Slip
 from pipeline.track.geodesy import Points, points_of
 from pipeline.track.survey import Track, track_of
 from schemas.arrays import Floats
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _SPACING_M = 20.0
 _MOST = 400
@@ -83,6 +86,8 @@ class _Key:
 
 @lru_cache(maxsize=2)
 def _line(key: _Key) -> Line:
+    from scipy.spatial import cKDTree
+
     track: Track = track_of(key.frame)
     places, along, heights = [], [], []
     surface = points_of(track.latitude_deg, track.longitude_deg).surface

@@ -1,8 +1,8 @@
 """From a survey of a line to a site.
 
 In: files that hold lines (GPX, KML, KMZ, GeoJSON, tables) or a run with better positions than GNSS alone.
-Out: track, links and balises as in CONTRACT section 2, and findings on what is doubtful. `sources` reads files,
-`make` alone writes them. Touches files.
+Out: track, links and balises as in CONTRACT section 2, and findings on what is doubtful.
+Touches files: `sources` reads them, `make` alone writes them.
 
 `sources` reads any of them (`xml_lines`, `geojson_lines`, `tables`, `recorded`) to pieces of line (`pieces`); `trace`
 cleans what a train recorded; `network` cuts pieces at shared nodes and links their ends; `balises` puts balises on

@@ -51,7 +51,9 @@ def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
         "in_use": True,
         "moving": True,
     }
-    return table(Epochs, len(t_s), **(good | columns))
+    # Between stages an epoch has columns that no table has.
+    between = {"fix_valid": pl.lit(value=True), "odometer_reason": pl.lit(None, pl.String)}
+    return table(Epochs, len(t_s), **(good | columns)).with_columns(**between)
 
 
 def passages(height: int = 0, **columns: Any) -> pl.DataFrame:

@@ -101,7 +101,7 @@ def test_what_the_evidence_cannot_see_is_said() -> None:
     assert "never that it was right" in found["notes"]
     assert "balise reads every 2 km and within 300 m of both ends" in found["notes"]
     assert "does not fit 2 gaps" in found["notes"]
-    assert "no vehicle file" in found["notes"]
+    assert "no odometer scale in a vehicle file" in found["notes"]
 
 
 def test_what_cleaning_and_alignment_found() -> None:
