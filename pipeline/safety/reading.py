@@ -34,6 +34,8 @@ _SOURCES = {
     "share_unknown": "DOMAIN 5.2",
     "stanford": "Stanford diagram, along track",
     "thr_vb": "TVB section 3",
+    "undetected": "docs/domain.md section 5.6",
+    "physical_spacing": "docs/domain.md section 5.6",
 }
 
 
