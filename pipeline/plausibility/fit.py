@@ -95,7 +95,12 @@ def _odometer(
         checks += _vehicle_checks(main, lambda: _by_reference(run, counter, reference, epoch_ns), reference, vehicle)
     if any(check.what == _LATENCY and check.state is State.MISFIT for check in checks):
         return checks, [Lag("odometer", reason="the latency of the vehicle file does not fit")]
-    return checks, [_odometer_lag(main, vehicle, config)]
+    lag = _odometer_lag(main, vehicle, config)
+    small = lag.sure and abs(lag.lag_s) <= config.fit_lag_limit_s
+    other = _by_reference(run, counter, reference, epoch_ns) if small and counter is not None else None
+    if other is not None and other.lag_told and not other.other_lag(0.0, config.fit_lag_told_s):
+        return checks, [Lag("odometer", reason=f"{lag.lag_s:+.2f} s, but none against the reference")]
+    return checks, [lag]
 
 
 def _odometer_lag(pair: PairFit, vehicle: Vehicle, config: IngestConfig) -> Lag:

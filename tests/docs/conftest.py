@@ -38,10 +38,11 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run_log(build_run(scenario, _spec(scenario, "evening")), folder / "runs")
     assert scenario.vehicle is not None
     (folder / "vehicle.toml").write_text(to_toml(scenario.vehicle))
-    _replay(folder, RUNS, Configuration())
+    _replay(folder, (*RUNS, "evening"), Configuration())
     shutil.copytree(folder / "OUT", folder / "OUT_A")
     shutil.copytree(folder / "OUT", folder / "OUT_B")
     _receiver_log(folder / "runs" / "evening", folder)
+    _line(folder / "SITE", folder / "line.gpx")
     return folder
 
 
@@ -87,6 +88,14 @@ def _with_a_clean_run(scenario: Scenario) -> Scenario:
 
 def _spec(scenario: Scenario, name: str) -> RunSpec:
     return next(run for run in scenario.runs if run.id == name)
+
+
+def _line(site: Path, gpx: Path) -> None:
+    """The line's track as somebody's GPX."""
+    columns = ("latitude_deg", "longitude_deg", "height_m")
+    rows = pl.read_parquet(site / "track.parquet").select(columns).iter_rows()
+    points = "".join(f'<trkpt lat="{lat}" lon="{lon}"><ele>{up or 0.0}</ele></trkpt>' for lat, lon, up in rows)
+    gpx.write_text(f'<gpx version="1.1"><trk><name>line</name><trkseg>{points}</trkseg></trk></gpx>')
 
 
 def _receiver_log(run: Path, folder: Path) -> None:

@@ -91,7 +91,7 @@ def test_one_run_of_two_is_corrected_and_nothing_of_it_is_in_doubt(tmp_path: Pat
 def test_a_folder_without_any_route_of_the_runs_is_refused(tmp_path: Path) -> None:
     home, runs = on_disk(tmp_path, "one")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match="no route of any"):
+    with pytest.raises(UsageError, match="no route for any"):
         make_plan(runs, home, tmp_path / "out", routes=tmp_path / "empty")
 
 

@@ -48,7 +48,6 @@ def test_balise_lists_of_spreadsheets(tmp_path: Path, content: bytes) -> None:
             BALISES.replace(",", ";").replace("10.5", "10,5").encode(),
             "measure_m: cannot be read; found '10,5' in row 0",
         ),
-        (BALISES.replace("v1", "vé").encode("latin-1"), "cannot be read as CSV"),
         (b"", "cannot be read as CSV"),
         (BALISES.replace("kind", "measure_m").encode(), "same name|column kind: is missing"),
     ],

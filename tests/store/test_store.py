@@ -204,7 +204,7 @@ def test_unknown_enum_is_refused(tmp_path: Path) -> None:
 
 def test_unknown_names(tmp_path: Path) -> None:
     store.write_run(tables_of("r"), tmp_path, METADATA)
-    with pytest.raises(UsageError, match="no table"):
+    with pytest.raises(UsageError, match="is not a table"):
         store.read_table(tmp_path, "epoch")
     with pytest.raises(UsageError, match=r"has no run 'other'; found r$"):
         store.read_table(tmp_path, "epochs", "other")
