@@ -1,4 +1,4 @@
-"""RTKLIB's `.pos` in all its forms; places as RTKLIB's own `pos2kml` puts them, the rest worked by hand."""
+"""RTKLIB's `.pos` in all its forms, each value worked by hand."""
 
 from __future__ import annotations
 
