@@ -2,8 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Two test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
-TESTS := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# Test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
+# A third one, for two cores: tests of stores and clusters mostly wait.
+TESTS := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
 .PHONY: install demo test quick check lint types bench mutations dictionary lock clean

@@ -332,7 +332,7 @@ def test_inspect_names_balises_that_linking_cannot_tell_apart(
         for name, along_m in (("NEAR1", 400.0), ("NEAR2", 480.0))
     ]
     pl.concat([near, *moved]).write_parquet(site / "balises.parquet")
-    said = balise("inspect", site)
+    said = balise("inspect", site, "--json")  # a table would break the sentences to the width of the terminal
     assert "balises NEAR1, NEAR2" in said.out
     assert "80.0 m apart, 103.2 m needed" in said.out
 
