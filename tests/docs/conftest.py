@@ -63,7 +63,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: None) -> Path:
     """A copy of the folder to work in; it is the working directory."""
     folder = tmp_path / "work"
     shutil.copytree(workspace, folder)
