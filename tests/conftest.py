@@ -69,7 +69,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Campaigns and pages are made in this process: for tests that are not about workers, which take seconds to start."""
+    """Campaigns and pages are made here: for tests that are not about workers, which take seconds to start."""
     from pipeline.campaign import run
     from pipeline.campaign.serial import SerialEngine
 

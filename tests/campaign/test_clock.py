@@ -45,7 +45,7 @@ def replay(trial: SmallTrial, out: Path, shift_years: float, runs: list[Path], c
     """A campaign in processes whose clock is off and goes back a minute each time somebody looks."""
     (clock / "sitecustomize.py").write_text(_WRONG_CLOCK)
     ended = subprocess.run(
-        command(trial, out, "--jobs", "2", runs=runs),
+        command(trial, out, "--jobs", "1", runs=runs),
         cwd=ROOT,
         text=True,
         capture_output=True,
