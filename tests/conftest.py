@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,11 +73,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Campaigns and pages are made here: for tests that are not about workers, which take seconds to start."""
-    from pipeline.campaign import run
+    from pipeline.campaign import run, workers
     from pipeline.campaign.serial import SerialEngine
 
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     monkeypatch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", lambda count, mp_context: contextlib.nullcontext(_Here()))
+
+
+class _Here:
+    """Does pieces of work here, each on a copy as a process would get it."""
+
+    def map(self, function: Callable[[object], object], tasks: Sequence[object]) -> Iterator[object]:
+        for task in tasks:
+            work, given = pickle.loads(pickle.dumps((function, task)))
+            yield pickle.loads(pickle.dumps(work(given)))
 
 
 @dataclass(frozen=True)
