@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
@@ -44,6 +45,8 @@ _SLOW = (
     "ingest/test_fuzz.py",
     "ingest/test_hostile.py",
     "ingest/test_json.py",
+    "judge/test_clean.py",
+    "judge/test_defects.py",
     "judge/test_ladder.py",
     "lds/test_outages.py",
     "line",
@@ -110,13 +113,39 @@ def cut(run: RunLog, run_id: str, begin_s: int, length_s: int = _LENGTH_S) -> Ru
     return RunLog(run_id=run_id, gnss=run.gnss.filter(inside), odometer=odometer)
 
 
+Shared = Callable[[str, Callable[[Path], object]], Path]
+"""Name of a folder, and what fills it; gives the folder, which is not to be changed."""
+
+
 @pytest.fixture(scope="session")
-def small_trial(tmp_path_factory: pytest.TempPathFactory) -> SmallTrial:
-    folder = tmp_path_factory.mktemp("small-trial")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """A folder that is made once, by whichever of the test processes needs it first."""
+    top = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        top = top.parent
+
+    def folder(name: str, fill: Callable[[Path], object]) -> Path:
+        with (top / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (top / name).exists():
+                (top / f"{name}.part").mkdir()
+                fill(top / f"{name}.part")
+                (top / f"{name}.part").rename(top / name)
+        return top / name
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_trial(shared: Shared) -> SmallTrial:
+    folder = shared("small-trial", _write_small_trial)
+    return SmallTrial(folder / "site", folder / "runs")
+
+
+def _write_small_trial(folder: Path) -> None:
     scenario = demo_scenario()
     spec = next(run for run in scenario.runs if run.id == "outage")
     run = build_run(scenario, spec)
     write_site(build_site(scenario), folder / "site")
     for number in range(4):
         write_run_log(cut(run, f"run{number}", 40 + 15 * number), folder / "runs")
-    return SmallTrial(folder / "site", folder / "runs")

@@ -8,10 +8,7 @@ import subprocess
 from pathlib import Path
 
 from tests.campaign.compare import ROOT, campaign_bytes, command, result_bytes
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 _YEAR_S = 365.25 * 86400.0
 _2100_S = 4_102_444_800

@@ -19,10 +19,8 @@ from schemas.enums import RunStatus
 from schemas.errors import UsageError
 from tests.campaign.compare import ROOT, Hurried, by_run, plan_of, result_bytes, wait_for
 from tests.campaign.compare import command as replay_command
-from tests.campaign.test_local import Spy, undisturbed
+from tests.campaign.test_local import Spy
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 _BEGUN_S = 0.5
 # None of it passes: the clock is put forward.

@@ -25,10 +25,7 @@ from pipeline.storage.address import Address
 from schemas.enums import RunStatus
 from schemas.errors import OutputError
 from tests.campaign.compare import ROOT, campaign_bytes, command, plan_of, result_bytes, run, start, wait_for
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 
 @contextlib.contextmanager

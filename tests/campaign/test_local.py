@@ -58,15 +58,6 @@ class Spy:
         assert len(self.seen) == len(summary.outcomes)
 
 
-@pytest.fixture(scope="session")
-def undisturbed(small_trial: SmallTrial, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Each run replayed by itself, in this process."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    for path in small_trial.paths:
-        run_campaign(plan_of(small_trial, out, [path]))
-    return out
-
-
 def one_run(trial: SmallTrial, folder: Path) -> Path:
     """A copy of one run that a test may change."""
     return Path(shutil.copytree(trial.paths[0], folder / trial.paths[0].name))

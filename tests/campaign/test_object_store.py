@@ -25,10 +25,7 @@ from schemas.enums import RunStatus
 from schemas.errors import InputError, OutputError
 from schemas.tables import TABLES
 from tests.campaign.compare import by_run, result_bytes, wait_for
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 SECRET = "not-for-anybodys-eyes"
 
