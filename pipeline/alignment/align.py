@@ -7,13 +7,13 @@ import polars as pl
 
 from pipeline.alignment.estimates import Estimates, stamp_jitter_s
 from pipeline.alignment.learning import learn
+from pipeline.epochs.verdicts import NO_ODOMETER, first_reason
 from pipeline.monitors.along import most_scatter_m
 from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 
-NO_ODOMETER = "no odometer"
 BEYOND_SPAN = "outside the odometer's time span"
 INTERRUPTED = "odometer interrupted or slipping"
 _OF_ODOMETER = (
@@ -103,16 +103,11 @@ def _columns(
     if rows_m.any():
         held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
         turning = speed_of_positions(at, held, config.align.speed_window_s)
-    reason = (
-        pl.when(pl.Series(known))
-        .then(None)
-        .when(pl.Series((at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])))
-        .then(pl.lit(INTERRUPTED))
-        .otherwise(pl.lit(BEYOND_SPAN))
-    )
+    inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
+    reason = first_reason((~known & inside, INTERRUPTED), (~known, BEYOND_SPAN))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
-        pl.select(reason.alias("odometer_reason")).to_series(),
+        reason.alias("odometer_reason"),
         pl.Series("odometer_segment", odometry.segment_at_s(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, odometry.noise.white_m2_per_s)),
