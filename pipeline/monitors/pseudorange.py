@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
+from pipeline.epochs.clock import met, unambiguous
 from pipeline.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
@@ -111,7 +112,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
     survey_m = np.hypot(np.maximum(survey_m, _LEAST_SURVEY_SIGMA_M), np.nan_to_num(chord_m))
     matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
-    sure = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
+    sure = met(epochs, unambiguous(config))
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])

@@ -247,7 +247,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig) -> Noise:
     """Noise of a recorded distance, of whose ways those to the next row are `whole` (rows - 1,)."""
     counter_m = count_step_m(distance_m, whole, config)
-    return Noise(white_m2_per_s, quantisation_noise(t_s, distance_m, whole, white_m2_per_s, config), counter_m)
+    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, config)
+    return Noise(white_m2_per_s, scatter, counter_m)
 
 
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:
