@@ -17,8 +17,8 @@ from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 BEYOND_SPAN = "outside the odometer's time span"
 INTERRUPTED = "odometer interrupted or slipping"
 _OF_ODOMETER = (
-    *("along_m", "odometer_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m", "odometer_period_s"),
-    *("odometer_scale", "scale_sigma"),
+    *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
+    *("odometer_period_s", "odometer_scale", "scale_sigma"),
 )
 
 
@@ -94,9 +94,10 @@ def _columns(
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
     rows = np.flatnonzero(known)
-    step = np.zeros(known.size)
+    step, driven = np.zeros((2, known.size))
     step[rows] = odometry.increments(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows]).distance_m
-    total = np.where(known, np.cumsum(step), np.nan)
+    driven[rows] = odometry.driven(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows])
+    total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
     speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
     rows_m = np.minimum(odometry.row_sigma_m(at), most_scatter_m(config))
     turning = speed
@@ -107,6 +108,7 @@ def _columns(
     reason = first_reason((~known & inside, INTERRUPTED), (~known, BEYOND_SPAN))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
+        pl.Series("travelled_m", travelled, nan_to_null=True),
         reason.alias("odometer_reason"),
         pl.Series("odometer_segment", odometry.segment_at_s(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),

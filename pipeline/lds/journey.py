@@ -94,7 +94,7 @@ def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configur
         scale_sigma=scale_sigma,
         direction=direction,
         travel=travel,
-        travelled_m=_travelled_m(odometer_m, travel),
+        travelled_m=floats(epochs, "travelled_m"),
         blind=_blind(t_ns, positioned, gap_ns),
         gap_ns=gap_ns,
     )
@@ -133,16 +133,6 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
         direction[known[seen_at] :] = sense
         travel[known[turned_at] :] = sense
     return direction, travel
-
-
-def _travelled_m(odometer_m: Floats, travel: Ints) -> Floats:
-    """Way run since the first epoch, on the scale in use; signed sums: jitter at a stand adds up to nothing."""
-    travelled_m = np.full(odometer_m.size, np.nan)
-    known = np.flatnonzero(np.isfinite(odometer_m))
-    if known.size:
-        steps_m = np.diff(odometer_m[known], prepend=odometer_m[known[0]])
-        travelled_m[known] = np.cumsum(steps_m * np.roll(travel[known], 1))
-    return travelled_m
 
 
 def turning_epochs(journey: Journey) -> frozenset[int]:
