@@ -209,7 +209,7 @@ class _Learner:
 
         The number of positions if it never goes on. What may settle is how far the position is from its place then.
         """
-        begin = position = max(alarm - 1, 0)
+        begin = position = alarm - 1  # the first position of all cannot fail
         bank: AxisState | None = None
         away_m, failed_s, block = np.zeros(1), np.full(1, -np.inf), _FIRST_BLOCK
         while position < self._rows.size:

@@ -162,15 +162,11 @@ def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], 
     return count
 
 
-def facing_of(
-    reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometry | None, least_m: float
-) -> set[int]:
+def facing_of(reference: ReferencePlaces, covered: list[Coverage], odometer: Odometry, least_m: float) -> set[int]:
     """Oriented net elements over which the train ran as the odometer counted up, by the reference.
 
     `least_m`: so much way together says which way the odometer counts (DOMAIN section 2).
     """
-    if reference is None or odometer is None:
-        return set()
     found: set[int] = set()
     for one in covered:
         part = slice(one.first, one.last + 1)

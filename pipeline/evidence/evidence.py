@@ -193,13 +193,9 @@ def evidence_of(
     borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
     gaps: list[Gap] = []
     if odometer is not None and borders:
-        gaps = gaps_of(
-            borders,
-            facing_of(reference, covered, odometer, config.matching.orientation_distance_m),
-            odometer,
-            network,
-            trust,
-        )
+        least_m = config.matching.orientation_distance_m
+        facing = set() if reference is None else facing_of(reference, covered, odometer, least_m)
+        gaps = gaps_of(borders, facing, odometer, network, trust)
     contradicted = sum(_contradicts(gap, odometer, trust) for gap in gaps)
     return Evidence(
         reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted, tuple(unknown), disputed
