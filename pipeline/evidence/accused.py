@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.evidence.carrying import Interval, Trust
+from pipeline.evidence.carrying import Interval, Trust, carried
 from pipeline.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints
 
@@ -32,16 +32,10 @@ def carried_forward(
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
         own = used[last[rows]]
-        found = _carried(accepted_ns[own], path_m[own], t_ns[rows], odometer, trust)
+        found = carried(odometer, accepted_ns[own], path_m[own], 0.0, t_ns[rows], trust)
         void = _stood_since(accepted_ns[own], t_ns[rows], stood)
         low[rows], high[rows] = (np.where(void, np.nan, values) for values in found)
     return low, high
-
-
-def _carried(since_ns: Ints, at_m: Floats, t_ns: Ints, odometer: Odometry, trust: Trust) -> Interval:
-    centre = at_m + odometer.between(since_ns, t_ns).distance_m
-    half = trust.beside_m(np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(since_ns)), 0.0)
-    return centre - half, centre + half
 
 
 def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometry, trust: Trust, limit_m: float) -> Ints:
@@ -51,7 +45,7 @@ def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometry, trust: Tr
         here = slice(number, number + 1)
         if used:
             before = np.array(used[-1:])
-            low, high = _carried(accepted_ns[before], path_m[before], accepted_ns[here], odometer, trust)
+            low, high = carried(odometer, accepted_ns[before], path_m[before], 0.0, accepted_ns[here], trust)
             if path_m[number] < low[0] - limit_m or path_m[number] > high[0] + limit_m:
                 continue
         if odometer.known_at(accepted_ns[here])[0]:

@@ -53,16 +53,19 @@ class Anchor:
 Interval = tuple[Floats, Floats]
 
 
-def driven_m(odometer: Odometry, since_ns: int, t_ns: Ints) -> Floats:
-    """Way driven from an instant to others, turns included [m]."""
-    driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(np.array([since_ns])))
+def driven_m(odometer: Odometry, since_ns: Ints, t_ns: Ints) -> Floats:
+    """Way driven from instants to others, turns included [m]."""
+    driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(since_ns))
     return driven
 
 
-def beside_anchor(odometer: Odometry, anchor: Anchor, at_m: float, t_ns: Ints, trust: Trust) -> Interval:
-    """Least and largest coordinate on one side of an anchor; NaN where the odometer does not reach."""
-    centre = at_m + _from(odometer, anchor, t_ns).distance_m
-    half = trust.beside_m(driven_m(odometer, anchor.t_ns, t_ns), anchor.sigma_m)
+def carried(odometer: Odometry, since_ns: Ints, at_m: Floats, sigma_m: float, t_ns: Ints, trust: Trust) -> Interval:
+    """Least and largest coordinate on one side of anchors of this sigma; NaN where the odometer does not reach.
+
+    Of each instant `t_ns` the anchor: when it was, and its coordinate.
+    """
+    centre = at_m + odometer.between(since_ns, t_ns).distance_m
+    half = trust.beside_m(driven_m(odometer, since_ns, t_ns), sigma_m)
     return centre - half, centre + half
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
@@ -56,11 +54,3 @@ def _held(steps: Bools, size: int) -> Bools:
     """Nothing follows upon the last epoch, which stays as it was before."""
     last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
     return np.concatenate([steps, last])[:size]
-
-
-def within_spans(t_ns: Ints, spans: Sequence[tuple[int, int]]) -> Bools:
-    """Instants of the spans, their ends left out."""
-    inside = np.zeros(t_ns.size, dtype=np.bool_)
-    for begin_ns, end_ns in spans:
-        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
-    return inside

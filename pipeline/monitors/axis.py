@@ -18,6 +18,9 @@ from pipeline.monitors.recursion import (
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MonitorConfig
 
+# Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
+FIRST_BLOCK, BLOCK = 2048, 8192
+
 
 @dataclass(frozen=True)
 class AxisSeries:
