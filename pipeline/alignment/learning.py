@@ -11,8 +11,16 @@ import polars as pl
 from pipeline.alignment.estimates import Estimates
 from pipeline.alignment.odometer_filter import FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.epochs.timeline import gap_limit_s
-from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
-from pipeline.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, error_model, run_axis
+from pipeline.monitors.axis import (
+    BLOCK,
+    FIRST_BLOCK,
+    AlongEpochs,
+    AxisSeries,
+    along_series,
+    error_model,
+    most_scatter_m,
+    run_axis,
+)
 from pipeline.monitors.recursion import AxisState
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from pipeline.odometry.odometry import Odometry

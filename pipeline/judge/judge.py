@@ -16,15 +16,13 @@ from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series, find_episodes
 from pipeline.judge.hazards import Draft, drafts_of
-from pipeline.judge.in_use import in_use_s
 from pipeline.judge.judgement import WRONG, judgement_words
 from pipeline.judge.jumps import find_jumps, steps_of
-from pipeline.judge.moving import moving_by_evidence
 from pipeline.judge.offers import Offers
 from pipeline.judge.passages import Found, passages_table
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.rows import failures_table, hazards_table
-from pipeline.judge.states import lds_states
+from pipeline.judge.states import in_use_s, lds_states, moving_by_evidence
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
 from schemas.enums import Evidence
 

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from pipeline.lds import LdsResult
-from pipeline.lds.crossings import balises_of
+from pipeline.lds.crossings import balises_of, reads_of
 from pipeline.lds.journey import journey_of
-from pipeline.lds.reads import reads_of
 from pipeline.lds.relink import LOST, NO_VEHICLE, SWITCHED_OFF, Relink
 from schemas.enums import BaliseKind
 from tests.lds.scripted import (
