@@ -22,10 +22,7 @@ NEAR_ENDS_M = 5.0
 # Two ends that point at each other so far apart are one track with a piece missing; a curve turns less in between.
 FACING_REACH_M = 300.0
 FACING_COSINE = 0.94
-HEIGHT_STEP_M = 0.5
-SHORT_ELEMENT_M = 1.0
 LENGTH_TOLERANCE = 1e-3
-LENGTH_TOLERANCE_M = 0.5
 CHORD_ERROR_M = 0.25
 # Of a finding about one balise: this and its id.
 BALISE_PLACE = "balises: "
@@ -142,10 +139,10 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
         )
         geometric = geometric_measures_m(latitude, longitude, height)
         length = float(geometric[-1])
-        if length < SHORT_ELEMENT_M:
+        if length < GAP_COUNTS_M:
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
-            if abs(declared - length) > max(LENGTH_TOLERANCE_M, LENGTH_TOLERANCE * length):
+            if abs(declared - length) > max(MEASURE_TOLERANCE_M, LENGTH_TOLERANCE * length):
                 text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
                 found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         error = chord_errors_m(track, part).max(initial=0.0)
@@ -191,7 +188,7 @@ def _check_gaps(track: Track, found: Remarks) -> None:
             found.findings.append(Finding("warning", "links", text, remedy))
         ends = [track.end(track.index[a], position_a), track.end(track.index[b], position_b)]
         step = float(np.abs(np.diff(track.height_m[ends])[0]))
-        if step > HEIGHT_STEP_M:
+        if step > GAP_COUNTS_M:
             text = f"end {position_a} of {a} and end {position_b} of {b} differ by {step:.1f} m in height"
             found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 

@@ -15,14 +15,13 @@ from pipeline.storage.writing import replace_files
 from pipeline.survey.balises import balises_every, balises_of_list
 from pipeline.survey.doubts import doubts
 from pipeline.survey.network import Network, make_network
-from pipeline.survey.pieces import Survey
+from pipeline.survey.pieces import SAME_PLACE_M, Survey
 from pipeline.survey.sources import read_surveys
 from pipeline.survey.trace import clean_traces
 from schemas.config import Configuration, Vehicle
 from schemas.errors import SiteError, UsageError
 from schemas.run import Finding, Site
 
-JOIN_M = 0.05
 _FILES = ("track", "links", "balises", "route")
 
 
@@ -34,7 +33,7 @@ class Wish:
     spacing_m: float | None = None
     balise_list: Path | None = None
     epsg: int | None = None
-    join_m: float = JOIN_M
+    join_m: float = SAME_PLACE_M
     flat: bool = False
 
 
@@ -70,7 +69,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
         for element in network.elements:
             element.height_m[:] = np.nan
     balises = _balises(wish, network, survey)
-    track = network.track()
+    track = network.track
     found = remarks(track, network.links, balises, None, {})
     if found.breaches:
         raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))

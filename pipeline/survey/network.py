@@ -6,6 +6,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import polars as pl
@@ -14,20 +15,18 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pipeline.site.checks import outward
-from pipeline.survey.pieces import COLUMNS, Piece, Survey
+from pipeline.survey.pieces import COLUMNS, SAME_PLACE_M, Piece, Survey
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import geometric_measures_m, track_of
-from schemas.arrays import Floats, Ints
+from schemas.arrays import Floats, Ints, spans_of
 from schemas.enums import Navigability
 from schemas.inputs import Links
 
 # OpenStreetMap writes seven decimals of a degree: equal positions are the same node.
 _NODE_DEG = 1e-7
-_SAME_PLACE_M = 0.05
 # A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
 # tram curve of 20 m. At a switch the branches lie within some 12 degrees (1:4.5); maps draw it up to 45.
 _MOST_AT_SWITCH_DEG = 45.0
-_MOST_AT_JOINT_DEG = 90.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,7 @@ class Network:
     ends: Ints
     links: pl.DataFrame
 
+    @cached_property
     def track(self) -> pl.DataFrame:
         """The track table, with `line_km` beside the contract's columns."""
         return track_table(self.elements)
@@ -114,16 +114,10 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
             survey.told("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
-        for first, last in _runs(new):
-            kept.append(piece.take(np.arange(first, last + 1)))
-            kept_nodes.append(own[first : last + 1])
+        for first, last in spans_of(new):
+            kept.append(piece.take(np.arange(first, last + 2)))
+            kept_nodes.append(own[first : last + 2])
     return kept, kept_nodes
-
-
-def _runs(wanted: np.ndarray) -> Iterator[tuple[int, int]]:
-    """First and one beyond the last of each unbroken row of true values."""
-    turns = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(np.int64), [0]])))
-    yield from zip(turns[::2].tolist(), turns[1::2].tolist(), strict=True)
 
 
 def _crossings(pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey) -> set[int]:
@@ -162,7 +156,7 @@ def _nodes_at(pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[flo
     latitude = np.concatenate([piece.latitude_deg for piece in pieces])
     longitude = np.concatenate([piece.longitude_deg for piece in pieces])
     wanted = points_of(*np.array(places_deg).T).surface
-    row = cKDTree(points_of(latitude, longitude).surface).query(wanted, distance_upper_bound=_SAME_PLACE_M)[1]
+    row = cKDTree(points_of(latitude, longitude).surface).query(wanted, distance_upper_bound=SAME_PLACE_M)[1]
     return set(np.concatenate(nodes)[row[row < len(latitude)]].tolist())
 
 
@@ -217,7 +211,7 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool) -> set[tuple[i
         (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
         for one, other in itertools.combinations(range(len(units)), 2)
     }
-    most = _MOST_AT_JOINT_DEG if len(units) == 2 else _MOST_AT_SWITCH_DEG
+    most = 90.0 if len(units) == 2 else _MOST_AT_SWITCH_DEG
     possible = {pair for pair, turn in turns.items() if turn <= most}
     ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
     two_by_two = ways == [2, 2, 2, 2]
