@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.track.geodesy import points_of
+from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
 from schemas.arrays import Floats
 from schemas.enums import Navigability
@@ -26,8 +27,6 @@ LENGTH_TOLERANCE = 1e-3
 CHORD_ERROR_M = 0.25
 # Of a finding about one balise: this and its id.
 BALISE_PLACE = "balises: "
-# An end's direction is that of its last metres: single vertices may lie a centimetre apart.
-END_REACH_M = 20.0
 
 
 @dataclass
@@ -123,7 +122,8 @@ def outward(track: Track) -> np.ndarray:
         surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
         for position, line in ((0, surface), (1, surface[::-1])):
             way = np.linalg.norm(line - line[0], axis=1)
-            inside = int(np.argmax(way >= END_REACH_M)) or int(np.argmax(way))
+            # Single vertices may lie a centimetre apart.
+            inside = int(np.argmax(way >= SAMPLE_SPACING_M)) or int(np.argmax(way))
             directions[element, position] = line[inside] - line[0]
     return directions
 

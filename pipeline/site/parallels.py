@@ -19,8 +19,6 @@ from schemas.run import Finding, Site
 
 # Where tracks part or cross, a shorter stretch is no parallel track [m].
 _SHORTEST_M = 100.0
-# So far past its end an element is still beside [m]: two surveys never end at the same place.
-_END_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,8 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
     points = points_of(along.latitude_deg, along.longitude_deg)
     found = candidates_of(points, network, segments_of(track), float(limit_m.max()))
     own = element[found.step]
-    near = (found.beyond_m <= _END_M) & (own < found.element)
+    # Two surveys never end at the same place.
+    near = (found.beyond_m <= config.survey_sigma_default_m) & (own < found.element)
     near &= found.distance_m < limit_m[own]
     pairs, row = own[near] * network.count + found.element[near], found.step[near]
     apart_m = found.distance_m[near]
