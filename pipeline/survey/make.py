@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,12 +62,11 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     Raises `SiteError`.
     """
     survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config))
+    if wish.flat:
+        survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
     network = make_network(survey, wish.join_m)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
-    if wish.flat:
-        for element in network.elements:
-            element.height_m[:] = np.nan
     balises = _balises(wish, network, survey)
     track = network.track
     found = remarks(track, network.links, balises, None, {})

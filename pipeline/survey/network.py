@@ -6,7 +6,6 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import polars as pl
@@ -31,16 +30,15 @@ _MOST_AT_SWITCH_DEG = 45.0
 
 @dataclass(frozen=True)
 class Network:
-    """Net elements with the nodes at their two ends, and the links between ends."""
+    """Net elements with the nodes at their two ends, and the links between ends.
+
+    `track`: the table of their points, with `line_km` beside the contract's columns.
+    """
 
     elements: list[Piece]
     ends: Ints
     links: pl.DataFrame
-
-    @cached_property
-    def track(self) -> pl.DataFrame:
-        """The track table, with `line_km` beside the contract's columns."""
-        return track_table(self.elements)
+    track: pl.DataFrame
 
 
 def make_network(survey: Survey, join_m: float) -> Network:
@@ -56,18 +54,18 @@ def make_network(survey: Survey, join_m: float) -> Network:
     switches = _nodes_at(pieces, nodes, survey.switches_deg)
     crossings = _crossings(pieces, nodes, switches, survey)
     elements, ends = _cut(pieces, nodes, crossings)
-    links = _links(elements, ends, crossings, switches, survey) if elements else Links.create_empty()
-    return Network(elements, ends, links)
+    if not elements:
+        return Network([], ends, Links.create_empty(), pl.DataFrame())
+    track = _track_table(elements)
+    return Network(elements, ends, _links(track, ends, crossings, switches, survey), track)
 
 
-def track_table(elements: list[Piece]) -> pl.DataFrame:
+def _track_table(elements: list[Piece]) -> pl.DataFrame:
     """Points of the elements in order, measures along their geometry; null for what is not known."""
-    parts = []
-    for piece in elements:
-        measure = geometric_measures_m(piece.latitude_deg, piece.longitude_deg, piece.height_m)
-        columns = {name: pl.Series(getattr(piece, name)).fill_nan(None) for name in COLUMNS}
-        parts.append(pl.DataFrame({"netelement_id": [piece.name] * len(piece), "measure_m": measure, **columns}))
-    return pl.concat(parts)
+    measures = [geometric_measures_m(one.latitude_deg, one.longitude_deg, one.height_m) for one in elements]
+    columns = {name: np.concatenate([getattr(one, name) for one in elements]) for name in COLUMNS}
+    names = list(itertools.chain.from_iterable([one.name] * len(one) for one in elements))
+    return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
 
 
 def _nodes(pieces: list[Piece], join_m: float) -> list[Ints]:
@@ -181,14 +179,14 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
-def _links(elements: list[Piece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
+def _links(table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
     """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
     arms: dict[int, list[tuple[int, int]]] = {}
     for element, pair in enumerate(ends.tolist()):
         for position, node in enumerate(pair):
             arms.setdefault(node, []).append((element, position))
-    directions = outward(track_of(track_table(elements)))
-    names = [element.name for element in elements]
+    track = track_of(table)
+    directions, names = outward(track), track.ids
     rows: list[tuple[str, int, str, int, str]] = []
     for node, meeting in arms.items():
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
