@@ -289,6 +289,22 @@ def test_a_later_pass_goes_on_from_the_end_of_the_first() -> None:
     assert track["measure_m"].sum() == pytest.approx(1996.0, abs=0.5)
 
 
+def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None:
+    east = np.arange(0.0, 1000.0, 4.0)
+    latitude, longitude = degrees(east, np.where((east >= 400) & (east < 420), 50.0, 0.0))
+    times = pl.Series((np.arange(len(east)) * 200_000_000), dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    points = pl.DataFrame({"t": times, "latitude_deg": latitude, "longitude_deg": longitude})
+    run = tmp_path / "run"
+    run.mkdir()
+    points.with_columns(fix=pl.lit("sbas")).write_parquet(run / "gnss.parquet")
+    points.with_columns(height_m=pl.lit(None, pl.Float64), sigma_m=pl.lit(0.02)).write_parquet(
+        run / "reference.parquet"
+    )
+    site = site_of(run)
+    assert "run: 5 positions to which no train can have come are left out" in told(site)
+    assert site.track["measure_m"].max() == pytest.approx(996.0, abs=0.1)
+
+
 BAD = {
     "exchanged.csv": ("# epsg: 2056\nx,y\n1260000,2683000\n1260100,2683000\n", "easting and northing may be exchanged"),
     "origin.csv": ("lat,lon\n50,4\n0,0\n", "point 2 of origin is no place on earth"),
