@@ -175,7 +175,7 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
     ratio = np.abs(windows.counted) / windows.gnss_m
     sign = -1.0 if np.median(windows.counted) < 0 else 1.0
     fit = windows.regressed()
-    (scale, slope), sigma = fit.estimate, _OVERLAP * fit.sigma
+    (scale, slope), sigma = fit.estimate.tolist(), (_OVERLAP * fit.sigma).tolist()
     return PairFit(
         factor=sign / scale,
         factor_sigma=sigma[0] / scale**2,

@@ -10,7 +10,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.plausibility.axes import fit_velocity
-from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, correction, not_checked
 from pipeline.plausibility.course import Places, places_of
 from pipeline.plausibility.frames import SLIPS, Slip
@@ -35,7 +34,7 @@ def written_checks(
     if line is not None and far_m <= _FAR_M:
         return []
     as_recorded = _witnesses(run, fixes, gnss, epoch_ns, config)
-    if line is None and all(as_recorded.values()):
+    if line is None and as_recorded and all(as_recorded.values()):
         return []
     words = f"they lie {far_m / 1000.0:.0f} km from every track" if line is not None else "no other stream fits them"
     for slip in SLIPS:
@@ -44,7 +43,7 @@ def written_checks(
             continue
         after = _witnesses(run, fixes, mended, epoch_ns, config)
         if line is None and sum(after.values()) > sum(as_recorded.values()) and all(after.values()):
-            return [_slipped(slip, words, sure="odometer" in after and not as_recorded.get("odometer", True))]
+            return [_slipped(slip, words, sure="odometer" in after and not as_recorded.get("odometer", False))]
         if line is not None and sum(after.values()) >= sum(as_recorded.values()):
             return [_slipped(slip, words, sure=True)]
         if line is not None:
@@ -77,14 +76,11 @@ def _witnesses(run: RunLog, fixes: pl.DataFrame, gnss: Places, epoch_ns: int, co
     for course in courses_of(run, epoch_ns).values():
         pair = fit_pair(gnss, course)
         if pair.told:
-            factor = abs(pair.factor)
-            unit = any(explain_factor(factor, speed) is not None for speed in (True, False))
-            fits = pair.constant > 0.5 and (abs(factor - 1.0) <= config.fit_scale_limit or unit)
-            found["odometer"] = found.get("odometer", True) and fits
+            fits = pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= config.fit_scale_limit
+            found["odometer"] = found.get("odometer", False) or fits
     velocity = fit_velocity(fixes, gnss, epoch_ns)
     if velocity is not None:
-        near = abs(velocity.ratio - 1.0) <= config.fit_scale_limit or explain_factor(velocity.ratio, True) is not None
-        found["velocity"] = velocity.best == 0 and near
+        found["velocity"] = velocity.best == 0 and abs(velocity.ratio - 1.0) <= config.fit_scale_limit
     if run.reference is not None and (record := places_of(run.reference, epoch_ns)) is not None:
         found["reference"] = apart_m(gnss, record.latitude_deg, record.longitude_deg) < _FAR_M
     return found
