@@ -59,7 +59,7 @@ def _slipped(slip: Slip, words: str, sure: bool) -> Check:
     if not sure:
         cause = f"{slip.cause}, or the velocity has exchanged axes or signs"
         return Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="A site tells which: name it with --site.")
-    if not slip.by_configuration:
+    if slip.minutes:
         advice = "Convert the positions: degrees are the whole part plus the rest times 100/60."
         return Check(_WHAT, State.IMPOSSIBLE, words, slip.cause, advice=advice)
     return Check(_WHAT, State.IMPOSSIBLE, words, slip.cause, _lines("gnss", slip))
@@ -111,7 +111,7 @@ def reference_elsewhere(gnss: Places, reference: pl.DataFrame, epoch_ns: int) ->
     for slip in SLIPS:
         latitude, longitude = slip.mended(record.latitude_deg, record.longitude_deg)
         if np.max(np.abs(latitude)) <= 90.0 and apart_m(gnss, latitude, longitude) < 10.0 * _FAR_M:
-            cause, advice = f"in the reference {slip.cause}", "" if slip.by_configuration else "Convert its positions."
-            lines = _lines("reference", slip) if slip.by_configuration else ""
+            cause, advice = f"in the reference {slip.cause}", "Convert its positions." if slip.minutes else ""
+            lines = "" if slip.minutes else _lines("reference", slip)
             return [Check(what, State.IMPOSSIBLE, words, cause, lines, advice=advice)]
     return [not_checked(what, words)]
