@@ -39,8 +39,8 @@ def reference_checks(
         return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
     told = abs(found.lag_s) > max(config.fit_lag_told_s, 5.0 * found.lag_sigma_s)
     agrees = explains(found.agreeing, 0.0)
-    small = abs(found.lag_s) <= config.fit_lag_limit_s and agrees and found.lag_is_steady
-    sure = told and (small or explains(found.agreeing, found.as_recorded))
+    small = abs(found.lag_s) <= config.fit_lag_limit_s and agrees
+    sure = told and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"

@@ -33,32 +33,41 @@ def written_checks(
     far_m = 0.0 if line is None else line.far_m(gnss.latitude_deg, gnss.longitude_deg)
     if line is not None and far_m <= _FAR_M:
         return []
-    as_recorded = _witnesses(run, fixes, gnss, epoch_ns, config)
-    if line is None and as_recorded and all(as_recorded.values()):
-        return []
-    words = f"they lie {far_m / 1000.0:.0f} km from every track" if line is not None else "no other stream fits them"
+    recorded = _witnesses(run, fixes, gnss, epoch_ns, config)
+    if line is None:
+        return [] if recorded and all(recorded.values()) else _without_survey(run, fixes, recorded, epoch_ns, config)
+    words = f"they lie {far_m / 1000.0:.0f} km from every track"
     for slip in SLIPS:
         mended = _mended(fixes, slip, epoch_ns)
-        if mended is None or (line is not None and line.far_m(mended.latitude_deg, mended.longitude_deg) > _FAR_M):
+        if mended is None or line.far_m(mended.latitude_deg, mended.longitude_deg) > _FAR_M:
             continue
-        after = _witnesses(run, fixes, mended, epoch_ns, config)
-        if line is None and sum(after.values()) > sum(as_recorded.values()) and all(after.values()):
-            return [_slipped(slip, words, sure="odometer" in after and not as_recorded.get("odometer", False))]
-        if line is not None and sum(after.values()) >= sum(as_recorded.values()):
-            return [_slipped(slip, words, sure=True)]
-        if line is not None:
-            cause = f"in the survey {slip.cause}: odometer, velocity or reference fit the positions as they are"
-            return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="Mend the columns of the site's track.")]
-    if line is None:
-        return []
+        if sum(_witnesses(run, fixes, mended, epoch_ns, config).values()) >= sum(recorded.values()):
+            return [_slipped(slip, words)]
+        cause = f"in the survey {slip.cause}: odometer, velocity or reference fit the positions as they are"
+        return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="Mend the columns of the site's track.")]
     advice = "Check that run and site belong together, and axes and datum of both."
     return [Check(_WHAT, State.MISFIT, words, "run and site of different places", advice=advice)]
 
 
-def _slipped(slip: Slip, words: str, sure: bool) -> Check:
-    if not sure:
+def _without_survey(
+    run: RunLog, fixes: pl.DataFrame, recorded: dict[str, bool], epoch_ns: int, config: IngestConfig
+) -> list[Check]:
+    """The slip that makes every other stream fit, if there is one."""
+    words = "no other stream fits them"
+    for slip in SLIPS:
+        mended = _mended(fixes, slip, epoch_ns)
+        found = {} if mended is None else _witnesses(run, fixes, mended, epoch_ns, config)
+        if not all(found.values()) or sum(found.values()) <= sum(recorded.values()):
+            continue
+        if "odometer" in found and not recorded.get("odometer", False):
+            return [_slipped(slip, words)]
+        # Signs leave the ways as they are: the velocity alone says that they differ.
         cause = f"{slip.cause}, or the velocity has exchanged axes or signs"
-        return Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="A site tells which: name it with --site.")
+        return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="A site tells which: name it with --site.")]
+    return []
+
+
+def _slipped(slip: Slip, words: str) -> Check:
     if slip.minutes:
         advice = "Convert the positions: degrees are the whole part plus the rest times 100/60."
         return Check(_WHAT, State.IMPOSSIBLE, words, slip.cause, advice=advice)
