@@ -46,9 +46,6 @@ _SUMMED = {
 }
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; above the 3 % of bad odometers.
 _NEAR = 0.045
-# Units so near to 1 that a bad odometer could be taken for them.
-_EXACT = 0.035
-
 # Streams are late by so much besides [s].
 _LATENCY_S = 2.2
 # GPS time is ahead of UTC by so many seconds since (IERS Bulletin C); TAI by 19 s more.
@@ -71,7 +68,8 @@ def explain_factor(factor: float, speed: bool) -> Explained | None:
     """The unit that makes recorded values `factor` times what they should be; the nearest one."""
     units = SPEED_UNITS if speed else WAY_UNITS | _SUMMED
     name, exact = min(units.items(), key=lambda item: abs(factor / item[1] - 1.0))
-    near = _EXACT if abs(exact - 1.0) < 0.15 else _NEAR
+    # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
+    near = min(_NEAR, abs(exact - 1.0) / 3.0)
     return Explained(f"in {name}", exact) if abs(factor / exact - 1.0) <= near else None
 
 

@@ -14,8 +14,7 @@ from schemas.enums import Fix
 
 # Two rows a second tell all that is asked here.
 _THIN_S = 0.45
-# A pause of positions or rows that is not bridged.
-_GAP_S = 5.0
+# A pause of so many periods is not bridged, nor is one of SPEED_S.
 _GAP_PERIODS = 3.5
 # Speed over this time: positions that scatter by 2 m give it to 0.7 m/s.
 SPEED_S = 4.0
@@ -30,7 +29,7 @@ class _Record:
     @cached_property
     def limit_s(self) -> float:
         """A longer pause is not bridged."""
-        return max(_GAP_S, _GAP_PERIODS * float(np.median(np.diff(self.t_s))))
+        return max(SPEED_S, _GAP_PERIODS * float(np.median(np.diff(self.t_s))))
 
     def known(self, t_s: Floats) -> Bools:
         """Whether instants lie between two rows that are no farther apart than the limit."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +88,3 @@ def usual(values: Floats, share: float = 0.5) -> float:
     """Quantile of what is known; NaN where nothing is."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
-
-
-Speed = Callable[[Floats], Floats]
-"""Speed [units/s] at instants [s]; NaN where it is not known."""
