@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import polars as pl
@@ -17,11 +17,13 @@ from pipeline.claim.tally import (
     Finding,
     Shown,
     Tally,
+    drawn,
     of_always,
     of_availability,
     of_rate,
     of_share,
 )
+from pipeline.line import distinct
 from pipeline.results import store
 from pipeline.storage.address import Address
 from schemas.config import Configuration
@@ -68,13 +70,32 @@ def claim(
     for run_id, metadata in store.completed_runs(out).items():
         store.check_site(site, metadata.get("site_digest"), run_id)
     runs = store.read_table(out, "runs").collect()
-    done = runs.filter(pl.col("status").cast(pl.String) != RunStatus.FAILED.value)
+    done = runs.filter((pl.col("status").cast(pl.String) != RunStatus.FAILED.value) & pl.col("run_id").is_in(run_ids))
+    done, twice = distinct(done)
     found: dict[str, Tallies] = defaultdict(dict)
-    for run_id in run_ids:
-        for run in done.filter(pl.col("run_id") == run_id).iter_rows(named=True):
-            _add(found[run["solution"]], _tallies_of(out, run, config, profile, areas, ahead_m))
+    days: set[tuple[object, ...]] = set()
+    # Which run of a day is its trial is drawn before an error is looked at.
+    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(run_name(row))):
+        told = _tallies_of(out, run, config, profile, areas, ahead_m)
+        if profile.method.independent == "day" and run["t_start"] is not None:
+            told = _once_a_day(told, (run["solution"], run["t_start"].date()), days)
+        _add(found[run["solution"]], told)
     outside_h = sum(counts["no_area", ALL].held_s for counts in found.values()) / S_PER_H
-    return Claim(profile, claim_table(found, profile), _notes(runs, outside_h, areas, ahead_m))
+    notes = [*twice, *_notes(runs, outside_h, areas, ahead_m)]
+    if profile.method.independent == "run":
+        notes.append(
+            'Runs of one day count as independent; `method.independent = "day"` of a profile counts one a day.'
+        )
+    return Claim(profile, claim_table(found, profile), notes)
+
+
+def _once_a_day(told: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
+    """Without the trials of requirements that another run of the day was a trial of; time and events stay."""
+    spent = {key for key, counts in told.items() if counts.trials and (*day, *key) in days}
+    days.update((*day, *key) for key, counts in told.items() if counts.trials)
+    return {
+        key: replace(counts, trials=0, kept=0, broken=0) if key in spent else counts for key, counts in told.items()
+    }
 
 
 def _tallies_of(
@@ -128,7 +149,7 @@ def _row(solution: str, key: Key, demand: Demand, counts: Tally) -> dict[str, An
         "hours_known": counts.known_s / S_PER_H,
         "hours_needed": shown.needed_h,
         "clause": demand.clause,
-        "reason": _reason(key, shown.finding, counts),
+        "reason": _reason(key, demand, shown.finding, counts),
     }
 
 
@@ -206,7 +227,7 @@ _NEVER = {
 }
 
 
-def _reason(key: Key, finding: Finding, counts: Tally) -> str | None:
+def _reason(key: Key, demand: Demand, finding: Finding, counts: Tally) -> str | None:
     """Why a requirement is not shown, in words."""
     if finding is not Finding.NOT_SHOWN:
         return None
@@ -218,6 +239,8 @@ def _reason(key: Key, finding: Finding, counts: Tally) -> str | None:
         return "nothing recorded to which it applies"
     if not counts.known_s:
         return "the evidence says nothing of it: too wide, missing, or the position in doubt"
+    if demand.shown is of_always:
+        return "no exceedance was seen, and no number of hours proves a maximum that is demanded without a probability"
     if counts.events == 0 and counts.known_s < counts.held_s:
         return "too few runs or hours; part of the time the evidence does not say"
     return "too few runs or hours"

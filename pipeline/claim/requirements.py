@@ -34,13 +34,13 @@ class Ride:
     profile: Profile
 
     def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
-        """Of the epochs `where` a requirement applies."""
-        clock = self.front.clock
-        rows = np.flatnonzero(where)
-        sizes = None if size is None else size[rows]
-        return tally(
-            self.name, clock.t_ns[rows], clock.held_s[rows], code[rows], self.profile.method.event_gap_s, sizes
-        )
+        """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
+        clock, silent = self.front.clock, self.front.silent_s
+        rows = np.flatnonzero(where | ((silent > 0) & np.append(where[1:], False)))
+        here = where[rows]
+        held, told = np.where(here, clock.held_s[rows], 0.0), np.where(here, code[rows], NOT_KNOWN)
+        sizes = None if size is None else np.where(here, size[rows], np.nan)
+        return tally(self.name, clock.t_ns[rows], held, told, self.profile.method.event_gap_s, sizes, silent[rows])
 
 
 def tallies(ride: Ride) -> Tallies:
@@ -116,18 +116,25 @@ def _safe(ride: Ride) -> Tallies:
 
 
 def _after_balise(ride: Ride) -> Tallies:
-    """The first estimate after each balise accepted; physical ones, and virtual ones as if they were."""
+    """The first estimate after each balise accepted; physical ones, and virtual ones as if they were.
+
+    Where it comes late or not at all nobody knows what it would have been.
+    """
     status, kinds = (ride.passages[name].cast(pl.String) for name in ("status", "kind"))
     front, demanded = ride.front, ride.profile.after_balise
     limit = demanded.limit_m(front.speed_mps)
-    code = _asked(front.within(limit, limit), limit)
+    code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
+    faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > demanded.to_kmh, False)
     found: Tallies = {}
     for kind in (BaliseKind.PHYSICAL.value, BaliseKind.VIRTUAL.value):
-        accepted = ride.passages.filter((status == PassageStatus.ACCEPTED.value) & (kinds == kind))
-        rows = _first_after(front, _passed(accepted))
-        here = np.zeros(code.size, dtype=np.bool_)
-        here[rows] = True
-        found["after_balise", kind] = ride.tally(code, here & front.output & np.isfinite(limit))
+        at_ns = _passed(ride.passages.filter((status == PassageStatus.ACCEPTED.value) & (kinds == kind)))
+        rows = _first_after(front, at_ns)
+        at_ns, rows = at_ns[~faster[rows]], rows[~faster[rows]]
+        # Each balise weighs the same, whatever time its epoch holds.
+        counts = tally(ride.name, at_ns, np.zeros(rows.size), code[rows], ride.profile.method.event_gap_s)
+        held = np.append(front.clock.held_s, 0.0)[rows]
+        known = code[rows] != NOT_KNOWN
+        found["after_balise", kind] = replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
     return found
 
 
@@ -138,11 +145,11 @@ def _passed(passages: pl.DataFrame) -> Ints:
 
 
 def _first_after(front: Front, at_ns: Ints) -> Ints:
-    """The epoch at or right after each instant, where no gap lies between."""
-    row = np.searchsorted(front.clock.t_ns, at_ns)
-    row, at_ns = row[row < front.clock.t_ns.size], at_ns[row < front.clock.t_ns.size]
-    near = front.clock.t_ns[row] - at_ns <= front.clock.limit_s * NS_PER_S
-    return np.unique(row[near])
+    """The epoch at or right after each instant; one beyond the last where there is none, or a gap lies between."""
+    t_ns = front.clock.t_ns
+    row = np.searchsorted(t_ns, at_ns)
+    late = np.append(t_ns, np.iinfo(np.int64).max)[row] - at_ns > front.clock.limit_s * NS_PER_S
+    return np.where(late, t_ns.size, row)
 
 
 def _speed(ride: Ride) -> Tallies:
@@ -150,9 +157,18 @@ def _speed(ride: Ride) -> Tallies:
     safe, close = ride.profile.safe_speed.limit_kmh(found.speed_kmh), ride.profile.speed.limit_kmh(found.speed_kmh)
     asked, none = np.isfinite(safe), np.full(safe.size, np.inf)
 
+    # Windows and the gaps of the log between them, in order of time.
+    gaps = np.flatnonzero(ride.front.silent_s > 0)
+    gap_s, nothing = ride.front.silent_s[gaps], np.zeros(gaps.size)
+    t_ns = np.concatenate((found.t_ns, ride.front.clock.t_ns[gaps]))
+    held_s = np.concatenate((found.length_s, nothing))
+    silent_s = np.concatenate((np.zeros(found.t_ns.size), gap_s))
+    order = np.argsort(t_ns, kind="stable")
+
     def counted(code: Ints, where: Bools) -> Tally:
-        rows = np.flatnonzero(where)
-        return tally(ride.name, found.t_ns[rows], found.length_s[rows], code[rows], method.event_gap_s)
+        rows = order[np.concatenate((where, gap_s > 0))[order]]
+        told = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))[rows]
+        return tally(ride.name, t_ns[rows], held_s[rows], told, method.event_gap_s, silent_s=silent_s[rows])
 
     return {
         ("maso", ALL): counted(found.within(safe, none), asked),

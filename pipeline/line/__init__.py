@@ -8,6 +8,7 @@ Touches results, to read, and the folder that it writes.
 `write` and `page` are files.
 """
 
+from pipeline.line.journeys import distinct
 from pipeline.line.write import write_line
 
-__all__ = ["write_line"]
+__all__ = ["distinct", "write_line"]

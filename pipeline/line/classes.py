@@ -53,7 +53,11 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Independent passes: each run, or the worst of a day."""
     if criteria.independent == "pass":
         return passes
-    dated = passes.with_columns(day=pl.col("t").dt.date(), judged=_judged_state())
+    # Loss, then what the evidence should have shown, then right, then what says nothing.
+    state = pl.col("state").replace_strict({int(State.UNKNOWN): 2, int(State.RIGHT): 1}, default=0)
+    dated = passes.with_columns(
+        day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
+    )
     worst = dated.sort("judged", "state", "cause", descending=[True, True, False]).group_by(
         *KEYS, "day", maintain_order=True
     )
@@ -61,17 +65,11 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
 
 
-def _judged_state() -> pl.Expr:
-    """Loss, then right, then what nobody knows."""
-    state = pl.col("state")
-    return pl.when(state >= int(FIRST_LOSS)).then(2).when(state == int(State.RIGHT)).then(1).otherwise(0)
-
-
 def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     state, cause = pl.col("state"), pl.col("cause")
     right, wrong = state == int(State.RIGHT), state == int(State.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
-    hours = pl.col("t").dt.hour()
+    hours = passes.filter(right).group_by(KEYS).agg(hours=pl.col("t").dt.hour().unique().sort())
     return (
         trials(passes, criteria)
         .group_by(KEYS)
@@ -80,21 +78,23 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
             lost=lost.sum(),
             wrong_in_use=wrong.sum(),
             claimed_wrongly=pl.col("claimed").sum(),
-            unknown=(state == int(State.UNKNOWN)).sum(),
+            unknown=state.is_between(int(State.UNSEEN), int(State.UNKNOWN)).sum(),
+            unjudged=(state == int(State.UNKNOWN)).sum(),
             after_alarm=(state == int(State.AFTER_ALARM)).sum(),
             wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
             unsafe=(cause == LineCause.UNSAFE_ACCEPTANCE.value).sum(),
             days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),
-            hours=hours.filter(right).unique().sort(),
             monitors=pl.col("monitor").drop_nulls(),
             **{f"lost_{one.value}": (cause == one.value).sum() for one in LOSSES},
         )
+        .join(hours, on=KEYS, how="left")
+        .with_columns(pl.col("hours").fill_null([]))
     )
 
 
 _NOTHING: dict[str, Any] = {
-    **dict.fromkeys(("right", "lost", "wrong_in_use", "claimed_wrongly", "unknown", "after_alarm", "days"), 0),
-    **dict.fromkeys(("wrong_track", "unsafe"), 0),
+    **dict.fromkeys(("right", "lost", "wrong_in_use", "claimed_wrongly", "unknown", "unjudged"), 0),
+    **dict.fromkeys(("after_alarm", "days", "wrong_track", "unsafe"), 0),
     **{f"lost_{one.value}": 0 for one in LOSSES},
     "hours": [],
     "monitors": [],
@@ -102,13 +102,16 @@ _NOTHING: dict[str, Any] = {
 
 
 def _judged(counts: dict[str, Any], criteria: LineCriteria) -> dict[str, Any]:
-    """Counts of one piece and direction with bounds and class."""
+    """Counts of one piece and direction with bounds and class: what was not judged counts against each bound."""
     bad = counts["lost"] + counts["wrong_in_use"]
     number = counts["right"] + bad
-    share = clopper_pearson(bad, number, criteria.confidence)
-    unsafe = clopper_pearson(counts["wrong_in_use"], number, criteria.confidence)
-    decided, cause = _class(counts, share.low, share.high, criteria)
-    needed = None if decided is PieceClass.UNSUITABLE else passes_needed(bad, number, criteria)
+    unjudged = counts["unjudged"]
+    low, high, unsafe = (
+        clopper_pearson(events, number + unjudged, criteria.confidence)
+        for events in (bad, bad + unjudged, counts["wrong_in_use"] + unjudged)
+    )
+    decided, cause = _class(counts, low.low, high.high, criteria)
+    needed = None if decided is PieceClass.UNSUITABLE else passes_needed(bad + unjudged, number + unjudged, criteria)
     monitors = [name for name, _ in sorted(Counter(counts["monitors"]).items(), key=lambda one: (-one[1], one[0]))]
     return {
         **{name: counts[name] for name in _NOTHING if name not in ("wrong_track", "unsafe", "hours", "monitors")},
@@ -116,9 +119,9 @@ def _judged(counts: dict[str, Any], criteria: LineCriteria) -> dict[str, Any]:
         "cause": cause.value,
         "monitors": " ".join(monitors),
         "passes": number,
-        "loss_share": share.value,
-        "loss_low": share.low,
-        "loss_high": share.high,
+        "loss_share": bad / number if number else None,
+        "loss_low": low.low,
+        "loss_high": high.high,
         "unsafe_high": unsafe.high,
         "passes_needed": needed,
         "hours": len(counts["hours"]),
@@ -154,6 +157,8 @@ def _most_lost(counts: dict[str, Any]) -> LineCause:
 
 
 def _open_cause(counts: dict[str, Any]) -> LineCause:
+    if counts["unjudged"] > counts["lost"]:
+        return LineCause.NOT_JUDGED
     if counts["lost"]:
         return _most_lost(counts)
     if counts["right"]:

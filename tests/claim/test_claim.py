@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -193,11 +194,49 @@ def test_what_few_runs_show() -> None:
 
 def test_exceedances_close_to_each_other_are_one_event() -> None:
     t_ns = np.array([0, 10, 310, 611]) * NS
-    assert clusters_s(t_ns, 300.0) == [310.0, 0.0]
+    assert clusters_s(t_ns, t_ns, 300.0) == [310.0, 0.0]
     code = np.array([-1, 0, 0, -1])
     counts = tally("run", t_ns, np.ones(4), code, 300.0)
     # What is not known between them may hold another event.
     assert (counts.events, counts.possible, counts.trials, counts.known_s) == (2, 3, 1, 2.0)
+
+
+def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
+    """100 runs of 100 s, each with 60 s without epochs: two in five draws are kept, and nothing is met."""
+    seconds = [float(second) for second in (*range(20), *range(80, 101))]
+    frame = epochs(seconds, netelement_id="A", measure_m=5.0, error_low_m=0.0, error_high_m=0.0)
+    found = front_of(frame, passages(), RUN, Configuration(), AREAS)
+    counts = [tallies(Ride(str(run), found, frame, passages(), PROFILE)) for run in range(100)]
+    for key in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
+        total = sum((one[key] for one in counts), Tally())
+        assert total.trials == 100
+        assert 25 <= total.kept <= 55, key
+        assert (total.broken, total.events, total.possible) == (0, 0, 100)
+        assert of_share(total, 0.954).finding is Finding.NOT_SHOWN
+
+
+def test_a_balise_without_a_first_estimate_is_not_known() -> None:
+    """Balises at 2 s, in a gap from 5 s to 15 s, and after the log's end."""
+    seconds = [float(second) for second in (*range(6), *range(15, 20))]
+    frame = epochs(seconds, error_low_m=0.0, error_high_m=0.0)
+    balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
+    counts = [
+        tallies(Ride(str(run), front_of(frame, balises, RUN, Configuration()), frame, balises, PROFILE))
+        for run in range(60)
+    ]
+    total = sum((one["after_balise", "physical"] for one in counts), Tally())
+    assert (total.trials, total.broken) == (60, 0)
+    assert 10 <= total.kept <= 30
+
+
+def test_runs_of_one_day_are_one_trial_by_option(result: Path) -> None:
+    method = PROFILE.method.model_copy(update={"independent": "day"})
+    found = claim(result, PROFILE.model_copy(update={"method": method}), areas=AREAS).table
+    node = found.filter((pl.col("requirement") == "front_accuracy") & (pl.col("applies_to") == "node"))
+    assert node.select("trials", "hours").row(0) == (1, pytest.approx(2 * 5 / 3600))
+    always = found.filter((pl.col("demanded") == "always") & (pl.col("hours") > 0) & (pl.col("finding") != "not met"))
+    assert always.height > 0
+    assert always["reason"].str.contains("no number of hours|no recording|evidence says nothing").all()
 
 
 CODES = st.lists(st.tuples(st.sampled_from([1, 0, -1]), st.booleans()), min_size=1, max_size=12)
@@ -374,6 +413,8 @@ def result(tmp_path: Path) -> Path:
     )
     for name, frame, evidence in (("judged", judged, "reference"), ("blind", blind, None)):
         runs = table(Runs, 1, solution="primary", status="ok", evidence=evidence, vehicle="file", config_digest=name)
+        t_end = datetime(2026, 3, 2, 8, len(name), tzinfo=UTC)
+        runs = runs.with_columns(t_start=pl.lit(t_end).dt.truncate("1d"), t_end=pl.lit(t_end)).cast(runs.schema)
         tables = RunTables(name, table(Hazards, 0), passages(), table(Alarms, 0), frame, runs)
         store.write_run(tables, tmp_path / "OUT", {})
     return tmp_path / "OUT"
