@@ -21,12 +21,11 @@ from pipeline.figures.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
+from pipeline.line import fewest
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 S_PER_H = 3600.0
 KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
-# Runs that a search for how many are still needed goes up to.
-_MOST_RUNS = 1 << 40
 
 
 class Finding(StrEnum):
@@ -156,23 +155,17 @@ def of_share(found: Tally, share: float) -> Shown:
         return Shown(Finding.MET, measured, 0.0)
     finding = Finding.NOT_MET if most is not None and most < share else Finding.NOT_SHOWN
     hours = found.held_s / found.trials / S_PER_H
-    return Shown(finding, measured, runs_needed(found, share) * hours if hours > 0 else None)
+    needed = runs_needed(found, share)
+    return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
 
 
-def runs_needed(found: Tally, share: float) -> int:
+def runs_needed(found: Tally, share: float) -> int | None:
     """Further runs, all kept, that show the share."""
 
     def shown(more: int) -> bool:
         return (clopper_pearson(found.kept + more, found.trials + more).low or 0.0) >= share
 
-    high = 1
-    while not shown(high) and high < _MOST_RUNS:
-        high *= 2
-    low = high // 2
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if shown(middle) else (middle, high)
-    return high
+    return fewest(shown)
 
 
 def of_rate(found: Tally, rate_per_h: float) -> Shown:

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.figures.bounds import clopper_pearson
-from pipeline.line.classes import KEYS, classes_array
+from pipeline.line.classes import KEYS
 from pipeline.line.pieces import Pieces
 from pipeline.line.spans import FIRST_LOSS, State
 from pipeline.site.windows import window_findings
@@ -109,7 +109,8 @@ def _travelled(line: Line) -> Bools:
 
 def _allowed(line: Line, sides: Sequence[bool], growing: Bools) -> Bools:
     """Pieces suitable in every one of these directions along their ways."""
-    rising, falling = (classes_array(line.table, side) == PieceClass.SUITABLE.value for side in (True, False))
+    suitable = (line.table["piece_class"].cast(pl.String) == PieceClass.SUITABLE.value).to_numpy()
+    rising, falling = suitable[0::2], suitable[1::2]
     good = {True: np.where(growing, rising, falling), False: np.where(growing, falling, rising)}
     allowed: Bools = np.logical_and.reduce([good[ahead] for ahead in sides])
     return allowed

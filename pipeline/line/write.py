@@ -11,13 +11,13 @@ import polars as pl
 
 from pipeline.export.places import ground_of
 from pipeline.line.classes import piece_classes
-from pipeline.line.journeys import distinct
 from pipeline.line.page import line_page
 from pipeline.line.passes import Ground, passes_of
 from pipeline.line.pieces import Pieces, middles, pieces_of
 from pipeline.line.proposals import Line, proposals, site_balises
 from pipeline.line.remarks import remarks
 from pipeline.line.spans import EPOCH_COLUMNS, State
+from pipeline.line.trials import distinct
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
 from pipeline.storage import write_bytes
 from schemas.arrays import floats

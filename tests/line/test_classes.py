@@ -149,9 +149,15 @@ def test_a_wrong_position_after_a_gap_is_wrong_there_and_not_along_it(site: Site
 
 def test_one_journey_counts_once() -> None:
     """A log under two names, the second replayed with another verdict; and another journey."""
-    start = pl.datetime(2026, 3, 2, time_unit="ns", time_zone="UTC")
-    runs = pl.DataFrame({"run_id": ["a", "b", "c"], "solution": "primary", "verdict": ["safe", "unsafe", "safe"]})
-    runs = runs.with_columns(t_start=start, t_end=start + pl.duration(seconds=pl.Series([60, 60, 61])))
+    runs = pl.DataFrame(
+        {
+            "run_id": ["a", "b", "c"],
+            "solution": "primary",
+            "verdict": ["safe", "unsafe", "safe"],
+            "t_start": 0,
+            "t_end": [60, 60, 61],
+        }
+    )
     kept, said = distinct(runs)
     assert kept["run_id"].to_list() == ["b", "c"]
     assert said

@@ -1,6 +1,8 @@
-"""Runs that are the same journey, so that none is counted twice."""
+"""What counts as a trial: no journey twice; and how many more trials show something."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import polars as pl
 
@@ -27,3 +29,15 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     return kept.sort("run_id", "solution"), [
         f"{left} runs begin and end with another one: counted once, as one journey."
     ]
+
+
+def fewest(enough: Callable[[int], bool]) -> int | None:
+    """The least number, from 0 on, that is enough; whatever is more must be enough too. None beyond 2^40."""
+    most = next((1 << power for power in range(41) if enough(1 << power)), None)
+    if most is None:
+        return None
+    low = -1
+    while most - low > 1:
+        middle = (low + most) // 2
+        low, most = (low, middle) if enough(middle) else (middle, most)
+    return most
