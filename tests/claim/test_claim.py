@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 import cli
 from pipeline.claim import claim, load_profile, read_areas
-from pipeline.claim.claim import claim_table, demands
+from pipeline.claim.claim import claim_table
 from pipeline.claim.front import Front, front_of
-from pipeline.claim.requirements import Ride, limits_m, tallies
+from pipeline.claim.requirements import Ride, requirements, tallies
 from pipeline.claim.speed import speed_errors
 from pipeline.claim.tally import (
     Finding,
@@ -78,7 +78,7 @@ def ten() -> Front:
 
 def test_ten_epochs_by_hand() -> None:
     found = ten()
-    limit = limits_m(found, PROFILE)
+    limit = Ride("run", found, epochs([]), passages(), PROFILE).limit_m
     assert limit[:9].tolist() == [30.0] * 5 + [10.0] * 4
     # Kept 1, not known 0, broken -1. Epoch 8 is on the wrong track; of epoch 6 the evidence says nothing.
     assert found.within(limit, np.inf)[:9].tolist() == [1, 1, 1, 1, -1, 1, 0, 1, -1]
@@ -312,7 +312,7 @@ def test_the_front_end_decides_on_the_area() -> None:
         error_high_m=0.0,
     )
     found = front_of(frame, passages(), RUN, Configuration(), AREAS, ahead_m=30.0)
-    assert limits_m(found, PROFILE).tolist() == [30.0] * 5 + [10.0] * 5
+    assert Ride("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
     assert found.output.all()
     assert found.within(5.0, 5.0).tolist() == [1] * 10
 
@@ -423,7 +423,7 @@ def result(tmp_path: Path) -> Path:
 def test_a_result_with_and_without_areas(result: Path) -> None:
     found = claim(result, PROFILE, areas=AREAS)
     rows = {(row["requirement"], row["applies_to"]): row for row in found.table.iter_rows(named=True)}
-    assert set(rows) == set(demands(PROFILE))
+    assert set(rows) == {one.key for one in requirements(PROFILE)}
     # The error lies from 200 m on, in the precise area; both runs count their hours, one its evidence.
     assert rows["mapo", "precise"]["finding"] == "not met"
     assert rows["mapu", "precise"]["finding"] == "not shown"
@@ -452,9 +452,9 @@ def test_the_command(result: Path, capsys: pytest.CaptureFixture[str], monkeypat
     assert cli._guarded(["claim", str(result)], debug=False) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("safe_front_end") and "not met" in line for line in lines)
-    assert max(map(len, lines[1 : 1 + len(demands(PROFILE))])) <= 80
+    assert max(map(len, lines[1 : 1 + len(requirements(PROFILE))])) <= 80
     assert cli._guarded(["claim", str(result), "--json"], debug=False) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["profile"], told["version"], len(told["sources"])) == ("lu-2023", "1", 3)
-    assert len(told["requirements"]) == len(demands(PROFILE))
+    assert len(told["requirements"]) == len(requirements(PROFILE))
     assert cli._guarded(["claim", str(result), "--profile", "lu-2050"], debug=False) == 2
