@@ -33,6 +33,9 @@ class LineCriteria(Settings):
     beside_m: Positive = 25.0
     # Distances of balises to propose: DOMAIN section 4.
     spacings_m: tuple[Positive, ...] = (400.0, 1000.0, 2000.0)
+    # Balises in a row lie a spacing apart, give or take this share of it, and never farther apart than the longest.
+    spacing_play: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    longest_m: Positive = 2500.0
     location_accuracy_m: Annotated[NonNegative, Field(le=63)] = 12.0
     # A suitable piece so near a station or signal is taken before others.
     near_m: Positive = 150.0
@@ -154,7 +157,7 @@ class LineBalises(dy.Schema):
     netelement_id = text("net element")
     measure_m = real("m", "measure", nullable=False)
     kind = text("virtual, or physical where no piece is suitable")
-    why = text("of a physical one: class and cause of the piece")
+    why = text("of a physical one: class and cause of the piece, per direction of travel over its net element")
     near = text("station or signal that it serves; empty where none")
     distance_m = real("m", "way from the balise before; null for the first", min=0)
     odometer_confidence_m = real("m", "confidence of the odometer there, 5 m + 5 % of this way", min=0)
