@@ -206,11 +206,12 @@ def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
     seconds = [float(second) for second in (*range(20), *range(80, 101))]
     frame = epochs(seconds, netelement_id="A", measure_m=5.0, error_low_m=0.0, error_high_m=0.0)
     found = front_of(frame, passages(), RUN, Configuration(), AREAS)
-    counts = [tallies(Ride(str(run), found, frame, passages(), PROFILE)) for run in range(100)]
-    for key in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
-        total = sum((one[key] for one in counts), Tally())
+    for one in requirements(PROFILE):
+        if one.key not in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
+            continue
+        total = sum((one.count(Ride(str(run), found, frame, passages(), PROFILE)) for run in range(100)), Tally())
         assert total.trials == 100
-        assert 25 <= total.kept <= 55, key
+        assert 25 <= total.kept <= 55, one.key
         assert (total.broken, total.events, total.possible) == (0, 0, 100)
         assert of_share(total, 0.954).finding is Finding.NOT_SHOWN
 
@@ -220,11 +221,9 @@ def test_a_balise_without_a_first_estimate_is_not_known() -> None:
     seconds = [float(second) for second in (*range(6), *range(15, 20))]
     frame = epochs(seconds, error_low_m=0.0, error_high_m=0.0)
     balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
-    counts = [
-        tallies(Ride(str(run), front_of(frame, balises, RUN, Configuration()), frame, balises, PROFILE))
-        for run in range(60)
-    ]
-    total = sum((one["after_balise", "physical"] for one in counts), Tally())
+    found = front_of(frame, balises, RUN, Configuration())
+    asked = next(one for one in requirements(PROFILE) if one.key == ("after_balise", "physical"))
+    total = sum((asked.count(Ride(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
     assert (total.trials, total.broken) == (60, 0)
     assert 10 <= total.kept <= 30
 

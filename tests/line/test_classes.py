@@ -104,8 +104,8 @@ def test_a_right_pass_never_raises_and_a_lost_one_never_lowers_a_bound(site: Sit
 
 def test_unknown_epochs_make_nothing_suitable(site: Site) -> None:
     runs = [epochs_of(number, ()).with_columns(judgement=pl.lit("unknown")) for number in range(2)]
-    many = pl.concat(passes_over(runs, site).with_columns(run_id=pl.lit(str(number))) for number in range(RUNS))
-    table = classes(many, site)
+    passed = passes_over(runs, site)
+    table = classes(pl.concat(passed.with_columns(run_id=pl.lit(str(number))) for number in range(RUNS)), site)
     assert set(table["word"]) == {"unknown"}
     assert table["passes"].sum() == 0
     assert "not_judged" in set(table["why"])
