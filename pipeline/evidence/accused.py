@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.evidence.carrying import Interval, Odometer, Trust
+from pipeline.evidence.carrying import Interval, Trust
+from pipeline.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints
 
 
@@ -14,7 +15,7 @@ def carried_forward(
     accepted_ns: Ints,
     path_m: Floats,
     t_ns: Ints,
-    odometer: Odometer,
+    odometer: Odometry,
     stood: Sequence[tuple[int, int]],
     trust: Trust,
     limit_m: float,
@@ -37,13 +38,13 @@ def carried_forward(
     return low, high
 
 
-def _carried(since_ns: Ints, at_m: Floats, t_ns: Ints, odometer: Odometer, trust: Trust) -> Interval:
+def _carried(since_ns: Ints, at_m: Floats, t_ns: Ints, odometer: Odometry, trust: Trust) -> Interval:
     centre = at_m + odometer.between(since_ns, t_ns).distance_m
     half = trust.beside_m(np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(since_ns)), 0.0)
     return centre - half, centre + half
 
 
-def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometer, trust: Trust, limit_m: float) -> Ints:
+def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometry, trust: Trust, limit_m: float) -> Ints:
     """Accepted balises, but for those that the odometer since the one before puts beyond the limit."""
     used: list[int] = []
     for number in range(path_m.size):

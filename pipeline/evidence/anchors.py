@@ -8,8 +8,9 @@ from typing import Self
 import numpy as np
 import polars as pl
 
-from pipeline.evidence.carrying import Anchor, Odometer
+from pipeline.evidence.carrying import Anchor
 from pipeline.evidence.routes import Place, Route, routes_of_path
+from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
@@ -113,7 +114,7 @@ class Coverage:
     end: Anchor
 
 
-def coverages(reference: ReferencePlaces | None, odometer: Odometer | None, config: HazardConfig) -> list[Coverage]:
+def coverages(reference: ReferencePlaces | None, odometer: Odometry | None, config: HazardConfig) -> list[Coverage]:
     """The times that the reference covers."""
     if reference is None or reference.t_ns.size == 0:
         return []
@@ -162,7 +163,7 @@ def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], 
 
 
 def facing_of(
-    reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometer | None, least_m: float
+    reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometry | None, least_m: float
 ) -> set[int]:
     """Oriented net elements over which the train ran as the odometer counted up, by the reference.
 

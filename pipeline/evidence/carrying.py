@@ -3,37 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from pipeline.evidence.routes import Place
-from schemas.arrays import Bools, Floats, Ints
+from pipeline.odometry import Odometry, Way
+from schemas.arrays import Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence
-
-
-class Way(Protocol):
-    """True distance between instants, signed [m], and its variance [m^2]; NaN where it is not known."""
-
-    @property
-    def distance_m(self) -> Floats: ...
-    @property
-    def variance_m2(self) -> Floats: ...
-
-
-class Odometer(Protocol):
-    """What evidence asks of the odometer; instants are int64 nanoseconds. `scale` is None without a vehicle file."""
-
-    @property
-    def begin_ns(self) -> int: ...
-    @property
-    def end_ns(self) -> int: ...
-    @property
-    def scale(self) -> float | None: ...
-    def between(self, begin_ns: Ints, end_ns: Ints) -> Way: ...
-    def travelled_at(self, t_ns: Ints) -> Floats: ...
-    def known_at(self, t_ns: Ints) -> Bools: ...
 
 
 @dataclass(frozen=True)
@@ -76,13 +53,13 @@ class Anchor:
 Interval = tuple[Floats, Floats]
 
 
-def driven_m(odometer: Odometer, since_ns: int, t_ns: Ints) -> Floats:
+def driven_m(odometer: Odometry, since_ns: int, t_ns: Ints) -> Floats:
     """Way driven from an instant to others, turns included [m]."""
     driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(np.array([since_ns])))
     return driven
 
 
-def beside_anchor(odometer: Odometer, anchor: Anchor, at_m: float, t_ns: Ints, trust: Trust) -> Interval:
+def beside_anchor(odometer: Odometry, anchor: Anchor, at_m: float, t_ns: Ints, trust: Trust) -> Interval:
     """Least and largest coordinate on one side of an anchor; NaN where the odometer does not reach."""
     centre = at_m + _from(odometer, anchor, t_ns).distance_m
     half = trust.beside_m(driven_m(odometer, anchor.t_ns, t_ns), anchor.sigma_m)
@@ -90,7 +67,7 @@ def beside_anchor(odometer: Odometer, anchor: Anchor, at_m: float, t_ns: Ints, t
 
 
 def between_anchors(
-    odometer: Odometer, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, trust: Trust
+    odometer: Odometry, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, trust: Trust
 ) -> Interval:
     """Least and largest coordinate between two anchors that lie at these coordinates of their route.
 
@@ -110,7 +87,7 @@ def between_anchors(
     return low, np.maximum(places[0] + halves[0], places[1] + halves[1])
 
 
-def closes(odometer: Odometer, anchors: tuple[Anchor, Anchor], apart_m: float, trust: Trust) -> bool:
+def closes(odometer: Odometry, anchors: tuple[Anchor, Anchor], apart_m: float, trust: Trust) -> bool:
     """The odometer's way from anchor to anchor is their distance, within k times both roots combined."""
     begin, end = anchors
     way = _from(odometer, begin, np.array([end.t_ns]))
@@ -118,5 +95,5 @@ def closes(odometer: Odometer, anchors: tuple[Anchor, Anchor], apart_m: float, t
     return bool((np.abs(apart_m - way.distance_m) <= trust.factor * root)[0])
 
 
-def _from(odometer: Odometer, anchor: Anchor, t_ns: Ints) -> Way:
+def _from(odometer: Odometry, anchor: Anchor, t_ns: Ints) -> Way:
     return odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns)

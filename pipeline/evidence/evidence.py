@@ -17,9 +17,10 @@ from pipeline.evidence.anchors import (
     lost_spans,
     read_anchors,
 )
-from pipeline.evidence.carrying import Anchor, Interval, Odometer, Trust, beside_anchor, between_anchors, closes
+from pipeline.evidence.carrying import Anchor, Interval, Trust, beside_anchor, between_anchors, closes
 from pipeline.evidence.gaps import Gap, Way, gaps_of
 from pipeline.evidence.routes import Route
+from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
@@ -64,7 +65,7 @@ class Evidence:
     reference: ReferencePlaces | None
     covered: tuple[Coverage, ...]
     gaps: tuple[Gap, ...]
-    odometer: Odometer | None
+    odometer: Odometry | None
     network: Network
     trust: Trust
     contradicted: int
@@ -170,7 +171,7 @@ def evidence_of(
     reference: ReferencePlaces | None,
     reads: pl.DataFrame | None,
     balises: pl.DataFrame | None,
-    odometer: Odometer | None,
+    odometer: Odometry | None,
     network: Network,
     config: Configuration,
 ) -> Evidence:
@@ -209,7 +210,7 @@ def _begin_ns(border: tuple[Anchor, Anchor]) -> int:
     return border[0].t_ns
 
 
-def _contradicts(gap: Gap, odometer: Odometer | None, trust: Trust) -> bool:
+def _contradicts(gap: Gap, odometer: Odometry | None, trust: Trust) -> bool:
     """An odometer with the scale of a vehicle file that closes on none of the chains between two anchors."""
     if gap.begin is None or gap.end is None or gap.ways is None or odometer is None or odometer.scale is None:
         return False

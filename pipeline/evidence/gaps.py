@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.evidence.carrying import Anchor, Odometer, Trust, driven_m
+from pipeline.evidence.carrying import Anchor, Trust, driven_m
 from pipeline.evidence.routes import Chain, Place, along_m, chains_between, extended
+from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
 
@@ -46,7 +47,7 @@ class Gap:
 
 
 def gaps_of(
-    borders: Sequence[tuple[Anchor, Anchor]], facing: set[int], odometer: Odometer, network: Network, trust: Trust
+    borders: Sequence[tuple[Anchor, Anchor]], facing: set[int], odometer: Odometry, network: Network, trust: Trust
 ) -> list[Gap]:
     """Gaps before, between and after what is known from one anchor to another, with all chains through each.
 
@@ -61,7 +62,7 @@ def gaps_of(
     return [_reaching(gap, sheets, odometer, network, trust) for gap in found]
 
 
-def _between(a: Anchor, b: Anchor, odometer: Odometer, network: Network, trust: Trust) -> list[Gap]:
+def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, trust: Trust) -> list[Gap]:
     """Where the odometer lost distance in a gap, it is two halves that know nothing of each other."""
     if b.t_ns <= a.t_ns:
         return []
@@ -131,7 +132,7 @@ def _connected(elements: set[int], network: Network) -> bool:
     return elements <= seen
 
 
-def _reaching(gap: Gap, sheets: set[bool], odometer: Odometer, network: Network, trust: Trust) -> Gap:
+def _reaching(gap: Gap, sheets: set[bool], odometer: Odometry, network: Network, trust: Trust) -> Gap:
     """The gap with the chains of the kept orientation, over every branch as far as the odometer says."""
     if gap.ways is None:
         return gap
@@ -148,7 +149,7 @@ def _reaching(gap: Gap, sheets: set[bool], odometer: Odometer, network: Network,
     return replace(gap, ways=reached)
 
 
-def _turned(gap: Gap, odometer: Odometer, trust: Trust) -> bool:
+def _turned(gap: Gap, odometer: Odometry, trust: Trust) -> bool:
     """The train went to and fro in the gap by more than the odometer's own error."""
     t_ns = _looks(gap)
     for anchor in gap.anchors[:1]:
@@ -178,7 +179,7 @@ def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
     return [Way(Chain((one,), (-along_m(network, one, anchor.place.measure_m),)), *at) for one in both]
 
 
-def _reach_m(gap: Gap, way: Way, odometer: Odometer, trust: Trust) -> tuple[float, float]:
+def _reach_m(gap: Gap, way: Way, odometer: Odometry, trust: Trust) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
     t_ns = _looks(gap)
     places = [at_m for at_m in (way.begin_m, way.end_m) if at_m is not None]

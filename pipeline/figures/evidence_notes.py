@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED, NO_ODOMETER
+from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED
 from pipeline.epochs.clock import Clock, met
+from pipeline.epochs.verdicts import NO_ODOMETER
 from pipeline.monitors.along import most_scatter_m
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures

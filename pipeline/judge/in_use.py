@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.clock import met, trusted
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, runs_of, times_ns
+from pipeline.epochs.timeline import crossing_gap_ns, nominal_period_s
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, times_ns
 from schemas.config import Configuration
 
 
@@ -18,23 +18,17 @@ def reaction_s(t_ns: Ints, config: Configuration) -> float:
     return nominal_period_s(t_ns) or 0.0
 
 
-def unambiguous(epochs: pl.DataFrame, config: Configuration) -> Bools:
-    """The track of the position is not in doubt by what the train knew then."""
-    sure: Bools = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
-    return sure
-
-
 def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
     """For how long each epoch stands for a position in use [s]: from the epoch before, for a fault may be that old.
 
-    At most max(1.5 periods, 1 s), the first epoch for one period; of a negated time only what comes before the
-    reaction.
+    At most max(1.5 periods, `crossing_gap_s`), the first epoch for one period; of a negated time only what comes
+    before the reaction.
     """
     t_ns = times_ns(epochs)
     usable = met(epochs, trusted(config))
     period_s = nominal_period_s(t_ns) or 0.0
     end_s = (t_ns - t_ns[:1]) / NS_PER_S
-    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), linking_gap_s(period_s))
+    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), crossing_gap_ns(t_ns, config.lds) / NS_PER_S)
     blocked = np.zeros(t_ns.size)
     for from_s, until_s in _negated_spans(end_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
         blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)

@@ -171,9 +171,7 @@ def _with_unoffered(
     ]
     if not rows:
         return passages
-    schema = {name: pl.String if isinstance(kind, pl.Enum) else kind for name, kind in passages.schema.items()}
-    plain = {name: pl.Int64 if kind == pl.Datetime else kind for name, kind in schema.items()}
-    added = pl.DataFrame(rows, schema=plain).cast(passages.schema)
+    added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
     return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")

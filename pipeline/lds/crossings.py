@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds.journey import Journey
+from schemas.conform import dtypes
 from schemas.enums import BaliseKind, PassageStatus, Reaction
 from schemas.stages import Crossings
 
@@ -148,7 +149,7 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
 def crossing_rows(crossings: Sequence[Crossing], journey: Journey) -> pl.DataFrame:
     """The table of crossings (`Crossings`), `crossings` in order of time."""
     rows = [_row(number, crossing, journey) for number, crossing in enumerate(crossings)]
-    return frame_of(rows, {name: column.dtype for name, column in Crossings.columns().items()})
+    return pl.DataFrame(rows, schema=dtypes(Crossings))
 
 
 def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]:
@@ -165,10 +166,3 @@ def _row(number: int, crossing: Crossing, journey: Journey) -> dict[str, object]
         "direction": journey.direction_at(crossing.t_ns, crossing.direction),
         "status": crossing.status and crossing.status.value,
     }
-
-
-def frame_of(rows: Sequence[dict[str, object]], kinds: dict[str, pl.DataType]) -> pl.DataFrame:
-    """Rows as a frame of these types; in the rows an instant is int64 [ns], an enum its text."""
-    plain = {pl.Datetime: pl.Int64, pl.Enum: pl.String}
-    schema = {name: plain.get(kind.base_type(), kind) for name, kind in kinds.items()}
-    return pl.DataFrame(rows, schema=schema, orient="row").cast(pl.Schema(kinds))

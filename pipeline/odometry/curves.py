@@ -7,9 +7,6 @@ import numpy as np
 from schemas.arrays import Floats, Ints
 from schemas.config import AlignConfig
 
-# Between rows this far apart a straight line is within 0.1 m of a train that brakes.
-_FINE_S = 0.5
-
 
 def filled_in(
     t_s: Floats, distance_m: Floats, speed_mps: Floats, rows: Ints, config: AlignConfig
@@ -29,7 +26,8 @@ def filled_in(
     true = np.abs(0.5 * (slopes[rows] + slopes[rows + 1]) * span - way) <= 0.25 * config.braking_mps2 * span**2
     low, high = np.minimum(0.0, 3.0 * way), np.maximum(0.0, 3.0 * way)
     start, end = (np.clip(np.where(true, slopes[at], smooth[at]) * span, low, high) for at in (rows, rows + 1))
-    fine = np.ceil(span / _FINE_S).astype(np.int64)
+    # A third of the span in which a straight line is near enough: within a ninth of that.
+    fine = np.ceil(3.0 * span / config.straight_s).astype(np.int64)
     which = np.repeat(np.arange(rows.size), fine - 1)
     part = np.concatenate([np.arange(1, count) / count for count in fine.tolist()])
     rest = 1.0 - part

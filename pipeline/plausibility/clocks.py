@@ -13,9 +13,9 @@ from schemas.arrays import Floats
 _MOST = 30_000
 # Less in common than this, and than this share of the shorter record, and any two journeys look alike.
 _LEAST_S = 90.0
-_LEAST_SHARE = 0.6
+LEAST_SHARE = 0.6
 # Shifts of the clocks that are worth a closer look: so many, so well correlated, so far from each other [s].
-_CANDIDATES, _LEAST_CORRELATION, _APART_S = 4, 0.4, 15.0
+_CANDIDATES, _LEAST_CORRELATION, APART_S = 4, 0.4, 15.0
 # Constant speed tells no lag: its scatter over its mean.
 _LEAST_CHANGE = 0.08
 
@@ -63,7 +63,7 @@ def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:
         if left[best] < _LEAST_CORRELATION:
             return
         yield float(lags_s[best])
-        left[np.abs(lags_s - lags_s[best]) < _APART_S] = -2.0
+        left[np.abs(lags_s - lags_s[best]) < APART_S] = -2.0
 
 
 def _bounded(speed: Floats) -> Floats:
@@ -90,7 +90,7 @@ def _correlations(one: Floats, other: Floats, least: float) -> Floats:
         return whole
 
     count = np.maximum(np.round(sums(0, 0)), 0.0)
-    need = max(least, _LEAST_SHARE * min(mask.sum() for mask in masks))
+    need = max(least, LEAST_SHARE * min(mask.sum() for mask in masks))
     many = np.maximum(count, 1.0)
     first, second = sums(1, 0), sums(0, 1)
     covariance = sums(1, 1) - first * second / many

@@ -90,12 +90,15 @@ class Datum:
     east_m: float
     north_m: float
 
+    def off_m(self, east_m: float, north_m: float) -> float:
+        """How far a shift is from this one."""
+        return float(np.hypot(self.east_m - east_m, self.north_m - north_m))
+
     def explains(self, east_m: float, north_m: float, one_heading: bool) -> bool:
         """Whether it is this shift; of a single heading only the part across it is known."""
         size_m = float(np.hypot(east_m, north_m))
-        apart = np.array([self.east_m - east_m, self.north_m - north_m])
-        apart_m = abs(apart @ [east_m, north_m]) / size_m if one_heading else np.hypot(*apart)
-        return bool(apart_m < max(_NEAR_M, _NEAR_SHARE * size_m))
+        across_m = abs((self.east_m - east_m) * east_m + (self.north_m - north_m) * north_m) / size_m
+        return (across_m if one_heading else self.off_m(east_m, north_m)) < max(_NEAR_M, _NEAR_SHARE * size_m)
 
 
 def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:

@@ -47,7 +47,7 @@ def fit_report(
         for into, lines in lines_of(fit.misfits).items():
             known = mending.setdefault(into, lines)
             mending[into] = known if lines in known else known + "\n" + lines
-    text = "\n".join(f"# append to {into}\n{lines}" for into, lines in mending.items())
+    text = "\n".join(f"# {into}\n{lines}" for into, lines in mending.items())
     if text:
         tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
     failing = found.values() if config.plausibility == "fail" else ()

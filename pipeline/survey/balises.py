@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from pipeline.site.tables import RawTable, typed_table
+from pipeline.survey.kilometres import measures_at
 from pipeline.survey.network import Network
 from pipeline.survey.pieces import Survey
 from pipeline.survey.sources import content_of_survey
@@ -57,6 +57,8 @@ def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
     typed = typed_table(RawTable(place, table), "balises", breaches)
     if typed is None:
         raise SiteError(breaches[0])
+    if (repeated := typed.filter(typed["balise_id"].is_duplicated())["balise_id"]).len():
+        raise SiteError("occurs more than once", place=f"{place}: column balise_id", found=repeated[0])
     return Balises.validate(typed, cast=True)
 
 
@@ -85,8 +87,8 @@ def balises_of_list(path: Path, network: Network, epsg: int | None, survey: Surv
     track = track_of(network.track())
     if "balise_id" not in table.columns:
         table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
-    if "kind" not in table.columns:
-        table = table.with_columns(kind=pl.lit("virtual"))
+    kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
+    table = table.with_columns(kind=kind)
     placer = _Placer(place, network, track, survey)
     found = [placer.placed(row) for row in table.iter_rows(named=True)]
     ids, measures = [one[0] for one in found], [one[1] for one in found]
@@ -163,26 +165,14 @@ class _Placer:
             (element.name, measure)
             for number, element in enumerate(self.network.elements)
             if wanted in (None, element.name)
-            for measure in _measures_at(element.line_km, self.track.measure_m[self.track.vertices(number)], km)
+            for measure in measures_at(element.line_km, self.track.measure_m[self.track.vertices(number)], km)
         ]
-        places = {name for name, _ in found}
         if not found:
             raise self._refusal(row, f"no track has line kilometre {km:g}", expected="a survey with line kilometres")
-        if len(places) > 1 and max(measure for _, measure in found) > 0:
-            inner = [one for one in found if one[1] > 0]
-            if len({name for name, _ in inner}) > 1:
-                remedy = "Name netelement_id in the list."
-                raise self._refusal(row, f"line kilometre {km:g} is on {', '.join(sorted(places))}", remedy=remedy)
-            found = inner
-        return found[0]
-
-
-def _measures_at(line_km: np.ndarray, measure_m: np.ndarray, km: float) -> list[float]:
-    """Where an element has a line kilometre; its first place, or none."""
-    known = np.flatnonzero(np.isfinite(line_km))
-    for low, high in itertools.pairwise(known.tolist()):
-        a, b = line_km[low], line_km[high]
-        if min(a, b) <= km <= max(a, b) and a != b:
-            share = (km - a) / (b - a)
-            return [float(measure_m[low] + share * (measure_m[high] - measure_m[low]))]
-    return []
+        # A joint is the end of one element and the start of the next: one place.
+        inner = [one for one in found if one[1] > 0] or found
+        if len(inner) > 1:
+            places = ", ".join(f"{name} at {measure:.1f} m" for name, measure in sorted(inner))
+            remedy = "Name netelement_id in the list; where one element has it twice, give measure_m too."
+            raise self._refusal(row, f"line kilometre {km:g} is on {places}", remedy=remedy)
+        return inner[0]

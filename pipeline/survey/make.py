@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from pipeline.survey.sources import read_surveys
 from pipeline.survey.trace import clean_traces
 from schemas.config import Configuration, Vehicle
 from schemas.errors import SiteError, UsageError
-from schemas.run import Site
+from schemas.run import Finding, Site
 
 JOIN_M = 0.05
 _FILES = ("track", "links", "balises", "route")
@@ -93,7 +93,9 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
     contents = {f"{name}.{suffix}": None for name in _FILES for suffix in ("csv", "geojson", "parquet")}
     tables = {"track": site.track, "links": site.links, "balises": site.balises}
     written = {f"{name}.parquet": _parquet(table) for name, table in tables.items() if table is not None}
-    replace_files(out, {**contents, **written, "site.html": page.encode()}, marker="track.parquet")
+    told = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
+    beside = {"findings.csv": told.write_csv().encode(), "site.html": page.encode()}
+    replace_files(out, {**contents, **written, **beside}, marker="track.parquet")
 
 
 def _parquet(table: pl.DataFrame) -> bytes:

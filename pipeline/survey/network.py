@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -137,12 +138,21 @@ def _crossings(pieces: list[Piece], nodes: list[Ints], switches: set[int], surve
     through, count = np.unique(inner, return_counts=True)
     told = _nodes_at(pieces, nodes, survey.crossings_deg)
     by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - switches
-    for node in sorted(by_form - told):
-        names = sorted({piece.name for piece, own in zip(pieces, nodes, strict=True) if node in own})
-        text = "cross where neither ends: taken as a crossing without a switch"
-        remedy = "Where trains turn off (a slip), name the node `railway=switch`, or end the lines there."
-        survey.told("note", f"track: {', '.join(names)}", text, remedy)
+    _tell_of_crossings(pieces, nodes, by_form - told, survey)
     return told | by_form
+
+
+def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int], survey: Survey) -> None:
+    """One note for each pair of lines that cross."""
+    names: dict[int, set[str]] = {node: set() for node in unnamed}
+    for piece, own in zip(pieces, nodes, strict=True):
+        for node in own[np.isin(own, list(unnamed))].tolist():
+            names[node].add(piece.name)
+    for pair, count in sorted(Counter(tuple(sorted(both)) for both in names.values()).items()):
+        times = f" ({count} times)" if count > 1 else ""
+        text = f"cross where neither ends{times}: taken as a crossing without a switch"
+        remedy = "Where trains turn off (a slip), name the node `railway=switch`, or end the lines there."
+        survey.told("note", f"track: {', '.join(pair)}", text, remedy)
 
 
 def _nodes_at(pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[float, float]]) -> set[int]:

@@ -150,8 +150,17 @@ def _with_toes(lap: Piece, first: int, last: int, known: list[Piece]) -> Piece:
 
 
 def _toe(lap: Piece, row: int, step: int, known: list[Piece]) -> Piece | None:
-    """The known vertex nearest to where the train was a toe's length before (-1) or after (1) the row."""
+    """The end of known track that the row goes on from; else the known vertex nearest to where the train was a toe's
+    length before (-1) or after (1) the row.
+    """
     places = _surface(lap)
+    for piece in known:
+        line = _surface(piece)
+        for end, before in ((0, 1), (len(line) - 1, len(line) - 2)):
+            ahead = places[row] - line[end]
+            nearest = np.linalg.norm(line - places[row], axis=1).argmin() == end
+            if nearest and np.linalg.norm(ahead) < _TOE_M and ahead @ (line[end] - line[before]) > 0:
+                return piece.take(np.array([end]))
     other = row
     while 0 <= other + step < len(lap) and np.linalg.norm(places[other] - places[row]) < _TOE_M:
         other += step

@@ -9,7 +9,8 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.alignment.align import BEYOND_SPAN, NO_ODOMETER, align, odometer_at, speed_of_positions
+from pipeline.alignment.align import BEYOND_SPAN, align, odometer_at, speed_of_positions
+from pipeline.epochs.verdicts import NO_ODOMETER
 from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry.odometry import Noise
 from pipeline.odometry.quantisation import QuantisationNoise

@@ -15,7 +15,7 @@ from pipeline.calibration.calibrate import calibrate
 from pipeline.ingest.clean import clean
 from pipeline.ingest.correct import corrected
 from pipeline.plausibility.causes import explain_factor, explain_lag
-from pipeline.plausibility.check import State
+from pipeline.plausibility.check import CONFIGURATION, State
 from pipeline.plausibility.fit import fit_run, lines_of
 from pipeline.stages import replay
 from schemas.config import Configuration, IngestConfig, Vehicle, settings_from
@@ -42,7 +42,7 @@ def test_what_is_wrong_is_told_and_its_lines_mend_it(wrong: Wrong, trips: list[T
         return
     changed = wrong.change(drawn.run)
     found = fit_run(changed, "primary", Vehicle(), IngestConfig(), drawn.site)
-    lines = lines_of(found.impossible).get("the configuration")
+    lines = lines_of(found.impossible).get(CONFIGURATION)
     if lines is None:
         return
     config = settings_from({**tomllib.loads(lines)["ingest"]}, IngestConfig, "the lines")
@@ -78,7 +78,7 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
     states = {
         check.what: (check.state, check.found) for check in fit_run(run, "primary", Vehicle(), IngestConfig()).checks
     }
-    assert states["clock of the odometer against the GNSS"] == (State.NOT_CHECKED, "the speed hardly changes")
+    assert states["clock of the odometer against the GNSS"] == (State.NOT_CHECKED, "the speed changes too little")
     assert states["odometer distance against the positions"][0] is State.FITS
 
 
@@ -129,7 +129,7 @@ def test_a_replay_of_an_impossible_run_fails_or_is_unproven() -> None:
     odometer = trial.run.odometer
     assert odometer is not None
     wrong = trial.run.with_streams(odometer=odometer.with_columns(pl.col("distance_m", "speed_mps") * 3.6))
-    with pytest.raises(InputError, match=r"km/h.*\[ingest\] correct = \[\{ stream = \"odometer\""):
+    with pytest.raises(InputError, match=r"km/h.*ingest\.correct = \[\{ stream = \"odometer\""):
         replay(wrong, trial.site, trial.vehicle)
     with pytest.raises(InputError, match="km/h"):
         calibrate([wrong], trial.site)
