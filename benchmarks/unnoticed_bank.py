@@ -16,6 +16,8 @@ import polars as pl
 from scipy.special import chdtri
 
 from datasets.experiment.geometry import TAUS_S, Constellation, Geometry, default_geometry
+from datasets.experiment.linear_bank import BankSpec, linear_bank
+from datasets.experiment.rare import missed_detection_probability
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import ewma_weight
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
@@ -91,7 +93,7 @@ def watched_of(offset_m: Floats, sigmas_m: Floats, alphas: Floats) -> Watched:
         t_s=np.arange(size, dtype=np.float64),
         fresh=fresh,
         free=series.border,
-        unseen_m=zero,
+        fastest_m=5.0 * second,
         way_s=second,
         rate_mps=series.rate_mps,
         least_mps=np.maximum(-limit[:, 0], series.rate_mps - 5.0),
@@ -120,7 +122,8 @@ def bank_figures(
             sigmas, rng = along_sigmas_m(sky, heading), np.random.default_rng([9, repetition, int(heading)])
             size = _WARM_S + 60 * minutes[-1] + 1
             rows = watched_of(noise_of(sigmas, size, rng), sigmas, alphas)
-            both = [largest_errors(one, _WARM_S, size - 1).most_m for one in (rows, rows.mirrored())]
+            seen = rows.since(_WARM_S, size - 1)
+            both = [largest_errors(one).most_m for one in (seen, seen.mirrored())]
             larger.append(np.maximum(*both))
     median = np.median(larger, axis=0)
     beyond = np.flatnonzero(median > 20.0)
@@ -140,10 +143,43 @@ def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple
                 rows = watched_of(noise_of(sigmas, _WARM_S + 60 * minutes[-1] + 1, rng), sigmas, alphas)
                 ends = [_WARM_S + 60 * minute for minute in minutes]
                 both = (rows, rows.mirrored())
-                larger.append([max(largest_of_shape(one, _WARM_S, end, shape) for one in both) for end in ends])
+                larger.append([max(largest_of_shape(one.since(_WARM_S, end), shape) for one in both) for end in ends])
         median = np.median(larger, axis=0)
         told.append(
             {"sky": constellation, "shape": shape} | {f"{m} min": v for m, v in zip(minutes, median, strict=True)}
+        )
+    return told
+
+
+def ramp_figures(draws: int) -> list[dict[str, object]]:
+    """Share of draws of noise in which a ramp of ten minutes goes unseen, against the experiment's probability.
+
+    One side counts the draws whose largest unnoticed ramp is as steep, by the linear bounds of this room. The other
+    samples misses (`datasets.experiment.rare`) with the bank's state equations, and shares nothing with it.
+    """
+    seconds, heading = 600, 0.0
+    sky, alphas = default_geometry("gps"), np.array(BANKS["0.1 0.01 0.001"])
+    sigmas, steepest = along_sigmas_m(sky, heading), []
+    for draw in range(draws):
+        noise = noise_of(sigmas, _WARM_S + seconds + 1, np.random.default_rng([11, draw]))
+        window = watched_of(noise, sigmas, alphas).since(_WARM_S, _WARM_S + seconds)
+        steepest.append(largest_of_shape(window, "ramp", np.array([1])) / seconds)
+    # The bank of the draws has run for as long since its restart.
+    bank = linear_bank(sky, heading, BankSpec(alphas=(1.0, *alphas.tolist()), age_s=float(_WARM_S)))
+    told: list[dict[str, object]] = []
+    for rate_mps in (0.012, 0.015, 0.018, 0.021, 0.024):
+        share = float(np.mean(np.array(steepest) >= rate_mps))
+        sampled = missed_detection_probability(bank, seconds, rate_mps / abs(float(bank.slope[0])), runs=20_000)
+        deviation = np.hypot(
+            np.sqrt(sampled.value * (1.0 - sampled.value) / draws), sampled.relative_error * sampled.value
+        )
+        told.append(
+            {
+                "ramp m/s": rate_mps,
+                "share unseen": share,
+                "experiment": sampled.value,
+                "sigmas apart": (share - sampled.value) / max(float(deviation), 1e-12),
+            }
         )
     return told
 
@@ -172,6 +208,7 @@ def main() -> None:
     show_table(pl.DataFrame([bank_figures(sky, name, given.repetitions, MINUTES) for sky in skies for name in BANKS]))
     show_table(pl.DataFrame([row for sky in skies for row in shape_figures(sky, given.repetitions, MINUTES[:4])]))
     ranges = [{"sky": sky, **{f"{h:.0f} deg": range_figure(sky, h) for h in HEADINGS_DEG}} for sky in skies]
+    show_table(pl.DataFrame(ramp_figures(100 * given.repetitions)), "Ramps of ten minutes")
     show_table(pl.DataFrame(ranges), "One range at fault, by the pseudorange monitor alone [m]")
     spread = [
         {"sky": sky, **{f"{h:.0f} deg": np.linalg.norm(along_sigmas_m(default_geometry(sky), h)) for h in HEADINGS_DEG}}

@@ -34,9 +34,8 @@ class Errors:
     outright: Bools
 
 
-def largest_errors(rows: Watched, start: int, end: int, grow: Grow = growth_of) -> Errors:
-    """The largest error ahead at the rows (start, end] of a fault that began after row `start`."""
-    window = rows.between(start, end + 1)
+def largest_errors(window: Watched, grow: Grow = growth_of) -> Errors:
+    """The largest error ahead at all rows but the first, of a fault that began after the first (`Watched.since`)."""
     most = np.zeros(window.rows)
     paid = np.zeros((window.rows, 1 + window.weight.shape[1]))
     outright = np.zeros(window.rows, dtype=np.bool_)
@@ -60,7 +59,7 @@ def largest_errors(rows: Watched, start: int, end: int, grow: Grow = growth_of) 
 def _across(window: Watched, row: int, most_m: Floats) -> float:
     """The fault at a row to which the bank did not see the way, or at a re-link inside one."""
     if window.fresh[row]:
-        unseen = float(window.unseen_m[row])
+        unseen = float(window.fastest_m[row])
     else:
         stretch = stretch_after(window, row - 1, row, known=row == 1)
         unseen = float(growth_of(stretch).most_m[0]) + _learned_m(window, row)

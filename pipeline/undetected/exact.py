@@ -36,15 +36,15 @@ class Optimum:
     binding: tuple[int, ...]
 
 
-def largest_profile(rows: Watched, start: int, end: int, margin: float = 0.0) -> Optimum:
-    """The profile with the largest error ahead at row `end` of a fault that began after row `start`.
+def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
+    """The profile with the largest error ahead at the last row of a fault that began after the first.
 
     `margin`: every threshold smaller by this share. Raises `BaliseError` where the solver finds none: no fault is a
     profile, so that is a defect.
     """
     from scipy.optimize import linprog  # only who asks for a profile solves the whole
 
-    program = _Program(rows.between(start, end + 1), margin)
+    program = _Program(window, margin)
     goal = np.zeros(program.width)
     goal[program.fault(program.window.rows - 1)] = -1.0
     found = linprog(
@@ -87,7 +87,7 @@ class _Program:
 
     def _bounds(self) -> tuple[Floats, Floats]:
         window, part = self.window, slice(1, None)
-        most = window.learned_m + np.where(window.fresh, window.unseen_m, 0.0)
+        most = window.learned_m + np.where(window.fresh, window.fastest_m, 0.0)
         inside = 1.0 - self._margin
         watched = (~window.fresh)[part]
         columns_low = [np.where(watched, inside * window.least_mps[part] / self._scale[part], 0.0)]

@@ -35,7 +35,7 @@ def tables() -> RunTables:
     return replay(run, site, VEHICLE, config())
 
 
-@pytest.mark.parametrize("seed", [3, 7, 15])
+@pytest.mark.parametrize("seed", [3, 7])
 def test_the_profile_goes_unseen_and_five_percent_more_does_not(seed: int, tmp_path: Path) -> None:
     found = proof(seed, False, tmp_path)
     assert found is not None
@@ -51,8 +51,7 @@ def test_a_read_ends_what_may_have_begun_before(tables: RunTables) -> None:
     begin = tables.epochs["t"][0]
     for passage in passages.iter_rows(named=True):
         last = max((t for t in reads if t < passage["t_offered"]), default=begin)
-        gone_s = (last - passage["undetected_since"]).total_seconds()
-        assert 0.0 <= gone_s <= 1.0 if last != begin else gone_s <= 0.0
+        assert passage["undetected_since"] == last if last != begin else passage["undetected_since"] >= last
     errors = tables.epochs.select("t", larger=pl.max_horizontal(BOTH))
     for t in reads:
         before, after = errors.filter(pl.col("t") < t)["larger"][-1], errors.filter(pl.col("t") > t)["larger"][0]
@@ -148,26 +147,24 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     clean, at = replay(run, site, VEHICLE), 60
     most_m, least_m = -np.inf, np.inf
     for name in sorted(diagnosis.satellites.filter(pl.col("used"))["sv"].unique()):
-        for size_m in (-1.0, 1.0):
-            reached = _largest_unseen(run, site, clean, name, size_m, at)
-            most_m, least_m = max(most_m, reached), min(least_m, reached)
+        reached = _unseen(run, site, clean, name, at)
+        most_m, least_m = max(most_m, *reached), min(least_m, *reached)
     assert high_m[at] == pytest.approx(most_m, abs=0.02)
     assert low_m[at] == pytest.approx(least_m, abs=0.02)
 
 
-def _largest_unseen(run: RunLog, site: Site, clean: RunTables, sv: str, size_m: float, at: int) -> float:
+def _unseen(run: RunLog, site: Site, clean: RunTables, sv: str, at: int) -> list[float]:
     """Where the sum of squares, a parabola through three replays, meets the threshold; what the position does there."""
     before = clean.epochs.filter(solution="gps")
     sums, moved = [before["pseudorange_value"][at]], [0.0]
     for times in (1.0, 2.0):
-        fault = {"kind": "step", "target": sv, "start_s": float(at), "duration_s": 0.5, "size_m": times * size_m}
+        fault = {"kind": "step", "target": sv, "start_s": float(at), "duration_s": 0.5, "size_m": times}
         spec = FaultSpec.model_validate(fault | {"solution": "gps"})
         after = replay(inject(run, spec, site), site, VEHICLE).epochs.filter(solution="gps")
         sums.append(after["pseudorange_value"][at])
         moved.append(after["path_m"][at] - before["path_m"][at])
     a, b, c = np.polyfit([0.0, 1.0, 2.0], sums, 2)
-    c -= before["pseudorange_threshold"][at]
-    return float((-b + np.sqrt(b * b - 4.0 * a * c)) / (2.0 * a) * moved[1])
+    return [float(end * moved[1]) for end in np.roots([a, b, c - before["pseudorange_threshold"][at]])]
 
 
 def test_a_second_solution_without_the_fault_holds_it(sky: tuple[RunLog, Site]) -> None:
