@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 _TOLERANCE = 1e-9
-# A bound within this share of itself is reached.
-_REACHED = 1e-6
+# A profile keeps by this share within its thresholds, so that rounding does not carry it over them; a bound that is so
+# near is reached.
+MARGIN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ class _Program:
     def binding(self, solution: Floats) -> tuple[int, ...]:
         """Which bounds the profile reaches, by how many rows do."""
         inside = np.isfinite(self.low) & np.isfinite(self.high)
-        margin = _REACHED * np.maximum(1.0, np.abs(np.where(inside, self.high, 1.0)))
+        margin = MARGIN * np.maximum(1.0, np.abs(np.where(inside, self.high, 1.0)))
         reached = (solution >= self.high - margin) | (solution <= self.low + margin)
         rows = reached.reshape(-1, self._per_row)
         watched = ~self.window.fresh[1:]

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.undetected.columns import Diagnosis, rows_of, rows_of_passages
 from pipeline.undetected.error import largest_errors
-from pipeline.undetected.exact import largest_profile
+from pipeline.undetected.exact import MARGIN, largest_profile
 from pipeline.undetected.shapes import largest_of_shape
 from pipeline.undetected.watched import Watched
 from pipeline.undetected.windows import windows
@@ -17,9 +17,6 @@ from schemas.arrays import NS_PER_S, Ints, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.tables import SCALES
-
-# Thresholds are taken so much smaller, that rounding does not carry the profile over them.
-MARGIN = 1e-6
 
 
 @dataclass(frozen=True)

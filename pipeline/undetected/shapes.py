@@ -14,8 +14,6 @@ from pipeline.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Floats, Ints
 
 Shape = Literal["step", "ramp"]
-# Starts are tried so far apart [s]: noise and thresholds change little in less.
-_STARTS_S = 1.0
 
 
 def largest_of_shape(window: Watched, shape: Shape, starts: Ints | None = None) -> float:
@@ -49,8 +47,11 @@ def largest_of_shape(window: Watched, shape: Shape, starts: Ints | None = None) 
 
 
 def _starts(window: Watched) -> Ints:
-    """Rows at which a shape begins: the first after each second, and where the bank began anew."""
-    seconds = np.floor(window.t_s / _STARTS_S)
+    """Rows at which a shape begins: the first after each second, and where the bank began anew.
+
+    Noise and thresholds change little in less than a second.
+    """
+    seconds = np.floor(window.t_s)
     first = np.flatnonzero(np.diff(seconds, prepend=seconds[0] - 1.0) > 0.0)
     return np.union1d(first[first > 0], np.union1d(np.flatnonzero(window.fresh[1:]) + 1, [1]))
 

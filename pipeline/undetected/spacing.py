@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.figures.undetected import Spacing
-from pipeline.undetected.error import largest_errors
+from pipeline.undetected.error import Errors, largest_errors, splits_after
 from pipeline.undetected.growth import growth_with, horizons
 from pipeline.undetected.shares import best_shares
 from pipeline.undetected.stretch import stretch_after
@@ -21,7 +21,7 @@ from schemas.arrays import Floats
 from schemas.config import Configuration
 
 # More starts are tried until the shortest way is known to this share.
-_CLOSE = 0.01
+_CLOSE = 0.1
 
 
 def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tuple[Spacing, Floats]:
@@ -32,8 +32,9 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
     if rows.rows < 2:
         return Spacing(), np.full(rows.rows, np.nan)
     step_s = config.undetected.spacing_step_s
-    both, splits = (rows, rows.mirrored()), splits_anywhere(rows)
-    search = partial(_first_beyond, both, limit_m=config.hazards.failure_limit_m, splits=splits, ahead_s=step_s)
+    both, grow = (rows, rows.mirrored()), partial(growth_with, splits=splits_anywhere(rows))
+    errors = partial(largest_errors, grow=grow, after=splits_after(rows))
+    search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
     found = {start: search(start) for start in starts if start + 1 < rows.rows}
     ways, times = (_shortest(found, place, search) for place in (way_m, rows.t_s))
@@ -69,18 +70,17 @@ def _before(found: dict[int, int], way_m: Floats) -> Floats:
 
 
 def _first_beyond(
-    both: tuple[Watched, Watched], start: int, limit_m: float, splits: list[Floats], ahead_s: float
+    both: tuple[Watched, Watched], start: int, errors: Callable[[Watched], Errors], limit_m: float, ahead_s: float
 ) -> int:
     """The first row after `start` at which the error may be beyond the limit, in either direction; else their number.
 
     `ahead_s`: first end of the search; it goes on twice as far as long as the limit is not reached.
     """
     rows = both[0]
-    grow = partial(growth_with, splits=splits)
     while True:
         end = min(int(np.searchsorted(rows.t_s, rows.t_s[start] + ahead_s)), rows.rows - 1)
         end = max(end, start + 1)
-        most = np.maximum(*(largest_errors(one.since(start, end), grow).most_m for one in both))
+        most = np.maximum(*(errors(one.since(start, end)).most_m for one in both))
         beyond = np.flatnonzero(most > limit_m)
         if beyond.size:
             return start + 1 + int(beyond[0])

@@ -15,8 +15,10 @@ from datasets.inject import inject
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.stages import diagnosed, replay
+from pipeline.undetected.columns import Diagnosis, rows_of
+from pipeline.undetected.error import largest_errors
 from pipeline.undetected.ranges import range_bounds
-from schemas.arrays import floats
+from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
 from tests.replay.journeys import VEHICLE, journey
@@ -92,11 +94,19 @@ def test_spacing_is_the_way_to_the_limit(tables: RunTables) -> None:
     assert row["physical_spacing_s"] <= first_s
 
 
-def test_no_vehicle_file_no_close_bound(tables: RunTables) -> None:
+def since_the_start(
+    run: RunLog, site: Site, vehicle: Vehicle, settings: Configuration
+) -> tuple[Floats, Ints, Diagnosis]:
+    """The largest errors ahead since the first row, their epochs, and what watched."""
+    diagnosis, _, _ = diagnosed(run, site, vehicle, settings, "primary")
+    rows = rows_of(diagnosis, vehicle, settings)
+    return largest_errors(rows.since(0, rows.rows - 1)).most_m, rows.epoch[1:], diagnosis
+
+
+def test_no_vehicle_file_no_close_bound() -> None:
     run, site = journey(gnss=ONE_HZ)
-    learned = replay(run, site, Vehicle(), config())
-    known, unknown = (one.epochs.select(pl.max_horizontal(BOTH)).to_series() for one in (tables, learned))
-    assert (unknown - known).drop_nulls().min() >= 0.0
+    known, unknown = (since_the_start(run, site, one, Configuration())[0] for one in (VEHICLE, Vehicle()))
+    assert (unknown[: known.size] >= known[: unknown.size]).all()
     # k_T times the prior sigma of 1 % of 6 to 8 km between the read and the end, and more.
     assert unknown.max() > 30.0
 
@@ -168,14 +178,12 @@ def _unseen(run: RunLog, site: Site, clean: RunTables, sv: str, at: int) -> list
 
 
 def test_a_second_solution_without_the_fault_holds_it(sky: tuple[RunLog, Site]) -> None:
-    run, site = sky
     # A bank that forgets within seconds holds little by itself.
     chosen = {"monitors": {"channel_reference": "gps", "disabled": ["along_ewma_0p01", "along_ewma_0p001"]}}
-    one = Configuration.model_validate(config(solutions_at_fault="one").model_dump() | chosen)
-    both = Configuration.model_validate(config().model_dump() | chosen)
-    held, free = (replay(run, site, VEHICLE, each).epochs.filter(solution="primary") for each in (one, both))
-    value, threshold = floats(held, "channel_value"), floats(held, "channel_threshold")
-    ahead = floats(held, "undetected_ahead_m")[1:]
-    assert (ahead <= (threshold - value)[1:] + 1e-9).all()
-    assert (ahead <= floats(free, "undetected_ahead_m")[1:] + 1e-9).all()
-    assert (ahead < floats(free, "undetected_ahead_m")[1:] - 0.5).any()
+    one = Configuration.model_validate({"undetected": {"solutions_at_fault": "one"}} | chosen)
+    held, epoch, diagnosis = since_the_start(*sky, VEHICLE, one)
+    free, _, _ = since_the_start(*sky, VEHICLE, Configuration.model_validate(chosen))
+    room = (floats(diagnosis.channel, "threshold") - floats(diagnosis.channel, "value"))[epoch]
+    assert (held <= room + 1e-9).all()
+    assert (held <= free + 1e-9).all()
+    assert (held < free - 0.5).any()
