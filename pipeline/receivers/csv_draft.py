@@ -28,7 +28,7 @@ _NAMES: dict[Stream, dict[str, str]] = {
     },
     "odometer": {
         "distance_m": r"(odo|odometer|distance|dist|weg|strecke|wegstrecke|mileage|km|chainage)(m|km)?",
-        "speed_mps": r"(odo|train|wheel|vehicle)?(speed|velocity|v|geschwindigkeit|vitesse)(mps|kmh|kph)?",
+        "speed_mps": r"(odo|train|wheel|vehicle)?(speed|velocity|v|geschwindigkeit|vitesse)(mps|kmh|kph|mph|kn|knots)?",
     },
 }
 _UNITS = {
@@ -39,7 +39,7 @@ _UNITS = {
 _UNIT_NEEDED = ("distance_m", "speed_mps", "vel_e_mps", "vel_n_mps", "vel_u_mps", "height_m")
 _TIMES = (
     r"(gps|utc|gnss)?(t|time|timestamp|datetime|zeit|zeitstempel|zeitpunkt|utc|datumzeit|datumuhrzeit|heure)"
-    r"(utc|gps|s|ms)?"
+    r"(utc|gps|s|ms|us|ns)?"
 )
 _DATES, _WEEKS = r"(gps|utc)?(date|datum|day|tag)(utc)?", r"(gps|gpst)?(week|wk|wn|weekno|weeknumber|woche)"
 _SECONDS = r"(gps)?(tow|sow|itow|timeofweek|secondsofweek|secofweek|weekseconds|gpsseconds|gpstime|seconds)(s|ms)?"
@@ -86,7 +86,7 @@ def _first(plain: Mapping[str, str], pattern: str) -> str | None:
 def _unit(name: str, log: LogTable) -> str | None:
     """As the header has it in brackets or at its end, or the row of units."""
     told = re.search(r"[\[(<]\s*([^\])>]+?)\s*[\])>]", name) or re.search(
-        r"_(kmh|kph|mps|mph|km|mm|cm|m|ms|s|ft|kn)$", name.lower()
+        r"_(kmh|kph|mps|mph|km|mm|cm|m|ms|s|ft|kn|knots)$", name.lower()
     )
     if told is not None:
         return told[1].lower()
@@ -96,10 +96,12 @@ def _unit(name: str, log: LogTable) -> str | None:
 
 
 def _stream(stream: Stream, table: pl.DataFrame, log: LogTable, file: str, time: list[str]) -> str:
-    plain = {name: word for name, word in _plain(table).items() if table[name].dtype.is_numeric()}
+    named = _plain(table)
+    plain = {name: word for name, word in named.items() if table[name].dtype.is_numeric()}
     found = {column: name for column, pattern in _NAMES[stream].items() if (name := _first(plain, pattern))}
+    unfit = _unfit(stream, table, {name: word for name, word in named.items() if name not in plain})
     if not found or (stream == "gnss" and not set(_POSITION) <= set(found)):
-        return ""
+        return "".join(f"\n{line}" for line in unfit)
     factors, remarks = _factors(found, log)
     scales = [line for line in time if line.startswith("t = ")]
     pairs = ", ".join(f"{column} = {json.dumps(name, ensure_ascii=False)}" for column, name in found.items())
@@ -110,7 +112,20 @@ def _stream(stream: Stream, table: pl.DataFrame, log: LogTable, file: str, time:
     lines += [f"factors = {{ {', '.join(listed)} }}"] if listed else []
     if stream == "gnss" and "height_m" not in found:
         remarks.append("# height_m: only a height over the ellipsoid; one over the sea is another 20 to 60 m in Europe")
-    return "\n".join(["", *lines, *remarks]) + "\n"
+    return "\n".join(["", *lines, *remarks, *unfit]) + "\n"
+
+
+def _unfit(stream: Stream, table: pl.DataFrame, plain: Mapping[str, str]) -> list[str]:
+    """What is left out though its name fits, since it holds texts."""
+    found = {column: name for column, pattern in _NAMES[stream].items() if (name := _first(plain, pattern))}
+    texts = {column: table[name].cast(pl.String).replace("", None).drop_nulls() for column, name in found.items()}
+    wrong = {column: cells.filter(cells.cast(pl.Float64, strict=False).is_null()) for column, cells in texts.items()}
+    return [
+        f"# {column}: left out, since {_one_line(found[column])!r} holds no number in {len(cells)} rows, "
+        f"first {_one_line(str(cells[0]))!r}"
+        for column, cells in wrong.items()
+        if len(cells)
+    ]
 
 
 def _factors(found: Mapping[str, str], log: LogTable) -> tuple[dict[str, float], list[str]]:
@@ -138,7 +153,8 @@ def _time_lines(table: pl.DataFrame, plain: Mapping[str, str], log: LogTable) ->
     time = _first(plain, _TIMES) or date
     if time is None:
         return ['# time = "field:COLUMN"  # no name tells which column is the time']
-    return [_field(time), *_epoch(table[time], log), *_order(table[time])]
+    scale = ['# time_scale = "gps"  # if these times are 18 s ahead of UTC'] if "gps" in plain[time] else []
+    return [_field(time), *_epoch(table[time], log), *_order(table[time]), *scale]
 
 
 def _field(*names: str) -> str:

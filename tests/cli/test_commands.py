@@ -69,6 +69,7 @@ def test_replay_one_run(balise: Balise, small_trial: SmallTrial, tmp_path: Path)
     assert (quiet.status, quiet.out, quiet.err) == (0, "", "")
 
 
+@pytest.mark.usefixtures("in_process")
 def test_quiet_says_what_failed_and_nothing_else(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"")
     given = (tmp_path / "bad.mcap", small_trial.paths[0], "--site", small_trial.site, "--out", tmp_path / "out")
