@@ -8,26 +8,28 @@ import re
 import signal
 import sys
 import traceback
+from collections.abc import Callable
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-import typer
+from typer import Argument, Exit, Option, Typer
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from pipeline.campaign import Summary
     from schemas.config import Configuration, Vehicle
+    from schemas.run import RunLog
+    from schemas.run import Site as Ground
+
+Command = TypeVar("Command", bound=Callable[..., None])
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
 _SHOWN_ELEMENTS = 25
 
-
-def _examples(*lines: str) -> str:
-    """What stands under the help of a command; an empty line keeps each on a line of its own."""
-    return "\n\n".join(["Examples:", *lines])
-
-
-app = typer.Typer(
+app = Typer(
     name="balise",
     help="Replay recorded train journeys and judge whether satellite positioning could have replaced balises.",
     epilog="Exit status: 0 ok; 1 a run failed or is partial, or results differ; 2 wrong usage, configuration or site; "
@@ -37,7 +39,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_NEW_RUN = "The run to write: a folder, or a file *.mcap."
+
+def _command(*examples: str, name: str | None = None) -> Callable[[Command], Command]:
+    """A command with examples under its help; an empty line keeps each on a line of its own."""
+    return app.command(name, epilog="\n\n".join(["Examples:", *examples]))
+
+
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 
@@ -53,73 +60,65 @@ def _here(value: Any) -> Any:
     return value
 
 
-Site = Annotated[
-    str, typer.Option("--site", help="Site: a folder with track, links, balises and route, or a GeoJSON file.")
-]
-Out = Annotated[str, typer.Option("--out", help="Result to write: a folder or an address.")]
-OutFolder = Annotated[Path, typer.Option("--out", callback=_here, help="Folder to write.")]
-VehicleFile = Annotated[Path | None, typer.Option("--vehicle", callback=_here, help="Vehicle file (TOML).")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", callback=_here, help="Configuration file (TOML).")]
+def _cores(jobs: int) -> int:
+    return jobs or os.cpu_count() or 1
+
+
+_place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
+_NEW_RUN = "The run to write: a folder, or a file *.mcap."
+
+Result = Annotated[str, Argument(help="A result of `balise replay`.")]
+ResultFolder = Annotated[Path, _place(help="A result of `balise replay`.")]
+Run = Annotated[str, Argument(help="A recorded run.")]
+Site = Annotated[str, Option(help="Site: a folder with track, links, balises and route, or a GeoJSON file.")]
+LogsSite = Annotated[str | None, Option("--site", help="Site of these logs.")]
+OutFolder = Annotated[Path, _file("--out", help="Folder to write.")]
+VehicleFile = Annotated[Path | None, _file("--vehicle", help="Vehicle file (TOML).")]
+ConfigFile = Annotated[Path | None, _file("--config", help="Configuration file (TOML).")]
 RouteFiles = Annotated[
-    Path | None,
-    typer.Option(
-        "--route", callback=_here, help="Known route: a file for all runs, or a folder with RUN.csv or RUN.parquet."
-    ),
+    Path | None, _file("--route", help="Known route: a file for all runs, or a folder with RUN.csv or RUN.parquet.")
 ]
-FoundRoutes = Annotated[
-    Path | None,
-    typer.Option(
-        "--write-route",
-        callback=_here,
-        help="Folder for the route found of each run; doubtful net elements are marked.",
-    ),
-]
-ResultFolder = Annotated[Path, typer.Argument(callback=_here, help="A result of `balise replay`.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no tables; errors only.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Solution = Annotated[str, Option(help="Solution of the runs.")]
+Jobs = Annotated[int, Option(min=0, callback=_cores, help="Number of runs at the same time; 0: one per core.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no tables; errors only.")]
+Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 
 
 @app.callback(invoke_without_command=True)
 def _about(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version of the program and of its tables.")
-    ] = False,
+    version: Annotated[bool, Option("--version", help="Print the version of the program and of its tables.")] = False,
 ) -> None:
     if version:
         from schemas.version import SOFTWARE
 
         print(SOFTWARE)
-        raise typer.Exit(OK)
+        raise Exit(OK)
 
 
-@app.command(
-    epilog=_examples(
-        "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
-        "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
-    )
+@_command(
+    "balise replay logs/*.mcap --site line9 --out week12 --vehicle train7.toml",
+    "balise replay s3://trial/logs --site line9 --out s3://trial/week12 --jobs 8",
 )
 def replay(
-    runs: Annotated[
-        list[str], typer.Argument(help="Runs: logs, run folders, folders of runs, glob patterns or addresses.")
-    ],
+    runs: Annotated[list[str], Argument(help="Runs: logs, run folders, folders of runs, glob patterns or addresses.")],
     site: Site,
-    out: Out,
+    out: Annotated[str, Option(help="Result to write: a folder or an address.")],
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
-    write_route: FoundRoutes = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
-    scheduler: Annotated[str | None, typer.Option(help="Run on this Dask cluster (tcp://host:port).")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Also replay runs that are already complete.")] = False,
-    time_limit: Annotated[
-        float, typer.Option(min=0.1, help="Seconds that one run may take; a slower run fails.")
-    ] = 3600.0,
+    write_route: Annotated[
+        Path | None, _file(help="Folder for the route found of each run; doubtful net elements are marked.")
+    ] = None,
+    jobs: Jobs = 0,
+    scheduler: Annotated[str | None, Option(help="Run on this Dask cluster (tcp://host:port).")] = None,
+    force: Annotated[bool, Option("--force", help="Also replay runs that are already complete.")] = False,
+    time_limit: Annotated[float, Option(min=0.1, help="Seconds that one run may take; a slower run fails.")] = 3600.0,
     undetected: Annotated[
-        bool, typer.Option("--undetected", help="Also compute the largest error that no monitor would have noticed.")
+        bool, Option("--undetected", help="Also compute the largest error that no monitor would have noticed.")
     ] = False,
     quiet: Quiet = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
+        bool, Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
     ] = False,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
@@ -133,36 +132,25 @@ def replay(
         asked = settings.undetected.model_copy(update={"compute": True})
         settings = settings.model_copy(update={"undetected": asked})
     plan = make_plan(runs, site, out, settings, train, route, write_route, settings_files(config, vehicle))
+    work = partial(run_campaign, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit)
     try:
-        summary = run_campaign(
-            plan,
-            jobs=jobs or os.cpu_count() or 1,
-            scheduler=scheduler,
-            force=force,
-            time_limit_s=time_limit,
-            watches=watches(quiet, as_json),
-        )
+        summary = work(plan, watches=watches(quiet, as_json))
     except Interrupted as interrupted:
         # A terminal that was closed takes no more words.
         with contextlib.suppress(OSError):
             if interrupted.summary is not None:
                 show_summary(interrupted.summary, out, quiet, as_json)
             print("balise: interrupted; repeat the command to continue", file=sys.stderr)
-        raise typer.Exit(128 + interrupted.signum) from None
+        raise Exit(128 + interrupted.signum) from None
     show_summary(summary, out, quiet, as_json)
-    raise typer.Exit(_status_of(summary))
+    raise Exit(_status_of(summary))
 
 
-@app.command(
-    epilog=_examples(
-        "balise dictionary --table hazards",
-        "balise dictionary --markdown > dictionary.md",
-    )
-)
+@_command("balise dictionary --table hazards", "balise dictionary --markdown > dictionary.md")
 def dictionary(
     as_json: Json = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print as one Markdown page.")] = False,
-    table: Annotated[str | None, typer.Option(help="Show this table only.")] = None,
+    markdown: Annotated[bool, Option("--markdown", help="Print as one Markdown page.")] = False,
+    table: Annotated[str | None, Option(help="Show this table only.")] = None,
 ) -> None:
     """List every table with its columns, units and meaning, and every key of the configuration."""
     from schemas.dictionary import dictionary_frame, dictionary_markdown, settings_frame
@@ -174,50 +162,38 @@ def dictionary(
     if as_json:
         _print_json(columns if table else {"columns": columns, "settings": settings_frame()})
         return
-    from pipeline.results.terminal import show_table
-
     for name, rows in columns.group_by("group", "table", maintain_order=True):
-        show_table(rows.drop("group", "table"), f"{name[1]} ({name[0]})")
+        _show(rows.drop("group", "table"), f"{name[1]} ({name[0]})")
         print()
     if table is None:
-        show_table(settings_frame(), "Configuration and vehicle")
+        _show(settings_frame(), "Configuration and vehicle")
 
 
-@app.command(
-    epilog=_examples(
-        "balise demo",
-        "balise demo --out /tmp/demo --seed 7",
-    )
-)
+@_command("balise demo", "balise demo --out /tmp/demo --seed 7")
 def demo(
     out: OutFolder = Path("demo-out"),
-    seed: Annotated[int | None, typer.Option(help="Seed of the trial; another seed gives other noise.")] = None,
+    seed: Annotated[int | None, Option(help="Seed of the trial; another seed gives other noise.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare what was found with what was injected."""
     from datasets.demo import demo as run_demo
     from datasets.demo import write_demo
-    from pipeline.results.terminal import show_table
 
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
     page = write_demo(result, out / "tables")
     if not quiet:
         differing = result.checks.filter(~result.checks["agrees"])
         if differing.height:
-            show_table(differing.drop("title", "agrees"), "What was found differs from what was expected")
+            _show(differing.drop("title", "agrees"), "What was found differs from what was expected")
         print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {page}\n")
-        show_table(result.lines)
+        _show(result.lines)
         print(result.sentence)
-    raise typer.Exit(OK if result.agrees else RUNS_NOT_OK)
+    raise Exit(OK if result.agrees else RUNS_NOT_OK)
 
 
-@app.command(
-    epilog=_examples(
-        "balise synth scenario.toml --out trial",
-    )
-)
+@_command("balise synth scenario.toml --out trial")
 def synth(
-    scenario: Annotated[Path, typer.Argument(callback=_here, help="Scenario (TOML).")],
+    scenario: Annotated[Path, _place(help="Scenario (TOML).")],
     out: OutFolder,
     quiet: Quiet = False,
 ) -> None:
@@ -230,25 +206,18 @@ def synth(
         print(f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
 
 
-@app.command(
-    epilog=_examples(
-        "balise safety",
-        "balise safety week12",
-        "balise safety week12 --config other_level.toml --json",
-    )
-)
+@_command("balise safety", "balise safety week12", "balise safety week12 --config other_level.toml --json")
 def safety(
     out: Annotated[
-        str | None, typer.Argument(help="Result of `balise replay` to assess; without it: the budget only.")
+        str | None, Argument(help="Result of `balise replay` to assess; without it: the budget only.")
     ] = None,
     config: ConfigFile = None,
     logs: Annotated[
-        list[str] | None,
-        typer.Option("--logs", help="Logs to replay with other limits, for the sensitivity of the verdict."),
+        list[str] | None, Option(help="Logs to replay with other limits, for the sensitivity of the verdict.")
     ] = None,
-    site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
+    site: LogsSite = None,
     vehicle: VehicleFile = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
+    jobs: Jobs = 0,
     as_json: Json = False,
 ) -> None:
     """Print the safety budget and its errata; for a result also its sources and each measured figure with bounds.
@@ -261,49 +230,34 @@ def safety(
         from pipeline.safety.assessment import assess, show
 
         settings = None if config is None else _configuration(config)
-        replay_again = again(logs or [], site, _vehicle(vehicle), jobs or os.cpu_count() or 1)
-        show(assess(out, settings, replay_again), as_json)
+        show(assess(out, settings, again(logs or [], site, _vehicle(vehicle), jobs)), as_json)
         return
     from pipeline.results.terminal import show_tables
     from pipeline.safety import safety_tables
 
-    settings = _configuration(config)
-    tables = safety_tables(settings.safety)
-    if as_json:
-        _print_json(tables)
-        return
-    show_tables(tables)
+    tables = safety_tables(_configuration(config).safety)
+    _print_json(tables) if as_json else show_tables(tables)
 
 
-@app.command(
-    epilog=_examples(
-        "balise claim week12 --site line9",
-        "balise claim week12 --site line9 --profile newer.toml --csv claim.csv",
-    )
-)
+@_command("balise claim week12 --site line9", "balise claim week12 --site line9 --profile newer.toml --csv claim.csv")
 def claim(
-    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    profile: Annotated[str, typer.Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
-    site: Annotated[str | None, typer.Option("--site", help="Site with areas.csv or areas.parquet.")] = None,
+    out: Result,
+    profile: Annotated[str, Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
+    site: Annotated[str | None, Option(help="Site with areas.csv or areas.parquet.")] = None,
     front_ahead: Annotated[
-        float,
-        typer.Option("--front-ahead", metavar="METRES", help="Distance of the front end ahead of the balise antenna."),
+        float, Option(metavar="METRES", help="Distance of the front end ahead of the balise antenna.")
     ] = 0.0,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="FILE", help="Write all columns as CSV; `-` is standard output.")
-    ] = None,
+    csv: Annotated[Path | None, _file(metavar="FILE", help="Write all columns as CSV; `-` is standard output.")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.claim import claim as hold
     from pipeline.claim import for_reading, load_profile, read_areas
     from pipeline.results.answer_files import write_csv
-    from pipeline.results.terminal import show_table
-    from pipeline.site.read import read_site
 
     wanted = load_profile(profile)
-    ground = None if site is None else read_site(site)
-    areas = None if site is None or ground is None else read_areas(site, ground)
+    ground = _ground(site) if site else None
+    areas = read_areas(site, ground) if site and ground else None
     found = hold(out, wanted, ground, areas, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
@@ -311,23 +265,15 @@ def claim(
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         _print_json({**head, "notes": found.notes, "requirements": found.table})
     elif str(csv) != "-":
-        show_table(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
+        _show(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
         print("\n".join(["", *found.notes]))
 
 
-@app.command(
-    epilog=_examples(
-        "balise inspect monday.mcap",
-        "balise inspect line9",
-        "balise inspect line9 --result week12",
-    )
-)
+@_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12")
 def inspect(
-    path: Annotated[str, typer.Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
-    result: Annotated[
-        str | None, typer.Option("--result", help="Result of runs on this site, to check its survey.")
-    ] = None,
-    site: Annotated[str | None, typer.Option("--site", help="Site to compare a log with.")] = None,
+    path: Annotated[str, Argument(help="A log, a CSV file, a site, or a result of `balise replay`.")],
+    result: Annotated[str | None, Option(help="Result of runs on this site, to check its survey.")] = None,
+    site: Annotated[str | None, Option(help="Site to compare a log with.")] = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     as_json: Json = False,
@@ -344,101 +290,81 @@ def inspect(
         show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
         if STARTING_CONFIG in tables:  # to be saved, so without a frame
             print("\n".join(tables[STARTING_CONFIG]["toml"]))
-    raise typer.Exit(RUNS_NOT_OK if "Problems" in tables else OK)
+    raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
-@app.command(
-    epilog=_examples(
-        "balise inject monday.mcap --fault ramp.toml --out monday_ramp.mcap",
-    )
-)
+@_command("balise inject monday.mcap --fault ramp.toml --out monday_ramp.mcap")
 def inject(
-    run: Annotated[str, typer.Argument(help="A recorded run.")],
-    fault: Annotated[Path, typer.Option("--fault", callback=_here, help="Fault file (TOML).")],
-    out: Annotated[Path, typer.Option("--out", callback=_here, help=_NEW_RUN)],
-    site: Annotated[str | None, typer.Option("--site", help="Site, for faults along its track.")] = None,
+    run: Run,
+    fault: Annotated[Path, _file(help="Fault file (TOML).")],
+    out: Annotated[Path, _file(help=_NEW_RUN)],
+    site: Annotated[str | None, Option(help="Site, for faults along its track.")] = None,
     config: ConfigFile = None,
 ) -> None:
     """Add a known fault to a recorded run, to measure detection on real noise."""
     from datasets.inject import inject_all, load_faults
     from datasets.trial import write_run_as
-    from pipeline.ingest import read_run
-    from pipeline.site.read import read_site
     from schemas.errors import UsageError
 
-    settings = _configuration(config)
     faults = load_faults(fault)
     if out.resolve() == Path(run).resolve():
         raise UsageError("is the recording itself", place=str(out), remedy="Name another place with --out.")
-    log = read_run(run, settings.ingest, with_digest=False)
-    write_run_as(inject_all(log, faults, None if site is None else read_site(site)), out)
+    log = _log(run, _configuration(config))
+    write_run_as(inject_all(log, faults, _ground(site) if site else None), out)
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
-@app.command(
-    epilog=_examples(
-        "balise undetected monday.mcap --site line9 --out worst --balise VB07",
-    )
-)
+@_command("balise undetected monday.mcap --site line9 --out worst --balise VB07")
 def undetected(
-    run: Annotated[str, typer.Argument(help="A recorded run.")],
+    run: Run,
     site: Site,
-    out: Annotated[Path, typer.Option("--out", callback=_here, help="Folder for the fault file and its profile.")],
+    out: Annotated[Path, _file(help="Folder for the fault file and its profile.")],
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
-    solution: Annotated[str, typer.Option(help="Solution of the run.")] = "primary",
-    balise: Annotated[
-        str | None, typer.Option(help="Place: where the run passes this balise; default: its end.")
-    ] = None,
-    at_s: Annotated[float | None, typer.Option(help="Place: this many seconds after the first epoch.")] = None,
-    behind: Annotated[bool, typer.Option("--behind", help="An error behind the train instead of ahead.")] = False,
+    solution: Solution = "primary",
+    balise: Annotated[str | None, Option(help="Place: where the run passes this balise; default: its end.")] = None,
+    at_s: Annotated[float | None, Option(help="Place: this many seconds after the first epoch.")] = None,
+    behind: Annotated[bool, Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
     from datasets.undetected import largest_fault, write_fault
-    from pipeline.ingest import read_run
-    from pipeline.site.read import read_site
 
     settings, train = _configuration(config), _vehicle(vehicle)
-    log = read_run(run, settings.ingest, with_digest=False)
-    found = largest_fault(log, read_site(site), train, settings, solution, balise, at_s, behind)
+    log = _log(run, settings)
+    found = largest_fault(log, _ground(site), train, settings, solution, balise, at_s, behind)
     one = settings.undetected.solutions_at_fault == "one"
     file = write_fault(found, solution if one else None, out)
     began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
     print(
-        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most."
+        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most.\n"
+        f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.\n"
+        f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.\n"
+        f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2."
     )
-    print(f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.")
-    print(f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.")
-    print(f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
-@app.command(
-    epilog=_examples(
-        "balise convert receiver.ubx --to monday",
-        "balise convert rover.pos --to monday --stream reference",
-        "balise convert second.sbf.gz --to monday --solution second",
-        "balise convert positions.csv --config columns.toml --to monday.mcap",
-    )
+@_command(
+    "balise convert receiver.ubx --to monday",
+    "balise convert rover.pos --to monday --stream reference",
+    "balise convert second.sbf.gz --to monday --solution second",
+    "balise convert positions.csv --config columns.toml --to monday.mcap",
 )
 def convert(
     logs: Annotated[
         list[Path],
-        typer.Argument(
-            callback=_here,
+        _place(
             help="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, ROS bags, MCAP, CSV with a mapping in --config, or a public "
-            "recording; .gz and .zip of these.",
+            "recording; .gz and .zip of these."
         ),
     ],
-    to: Annotated[
-        Path, typer.Option("--to", callback=_here, help=_NEW_RUN + " To one that exists, streams are added.")
-    ],
+    to: Annotated[Path, _file(help=_NEW_RUN + " To one that exists, streams are added.")],
     config: ConfigFile = None,
-    solution: Annotated[str | None, typer.Option(help="Name of the receiver in the run, where it has several.")] = None,
-    stream: Annotated[Literal["gnss", "reference"], typer.Option(help="What the positions are for.")] = "gnss",
+    solution: Annotated[str | None, Option(help="Name of the receiver in the run, where it has several.")] = None,
+    stream: Annotated[Literal["gnss", "reference"], Option(help="What the positions are for.")] = "gnss",
     date: Annotated[
-        datetime | None, typer.Option(formats=["%Y-%m-%d"], help="Day of an NMEA log that holds none (UTC).")
+        datetime | None, Option(formats=["%Y-%m-%d"], help="Day of an NMEA log that holds none (UTC).")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a stream or solution that the run has.")] = False,
+    force: Annotated[bool, Option("--force", help="Replace a stream or solution that the run has.")] = False,
 ) -> None:
     """Convert receiver logs to a run, or add streams to a run."""
     from datasets.recordings import known_recording
@@ -468,34 +394,30 @@ def convert(
         print(line)
 
 
-@app.command(
-    "site",
-    epilog=_examples(
-        "balise site line.gpx --balises every 1000 --out line9",
-        "balise site railways.geojson --balises wanted.csv --out line9",
-    ),
+@_command(
+    "balise site line.gpx --balises every 1000 --out line9",
+    "balise site railways.geojson --balises wanted.csv --out line9",
+    name="site",
 )
 def make_a_site(
     surveys: Annotated[
-        list[Path],
-        typer.Argument(callback=_here, help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions."),
+        list[Path], _place(help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions.")
     ],
     out: OutFolder,
     balises: Annotated[
-        str | None, typer.Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
+        str | None, Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
     ] = None,
-    epsg: Annotated[int | None, typer.Option(help="Of x and y in tables that do not say.")] = None,
-    join: Annotated[float, typer.Option(help="Ends of lines within so many metres meet.")] = 0.05,
-    flat: Annotated[bool, typer.Option("--flat", help="Leave heights out.")] = False,
+    epsg: Annotated[int | None, Option(help="Of x and y in tables that do not say.")] = None,
+    join: Annotated[float, Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    flat: Annotated[bool, Option("--flat", help="Leave heights out.")] = False,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a site that is there.")] = False,
+    force: Annotated[bool, Option("--force", help="Replace a site that is there.")] = False,
     as_json: Json = False,
 ) -> None:
     """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
     from pipeline.report.site_page import site_page
     from pipeline.results.inspection import findings_table
-    from pipeline.results.terminal import show_table
     from pipeline.site.describe import elements_table
     from pipeline.survey.make import make_site, wish_of, write_made
 
@@ -506,128 +428,96 @@ def make_a_site(
     if as_json:
         _print_json({"elements": elements, "findings": findings, "balises": site.balises})
         return
-    show_table(elements.head(_SHOWN_ELEMENTS), "Elements")
-    show_table(findings, "Findings")
+    _show(elements.head(_SHOWN_ELEMENTS), "Elements")
+    _show(findings, "Findings")
     count = 0 if site.balises is None else site.balises.height
     print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
     print(f"Look at {out / 'site.html'} before you replay on it.")
 
 
-@app.command(
-    epilog=_examples(
-        "balise calibrate good/*.mcap --site line9 --out train7.toml",
-    )
-)
+@_command("balise calibrate good/*.mcap --site line9 --out train7.toml")
 def calibrate(
-    runs: Annotated[list[str], typer.Argument(help="Fault-free runs: paths, folders, glob patterns.")],
+    runs: Annotated[list[str], Argument(help="Fault-free runs: paths, folders, glob patterns.")],
     site: Site,
-    out: Annotated[Path, typer.Option("--out", callback=_here, help="Vehicle file to write.")],
+    out: Annotated[Path, _file(help="Vehicle file to write.")],
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
-    solution: Annotated[str, typer.Option(help="Solution of the runs to measure on.")] = "primary",
+    solution: Solution = "primary",
     as_json: Json = False,
 ) -> None:
     """Measure odometer scale, GNSS latency and the monitors' sigmas on fault-free runs."""
     from pipeline.calibration.calibrate import calibrate as measure
     from pipeline.campaign import find_runs
-    from pipeline.ingest import read_run
-    from pipeline.results.terminal import show_table
-    from pipeline.site.read import read_site
     from pipeline.storage import write_bytes
     from schemas.config import to_toml
 
-    settings, train = _configuration(config), _vehicle(vehicle)
-    logs = [read_run(address, settings.ingest, with_digest=False) for address in find_runs(runs).values()]
-    found = measure(logs, read_site(site), train, settings, solution)
+    settings = _configuration(config)
+    logs = [_log(address, settings) for address in find_runs(runs).values()]
+    found = measure(logs, _ground(site), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     if as_json:
         measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
         _print_json({**measured, "runs": found.runs, "sigmas": found.sigmas})
         return
-    show_table(found.runs, "Scale and latency")
-    show_table(found.sigmas, "Sigma of the monitors")
+    _show(found.runs, "Scale and latency")
+    _show(found.sigmas, "Sigma of the monitors")
     if found.vehicle.gnss_latency_s is None:
         print("\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few.")
     print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
 
 
-@app.command(
-    epilog=_examples(
-        "balise experiment list",
-        "balise experiment diagnostics --repetitions 50",
-    )
-)
+@_command("balise experiment list", "balise experiment diagnostics --repetitions 50")
 def experiment(
-    name: Annotated[str, typer.Argument(help="Name of the experiment; `list` prints all names.")],
+    name: Annotated[str, Argument(help="Name of the experiment; `list` prints all names.")],
     out: OutFolder = Path("experiment-out"),
-    repetitions: Annotated[
-        int | None, typer.Option(min=1, help="Number of repetitions; default: the published number.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
-    jobs: Annotated[int, typer.Option(min=0, help="Number of processes; 0: one per core.")] = 0,
-    config: Annotated[
-        Path | None,
-        typer.Option("--config", callback=_here, help="Monitor bank to assess (`rare`, `bank`, `catalogue` only)."),
-    ] = None,
+    repetitions: Annotated[int | None, Option(min=1, help="Number of repetitions; default: as published.")] = None,
+    seed: Annotated[int, Option(help="Seed of all random numbers.")] = 1,
+    jobs: Annotated[int, Option(min=0, callback=_cores, help="Number of processes; 0: one per core.")] = 0,
+    config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue` only).")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Repeat a published experiment, by default with its own number of runs."""
     from datasets.experiment import EXPERIMENTS
-    from schemas.errors import UsageError
 
     if name == "list":
         print("\n".join(EXPERIMENTS))
         return
     if name not in EXPERIMENTS:
+        from schemas.errors import UsageError
         from schemas.near import did_you_mean
 
-        raise UsageError(
-            f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=", ".join(EXPERIMENTS)
-        )
+        known = ", ".join(EXPERIMENTS)
+        raise UsageError(f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=known)
     from pipeline.campaign.workers import watched
     from pipeline.results.terminal import how_far
 
     bank = None if config is None else _configuration(config)
     with watched(None if quiet else how_far("pieces of work")):
-        written = EXPERIMENTS[name](out, repetitions, seed, jobs or os.cpu_count() or 1, bank)
-    for path in written:
-        print(path)
+        print(*EXPERIMENTS[name](out, repetitions, seed, jobs, bank), sep="\n")
 
 
-@app.command(
-    epilog=_examples(
-        'balise sql week12 "SHOW TABLES"',
-        'balise sql week12 "SELECT run_id, verdict FROM runs" --csv runs.csv',
-        'balise sql week12 "SELECT r.run_id, r.verdict, o.verdict FROM runs r JOIN old_runs o USING (run_id)"'
-        " --with old=week11",
-    )
+@_command(
+    'balise sql week12 "SHOW TABLES"',
+    'balise sql week12 "SELECT run_id, verdict FROM runs" --csv runs.csv',
+    'balise sql week12 "SELECT r.run_id, r.verdict, o.verdict FROM runs r JOIN old_runs o USING (run_id)"'
+    " --with old=week11",
 )
 def sql(
-    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    query: Annotated[str, typer.Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
+    out: Result,
+    query: Annotated[str, Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
     beside: Annotated[
         list[str] | None,
-        typer.Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
+        Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="FILE", callback=_here, help="Write CSV; `-` is standard output.")
-    ] = None,
-    parquet: Annotated[
-        Path | None, typer.Option("--parquet", metavar="FILE", callback=_here, help="Write Parquet.")
-    ] = None,
-    xlsx: Annotated[
-        Path | None,
-        typer.Option("--xlsx", metavar="FILE", callback=_here, help="Write an Excel workbook (extra `excel`)."),
-    ] = None,
+    csv: Annotated[Path | None, _file(metavar="FILE", help="Write CSV; `-` is standard output.")] = None,
+    parquet: Annotated[Path | None, _file(metavar="FILE", help="Write Parquet.")] = None,
+    xlsx: Annotated[Path | None, _file(metavar="FILE", help="Write an Excel workbook (extra `excel`).")] = None,
     as_json: Json = False,
-    allow_files: Annotated[
-        bool, typer.Option("--allow-files", help="Let the query read other files (`read_csv`).")
-    ] = False,
+    allow_files: Annotated[bool, Option("--allow-files", help="Let the query read other files (`read_csv`).")] = False,
 ) -> None:
     """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
     from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
     from pipeline.results.query import named_results, run_sql
-    from pipeline.results.terminal import show_table
 
     answer = run_sql(out, query, allow_files, named_results(beside or []))
     written = [(csv, write_csv), (parquet, write_parquet), (xlsx, write_xlsx)]
@@ -639,18 +529,14 @@ def sql(
     if as_json:
         _print_json(answer)
     elif all(file is None for file, _ in written):
-        show_table(answer)
+        _show(answer)
 
 
-@app.command(
-    epilog=_examples(
-        "balise report week12 --site line9",
-    )
-)
+@_command("balise report week12 --site line9")
 def report(
     out: ResultFolder,
-    site: Annotated[str | None, typer.Option("--site", help="Site, for plans of the track.")] = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
+    site: Annotated[str | None, Option(help="Site, for plans of the track.")] = None,
+    jobs: Annotated[int, Option(min=0, help="Pages at the same time; 0: one per core if there are many.")] = 0,
     quiet: Quiet = False,
 ) -> None:
     """Write HTML pages for the campaign and each run. They open offline.
@@ -659,103 +545,77 @@ def report(
     """
     from pipeline.report import write_report
     from pipeline.results.terminal import how_far
-    from pipeline.site.read import read_site
 
-    place = None if site is None else read_site(site)
-    pages = write_report(out, place, jobs, None if quiet else how_far("pages"))
+    pages = write_report(out, _ground(site) if site else None, jobs, None if quiet else how_far("pages"))
     if not quiet:
         print(f"{len(pages)} files; begin with {pages[0]}")
 
 
-@app.command(
-    epilog=_examples(
-        "balise line week12 --site line9",
-        "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
-    )
+@_command(
+    "balise line week12 --site line9",
+    "balise line week12 --site line9 --criteria ours.toml --points signals.csv --out placing",
 )
 def line(
     out: ResultFolder,
-    site: Annotated[str, typer.Option("--site", help="Site that the runs were replayed on.")],
-    criteria: Annotated[Path | None, typer.Option("--criteria", callback=_here, help="Criteria (TOML).")] = None,
-    points: Annotated[
-        Path | None,
-        typer.Option("--points", callback=_here, help="Stations and signals: CSV with name, netelement_id, measure_m."),
-    ] = None,
-    solution: Annotated[
-        str | None, typer.Option(help="Solution of the runs; `primary` where there are several.")
-    ] = None,
-    to: Annotated[
-        Path | None, typer.Option("--out", callback=_here, help="Folder to write; by default OUT/line.")
-    ] = None,
+    site: Annotated[str, Option(help="Site that the runs were replayed on.")],
+    criteria: Annotated[Path | None, _file(help="Criteria (TOML).")] = None,
+    points: Annotated[Path | None, _file(help="Stations and signals: CSV with name, netelement_id, measure_m.")] = None,
+    solution: Annotated[str | None, Option(help="Solution of the runs; `primary` where there are several.")] = None,
+    to: Annotated[Path | None, _file("--out", help="Folder to write; by default OUT/line.")] = None,
     as_json: Json = False,
 ) -> None:
     """Say of each piece of track whether virtual balises may be placed there, and propose some."""
     from pipeline.line import write_line
     from pipeline.line.write import read_points
-    from pipeline.results.terminal import show_table
-    from pipeline.site.read import read_site
     from schemas.config import load_settings
     from schemas.line import LineCriteria
 
     given = None if points is None else read_points(points)
-    found = write_line(out, read_site(site), load_settings(criteria, LineCriteria), solution, given, to)
+    found = write_line(out, _ground(site), load_settings(criteria, LineCriteria), solution, given, to)
     if as_json:
         _print_json({"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)})
         return
-    show_table(found.summary, "Pieces of track")
-    show_table(found.proposals, "Proposals")
+    _show(found.summary, "Pieces of track")
+    _show(found.proposals, "Proposals")
     print("\n".join(found.remarks))
     print(f"{len(found.files)} files; begin with {found.files[0]}")
 
 
-@app.command(
-    epilog=_examples(
-        "balise export week12 monday --to monday.mcap --site line9",
-        "balise export week12 monday --to monday.geojson",
-    )
+@_command(
+    "balise export week12 monday --to monday.mcap --site line9", "balise export week12 monday --to monday.geojson"
 )
 def export(
     out: ResultFolder,
-    run: Annotated[str, typer.Argument(help="Id of the run.")],
-    to: Annotated[
-        Path, typer.Option("--to", callback=_here, help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")
-    ],
-    site: Annotated[str | None, typer.Option("--site", help="Site, for positions on the ground.")] = None,
-    log: Annotated[str | None, typer.Option("--log", help="The recorded run, for its raw positions.")] = None,
-    ros: Annotated[bool, typer.Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
+    run: Annotated[str, Argument(help="Id of the run.")],
+    to: Annotated[Path, _file(help="F.mcap (with a Foxglove layout), F.geojson or F.gpx.")],
+    site: Annotated[str | None, Option(help="Site, for positions on the ground.")] = None,
+    log: Annotated[str | None, Option(help="The recorded run, for its raw positions.")] = None,
+    ros: Annotated[bool, Option("--ros", help="ROS 2 messages instead of Foxglove's protobuf.")] = False,
     config: ConfigFile = None,
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
     from pipeline.export import export_run
     from pipeline.ingest.run import read_run
-    from pipeline.site.read import read_site
 
-    settings = _configuration(config)
-    ground = None if site is None else read_site(site)
-    recorded = None if log is None else read_run(log, settings.ingest)
+    recorded = read_run(log, _configuration(config).ingest) if log else None
+    ground = _ground(site) if site else None
     files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
     print("Wrote " + " and ".join(str(path) for path in files))
     for text in missing:
         print(f"Without {text}")
 
 
-@app.command(
-    epilog=_examples(
-        "balise verify week12",
-        "balise verify week12 --logs logs --site line9 --vehicle train7.toml",
-    )
-)
+@_command("balise verify week12", "balise verify week12 --logs logs --site line9 --vehicle train7.toml")
 def verify(
-    out: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
+    out: Result,
     logs: Annotated[
-        list[str] | None,
-        typer.Option("--logs", help="Logs to replay again and compare: paths, folders, glob patterns."),
+        list[str] | None, Option(help="Logs to replay again and compare: paths, folders, glob patterns.")
     ] = None,
-    site: Annotated[str | None, typer.Option("--site", help="Site of these logs.")] = None,
+    site: LogsSite = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
-    jobs: Annotated[int, typer.Option(min=0, help="Number of runs at the same time; 0: one per core.")] = 0,
+    jobs: Jobs = 0,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -764,7 +624,7 @@ def verify(
     from pipeline.campaign.verify import recompute
     from pipeline.campaign.verify import verify as compare
     from pipeline.results.store import read_config
-    from pipeline.results.terminal import how_far, show_table
+    from pipeline.results.terminal import how_far
     from schemas.errors import UsageError
 
     found = [compare(out, None if quiet else how_far("runs"))]
@@ -773,29 +633,22 @@ def verify(
             raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
         settings = _configuration(config) if config else read_config(out)
         train = _vehicle(vehicle)
-        found.append(
-            recompute(out, lambda to: make_plan(logs, site, to, settings, train, route), jobs or os.cpu_count() or 1)
-        )
+        found.append(recompute(out, lambda to: make_plan(logs, site, to, settings, train, route), jobs))
     if as_json:
         _print_json([{"compared": one.compared, "problems": one.table} for one in found])
     for one in found if not as_json else []:
         if one.problems:
-            show_table(one.table)
+            _show(one.table)
         if one.problems or not quiet:
             print(one.sentence)
-    raise typer.Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
+    raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
 
 
-@app.command(
-    epilog=_examples(
-        "balise diff week11 week12",
-        "balise diff week11 week12 --detail",
-    )
-)
+@_command("balise diff week11 week12", "balise diff week11 week12 --detail")
 def diff(
-    out_a: Annotated[str, typer.Argument(help="A result of `balise replay`.")],
-    out_b: Annotated[str, typer.Argument(help="The result to compare it with.")],
-    detail: Annotated[bool, typer.Option("--detail", help="Also list every changed value.")] = False,
+    out_a: Result,
+    out_b: Annotated[str, Argument(help="The result to compare it with.")],
+    detail: Annotated[bool, Option("--detail", help="Also list every changed value.")] = False,
     as_json: Json = False,
 ) -> None:
     """Compare two results; exit status 1 if they differ."""
@@ -806,7 +659,7 @@ def diff(
         _print_json(found.as_dict())
     else:
         print(found.text(detail))
-    raise typer.Exit(OK if found.same else RUNS_NOT_OK)
+    raise Exit(OK if found.same else RUNS_NOT_OK)
 
 
 def main() -> None:
@@ -857,6 +710,24 @@ def _vehicle(file: Path | None) -> Vehicle:
     from schemas.config import Vehicle, load_settings
 
     return load_settings(file, Vehicle)
+
+
+def _log(address: str, settings: Configuration) -> RunLog:
+    from pipeline.ingest import read_run
+
+    return read_run(address, settings.ingest, with_digest=False)
+
+
+def _ground(site: str) -> Ground:
+    from pipeline.site.read import read_site
+
+    return read_site(site)
+
+
+def _show(table: pl.DataFrame, title: str = "") -> None:
+    from pipeline.results.terminal import show_table
+
+    show_table(table, title)
 
 
 def _say(text: str) -> None:

@@ -66,6 +66,7 @@ class Aligned(Positions):
     confidence_m = real("m", "half-width of the confidence interval along the track", min=0)
     along_m = real("m", "path position without the way that a curve adds beside the track: for increments")
     odometer_m = real("m", "odometer distance along growing path, scale corrected, 0 at the first epoch")
+    travelled_m = real("m", "way driven since the first epoch by the odometer, turns included, scale corrected", min=0)
     odometer_reason = text("why there is no odometer", nullable=True)
     odometer_segment = dy.Int64(min=0, description="continuity segment: distances compare where it is the same")
     odometer_white_m2_per_s = real("m2/s", "variance that the odometer's distance gathers in a second", min=0)

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +45,8 @@ _SLOW = (
     "ingest/test_fuzz.py",
     "ingest/test_hostile.py",
     "ingest/test_json.py",
+    "judge/test_clean.py",
+    "judge/test_defects.py",
     "judge/test_ladder.py",
     "lds/test_outages.py",
     "line",
@@ -66,6 +73,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
 
 
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Campaigns and pages are made here: for tests that are not about workers, which take seconds to start."""
+    from pipeline.campaign import run, workers
+    from pipeline.campaign.serial import SerialEngine
+
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", lambda count, mp_context: contextlib.nullcontext(_Here()))
+
+
+class _Here:
+    """Does pieces of work here, each on a copy as a process would get it."""
+
+    def map(self, function: Callable[[object], object], tasks: Sequence[object]) -> Iterator[object]:
+        for task in tasks:
+            work, given = pickle.loads(pickle.dumps((function, task)))
+            yield pickle.loads(pickle.dumps(work(given)))
+
+
 @dataclass(frozen=True)
 class SmallTrial:
     """Four short cuts of one journey, and the site they are on."""
@@ -86,13 +113,39 @@ def cut(run: RunLog, run_id: str, begin_s: int, length_s: int = _LENGTH_S) -> Ru
     return RunLog(run_id=run_id, gnss=run.gnss.filter(inside), odometer=odometer)
 
 
+Shared = Callable[[str, Callable[[Path], object]], Path]
+"""Name of a folder, and what fills it; gives the folder, which is not to be changed."""
+
+
 @pytest.fixture(scope="session")
-def small_trial(tmp_path_factory: pytest.TempPathFactory) -> SmallTrial:
-    folder = tmp_path_factory.mktemp("small-trial")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """A folder that is made once, by whichever of the test processes needs it first."""
+    top = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        top = top.parent
+
+    def folder(name: str, fill: Callable[[Path], object]) -> Path:
+        with (top / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (top / name).exists():
+                (top / f"{name}.part").mkdir()
+                fill(top / f"{name}.part")
+                (top / f"{name}.part").rename(top / name)
+        return top / name
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_trial(shared: Shared) -> SmallTrial:
+    folder = shared("small-trial", _write_small_trial)
+    return SmallTrial(folder / "site", folder / "runs")
+
+
+def _write_small_trial(folder: Path) -> None:
     scenario = demo_scenario()
     spec = next(run for run in scenario.runs if run.id == "outage")
     run = build_run(scenario, spec)
     write_site(build_site(scenario), folder / "site")
     for number in range(4):
         write_run_log(cut(run, f"run{number}", 40 + 15 * number), folder / "runs")
-    return SmallTrial(folder / "site", folder / "runs")

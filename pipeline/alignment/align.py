@@ -7,18 +7,18 @@ import polars as pl
 
 from pipeline.alignment.estimates import Estimates, stamp_jitter_s
 from pipeline.alignment.learning import learn
-from pipeline.monitors.along import most_scatter_m
+from pipeline.epochs.verdicts import NO_ODOMETER, first_reason
+from pipeline.monitors.axis import most_scatter_m
 from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
 
-NO_ODOMETER = "no odometer"
 BEYOND_SPAN = "outside the odometer's time span"
 INTERRUPTED = "odometer interrupted or slipping"
 _OF_ODOMETER = (
-    *("along_m", "odometer_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m", "odometer_period_s"),
-    *("odometer_scale", "scale_sigma"),
+    *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
+    *("odometer_period_s", "odometer_scale", "scale_sigma"),
 )
 
 
@@ -94,25 +94,22 @@ def _columns(
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
     rows = np.flatnonzero(known)
-    step = np.zeros(known.size)
+    step, driven = np.zeros((2, known.size))
     step[rows] = odometry.increments(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows]).distance_m
-    total = np.where(known, np.cumsum(step), np.nan)
+    driven[rows] = odometry.driven(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows])
+    total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
     speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
     rows_m = np.minimum(odometry.row_sigma_m(at), most_scatter_m(config))
     turning = speed
     if rows_m.any():
         held = with_hysteresis(total, hysteresis_m(rows_m, config.align))
         turning = speed_of_positions(at, held, config.align.speed_window_s)
-    reason = (
-        pl.when(pl.Series(known))
-        .then(None)
-        .when(pl.Series((at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])))
-        .then(pl.lit(INTERRUPTED))
-        .otherwise(pl.lit(BEYOND_SPAN))
-    )
+    inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
+    reason = first_reason((~known & inside, INTERRUPTED), (~known, BEYOND_SPAN))
     return [
         pl.Series("odometer_m", total, nan_to_null=True),
-        pl.select(reason.alias("odometer_reason")).to_series(),
+        pl.Series("travelled_m", travelled, nan_to_null=True),
+        reason.alias("odometer_reason"),
         pl.Series("odometer_segment", odometry.segment_at_s(at)),
         pl.Series("stamp_jitter_s", np.full(known.size, jitter_s)),
         pl.Series("odometer_white_m2_per_s", np.full(known.size, odometry.noise.white_m2_per_s)),

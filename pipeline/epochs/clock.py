@@ -47,7 +47,16 @@ def usable() -> pl.Expr:
     return pl.col("path_m").is_not_null() & pl.col("on_track")
 
 
+def unambiguous(config: Configuration) -> pl.Expr:
+    """The track of the position is not in doubt by what the train knew then."""
+    return pl.col("gate_probability") >= config.matching.ambiguity_probability
+
+
+def confident(config: Configuration) -> pl.Expr:
+    """The confidence interval along the track is within its limit."""
+    return pl.col("confidence_m") <= config.lds.ci_limit_m
+
+
 def trusted(config: Configuration) -> pl.Expr:
     """An epoch whose position is valid, confident and unambiguous (CONTRACT section 3, `mtbf_h`)."""
-    confident = pl.col("confidence_m") <= config.lds.ci_limit_m
-    return usable() & confident & (pl.col("gate_probability") >= config.matching.ambiguity_probability)
+    return usable() & confident(config) & unambiguous(config)

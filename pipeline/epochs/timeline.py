@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
+from schemas.config import LdsConfig
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,19 @@ def nominal_period_s(t_ns: Ints) -> float | None:
     return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else None
 
 
-def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
-    """Longest distance of epochs [s] that is not yet a gap (CONTRACT section 3, `outages`)."""
-    return min(gap_reset_s, max(1.5 * (period_s or 0.0), 1.0))
-
-
 def linking_gap_s(period_s: float | None, crossing_gap_s: float = 1.0) -> float:
     """Longest time between epochs [s] over which a movement is interpolated (DOMAIN section 4)."""
     return max(1.5 * (period_s or 0.0), crossing_gap_s)
+
+
+def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:
+    """The same of these epochs, as configured [ns]: for so long at most a position stands for what comes before it."""
+    return round(linking_gap_s(nominal_period_s(t_ns), lds.crossing_gap_s) * NS_PER_S)
+
+
+def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
+    """Longest distance of epochs [s] that is not yet a gap (CONTRACT section 3, `outages`)."""
+    return min(gap_reset_s, linking_gap_s(period_s))
 
 
 def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:

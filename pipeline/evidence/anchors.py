@@ -8,8 +8,9 @@ from typing import Self
 import numpy as np
 import polars as pl
 
-from pipeline.evidence.carrying import Anchor, Odometer
+from pipeline.evidence.carrying import Anchor
 from pipeline.evidence.routes import Place, Route, routes_of_path
+from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
@@ -113,7 +114,7 @@ class Coverage:
     end: Anchor
 
 
-def coverages(reference: ReferencePlaces | None, odometer: Odometer | None, config: HazardConfig) -> list[Coverage]:
+def coverages(reference: ReferencePlaces | None, odometer: Odometry | None, config: HazardConfig) -> list[Coverage]:
     """The times that the reference covers."""
     if reference is None or reference.t_ns.size == 0:
         return []
@@ -130,7 +131,7 @@ def coverages(reference: ReferencePlaces | None, odometer: Odometer | None, conf
 
 
 def lost_spans(reference: ReferencePlaces | None, config: HazardConfig) -> list[tuple[int, int]]:
-    """Times at which the reference was heard and lay nowhere [ns]: nobody knows where the train was then."""
+    """Times at which the reference was heard and lay nowhere [ns], ends left out: nobody knows where the train was."""
     if reference is None:
         return []
     gap_ns = round(config.reference_gap_s * NS_PER_S)
@@ -139,7 +140,7 @@ def lost_spans(reference: ReferencePlaces | None, config: HazardConfig) -> list[
         after = int(np.searchsorted(reference.t_ns, t_ns))
         before_ns = int(reference.t_ns[after - 1]) if after else t_ns
         after_ns = int(reference.t_ns[after]) if after < reference.t_ns.size else t_ns
-        spans.append((max(before_ns, t_ns - gap_ns), min(after_ns, t_ns + gap_ns)))
+        spans.append((max(before_ns, t_ns - gap_ns) + 1, min(after_ns, t_ns + gap_ns)))
     return spans
 
 
@@ -161,15 +162,11 @@ def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], 
     return count
 
 
-def facing_of(
-    reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometer | None, least_m: float
-) -> set[int]:
+def facing_of(reference: ReferencePlaces, covered: list[Coverage], odometer: Odometry, least_m: float) -> set[int]:
     """Oriented net elements over which the train ran as the odometer counted up, by the reference.
 
     `least_m`: so much way together says which way the odometer counts (DOMAIN section 2).
     """
-    if reference is None or odometer is None:
-        return set()
     found: set[int] = set()
     for one in covered:
         part = slice(one.first, one.last + 1)

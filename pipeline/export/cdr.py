@@ -6,12 +6,13 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from schemas.arrays import NS_PER_S
+
 Fields = tuple[tuple[str, str], ...]
 """Names and kinds: `time`, `double`, `int64`, `fixed32`, `level`, `bool`, `string`; `int8`, `uint8`, `uint16` (ROS 2
 only), `doubles` and `covariance type` (protobuf only).
 """
 
-_SECOND_NS = 1_000_000_000
 _HEADER = b"\x00\x01\x00\x00"
 # Kind: type in the definition, format, alignment; times and strings are laid out by themselves.
 _PLAIN = {
@@ -47,7 +48,7 @@ def cdr_messages(fields: Fields, rows: Iterator[Mapping[str, Any]]) -> Iterator[
 
 def _append(content: bytearray, kind: str, value: Any) -> None:
     if kind == "time":
-        seconds, rest = divmod(value, _SECOND_NS)
+        seconds, rest = divmod(value, NS_PER_S)
         content += bytes(-len(content) % 4) + struct.pack("<iI", seconds, rest)
     elif kind == "string":
         text = value.encode() + b"\0"

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import polars as pl
 
 from pipeline.export.cdr import Fields, cdr_messages, definition
+from schemas.arrays import NS_PER_S
 
-_SECOND_NS = 1_000_000_000
 # descriptor.proto: FieldDescriptorProto.Type and Label
 _DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM = 1, 3, 7, 8, 9, 11, 14
 _OPTIONAL, _REPEATED = 1, 3
@@ -166,7 +166,7 @@ def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
         if kind == "time":
             stamp = getattr(message, field)
             stamp.SetInParent()
-            stamp.seconds, stamp.nanos = divmod(value, _SECOND_NS)
+            stamp.seconds, stamp.nanos = divmod(value, NS_PER_S)
         elif kind == "doubles":
             getattr(message, field).extend(value)
         else:

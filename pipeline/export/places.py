@@ -13,6 +13,8 @@ from pipeline.track.survey import Track, track_of
 from schemas.arrays import Floats, Ints
 from schemas.run import Site
 
+_POINTS = 3000
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -143,17 +145,17 @@ def origin_of(site: Site) -> tuple[float, float]:
 
 
 def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
-    """Each net element as a line east and north of the origin [m]."""
+    """Each net element as a line east and north of the origin [m], of no more points than a screen shows."""
     survey = track_of(site.track)
     nothing = np.full(len(survey.latitude_deg), np.nan)
     east, north = plane_m(Ground(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
     for _, name, rows in survey.elements():
-        yield name, east[rows], north[rows]
+        yield name, _thinned(east[rows]), _thinned(north[rows])
 
 
-def thinned(values: Floats, most: int) -> Floats:
-    """No more than about so many of the values, the last one among them."""
-    return np.append(values[: -1 : max(1, -(-len(values) // most))], values[-1:])
+def _thinned(values: Floats) -> Floats:
+    """Some thousand of the values, the last one among them."""
+    return np.append(values[: -1 : max(1, -(-len(values) // _POINTS))], values[-1:])
 
 
 def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:

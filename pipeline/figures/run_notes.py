@@ -19,7 +19,6 @@ from schemas.config import Vehicle
 from schemas.run import RunLog, Site
 
 _SHOWN = 5
-_SAME_TIME_NS = 1_000_000_000  # ends of streams that are no farther apart need no remark
 
 
 def run_notes(
@@ -90,7 +89,7 @@ def _extents(run: RunLog) -> Iterator[str]:
         "the GNSS ends before the odometer": odometer_end - gnss_end,
         "the GNSS begins after the odometer": gnss_begin - odometer_begin,
     }
-    yield from (text for text, apart in apart_ns.items() if apart > _SAME_TIME_NS)
+    yield from (text for text, apart in apart_ns.items() if apart > NS_PER_S)
 
 
 def _odometer(odometry: Odometry | None, straight_s: float) -> Iterator[str]:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-# One-sided, as of claims (DOMAIN section 6).
-_DOUBT = 0.05
+from pipeline.figures.bounds import CONFIDENCE
 
 
 @dataclass(frozen=True)
@@ -50,24 +49,28 @@ def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: f
 
 
 def undetected_spread() -> dict[str, pl.Expr]:
-    """Of the passages of one balise: the larger of both directions, over those where it is known."""
-    larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
+    """Of the passages of one balise: the larger of both directions, and how far before a physical one may lie."""
+    larger, before = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m"), pl.col("physical_before_m")
     return {
         "undetected_count": larger.count().cast(pl.Int64),
         "undetected_median_m": larger.median(),
         "undetected_p95_m": larger.quantile(0.95, interpolation="higher"),
         "undetected_max_m": larger.max(),
+        "physical_before_count": before.count().cast(pl.Int64),
+        "physical_before_median_m": before.median(),
+        "physical_before_p05_m": before.quantile(0.05, interpolation="lower"),
+        "physical_before_min_m": before.min(),
     }
 
 
 def spacing_of_runs() -> dict[str, pl.Expr]:
     """Of the runs of one solution: the shortest spacing, and the share of all runs that keep it, from below.
 
-    None of n runs fell short of their own shortest: with 95 % confidence a share of 0.05^(1/n) does not (Clopper and
-    Pearson, n of n).
+    None of n runs fell short of their own shortest: with 95 % confidence, one-sided as of claims (DOMAIN section 6), a
+    share of 0.05^(1/n) does not (Clopper and Pearson, n of n).
     """
     runs = pl.col("physical_spacing_starts").count()
-    share = pl.when(runs > 0).then(pl.lit(_DOUBT).pow(1.0 / runs))
+    share = pl.when(runs > 0).then(pl.lit(1.0 - CONFIDENCE).pow(1.0 / runs))
     return {
         "undetected_max_m": pl.col("undetected_max_m").max(),
         "physical_spacing_runs": runs.cast(pl.Int64),

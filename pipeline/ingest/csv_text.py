@@ -8,6 +8,7 @@ import codecs
 import csv
 import io
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from schemas.errors import InputError
 
 _SEPARATORS = (",", ";", "\t")
 _MOST_COMMENTS = 50
+_NO_ROW = r"#|sep=.$"  # a comment; Excel's own line, which says what separates
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
@@ -25,10 +27,13 @@ _UTF16_ZEROS = 0.3
 
 
 class LogTable(NamedTuple):
-    """A table of a log; `cut` rows that break off at the end (0 or 1); the row of units, if it has one."""
+    """A table of a log; `cut` rows that break off at the end (0 or 1), rows with fewer values than the header; the row
+    of units, if it has one.
+    """
 
     table: pl.DataFrame
     cut: int
+    short: int
     units: tuple[str, ...]
     separator: str
 
@@ -52,7 +57,10 @@ def read_log_table(log: Path, infer: bool) -> LogTable:
         return _whole_rows(log.read_bytes(), infer)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
-    except (ValueError, pl.exceptions.PolarsError) as error:
+    except (ValueError, csv.Error, pl.exceptions.PolarsError) as error:
+        if isinstance(error, pl.exceptions.ComputeError):
+            with suppress(csv.Error):
+                _refuse_long_rows(_lines(log.read_bytes()), log)
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
 
 
@@ -63,7 +71,23 @@ def _whole_rows(data: bytes, infer: bool) -> LogTable:
     ended = data.rstrip(b" \0").endswith((b"\n", b"\r"))
     cut = len(lines) > 1 and not ended and lines[-1].count(separator) < header.count(separator)
     lines, units = _without_units(lines[:-1] if cut else lines, separator)
-    return LogTable(_table(lines, infer), int(cut), units, separator)
+    table = _table(lines, infer)
+    short = sum(0 < line.count(separator) < header.count(separator) for line in lines)
+    return LogTable(table, int(cut), short, units, separator)
+
+
+def _refuse_long_rows(lines: list[str], log: Path) -> None:
+    rows = enumerate(csv.reader(lines, delimiter=_separator(lines)), 1)
+    header = next((row for _, row in rows if row), [])
+    for number, row in rows:
+        if len(row) > len(header):
+            raise InputError(
+                "has more values than the header",
+                place=f"{log}: line {number}, comments not counted",
+                found=f"{len(row)}: {', '.join(row[:4])[:80]}",
+                expected=f"at most {len(header)}: {', '.join(header[:4])[:80]}",
+                remedy="The first line names the columns: begin the lines before it with #, and correct longer rows.",
+            )
 
 
 def _without_units(lines: list[str], separator: str) -> tuple[list[str], tuple[str, ...]]:
@@ -85,7 +109,7 @@ def _has_number(cell: str) -> bool:
 
 
 def _lines(data: bytes) -> list[str]:
-    return [line for line in text_of(data).splitlines() if not line.startswith("#")]
+    return [line for line in text_of(data).splitlines() if not re.match(_NO_ROW, line)]
 
 
 def _separator(lines: list[str]) -> str:

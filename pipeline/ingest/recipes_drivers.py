@@ -28,7 +28,7 @@ def _word(kind: Fix) -> pl.Expr:
 
 # Septentrio SBF reference guide, block PVTGeodetic: Mode, bits 0-3.
 SBF_FIXES = {
-    1: Fix.AUTONOMOUS, 2: Fix.DIFFERENTIAL, 3: Fix.AUTONOMOUS, 4: Fix.RTK_FIXED, 5: Fix.RTK_FLOAT, 6: Fix.SBAS,
+    1: Fix.AUTONOMOUS, 2: Fix.DIFFERENTIAL, 3: Fix.NONE, 4: Fix.RTK_FIXED, 5: Fix.RTK_FLOAT, 6: Fix.SBAS,
     7: Fix.RTK_FIXED, 8: Fix.RTK_FLOAT, 10: Fix.DIFFERENTIAL,
 }  # fmt: skip
 _SBF_KEY = ("block_header.wnc", "block_header.tow")

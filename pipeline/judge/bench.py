@@ -8,15 +8,14 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.epochs.clock import met, unambiguous
+from pipeline.epochs.timeline import crossing_gap_ns
 from pipeline.evidence import Evidence as AllEvidence
-from pipeline.evidence.accused import carried_forward
+from pipeline.evidence.carrying import carried_forward
 from pipeline.evidence.evidence import KINDS
 from pipeline.evidence.routes import Route, routes_of_path
-from pipeline.judge.in_use import unambiguous
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, margins_m, with_own_anchors
-from pipeline.judge.moving import stood_spans
-from pipeline.judge.states import odometer_beyond_confidence
+from pipeline.judge.states import odometer_beyond_confidence, stood_spans
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
@@ -129,7 +128,7 @@ class Bench:
             leg=ints(epochs["leg"]),
             path_m=self.path_m,
             direction=direction,
-            unambiguous=unambiguous(epochs, self.config),
+            unambiguous=met(epochs, unambiguous(self.config)),
         )
 
     @cached_property
@@ -217,4 +216,4 @@ class Bench:
     @cached_property
     def gap_ns(self) -> int:
         """Longest time between epochs over which a movement is interpolated."""
-        return round(linking_gap_s(nominal_period_s(self.t_ns), self.config.lds.crossing_gap_s) * NS_PER_S)
+        return crossing_gap_ns(self.t_ns, self.config.lds)

@@ -33,9 +33,7 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
         pl.Series("diagnosis_faulty", ~np.array(system.evaluated, dtype=bool)),
         pl.Series("alarm", system.alarm, dtype=pl.Boolean),
     ]
-    return pl.DataFrame(columns).with_columns(
-        *system.balises.order.columns().values(), *system.distance.columns().values()
-    )
+    return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
 
 
 def _modes(system: LocationSystem, index: np.ndarray, journey: Journey) -> pl.Series:

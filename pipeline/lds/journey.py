@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.epochs.clock import confident, met, unambiguous
+from pipeline.epochs.timeline import crossing_gap_ns
 from pipeline.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig
@@ -78,7 +79,7 @@ def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configur
     positioned = np.isfinite(path_m)
     odometer_m = floats(epochs, "odometer_m")
     direction, travel = _directions(odometer_m, epochs["direction"], config.lds.odometer_fixed_m)
-    gap_ns = round(linking_gap_s(nominal_period_s(t_ns), config.lds.crossing_gap_s) * NS_PER_S)
+    gap_ns = crossing_gap_ns(t_ns, config.lds)
     return Journey(
         t_ns=t_ns,
         leg=epochs["leg"].fill_null(strategy="forward").fill_null(0).to_numpy().astype(np.int64),
@@ -93,7 +94,7 @@ def journey_of(epochs: pl.DataFrame, scale_sigma: float | None, config: Configur
         scale_sigma=scale_sigma,
         direction=direction,
         travel=travel,
-        travelled_m=_travelled_m(odometer_m, travel),
+        travelled_m=floats(epochs, "travelled_m"),
         blind=_blind(t_ns, positioned, gap_ns),
         gap_ns=gap_ns,
     )
@@ -109,17 +110,11 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: int) -> Bools:
 
 def _refusals(epochs: pl.DataFrame, positioned: Bools, config: Configuration) -> list[PassageStatus | None]:
     """Ambiguity before confidence; what is not known (null) is never taken as good."""
-    sure = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
-    confident = floats(epochs, "confidence_m") <= config.lds.ci_limit_m
-    refusals: list[PassageStatus | None] = [None] * len(positioned)
-    for k in np.flatnonzero(~(positioned & sure & confident)).tolist():
-        if not positioned[k]:
-            refusals[k] = PassageStatus.NOT_AVAILABLE
-        elif sure[k]:
-            refusals[k] = PassageStatus.REJECTED_CONFIDENCE
-        else:
-            refusals[k] = PassageStatus.REJECTED_AMBIGUOUS
-    return refusals
+    refusals = np.full(positioned.size, None)
+    refusals[~met(epochs, confident(config))] = PassageStatus.REJECTED_CONFIDENCE
+    refusals[~met(epochs, unambiguous(config))] = PassageStatus.REJECTED_AMBIGUOUS
+    refusals[~positioned] = PassageStatus.NOT_AVAILABLE
+    return list(refusals)
 
 
 def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[Ints, Ints]:
@@ -138,16 +133,6 @@ def _directions(odometer_m: Floats, matched: pl.Series, turn_m: float) -> tuple[
         direction[known[seen_at] :] = sense
         travel[known[turned_at] :] = sense
     return direction, travel
-
-
-def _travelled_m(odometer_m: Floats, travel: Ints) -> Floats:
-    """Way run since the first epoch, on the scale in use; signed sums: jitter at a stand adds up to nothing."""
-    travelled_m = np.full(odometer_m.size, np.nan)
-    known = np.flatnonzero(np.isfinite(odometer_m))
-    if known.size:
-        steps_m = np.diff(odometer_m[known], prepend=odometer_m[known[0]])
-        travelled_m[known] = np.cumsum(steps_m * np.roll(travel[known], 1))
-    return travelled_m
 
 
 def turning_epochs(journey: Journey) -> frozenset[int]:

@@ -7,31 +7,29 @@ from math import sqrt
 import numpy as np
 import polars as pl
 
-from pipeline.lds import relink
+from pipeline.epochs.verdicts import (
+    DISABLED,
+    NO_ODOMETER,
+    NO_POSITION,
+    NO_SIGMA,
+    first_reason,
+    of_monitor,
+    verdicts,
+)
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
 from pipeline.lds.relink import Anchor, Comparison
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools
 from schemas.config import Configuration
-from schemas.enums import MonitorState
-from schemas.tables import Epochs
 
 # Identities are counted: half a balise lies between none and one.
 ORDER_THRESHOLD = 0.5
 _BLOCK = 4096  # epochs evaluated at once
 
-DISABLED = "disabled by configuration"
-NO_ODOMETER = "no odometer"
-NO_POSITION = "no position"
 AMBIGUOUS = "match ambiguous or off track"
-NO_SIGMA = "no standard deviation of the position"
 FIRST_EPOCH = "no epoch before"
 NEVER = "no balise or validated position to measure from"
 LOST = "odometer distance lost since the last validated position"
-_OF_RELINK = (relink.LOST, relink.NO_ANCHOR, relink.NO_VEHICLE, relink.SWITCHED_OFF)
-_REASONS = (DISABLED, NO_ODOMETER, NO_POSITION, AMBIGUOUS, NEVER, NO_SIGMA, FIRST_EPOCH, LOST, *_OF_RELINK)
-_NO_REASON = -1  # a reason is held as its place in the list above
-_STATES = tuple(state.value for state in MonitorState)
 
 
 def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
@@ -54,18 +52,19 @@ class LinkOrder:
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
         self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled)
-        self._value = np.where(self._reason == _NO_REASON, 0.0, np.nan)
+        self._evaluated: Bools = self._reason.is_null().to_numpy()
+        self._value = np.zeros(journey.t_ns.size)
 
     def is_evaluated(self, k: int) -> bool:
-        return bool(self._reason[k] == _NO_REASON)
+        return bool(self._evaluated[k])
 
     def note(self, k: int, out_of_order: int) -> None:
         self._value[k] = out_of_order
 
-    def columns(self) -> dict[str, pl.Series]:
+    def columns(self) -> list[pl.Series]:
         """`link_order_*` as in the contract of epochs."""
-        threshold = np.where(np.isnan(self._value), np.nan, ORDER_THRESHOLD)
-        return _columns("link_order", self._value, threshold, self._reason)
+        threshold = np.full(self._value.size, ORDER_THRESHOLD)
+        return of_monitor("link_order", verdicts(self._value, threshold, self._reason))
 
 
 class LinkDistance:
@@ -78,8 +77,9 @@ class LinkDistance:
     def __init__(self, journey: Journey, config: Configuration) -> None:
         self._journey, self._config = journey, config.lds
         self._factor = config.monitors.threshold_factor
-        self._reason = _distance_reasons(journey, "link_distance" in config.monitors.disabled)
-        self._possible: Bools = self._reason == _NO_REASON
+        reasons = _distance_reasons(journey, "link_distance" in config.monitors.disabled)
+        self._possible: Bools = reasons.is_null().to_numpy()
+        self._reason = reasons.to_numpy().astype(np.object_)  # None where it is evaluated
         self._offset_m = journey.path_m - journey.odometer_m
         self._value = np.full(journey.t_ns.size, np.nan)
         self._threshold = np.full(journey.t_ns.size, np.nan)
@@ -125,7 +125,8 @@ class LinkDistance:
         threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
         lost = self._possible[ahead] & (self._journey.segment[ahead] != anchor.segment)
         known = self._possible[ahead] & ~lost
-        self._reason[ahead] = np.where(lost, _REASONS.index(LOST), np.where(known, _NO_REASON, self._reason[ahead]))
+        self._reason[ahead][self._possible[ahead]] = None
+        self._reason[ahead][lost] = LOST
         self._value[ahead] = np.where(known, self._offset_m[ahead] - anchor.offset_m, np.nan)
         self._threshold[ahead] = np.where(known, threshold_m, np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
@@ -136,28 +137,30 @@ class LinkDistance:
             return
         self._value[k], self._threshold[k] = found.moved_m, found.bound_m
         self._fails[k] = found.reason is None and not found.holds
-        self._reason[k] = _NO_REASON if found.reason is None else _REASONS.index(found.reason)
+        self._reason[k] = found.reason
 
     def forget(self, k: int) -> None:
         """From epoch `k` on there is nothing to measure from."""
         self.measure_from(None, k)
         self._value[k:] = self._threshold[k:] = np.nan
-        self._reason[k:][self._possible[k:]] = _NO_REASON
+        self._reason[k:][self._possible[k:]] = None
 
-    def columns(self) -> dict[str, pl.Series]:
+    def columns(self) -> list[pl.Series]:
         """`link_distance_*` as in the contract of epochs."""
-        unknown = np.isnan(self._value) & (self._reason == _NO_REASON)
-        reason = np.where(unknown, _REASONS.index(NEVER), self._reason)
-        return _columns("link_distance", self._value, self._threshold, reason)
+        reasons = pl.Series(self._reason.tolist(), dtype=pl.String)
+        unknown = reasons.is_null() & pl.Series(np.isnan(self._value))
+        reasons = first_reason((reasons.is_not_null(), reasons), (unknown, NEVER))
+        return of_monitor("link_distance", verdicts(self._value, self._threshold, reasons))
 
 
-def _order_reasons(journey: Journey, disabled: bool) -> Ints:
+def _order_reasons(journey: Journey, disabled: bool) -> pl.Series:
     """Per step, so both its ends must be good for it; a step ends at the epoch that it is noted at."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
     odometer, ambiguous, sigma = np.isfinite(journey.odometer_m), journey.ambiguous, np.isfinite(journey.sigma_m)
-    masks = (
+    return first_reason(
+        (np.full(before.size, disabled), DISABLED),
         (~odometer, NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (before < 0, FIRST_EPOCH),
@@ -165,38 +168,13 @@ def _order_reasons(journey: Journey, disabled: bool) -> Ints:
         (ambiguous | ambiguous[before], AMBIGUOUS),
         (~(sigma & sigma[before]), NO_SIGMA),
     )
-    return _reasons(masks, disabled)
 
 
-def _distance_reasons(journey: Journey, disabled: bool) -> Ints:
-    masks = (
+def _distance_reasons(journey: Journey, disabled: bool) -> pl.Series:
+    return first_reason(
+        (np.full(journey.t_ns.size, disabled), DISABLED),
         (~np.isfinite(journey.odometer_m), NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (journey.ambiguous, AMBIGUOUS),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
     )
-    return _reasons(masks, disabled)
-
-
-def _reasons(masks: tuple[tuple[Bools, str], ...], disabled: bool) -> Ints:
-    """The first reason that applies."""
-    reasons = np.full(masks[0][0].size, _REASONS.index(DISABLED) if disabled else _NO_REASON)
-    for mask, reason in () if disabled else reversed(masks):
-        reasons[mask] = _REASONS.index(reason)
-    return reasons
-
-
-def _columns(monitor: str, value: Floats, threshold: Floats, reasons: Ints) -> dict[str, pl.Series]:
-    fail, passed, unknown = (
-        _STATES.index(state) for state in (MonitorState.FAIL, MonitorState.PASS, MonitorState.NOT_EVALUATED)
-    )
-    state = np.where(np.isnan(value), unknown, np.where(np.abs(value) > threshold, fail, passed))
-    kind = Epochs.columns()[f"{monitor}_state"].dtype
-    words = pl.Series([*_REASONS, None], dtype=pl.String)
-    columns = {
-        "value": pl.Series(value).fill_nan(None),
-        "threshold": pl.Series(threshold).fill_nan(None),
-        "state": pl.Series(_STATES, dtype=kind).gather(state),
-        "reason": words.gather(np.where(reasons == _NO_REASON, len(_REASONS), reasons)),
-    }
-    return {f"{monitor}_{part}": column.alias(f"{monitor}_{part}") for part, column in columns.items()}

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.lds.crossings import Balise, Crossing, frame_of
+from pipeline.lds.crossings import Balise, Crossing
 from pipeline.lds.journey import Journey
 from pipeline.lds.windows import Window
+from schemas.conform import dtypes
 from schemas.enums import Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
@@ -51,8 +52,8 @@ def passage_rows(
     rows = [_row(passage, ids, journey, solution) for passage in passages]
     when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
     order = sorted(range(len(rows)), key=lambda i: (when[i], passages[i].balise.balise_id))
-    kinds = {name: column.dtype for name, column in Passages.columns().items()}
-    return frame_of([rows[i] for i in order], kinds | {"t_reckoned": pl.Datetime("ns", "UTC")})
+    schema = dtypes(Passages) | {"t_reckoned": pl.Datetime("ns", "UTC")}
+    return pl.DataFrame([rows[i] for i in order], schema=schema)
 
 
 def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:

@@ -8,11 +8,10 @@ import polars as pl
 
 from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.columns import epoch_columns
-from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time
+from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time, reads_of
 from pipeline.lds.journey import journey_of
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
-from pipeline.lds.reads import reads_of
 from pipeline.lds.relink import Held
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
@@ -48,7 +47,7 @@ def run_lds(
 
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
-    where unknown)`, odometer_segment, direction` (+1/-1, used where there is no odometer).
+    where unknown)`, travelled_m, odometer_segment, direction` (+1/-1, used where there is no odometer).
     `balises`: those of the travelled path. `balise_reads`: `t, balise_id`, `odometer_m` at the read where the run has
     an odometer. A run without that stream has no reader, so its physical balises have no passages. `scale_sigma`: of
     the odometer, None unless a vehicle file gives it with the scale.

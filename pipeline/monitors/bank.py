@@ -8,19 +8,22 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.epochs.verdicts import (
+    DISABLED,
+    FAIL,
+    NOT_EVALUATED,
+    no_verdicts,
+    of_monitor,
+    states_of,
+    verdicts,
+)
+from pipeline.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, run_axis
 from pipeline.monitors.recursion import AxisState
-from pipeline.monitors.series import DISABLED, FIRST_EPOCH, Axis, axes_of
-from pipeline.monitors.single import blind_monitor
+from pipeline.monitors.series import FIRST_EPOCH, Axis, axes_of
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import SCALES
-
-STATES = [state.value for state in MonitorState]
-_PASS, _FAIL, _NOT_EVALUATED = (STATES.index(state) for state in ("pass", "fail", "not_evaluated"))
-# Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
-_FIRST_BLOCK, _BLOCK = 2048, 8192
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,10 @@ class _AxisBank:
         width = len(SCALES)
         self.value = np.full((epochs, width), np.nan, order="F")
         self.threshold = np.full((epochs, width), np.nan, order="F")
-        self.state = np.full((epochs, width), _NOT_EVALUATED, dtype=np.int8, order="F")
+        self.state = np.full((epochs, width), NOT_EVALUATED, dtype=np.int8, order="F")
         self._series = axis.series
         self._done = 0
-        self._block = _BLOCK
+        self._block = BLOCK
         self._carry: AxisState | None = None
 
     def advance(self, epoch: int) -> int:
@@ -62,13 +65,12 @@ class _AxisBank:
             part = self._series.between(self._done, end)
             value, sigma, self._carry = run_axis(part, self._alphas, self._carry)
             self._store(part, value, self._factor * sigma)
-            self._done, self._block = end, min(2 * self._block, _BLOCK)
+            self._done, self._block = end, min(2 * self._block, BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats) -> None:
         evaluated = ~part.fresh[:, None] & self._enabled[None, :]
-        failing = ~(np.abs(value) <= threshold)  # what cannot be compared is no pass
-        self.state[part.epoch] = np.where(evaluated, np.where(failing, _FAIL, _PASS), _NOT_EVALUATED)
+        self.state[part.epoch] = states_of(value, threshold, evaluated)
         self.value[part.epoch] = np.where(evaluated, value, np.nan)
         self.threshold[part.epoch] = np.where(evaluated, threshold, np.nan)
 
@@ -81,7 +83,7 @@ class _AxisBank:
             self._series = replace(self._series, fresh=fresh)
         self._done = row
         self._carry = None
-        self._block = _FIRST_BLOCK
+        self._block = FIRST_BLOCK
 
     def record(self) -> AxisRecord:
         return AxisRecord(self._series, self.value, self.threshold, self._enabled)
@@ -89,25 +91,11 @@ class _AxisBank:
     def columns(self) -> list[pl.Series]:
         """Value, threshold, state and reason of each monitor of the axis."""
         columns: list[pl.Series] = []
-        reasons = {on: self.axis.reasons.fill_null(FIRST_EPOCH if on else DISABLED) for on in (True, False)}
         for index, scale in enumerate(SCALES):
-            name = f"{self.axis.name}_{scale}"
-            state = self.state[:, index]
-            columns += [
-                pl.Series(f"{name}_value", self.value[:, index], nan_to_null=True),
-                pl.Series(f"{name}_threshold", self.threshold[:, index], nan_to_null=True),
-                _state_series(f"{name}_state", state),
-                _where_not_evaluated(f"{name}_reason", state, reasons[bool(self._enabled[index])]),
-            ]
+            reasons = self.axis.reasons.fill_null(FIRST_EPOCH if self._enabled[index] else DISABLED)
+            said = verdicts(self.value[:, index], self.threshold[:, index], reasons, self.state[:, index])
+            columns += of_monitor(f"{self.axis.name}_{scale}", said)
         return columns
-
-
-def _state_series(name: str, codes: npt.NDArray[np.int8]) -> pl.Series:
-    return pl.Series(name, STATES, dtype=pl.Enum(STATES)).gather(pl.Series(codes.astype(np.uint32)))
-
-
-def _where_not_evaluated(name: str, codes: npt.NDArray[np.int8], reasons: pl.Series) -> pl.Series:
-    return reasons.alias(name).zip_with(pl.Series(codes == _NOT_EVALUATED), pl.Series([None], dtype=reasons.dtype))
 
 
 class MonitorBank:
@@ -126,7 +114,7 @@ class MonitorBank:
             for axis in axes_of(epochs, config)
         )
         self._single = {
-            name: blind_monitor(count, DISABLED) if name in disabled else frame for name, frame in single.items()
+            name: no_verdicts(count, DISABLED) if name in disabled else frame for name, frame in single.items()
         }
         self._single_fails = np.zeros(count, dtype=np.bool_)
         for frame in self._single.values():
@@ -142,11 +130,11 @@ class MonitorBank:
         begin = self._known_to + 1
         self._known_to = min(axis.advance(epoch) for axis in self._axes)
         part = slice(begin, self._known_to + 1)
-        fails = [axis.state[part] == _FAIL for axis in self._axes]
+        fails = [axis.state[part] == FAIL for axis in self._axes]
         self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
         fast = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
         self._fast[part] = fast | self._single_fails[part]
-        self._along[part] = (self._axes[0].state[part] != _NOT_EVALUATED).any(axis=1)
+        self._along[part] = (self._axes[0].state[part] != NOT_EVALUATED).any(axis=1)
 
     def failed(self, epoch: int) -> bool:
         self._look(epoch)
@@ -186,6 +174,4 @@ class MonitorBank:
         if self._any.size:
             self._look(self._any.size - 1)
         columns = [column for axis in self._axes for column in axis.columns()]
-        for name, frame in self._single.items():
-            columns += [frame[part].alias(f"{name}_{part}") for part in ("value", "threshold", "state", "reason")]
-        return columns
+        return columns + [column for name, frame in self._single.items() for column in of_monitor(name, frame)]

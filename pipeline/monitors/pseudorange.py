@@ -16,18 +16,18 @@ import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
-from pipeline.monitors.series import NO_POSITION
+from pipeline.epochs.clock import met, unambiguous
+from pipeline.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.monitors.axis import BLOCK
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
-from pipeline.monitors.single import NO_RANGES, blind_monitor, judged
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
 
+NO_RANGES = "no satellites stream"
 NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
 TOO_FEW = "too few satellites to test the ranges"
 AMBIGUOUS = "the track is ambiguous"
-_LEAST_SURVEY_SIGMA_M = 1e-3
 _RIDGE = 1e-13
-_CHUNK = 8192
 
 
 def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, config: Configuration) -> pl.DataFrame:
@@ -37,7 +37,7 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
     chi-square quantile at the configured false-alarm probability for the epoch's degrees of freedom.
     """
     if satellites is None or satellites.is_empty():
-        return blind_monitor(epochs.height, NO_RANGES)
+        return no_verdicts(epochs.height, NO_RANGES)
     ranges = _ranges_by_epoch(epochs, satellites, config.monitors.satellite_stamp_s)
     track = _track_of(epochs, config)
     value, freedom = np.full(epochs.height, np.nan), np.zeros(epochs.height, dtype=np.int64)
@@ -46,7 +46,11 @@ def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, c
     tested = freedom > 0
     threshold = np.full(epochs.height, np.nan)
     threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
-    return judged(value, threshold, _reasons(epochs, track, ranges, tested))
+    seen = np.isin(np.arange(epochs.height), ranges.epoch)
+    reasons = first_reason(
+        (~track.matched, NO_POSITION), (~track.usable, AMBIGUOUS), (~seen, NO_RANGES_AT_EPOCH), (~tested, TOO_FEW)
+    )
+    return verdicts(value, threshold, reasons)
 
 
 @dataclass(frozen=True)
@@ -105,9 +109,9 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
-    survey_m = np.hypot(np.maximum(survey_m, _LEAST_SURVEY_SIGMA_M), np.nan_to_num(chord_m))
+    survey_m = np.hypot(np.maximum(survey_m, config.matching.offset_floor_m), np.nan_to_num(chord_m))
     matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
-    sure = floats(epochs, "gate_probability") >= config.matching.ambiguity_probability
+    sure = met(epochs, unambiguous(config))
     known = np.isfinite(vertical_m)
     left = np.stack([-np.cos(angle), np.sin(angle), zero], axis=-1)
     offset = cross_m[:, None] * left + np.where(known, vertical_m, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
@@ -151,8 +155,8 @@ def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configu
 def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
     usable = np.flatnonzero(track.usable)
     chosen = usable[np.isin(usable, ranges.epoch)]
-    for begin in range(0, chosen.size, _CHUNK):
-        yield _equations(ranges, track, chosen[begin : begin + _CHUNK])
+    for begin in range(0, chosen.size, BLOCK):
+        yield _equations(ranges, track, chosen[begin : begin + BLOCK])
 
 
 def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:
@@ -203,18 +207,3 @@ def normal_of(design: Floats, weight: Floats, prior: Floats) -> Floats:
     # Badly placed satellites may leave a direction open; the ridge is far below any information in a range.
     normal[:, index, index] += _RIDGE * normal[:, index, index].max(axis=1, keepdims=True)
     return np.asarray(normal)
-
-
-def _reasons(epochs: pl.DataFrame, track: _Track, ranges: _Ranges, tested: Bools) -> pl.Series:
-    seen = np.isin(np.arange(epochs.height), ranges.epoch)
-    return pl.select(
-        pl.when(pl.Series(tested))
-        .then(pl.lit(None, pl.String))
-        .when(pl.Series(~track.matched))
-        .then(pl.lit(NO_POSITION))
-        .when(pl.Series(~track.usable))
-        .then(pl.lit(AMBIGUOUS))
-        .when(pl.Series(~seen))
-        .then(pl.lit(NO_RANGES_AT_EPOCH))
-        .otherwise(pl.lit(TOO_FEW))
-    ).to_series()

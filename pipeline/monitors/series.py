@@ -8,18 +8,15 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.monitors.along import AlongEpochs, along_series
-from pipeline.monitors.axis import AxisSeries, Source, errors_of, time_steps
+from pipeline.epochs.verdicts import NO_POSITION, NO_SIGMA, first_reason
+from pipeline.monitors.axis import AlongEpochs, AxisSeries, Source, along_series, errors_of, time_steps
 from pipeline.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration
 
-NO_POSITION = "no position"
-NO_SIGMA = "no standard deviation of the position"
 OFF_TRACK = "off track"
 NO_HEIGHT = "no height in the position or the survey"
 FIRST_EPOCH = "first epoch after a restart"
-DISABLED = "disabled by configuration"
 _STRAIGHT_PER_M = 1e-6
 
 
@@ -37,8 +34,8 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     t_ns = times_ns(epochs)
     t_s = (t_ns - t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
-    along_reasons = _first_of(matched, epochs["odometer_reason"])
-    up_reasons = _first_of(matched, _where(epochs["vertical_m"].is_null(), NO_HEIGHT))
+    along_reasons = matched.zip_with(matched.is_not_null(), epochs["odometer_reason"])
+    up_reasons = first_reason((matched.is_not_null(), matched), (epochs["vertical_m"].is_null(), NO_HEIGHT))
     builder = _Builder(epochs, t_s, config)
     return (
         Axis("along", builder.along(along_reasons), along_reasons),
@@ -47,23 +44,10 @@ def axes_of(epochs: pl.DataFrame, config: Configuration) -> tuple[Axis, Axis, Ax
     )
 
 
-def _where(mask: pl.Series, reason: str) -> pl.Series:
-    """The reason where the mask holds, null elsewhere."""
-    return pl.select(pl.when(mask).then(pl.lit(reason, pl.String))).to_series()
-
-
-def _first_of(*reasons: pl.Series) -> pl.Series:
-    return pl.select(pl.coalesce([pl.lit(series) for series in reasons])).to_series()
-
-
 def _match_reasons(epochs: pl.DataFrame) -> pl.Series:
     """Why the match gives no position that the bank could use."""
     no_sigma = epochs["sigma_along_m"].is_null() | epochs["sigma_cross_m"].is_null()
-    return _first_of(
-        _where(~epochs["fix_valid"], NO_POSITION),
-        _where(~epochs["near_track"], OFF_TRACK),
-        _where(no_sigma, NO_SIGMA),
-    )
+    return first_reason((~epochs["fix_valid"], NO_POSITION), (~epochs["near_track"], OFF_TRACK), (no_sigma, NO_SIGMA))
 
 
 class _Builder:

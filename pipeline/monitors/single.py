@@ -9,54 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
 from pipeline.monitors.channels import paired
-from pipeline.monitors.series import FIRST_EPOCH, NO_POSITION
+from pipeline.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns
 from schemas.config import Configuration
-from schemas.enums import MonitorState
 
 NO_VELOCITY = "no GNSS velocity"
-NO_VALUE = "nothing to compute it from"
-NO_RANGES = "no satellites stream"
 NO_OTHER_SOLUTION = "no other solution configured to compare with"
 NO_OTHER_EPOCH = "the other solution has no position at this epoch"
-_STATES = pl.Enum([state.value for state in MonitorState])
-
-
-def judged(value: Floats, threshold: Floats, reasons: pl.Series) -> pl.DataFrame:
-    """States of a monitor: where a reason stands it is not evaluated, else |value| against the threshold.
-
-    What has no reason and yet no value or threshold is not evaluated either: absence is never health.
-    """
-    frame = pl.DataFrame(
-        {
-            "value": pl.Series(value, nan_to_null=True),
-            "threshold": pl.Series(threshold, nan_to_null=True),
-            "reason": reasons.cast(pl.String),
-        }
-    )
-    unknown = pl.col("value").is_null() | pl.col("threshold").is_null()
-    frame = frame.with_columns(reason=pl.coalesce("reason", pl.when(unknown).then(pl.lit(NO_VALUE))))
-    evaluated = pl.col("reason").is_null()
-    state = (
-        pl.when(~evaluated)
-        .then(pl.lit(MonitorState.NOT_EVALUATED.value))
-        .when(pl.col("value").abs() > pl.col("threshold"))
-        .then(pl.lit(MonitorState.FAIL.value))
-        .otherwise(pl.lit(MonitorState.PASS.value))
-    )
-    return frame.select(
-        pl.when(evaluated).then(pl.col("value")).alias("value"),
-        pl.when(evaluated).then(pl.col("threshold")).alias("threshold"),
-        state.cast(_STATES).alias("state"),
-        "reason",
-    )
-
-
-def blind_monitor(epochs: int, reason: str) -> pl.DataFrame:
-    """A monitor that has nothing to look at in the whole run."""
-    nothing = np.full(epochs, np.nan)
-    return judged(nothing, nothing, pl.Series([reason] * epochs, dtype=pl.String))
 
 
 def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
@@ -82,18 +43,14 @@ def doppler_monitor(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame
         + (floats(epochs, "scale_sigma") * speed) ** 2
         + ((floats(epochs, "latency_sigma_s") + np.abs(floats(epochs, "latency_s"))) * change / span) ** 2
     )
-    reasons = pl.select(
-        pl.when(pl.Series(usable & np.isfinite(span)))
-        .then(pl.lit(None, pl.String))
-        .when(pl.Series(~np.isfinite(velocity)))
-        .then(pl.lit(NO_VELOCITY))
-        .when(epochs["odometer_reason"].is_not_null())
-        .then(epochs["odometer_reason"])
-        .when(~epochs["fix_valid"])
-        .then(pl.lit(NO_POSITION))
-        .otherwise(pl.lit(FIRST_EPOCH))
-    ).to_series()
-    return judged(by_doppler - by_odometer, config.monitors.threshold_factor * np.sqrt(variance), reasons)
+    unknown = epochs["odometer_reason"]
+    reasons = first_reason(
+        (~np.isfinite(velocity), NO_VELOCITY),
+        (unknown.is_not_null(), unknown),
+        (~epochs["fix_valid"], NO_POSITION),
+        (~np.isfinite(span), FIRST_EPOCH),
+    )
+    return verdicts(by_doppler - by_odometer, config.monitors.threshold_factor * np.sqrt(variance), reasons)
 
 
 def channel_monitor(
@@ -106,20 +63,18 @@ def channel_monitor(
     (troposphere) make the threshold larger than it need be. `absent`: the reason where there is none.
     """
     if other is None:
-        return blind_monitor(epochs.height, absent)
+        return no_verdicts(epochs.height, absent)
     usable = other.filter("fix_valid", "on_track")
-    placed = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
-    pairs = paired(epochs.select("t", path_m=placed), usable)
+    own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
+    pairs = paired(epochs.select("t", path_m=own_m), usable)
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
     value = floats(pairs, "path_m") - floats(met, "path_m")
     both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
-    reasons = epochs.select(
-        pl.when(~pl.col("fix_valid") | ~pl.col("on_track") | pl.col("sigma_along_m").is_null())
-        .then(pl.lit(NO_POSITION))
-        .when(met["path_m"].is_null() | met["sigma_along_m"].is_null())
-        .then(pl.lit(NO_OTHER_EPOCH))
-    ).to_series()
-    return judged(value, config.monitors.threshold_factor * both_m, reasons)
+    placed = epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null()
+    reasons = first_reason(
+        (~placed, NO_POSITION), (met["path_m"].is_null() | met["sigma_along_m"].is_null(), NO_OTHER_EPOCH)
+    )
+    return verdicts(value, config.monitors.threshold_factor * both_m, reasons)
 
 
 def _window(

@@ -4,6 +4,6 @@ In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry
 Touches no file, and knows no position: only the sign against the path is set from one (`polarity`).
 """
 
-from pipeline.odometry.odometry import Odometry, odometry_of
+from pipeline.odometry.odometry import Odometry, Way, odometry_of
 
-__all__ = ["Odometry", "odometry_of"]
+__all__ = ["Odometry", "Way", "odometry_of"]

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.odometry.curves import filled_in
 from pipeline.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
 from pipeline.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
-from pipeline.odometry.rows import leaps, ways_between
+from pipeline.odometry.rows import filled_in, leaps, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 
@@ -137,11 +136,20 @@ class Odometry:
 
         `scale`: true over recorded distance; `latency_s`: by how much the position at an instant is older.
         """
-        t_s = self.seconds(t_ns)
-        now = t_s - latency_s
-        before = np.concatenate([now[:1], t_s[:-1] - latency_s[1:]])
+        before, now = self._steps_s(t_ns, latency_s)
         distance = scale * (self.distance_at_s(now) - self.distance_at_s(before))
         return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
+
+    def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
+        """The same of the way driven, turns included [m]."""
+        begin_m, end_m = (np.interp(at_s, self.t_s, self._travelled_m) for at_s in self._steps_s(t_ns, latency_s))
+        return np.asarray(scale * (end_m - begin_m))
+
+    def _steps_s(self, t_ns: Ints, latency_s: Floats) -> tuple[Floats, Floats]:
+        """Begin and end of the step to each instant, both less the latency in use at the later one [s]."""
+        t_s = self.seconds(t_ns)
+        now = t_s - latency_s
+        return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
     def known_at_s(self, t_s: Floats) -> Bools:
         """`known_at` in seconds on the odometer's own scale, as the functions below: for estimates of latency."""
@@ -247,7 +255,8 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig) -> Noise:
     """Noise of a recorded distance, of whose ways those to the next row are `whole` (rows - 1,)."""
     counter_m = count_step_m(distance_m, whole, config)
-    return Noise(white_m2_per_s, quantisation_noise(t_s, distance_m, whole, white_m2_per_s, config), counter_m)
+    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, config)
+    return Noise(white_m2_per_s, scatter, counter_m)
 
 
 def _declared_m2_per_s(stream: pl.DataFrame, period_s: float) -> float:

@@ -7,8 +7,6 @@ import numpy as np
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Floats, Ints
 
-_STARTS = 40
-
 
 def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) -> int:
     """+1 or -1: the odometer's sign against growing path, from the first `distance_m` of net movement.
@@ -25,8 +23,8 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
     odometer, path = recorded_m[usable], path_m[usable]
     way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
     window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
-    # Starts a fixed way apart: a long stand before the departure has one vote, not thousands.
-    starts = np.unique(np.searchsorted(way, np.linspace(0.0, 2.0 * distance_m, _STARTS)))
+    # Starts a metre apart: a long stand before the departure has one vote, not thousands.
+    starts = np.unique(np.searchsorted(way, np.arange(0.0, 2.0 * distance_m)))
     starts = starts[starts < min(window, way.size)]
     votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
     return -1 if sum(votes) < 0 else 1

@@ -46,17 +46,18 @@ NO_QUANTISATION = QuantisationNoise()
 
 
 def quantisation_noise(
-    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig
+    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, counter_m: float, config: AlignConfig
 ) -> QuantisationNoise:
     """What rows scatter about smooth curves beyond what white noise of the increments explains.
 
     `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves, so that
     slips do not count; of lower and higher speeds where these differ enough to tell stamps from counts. Noise that is
-    less than what the white noise makes of the same rows counts as none. A counter has the noise of its step at least:
-    at a speed at which each row gains as many steps as the last it does not show, until it does.
+    less than what the white noise makes of the same rows counts as none. A counter has the noise of its step
+    (`counter_m`) at least: at a speed at which each row gains as many steps as the last it does not show, until it
+    does.
     """
     scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, config)
-    return replace(scatter, still_m2=max(scatter.still_m2, count_step_m(distance_m, whole, config) ** 2 / 12.0))
+    return replace(scatter, still_m2=max(scatter.still_m2, counter_m**2 / 12.0))
 
 
 def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float:

@@ -1,9 +1,12 @@
-"""What one comparison of two streams says."""
+"""What one comparison says, and the lines of configuration that mend it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+
+CONFIGURATION = "append to the configuration file"
 
 
 class State(StrEnum):
@@ -17,17 +20,17 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison: `found` in words with figures, its `cause`, and the lines of configuration that mend it.
+    """One comparison: `found` in words with figures, its `cause`, and the lines that mend it.
 
-    `lines` is TOML that can be appended to a file, `into` says to which; `advice` is what to do where no line mends it.
+    `lines` is text for a file, `into` says what to do with it; `advice` is what to do where no line mends it.
     """
 
     what: str
     state: State
     found: str
     cause: str = ""
-    into: str = ""
     lines: str = ""
+    into: str = CONFIGURATION
     advice: str = ""
 
     @property
@@ -43,3 +46,31 @@ def not_checked(what: str, why: str) -> Check:
 
 def fits(what: str, found: str) -> Check:
     return Check(what, State.FITS, found)
+
+
+def correction(
+    stream: str,
+    factors: Mapping[str, float] | None = None,
+    shift_s: float = 0.0,
+    exchange: tuple[str, str] | None = None,
+    shift_m: Mapping[str, float] | None = None,
+    solution: str | None = None,
+) -> str:
+    """One `[[ingest.correct]]` table, which can be appended to any configuration file."""
+    lines = ["[[ingest.correct]]", f'stream = "{stream}"']
+    if solution is not None:
+        lines.append(f'solution = "{solution}"')
+    if exchange is not None:
+        lines.append(f'exchange = ["{exchange[0]}", "{exchange[1]}"]')
+    if factors:
+        lines.append(f"factors = {{ {', '.join(f'{name} = {_number(value)}' for name, value in factors.items())} }}")
+    if shift_s:
+        lines.append(f"shift_s = {_number(shift_s)}")
+    lines += [f"shift_{axis}_m = {_number(value)}" for axis, value in (shift_m or {}).items()]
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    """A number as TOML has it, a float always."""
+    text = repr(round(float(value), 12)) if abs(value) >= 1e-3 else repr(float(value))
+    return text if any(sign in text for sign in ".e") else f"{text}.0"

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.plausibility.check import Check, State, fits, not_checked
-from pipeline.plausibility.corrections import correction
+from pipeline.plausibility.check import Check, State, correction, fits, not_checked
 from pipeline.plausibility.course import Course, Places
+from pipeline.plausibility.robust import LEAST, MOVES_MPS
 from schemas.arrays import Floats, runs_of
 
 _SIGNS = "sign of the odometer's speed against its distance"
 _TURNS = "direction of the counter where the train reverses"
-# A stand in between, and the way before and after it that tells the heading.
-_STANDS_MPS, _HEADING_S, _HEADING_M = 0.7, 20.0, 40.0
+# The way before and after a stand that tells the heading, and how much of it the counter has to gain as well.
+_HEADING_S, _SAME_WAY = 20.0, 0.3
 _OPPOSITE = 0.7
-# The counter gains what the positions move, but for this share.
-_SAME_WAY = 0.3
-# The same sign in so many windows is a constant one.
-_ALWAYS = 0.9
 
 
 def sign_check(distance: Course | None, speed: Course | None) -> list[Check]:
@@ -26,20 +22,25 @@ def sign_check(distance: Course | None, speed: Course | None) -> list[Check]:
         return []
     begin_s, end_s = max(distance.t_s[0], speed.t_s[0]), min(distance.t_s[-1], speed.t_s[-1])
     starts = np.linspace(begin_s, max(end_s - 10.0, begin_s), 300)
-    one, other = distance.gained(starts, starts + 10.0), speed.gained(starts, starts + 10.0)
-    sizes = np.abs(one), np.abs(other)
-    moves = np.isfinite(one) & np.isfinite(other)
-    if moves.any():
-        moves &= (sizes[0] > 0.1 * np.max(sizes[0][moves])) & (sizes[1] > 0.1 * np.max(sizes[1][moves]))
-    if moves.sum() < 5:
+    gained = np.array([course.gained(starts, starts + 10.0) for course in (distance, speed)])
+    # By the median of what moves: a counter that is reset seems to run far, once.
+    moves = np.all(np.nan_to_num(gained) != 0.0, axis=0)
+    least = 0.2 * np.median(np.abs(gained[:, moves]), axis=1, keepdims=True) if moves.any() else 0.0
+    moves &= np.all(np.abs(gained) > least, axis=0)
+    if moves.sum() < LEAST:
         return [not_checked(_SIGNS, "hardly any movement with both")]
-    falling, forward = one[moves] < 0, other[moves] > 0
-    against = float(np.mean(falling == forward))
-    if against > _ALWAYS:
-        lines = correction("odometer", {"speed_mps": -1.0})
-        found = f"the distance {'falls' if falling.mean() > 0.5 else 'grows'} at the opposite speed"
-        return [Check(_SIGNS, State.IMPOSSIBLE, found, "one counts backwards", "the configuration", lines)]
-    if against > 1.0 - _ALWAYS and forward.all() and not falling.all():
+    falls, back = gained[:, moves] < 0
+    against = float(np.mean(falls != back))
+    if against > 0.9:
+        # A train that runs backwards all the way is rarer than a counter of the wrong sign.
+        column, name = ("distance_m", "distance") if falls.mean() > 0.5 else ("speed_mps", "speed")
+        found = f"the distance {'falls' if falls.mean() > 0.5 else 'grows'} at the opposite speed"
+        return [
+            Check(
+                _SIGNS, State.IMPOSSIBLE, found, f"the {name} counts backwards", correction("odometer", {column: -1.0})
+            )
+        ]
+    if against > 0.1 and not back.any() and not falls.all():
         return [Check(_SIGNS, State.MISFIT, "the speed has no sign", "it stays positive where the distance falls")]
     return [fits(_SIGNS, "the same")]
 
@@ -47,7 +48,7 @@ def sign_check(distance: Course | None, speed: Course | None) -> list[Check]:
 def turn_check(gnss: Places, counter: Course, factor: float, lag_s: float) -> Check:
     """Whether the counter turns where the train does; stands beside a jump of the position tell nothing."""
     grid = np.arange(gnss.t_s[0], gnss.t_s[-1], 1.0)
-    firsts, lasts = runs_of(gnss.speed(grid) < _STANDS_MPS)
+    firsts, lasts = runs_of(gnss.speed(grid) < MOVES_MPS)
     ends = grid[firsts], grid[lasts]
     before, after = _moved(gnss, ends[0] - _HEADING_S, ends[0]), _moved(gnss, ends[1], ends[1] + _HEADING_S)
     sizes = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
@@ -58,7 +59,7 @@ def turn_check(gnss: Places, counter: Course, factor: float, lag_s: float) -> Ch
             counter.gained(ends[1] + lag_s, ends[1] + _HEADING_S + lag_s) / factor,
         )
         product = gained[0] * gained[1]
-        told = np.isfinite(cosine) & (sizes[0] > _HEADING_M) & (sizes[1] > _HEADING_M)
+        told = np.isfinite(cosine) & (np.minimum(*sizes) > 2.0 * MOVES_MPS * _HEADING_S)
         for size, way in zip(sizes, gained, strict=True):
             told &= np.abs(np.abs(way) - size) < _SAME_WAY * size
         reversal, onward = told & (cosine < -_OPPOSITE), told & (cosine > _OPPOSITE)

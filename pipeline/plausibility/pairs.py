@@ -6,34 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plausibility.clocks import Candidates, possible_lags
+from pipeline.plausibility.clocks import APART_S, LEAST_SHARE, Candidates, possible_lags
 from pipeline.plausibility.course import Course, Places
+from pipeline.plausibility.robust import LEAST, MOVES_MPS, Regression, explains, regressed, steady, usual
 from schemas.arrays import Bools, Floats
 
 # A window is some 150 m long: positions that scatter by 2 m tell its way to 2 %.
 _WINDOW_M = 150.0
 _WINDOW_S = (8.0, 60.0)
-_LEAST_WINDOWS = 6
 # Slower than this share of the usual speed a window tells more of noise than of the scale.
 _SLOW_SHARE = 0.2
-# Of a stand, positions seem to move so fast [m/s].
-_STANDS_MPS = 0.25
 # A window agrees if its ratio is within so much of the usual one.
 _AGREES = 0.12
-# Speeds agree at a lag in so much of the moving time; another lag has to do it in so much more, and leave so much less
-# of the rest. Both records have so much of the shorter one in common.
-_ALIKE, _MORE, _LESS, _LEAST_OVERLAP = 0.5, 0.08, 0.6, 0.6
-# A journey that repeats itself agrees nearly as well at another lag.
-_RIVAL = 0.05
-# Nobody looks for another lag where they agree in so much of it.
-_SURELY = 0.93
-# Steps in which a lag is improved, lags that are the same, and those that are none [s].
-_CLIMB_S, _SAME_S, _ZERO_S = (8.0, 4.0, 2.0, 1.0), 25.0, 1.5
-# Tukey's biweight, 95 % efficient on Gaussian noise (Huber and Ronchetti 2009); windows overlap by half.
-_BIWEIGHT, _OVERLAP = 4.685, 1.5
-_ROUNDS = 8
-# Positions a step apart are known to no better than this [m].
-_LEAST_SPREAD_M = 0.05
+# Nobody looks for another lag where speeds agree in so much of the run; a journey that repeats itself agrees nearly as
+# well at another one.
+SURELY, _RIVAL = 0.93, 0.05
+# Steps in which a lag is improved; regressed it is as near, or faults of the counter have bent it [s].
+_CLIMB_S, _NEAR_S = (8.0, 4.0, 2.0, 1.0), 2.0
+# Windows overlap by half. Positions a step apart are known to no better than this [m].
+_OVERLAP, _LEAST_SPREAD_M = 1.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -52,7 +43,6 @@ class PairFit:
     lag_sigma_s: float = float("inf")
     halves: tuple[tuple[float, float], ...] = ()
     constant: float = 0.0
-    windows: int = 0
     reason: str = ""
     stands: bool = False
     shifted: bool = False
@@ -67,63 +57,75 @@ class PairFit:
         return self.told and self.lag_sigma_s < 0.5
 
     def other_lag(self, lag_s: float, least_s: float) -> bool:
-        """Whether the lag differs from `lag_s` by more than `least_s` and than its noise, in both halves of the run.
-
-        A drift or slip in one half is no lag.
-        """
-        apart = [one - lag_s for one in (self.lag_s, *(lag for _, lag in self.halves))]
-        beyond = abs(apart[0]) > max(least_s, 5.0 * self.lag_sigma_s)
-        return self.lag_told and beyond and all(one * apart[0] > 0.5 * apart[0] ** 2 for one in apart)
+        """Whether the lag differs from `lag_s` by more than `least_s` and than its noise, in both halves of the run."""
+        return self.lag_told and _beyond(
+            self.lag_s - lag_s, [lag - lag_s for _, lag in self.halves], max(least_s, 5.0 * self.lag_sigma_s)
+        )
 
     def other_factor(self, factor: float, least: float) -> bool:
         """Whether the factor differs from this one by a larger share than `least`, in both halves of the run."""
-        apart = [abs(one) / abs(factor) - 1.0 for one in (self.factor, *(one for one, _ in self.halves))]
-        beyond = abs(apart[0]) > max(least, 5.0 * self.factor_sigma / abs(self.factor))
-        return self.told and beyond and all(one * apart[0] > 0.5 * apart[0] ** 2 for one in apart)
+        apart, *halves = (abs(one) / abs(factor) - 1.0 for one in (self.factor, *(one for one, _ in self.halves)))
+        return self.told and _beyond(apart, halves, max(least, 5.0 * self.factor_sigma / abs(self.factor)))
+
+
+def _beyond(apart: float, halves: list[float], least: float) -> bool:
+    """A drift or slip in one half is none."""
+    return abs(apart) > least and steady(np.array([apart]), *(np.array([half]) for half in halves))
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Ways of both [m], [units], and the counter's change of speed [units/s] from begin to end of each window."""
+    """Ways of both [m], [units], the counter's change of speed [units/s] from begin to end, and its signed way."""
 
     gnss_m: Floats
-    counted: Floats
+    size: Floats
     change: Floats
+    counted: Floats
 
     def take(self, rows: Bools) -> _Windows:
-        return _Windows(self.gnss_m[rows], self.counted[rows], self.change[rows])
+        return _Windows(self.gnss_m[rows], self.size[rows], self.change[rows], self.counted[rows])
+
+    def regressed(self) -> Regression:
+        """Metres per unit, and its slope over the change of speed.
+
+        GNSS way = a counted + b change, for the counter is the less noisy one; a lag of the counter's stamps by
+        `d` beyond the assumed one is b = a d.
+        """
+        ratio = self.size / self.gnss_m
+        unit = float(np.median(ratio))
+        # A counter that is reset seems to run so far that it would weigh more than all the rest.
+        sane = np.abs(np.log(ratio / unit)) < np.log(2.0)
+        design = np.column_stack([self.size, self.change])[sane, None, :] / unit
+        fit = regressed(design, self.gnss_m[sane, None], _LEAST_SPREAD_M)
+        halves = tuple(half / unit for half in fit.halves)
+        return replace(fit, estimate=fit.estimate / unit, sigma=fit.sigma / unit, halves=halves)
 
 
 def fit_pair(gnss: Places, counter: Course) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
-    spans = [(float(one.t_s[0]), float(one.t_s[-1])) for one in (gnss, counter)]
-    possible = possible_lags(spans[0], gnss.speed, spans[1], counter.speed)
-    coarse_s, clock_reason = _clock_lag(gnss, counter, possible)
-    lag_s, found = coarse_s, PairFit()
-    for _ in range(2):
-        found = _fitted(gnss, counter, lag_s)
-        if not found.lag_told or abs(found.lag_s - coarse_s) > 5.0:
-            break
-        lag_s = found.lag_s
-    if coarse_s and abs(found.lag_s - coarse_s) > 5.0:
-        found = replace(found, lag_s=coarse_s)
+    coarse_s, clock_reason = _clock_lag(gnss, counter)
+    found = _fitted(gnss, counter, coarse_s)
+    if found.lag_told and abs(found.lag_s - coarse_s) < _CLIMB_S[1]:
+        found = _fitted(gnss, counter, found.lag_s)
+    if coarse_s and not (found.lag_told and abs(found.lag_s - coarse_s) < _NEAR_S):
+        found = replace(found, lag_s=coarse_s, lag_sigma_s=_CLIMB_S[-1])
     return replace(found, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
 
-def _clock_lag(gnss: Places, counter: Course, possible: Candidates) -> tuple[float, str]:
+def _clock_lag(gnss: Places, counter: Course) -> tuple[float, str]:
     """The lag of the clocks that makes the speeds agree, 0 where they do as recorded; and why none is told.
 
     A fault of one of both leaves part of the journey that agrees, and with it the right lag ahead of all others.
     """
+    as_recorded = _agreement(gnss, counter, 0.0, 0.0)
+    if as_recorded >= SURELY:
+        return 0.0, ""
+    possible = possible_lags(gnss, counter)
     if possible.reason:
         return 0.0, possible.reason
-    as_recorded = _agreement(gnss, counter, 0.0, 0.0)
-    if as_recorded >= _SURELY:
-        return 0.0, ""
     rated = _rated(gnss, counter, possible)
-    if not rated or not _beats(rated[0][0], as_recorded):
-        alike = as_recorded >= _ALIKE
-        return 0.0, "" if alike else "no shift of the clocks makes the speeds agree"
+    if not rated or not explains(rated[0][0], as_recorded):
+        return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
     if len(rated) > 1 and rated[0][0] - rated[1][0] < _RIVAL:
         return 0.0, "several shifts of the clocks make the speeds agree"
     return rated[0][1], ""
@@ -133,18 +135,14 @@ def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[fl
     """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
     found: list[tuple[float, float]] = []
     for first_s in possible.lags_s:
-        best = _agreement(gnss, counter, first_s, _LEAST_OVERLAP), first_s
+        best = _agreement(gnss, counter, first_s, LEAST_SHARE), first_s
         for step_s in _CLIMB_S:
             near = [best[1] - step_s, best[1] + step_s]
-            best = max(best, *((_agreement(gnss, counter, lag_s, _LEAST_OVERLAP), lag_s) for lag_s in near))
+            best = max(best, *((_agreement(gnss, counter, lag_s, LEAST_SHARE), lag_s) for lag_s in near))
         found.append(best)
     found.sort(reverse=True)
-    apart = found[:1] + [one for one in found[1:] if abs(one[1] - found[0][1]) > _SAME_S]
-    return [one for one in apart if abs(one[1]) > _ZERO_S]
-
-
-def _beats(share: float, other: float) -> bool:
-    return share >= _ALIKE and share - other >= _MORE and 1.0 - share <= _LESS * (1.0 - other)
+    apart = found[:1] + [one for one in found[1:] if abs(one[1] - found[0][1]) > APART_S]
+    return [one for one in apart if abs(one[1]) > _NEAR_S]
 
 
 def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float) -> float:
@@ -158,13 +156,13 @@ def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float
     one, other = gnss.speed(grid), np.abs(counter.speed(grid + lag_s))
     known = np.isfinite(one) & np.isfinite(other)
     one, other = one[known], other[known]
-    bounds = _SLOW_SHARE * _usual(one), _SLOW_SHARE * _usual(other)
+    bounds = _SLOW_SHARE * usual(one, 0.9), _SLOW_SHARE * usual(other, 0.9)
     both = (one > bounds[0]) & (other > bounds[1])
-    if both.sum() < _LEAST_WINDOWS:
+    if both.sum() < LEAST:
         return 0.0
-    usual, factor = bounds[0] / _SLOW_SHARE, float(np.median(other[both] / one[both]))
+    fast, factor = bounds[0] / _SLOW_SHARE, float(np.median(other[both] / one[both]))
     moves = (one > bounds[0]) | (other > bounds[1])
-    return float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * usual)[moves]))
+    return float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * fast)[moves]))
 
 
 def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
@@ -173,40 +171,29 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
     if end_s - begin_s < 3.0 * _WINDOW_S[0]:
         return PairFit(reason="nothing in common")
     windows, stands = _windows(gnss, counter, begin_s, end_s, lag_s)
-    if windows.gnss_m.size < _LEAST_WINDOWS:
+    if windows.gnss_m.size < LEAST:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
     ratio = np.abs(windows.counted) / windows.gnss_m
-    usual = float(np.median(ratio))
-    agrees = np.abs(np.log(ratio / usual)) < _AGREES
     sign = -1.0 if np.median(windows.counted) < 0 else 1.0
-    scale, slope, sigmas = _regressed(windows, usual)
+    fit = windows.regressed()
+    (scale, slope), sigma = fit.estimate.tolist(), (_OVERLAP * fit.sigma).tolist()
     return PairFit(
         factor=sign / scale,
-        factor_sigma=sigmas[0] / scale**2,
+        factor_sigma=sigma[0] / scale**2,
         lag_s=lag_s + slope / scale,
-        lag_sigma_s=sigmas[1] / scale,
-        halves=_halves(windows, usual, sign, lag_s),
-        constant=float(agrees.mean()),
-        windows=ratio.size,
+        lag_sigma_s=sigma[1] / scale,
+        halves=tuple((sign / one, lag_s + change / one) for one, change in fit.halves),
+        constant=float(np.mean(np.abs(np.log(ratio / np.median(ratio))) < _AGREES)),
     )
-
-
-def _halves(windows: _Windows, usual: float, sign: float, lag_s: float) -> tuple[tuple[float, float], ...]:
-    """Factor and lag of each half that is long enough."""
-    order = np.arange(windows.gnss_m.size)
-    parts = [windows.take(order < order.size // 2), windows.take(order >= order.size // 2)]
-    fitted = [_regressed(part, usual) for part in parts if part.gnss_m.size >= _LEAST_WINDOWS]
-    return tuple((sign / scale, lag_s + slope / scale) for scale, slope, _ in fitted)
 
 
 def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s: float) -> tuple[_Windows, bool]:
     """Windows in which both move; and whether the counter stands where the positions move."""
-    grid = np.linspace(begin_s, end_s, int(np.clip((end_s - begin_s) / 10.0, 20, 400)))
-    speed = gnss.way(grid[:-1], grid[:-1] + 10.0) / 10.0
-    fast = speed[speed > _STANDS_MPS] if np.isfinite(speed).any() else speed[:0]
+    speed = gnss.speed(np.linspace(begin_s, end_s, 400))
+    fast = speed[np.nan_to_num(speed) > MOVES_MPS]
     if not fast.size:
-        return _Windows(*(np.zeros(0),) * 3), False
+        return _Windows(*(np.zeros(0),) * 4), False
     length_s = float(np.clip(_WINDOW_M / np.median(fast), *_WINDOW_S))
     starts = np.arange(begin_s, end_s - length_s, length_s / 2)
     ends = starts + length_s
@@ -215,38 +202,11 @@ def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s:
     change = _speed(counter, ends + lag_s) - _speed(counter, starts + lag_s)
     known = np.isfinite(way) & np.isfinite(counted) & np.isfinite(change)
     size = np.abs(counted)
-    moves = known & (way > _SLOW_SHARE * _usual(way[known])) & (way > _STANDS_MPS * length_s)
+    moves = known & (way > _SLOW_SHARE * usual(way[known], 0.9)) & (way > MOVES_MPS * length_s)
     stands = bool(moves.any() and np.mean(size[moves] == 0.0) > 0.9)
-    moves &= size > _SLOW_SHARE * _usual(size[known])
-    change = np.where(counted < 0, -change, change)
-    return _Windows(way, counted, change).take(moves), stands
-
-
-def _usual(values: Floats) -> float:
-    return float(np.quantile(values, 0.9)) if values.size else 0.0
+    moves &= size > _SLOW_SHARE * usual(size[moves])
+    return _Windows(way, size, np.where(counted < 0, -change, change), counted).take(moves), stands
 
 
 def _speed(counter: Course, t_s: Floats) -> Floats:
     return counter.gained(t_s - 1.0, t_s + 1.0) / 2.0
-
-
-def _regressed(windows: _Windows, usual: float) -> tuple[float, float, Floats]:
-    """Metres per unit, its slope over the change of speed, and the sigmas of both.
-
-    GNSS way = a counted + b change, for the counter is the less noisy one; a lag of the counter's stamps by
-    `d` beyond the assumed one is b = a d.
-    """
-    design = np.column_stack([np.abs(windows.counted), windows.change])
-    estimate = np.array([1.0 / usual, 0.0])
-    weight = np.ones(windows.gnss_m.size)
-    spread_m = 0.0
-    for _ in range(_ROUNDS):
-        left_m = windows.gnss_m - design @ estimate
-        spread_m = max(1.4826 * float(np.median(np.abs(left_m))), _LEAST_SPREAD_M)
-        weight = np.clip(1.0 - (left_m / (_BIWEIGHT * spread_m)) ** 2, 0.0, None) ** 2
-        normal = design.T @ (design * weight[:, None])
-        if np.linalg.cond(normal) > 1e14:
-            return 1.0 / usual, 0.0, np.array([spread_m / np.sqrt((design[:, 0] ** 2).sum()), np.inf])
-        estimate = np.linalg.solve(normal, design.T @ (weight * windows.gnss_m))
-    sigmas = _OVERLAP * spread_m * np.sqrt(np.diag(np.linalg.inv(normal)))
-    return float(estimate[0]), float(estimate[1]), sigmas

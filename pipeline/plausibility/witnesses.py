@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipeline.plausibility.causes import explain_lag, leap_seconds
-from pipeline.plausibility.check import Check, State, fits, not_checked
-from pipeline.plausibility.corrections import correction
+from pipeline.plausibility.check import Check, State, correction, fits, not_checked
 from schemas.config import IngestConfig
 
 # Two lags are of one clock if they are so near to each other [s].
@@ -30,59 +29,47 @@ class Lag:
     latency_known: bool = False
 
 
-def lag_checks(
-    lags: list[Lag], streams: list[str], solution: str | None, t_ns: int, config: IngestConfig
-) -> list[Check]:
-    """One check per stream; `streams`: what the run holds, `solution`: the GNSS solution if there are several.
+@dataclass(frozen=True)
+class Clocks:
+    """The streams of a run, the GNSS solution if there are several, an instant of it, and what is still no misfit."""
 
-    What two recorders say against the GNSS is the GNSS's own.
-    """
-    wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > config.fit_lag_limit_s]
-    others = [lag for lag in lags if not lag.reason and lag not in wrong]
-    shared = [one for one in wrong if all(abs(one.lag_s - other.lag_s) < _SAME_S for other in wrong)]
-    gnss_is_wrong = len(shared) >= 2 and not others
-    return [_check(lag, gnss_is_wrong, bool(others), streams, solution, t_ns, config) for lag in lags]
+    streams: list[str]
+    solution: str | None
+    t_ns: int
+    config: IngestConfig
 
+    def checks(self, lags: list[Lag]) -> list[Check]:
+        """One check per stream. What two recorders say against the GNSS is the GNSS's own."""
+        wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > self.config.fit_lag_limit_s]
+        others = [lag for lag in lags if not lag.reason and lag not in wrong]
+        alike = all(abs(one.lag_s - wrong[0].lag_s) < _SAME_S for one in wrong)
+        gnss_is_wrong = len(wrong) >= 2 and alike and not others
+        return [self._check(lag, gnss_is_wrong, known=bool(others) or len(wrong) >= 2) for lag in lags]
 
-def _check(
-    lag: Lag,
-    gnss_is_wrong: bool,
-    contradicted: bool,
-    streams: list[str],
-    solution: str | None,
-    t_ns: int,
-    config: IngestConfig,
-) -> Check:
-    what = f"clock of the {NAMES[lag.stream]} against the GNSS"
-    if lag.reason:
-        return not_checked(what, lag.reason)
-    size_s = abs(lag.lag_s)
-    if not lag.sure and size_s > max(config.fit_lag_told_s, 5.0 * lag.sigma_s):
-        return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
-    if not lag.sure or size_s <= config.fit_lag_told_s:
-        sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
-        return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
-    found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {NAMES[lag.stream]} are {_later(lag.lag_s)}"
-    if size_s <= config.fit_lag_limit_s:
-        return _small(what, found, lag)
-    explained = explain_lag(lag.lag_s, t_ns, min(3.0 * lag.sigma_s, 3.0))
-    exact_s = lag.lag_s if explained is None else explained.exact
-    cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
-    exact_s = round(exact_s, 2)
-    at_gnss = gnss_is_wrong or (not contradicted and _rather_gnss(lag.lag_s, cause, t_ns))
-    if at_gnss:
-        lines = "".join(
-            correction(stream, shift_s=exact_s, solution=solution)
-            for stream in ("gnss", "satellites")
-            if stream in streams
-        )
-        return Check(what, State.IMPOSSIBLE, found, f"{cause}, in the GNSS", "the configuration", lines)
-    lines = correction(lag.stream, shift_s=-exact_s)
-    return Check(what, State.IMPOSSIBLE, found, f"{cause}, in the {NAMES[lag.stream]}", "the configuration", lines)
-
-
-def _later(lag_s: float) -> str:
-    return "later" if lag_s > 0 else "earlier"
+    def _check(self, lag: Lag, gnss_is_wrong: bool, known: bool) -> Check:
+        what, size_s = f"clock of the {NAMES[lag.stream]} against the GNSS", abs(lag.lag_s)
+        if lag.reason:
+            return not_checked(what, lag.reason)
+        if not lag.sure and size_s > max(self.config.fit_lag_told_s, 5.0 * lag.sigma_s):
+            return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
+        if not lag.sure or size_s <= self.config.fit_lag_told_s:
+            sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
+            return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
+        later = "later" if lag.lag_s > 0 else "earlier"
+        found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {NAMES[lag.stream]} are {later}"
+        if size_s <= self.config.fit_lag_limit_s:
+            return _small(what, found, lag)
+        explained = explain_lag(lag.lag_s, self.t_ns, min(3.0 * lag.sigma_s, 3.0))
+        exact_s = round(lag.lag_s if explained is None else explained.exact, 2)
+        cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
+        at_gnss = gnss_is_wrong or (not known and _rather_gnss(lag.lag_s, cause, self.t_ns))
+        pair = ("GNSS", NAMES[lag.stream]) if at_gnss else (NAMES[lag.stream], "GNSS")
+        cause += f", in the {pair[0]}" if known or gnss_is_wrong else f", rather in the {pair[0]} than in the {pair[1]}"
+        if not at_gnss:
+            return Check(what, State.IMPOSSIBLE, found, cause, correction(lag.stream, shift_s=-exact_s))
+        streams = [stream for stream in ("gnss", "satellites") if stream in self.streams]
+        lines = "".join(correction(stream, shift_s=exact_s, solution=self.solution) for stream in streams)
+        return Check(what, State.IMPOSSIBLE, found, cause, lines)
 
 
 def _rather_gnss(lag_s: float, cause: str, t_ns: int) -> bool:
@@ -100,10 +87,9 @@ def _small(what: str, found: str, lag: Lag) -> Check:
     latency_s = round(-lag.lag_s, 2)
     if lag.stream == "odometer" and latency_s > 0 and not lag.latency_known:
         lines = f"gnss_latency_s = {latency_s}\ngnss_latency_sigma_s = {max(round(lag.sigma_s, 3), 0.02)}\n"
-        return Check(what, State.MISFIT, found, "positions arrive too old", "the vehicle file", lines)
+        return Check(what, State.MISFIT, found, "positions arrive too old", lines, "append to the vehicle file")
     cause = f"one of both is stamped {'too late' if latency_s < 0 else 'too early'}, or the positions are off"
     if lag.stream == "reference":
         # The judge believes the reference: nobody should shift it to where the positions want it.
         return Check(what, State.MISFIT, found, cause, advice="Find out which clock is wrong before one is corrected.")
-    lines = correction(lag.stream, shift_s=latency_s)
-    return Check(what, State.MISFIT, found, cause, "the configuration", lines)
+    return Check(what, State.MISFIT, found, cause, correction(lag.stream, shift_s=latency_s))

@@ -27,6 +27,8 @@ class Purpose:
 
 def assigned(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
     """The streams as they are meant; raises `UsageError` where one name would cover several receivers."""
+    if purpose.solution is not None and not purpose.solution.strip():
+        raise UsageError("is empty", place="--solution", expected="a name for the receiver")
     if purpose.stream == "reference":
         return {name: frame for name, frame in streams.items() if name not in _BY_SOLUTION} | _reference(
             streams, purpose, sigmas
@@ -66,7 +68,8 @@ def _reference(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
         )
     by_fix = {fix.value: sigmas.horizontal_m(fix) for fix in Fix}
     table = pl.col("fix").cast(pl.String).replace_strict(by_fix, return_dtype=pl.Float64)
-    stated = ((pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2).sqrt()
+    mean, half = (pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2, (pl.col("cov_ee_m2") - pl.col("cov_nn_m2")) / 2
+    stated = (mean + (half**2 + pl.col("cov_en_m2") ** 2).sqrt()).sqrt()  # of the worst direction
     columns = ("t", "latitude_deg", "longitude_deg", "height_m")
     return {"reference": fixes.select(*columns, sigma_m=pl.coalesce(stated, table))}
 

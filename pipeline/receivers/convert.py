@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from pipeline.receivers.epochs import Epochs, Gathered
 from pipeline.receivers.frames import Frame, Protocol, frames
 from pipeline.receivers.names import name_of
 from pipeline.receivers.rtklib import is_solution, read_solution
-from pipeline.receivers.unpack import unpacked
+from pipeline.receivers.unpack import BAG_FOLDER, unpacked
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import InputError
 from schemas.run import STREAMS, RunLog, Stream
@@ -85,11 +86,17 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
     dropped: Counter[str] = Counter()
     parts: list[tuple[Path, Streams]] = []
     failures: list[NoEpochError] = []
+    strangers: list[UnknownError] = []
     for log in logs:
         with unpacked(log) as inner:
             for plain in inner:
                 try:
                     streams, counts = _convert_one(plain, config or IngestConfig(), date)
+                except UnknownError as error:
+                    if plain == log:
+                        raise
+                    strangers.append(error)
+                    continue
                 except NoEpochError as error:
                     failures.append(error)
                     continue
@@ -97,13 +104,20 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
                 dropped.update(counts)
     if failures and not any("gnss" in streams for _, streams in parts):
         raise failures[0]
-    dropped.update({"log without an epoch": len(failures)} if failures else {})
+    if strangers and not parts:
+        raise strangers[0]
+    counts = {"log without an epoch": len(failures), "file of an archive that is no log": len(strangers)}
+    dropped.update({reason: count for reason, count in counts.items() if count})
     _refuse_overlaps(parts)
     return Gatherings(_joined(parts), dict(dropped))
 
 
 class NoEpochError(InputError):
     """A log of a receiver whose messages tell no position with a time."""
+
+
+class UnknownError(InputError):
+    """A file without a message of a known receiver."""
 
 
 def _reasons(dropped: Mapping[str, int]) -> str:
@@ -152,7 +166,8 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[St
     try:
         content = log.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
+        expected = f"a file, or the folder of a bag with its {BAG_FOLDER}" if log.is_dir() else None
+        raise InputError(f"cannot be read: {error.strerror}", place=str(log), expected=expected) from None
     if is_solution(content):
         return read_solution(content, log)
     return _read(content, log, date)
@@ -194,11 +209,12 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
     """What there is in place of positions tells what to change at the receiver."""
     met = Counter(name_of(frame) for frame in frames(content, lambda: None))
     if not met:
-        return InputError(
-            "holds no message of a known receiver",
+        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, content)), _OTHER)
+        return UnknownError(
+            "holds no message of a known receiver" if content else "is empty",
             place=str(log),
             expected="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, a bag, or CSV",
-            remedy="Convert it to CSV and give a mapping, if the receiver is another one." + _reasons(dropped),
+            remedy=hint + _reasons(dropped),
         )
     return NoEpochError(
         "no epoch with a time and a position",
@@ -237,6 +253,13 @@ def _decode(frame: Frame, decode: Decode, gathered: Gathered) -> None:
         gathered.drop(_UNFIT)
 
 
+# What is left out though it is almost a log, and what to do.
+_OTHER = "Convert it to CSV and give a mapping, if the receiver is another one."
+_ALMOST = {
+    rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
+    rb"(?m)^<(BEST|PSR|INS)": "Abbreviated ASCII of NovAtel has no checksums: log BESTPOSA or BESTPOSB.",
+    rb"\A\s*\d{4}(/\d\d/\d\d|\s+\d+\.\d+\s)": "If it is of RTKLIB, let it write its header (out-outhead = on).",
+}
 _MOST_NAMES = 20
 _UNFIT = "message that does not fit its definition"
 

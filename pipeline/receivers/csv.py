@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
 from pipeline.ingest.breaches import refuse
@@ -20,9 +22,17 @@ from schemas.run import STREAMS, Stream
 CUT_ROW = "row that breaks off at the end of the file"
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _UNITS_ROW = "row of units"
-_COMMA_NUMBER = r"^\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$"
-_WHOLE_NUMBER = r"^\s*[+-]?\d+\s*$"
-_THOUSANDS = r"^\s*[+-]?\d{1,3},\d{3}\s*$"
+_SHORT_ROW = "end of a row, which is missing (taken as empty)"
+# What rows of a stream are for. Of positions, so few tell no usual step; a longer one than so many lacks an epoch.
+_VALUES: dict[Stream, tuple[str, ...]] = {
+    "gnss": ("latitude_deg", "longitude_deg"),
+    "odometer": ("distance_m", "speed_mps"),
+    "reference": ("latitude_deg", "longitude_deg"),
+    "balise_reads": ("balise_id",),
+}
+_FEWEST, _USUAL_STEPS = 3, 1.5
+# Decimal mark, and what may separate thousands beside it.
+_MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
 
 
 def names_file(config: IngestConfig, path: Path) -> bool:
@@ -38,10 +48,13 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
     log = read_log_table(path, infer=True)
     table = with_points(log)
     streams: dict[Stream, pl.DataFrame] = {}
+    empty: Counter[str] = Counter()
     for name in STREAMS:
         for mapping in mappings_of(config, name):
             if mapping.topic in (path.name, path.stem, "*"):
-                frame = _mapped(table, mapping, name, path)
+                mapped = _mapped(table, mapping, name, path)
+                frame = mapped.filter(_told(mapped, name, "fix" in mapping.fields))
+                empty[f"row without a value of {name}"] += mapped.height - frame.height
                 streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
     if not streams:
         raise InputError(
@@ -51,34 +64,52 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
             expected=f'a table [ingest.gnss] with topic = "{path.name}"',
             remedy="Give a mapping by --config; `balise inspect` of the file prints a draft.",
         )
-    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units))}
+    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short} | empty
     return streams, {reason: count for reason, count in left.items() if count}
 
 
-def with_points(log: LogTable) -> pl.DataFrame:
-    """The table with decimal commas read as such: where no number of the file has a decimal point.
+def _told(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
+    """Rows that tell something of a stream: tables of several recorders leave cells empty.
 
-    Between commas, 1,234 in quotes is rather a thousand and more than one: such a file must have other fractions too.
+    An empty position may as well be an outage, which a kind of fix would say. Without one it is none where the
+    positions around it follow each other as they usually do.
     """
-    texts = [name for name, dtype in log.table.schema.items() if dtype == pl.String]
-    fractions = [name for name in texts if _all_numbers(log.table[name])]
-    written = (
-        pl.concat([log.table[name].drop_nulls() for name in fractions]) if fractions else pl.Series(dtype=pl.String)
-    )
-    with_comma = written.filter(written.str.contains(","))
-    doubtful = log.separator == "," and with_comma.str.contains(_THOUSANDS).all()
-    if any(dtype.is_float() for dtype in log.table.schema.values()) or doubtful:
+    names = [name for name in _VALUES.get(stream, ()) if name in frame.columns]
+    if not names:
+        return pl.repeat(True, frame.height, eager=True)
+    told = frame.select(pl.any_horizontal(pl.col(names).is_not_null())).to_series()
+    if stream != "gnss" or told.sum() < _FEWEST or told.all():
+        return told if stream != "gnss" else pl.repeat(True, frame.height, eager=True)
+    t_ns = frame["t"].to_physical().fill_null(0).to_numpy()
+    at = np.sort(t_ns[told.to_numpy()])
+    after = at.searchsorted(t_ns).clip(1, at.size - 1)
+    steps = np.diff(at)
+    between = (t_ns > at[0]) & (t_ns < at[-1]) & (steps[after - 1] <= _USUAL_STEPS * np.median(steps))
+    return told | has_fix | pl.Series(~between)
+
+
+def with_points(log: LogTable) -> pl.DataFrame:
+    """The table with its numbers as such: those with a decimal comma where no number of the file has a decimal point,
+    and those with separated thousands.
+
+    Between commas, 1,234 in quotes may be a fraction or a thousand and more: such a file must have other numbers too.
+    """
+    texts = log.table.select(pl.col(pl.String).replace("", None))
+    fitting = {mark: {name for name in texts.columns if _fits(texts[name], mark)} for mark in _MARKS}
+    numbers = set.union(*fitting.values())
+    has_point = any(dtype.is_float() for dtype in log.table.schema.values())
+    marks = [mark for mark, names in fitting.items() if names == numbers and not (mark == "," and has_point)]
+    if not marks or (len(marks) == len(_MARKS) and log.separator == ","):
         return log.table
-    return log.table.with_columns(
-        pl.col(fractions).replace("", None).str.replace(",", ".", literal=True).cast(pl.Float64)
-    )
+    plain = pl.col(sorted(numbers)).replace("", None).str.replace("\u2212", "-").str.replace_all(_MARKS[marks[0]], "")
+    return log.table.with_columns(plain.str.replace(marks[0], ".", literal=True).cast(pl.Float64))
 
 
-def _all_numbers(column: pl.Series) -> bool:
-    """Whether every cell is a number, some of them with a comma."""
-    cells = column.replace("", None).drop_nulls()
-    with_comma = cells.str.contains(_COMMA_NUMBER)
-    return bool(with_comma.any()) and bool((with_comma | cells.str.contains(_WHOLE_NUMBER)).all())
+def _fits(column: pl.Series, mark: str) -> bool:
+    """Whether every cell is a number with this decimal mark."""
+    whole = rf"(?:\d{{1,3}}(?:{_MARKS[mark]}\d{{3}})+|\d+)"
+    number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}]\d+)?|[{mark}]\d+)(?:[eE][+-]?\d+)?\s*$"
+    return column.null_count() < len(column) and bool(column.drop_nulls().str.contains(number).all())
 
 
 def _mapped(table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path) -> pl.DataFrame:
@@ -107,10 +138,17 @@ def _kind(dtype: pl.DataType) -> str:
 def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
     try:
         return recorded.cast(source.types[recorded.name])
-    except pl.exceptions.PolarsError as error:
+    except pl.exceptions.PolarsError:
         wanted = ", ".join(name for name in source.columns if recorded.name in source.recipe.fields_of(name))
-        reason = str(error).splitlines()[0]
-        raise InputError(f"cannot be {wanted}: {reason}", place=f"{path}: column {recorded.name}") from None
+        unfit = recorded.cast(source.types[recorded.name], strict=False).is_null() & (recorded != "")
+        row = int(unfit.arg_max() or 0)
+        raise InputError(
+            f"cannot be {wanted}",
+            place=f"{path}: column {recorded.name}",
+            found=f"{recorded[row]} in row {row + 1}, {unfit.sum()} rows of this kind",
+            expected="numbers" if source.types[recorded.name].is_numeric() else "true or false",
+            remedy="Correct these cells, or empty them where nothing is known.",
+        ) from None
 
 
 def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:

@@ -25,7 +25,7 @@ _LATEST_MESSAGE = 32
 class Epoch:
     """What is known of one epoch: `gnss` columns and satellite rows. Without a time it yields nothing."""
 
-    key: Hashable
+    key: Any  # hashable
     number: int
     t_ns: int | None = None
     gnss: dict[str, Any] = field(default_factory=dict)

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 
 from pipeline.receivers.frames import Frame, Protocol
+from pipeline.receivers.novatel import BINARY_NAMES
 
 
 def name_of(frame: Frame) -> str:
@@ -37,7 +38,8 @@ def _rtcm(content: bytes) -> str:
 def _novatel(content: bytes) -> str:
     if content[:1] in (b"#", b"%"):
         return content[1:].split(b",")[0].decode()
-    return f"message {struct.unpack_from('<H', content, 4)[0]}"
+    number = struct.unpack_from("<H", content, 4)[0]
+    return BINARY_NAMES.get(number, f"message {number}")
 
 
 _NAMES: dict[Protocol, Callable[[bytes], str]] = {

@@ -19,6 +19,7 @@ _FIXES = {
     4: Fix.RTK_FIXED,
     5: Fix.RTK_FLOAT,
     6: Fix.ESTIMATED,
+    9: Fix.SBAS,  # of NovAtel's receivers; 7 and 8 are typed in or simulated
 }
 # Mode letters of RMC and GNS, the best first: a solution is as good as its best satellite system.
 _MODES = {
@@ -62,8 +63,8 @@ class NmeaDecoder:
 
     def _follow(self, message: Any) -> None:
         """The day of this sentence: as it says itself, or the last one, past midnight the next."""
-        if message.msgID == "RMC" and isinstance(message.date, date):
-            self._day = message.date
+        if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
+            self._day = message.date  # before its first position a receiver tells a date of its own making
         elif message.msgID == "ZDA" and (day := _date_of(message)):
             self._day = day
         elif self._day is not None and self._latest is not None:

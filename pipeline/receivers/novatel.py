@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from pipeline.ingest.novatel import FIX_BY_CODE
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.ingest.timescale import utc_of_week
 from pipeline.receivers.epochs import Epoch, Gathered
 from schemas.enums import Fix
 
 # Messages with a position, by rank: that of the receiver before those of the inertial solution.
 _RANKS = {"INSPVAS": 0, "INSPVA": 0, "INSPVAX": 1, "PSRPOS": 2, "BESTGNSSPOS": 3, "BESTPOS": 4}
 _INERTIAL = ("INSPVAS", "INSPVA", "INSPVAX")
-_WANTED = {
+BINARY_NAMES = {
     42: "BESTPOS",
     47: "PSRPOS",
     99: "BESTVEL",
@@ -32,12 +32,13 @@ _COARSE = 100  # "GPS reference time status": below it the time is approximate o
 _WGS84 = 61
 # "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
 _SOLVED = (2, 3, 6, 7)
-_WEEK_MS = 604_800_000
+_VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
+_LONGEST_BETWEEN_NS = 1_500_000_000  # between two velocities at 1 Hz, one of them late
 
 
 def parse(raw: bytes) -> Any:
     """The message, none if it is of no interest."""
-    return _decoder().decode(raw) if _name(raw) in _WANTED.values() else None
+    return _decoder().decode(raw) if _name(raw) in BINARY_NAMES.values() else None
 
 
 @cache
@@ -50,7 +51,7 @@ def _decoder() -> Any:
 def _name(raw: bytes) -> str:
     if raw[:1] in (b"#", b"%"):
         return raw[1:].split(b",")[0].decode().removesuffix("A")
-    return _WANTED.get(struct.unpack_from("<H", raw, 4)[0], "")
+    return BINARY_NAMES.get(struct.unpack_from("<H", raw, 4)[0], "")
 
 
 def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
@@ -60,11 +61,13 @@ def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
         gathered.drop("time not valid")
         return
     week, ms = int(m.header.week), round(float(m.header.milliseconds))
-    epoch = gathered.at((week, ms), name if name in _RANKS else "", raw)
-    gps_ns = GPS_EPOCH_NS + (week * _WEEK_MS + ms) * 1_000_000
-    epoch.tell_time(0, int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0]))
+    if name == "BESTVEL" and int(m.status):
+        return
+    epoch = gathered.at((name if name == "BESTVEL" else "", week, ms), name if name in _RANKS else "", raw)
+    epoch.t_ns = utc_of_week(week, ms * 1_000_000)
     if name == "BESTVEL":
-        _velocity(epoch, m)
+        epoch.t_ns -= round(m.latency * 1e9)
+        epoch.gnss |= _velocity(m)
     elif name in _INERTIAL:
         _inertial(epoch, m, _RANKS[name])
     elif int(m.datum_id) != _WGS84:
@@ -76,7 +79,11 @@ def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
 
 
 def settle_source(gathered: Gathered) -> None:
-    """Keep the epochs of the message of highest rank: several in turn would be several receivers under one name."""
+    """Keep the epochs of the message of highest rank, with their velocities: several in turn would be several receivers
+    under one name.
+    """
+    velocities = [epoch for epoch in gathered.epochs if epoch.key[0] == "BESTVEL"]
+    gathered.epochs = [epoch for epoch in gathered.epochs if epoch.key[0] != "BESTVEL"]
     names = {
         name for epoch in gathered.epochs if epoch.gnss.get("fix", Fix.NONE) != Fix.NONE for name in epoch.positions
     }
@@ -86,6 +93,7 @@ def settle_source(gathered: Gathered) -> None:
     other = [epoch for epoch in gathered.epochs if epoch.positions and best not in epoch.positions]
     gathered.drop(f"NovAtel position beside those of {best}", len(other))
     gathered.epochs = [epoch for epoch in gathered.epochs if best in epoch.positions]
+    _give(velocities, gathered.epochs)
 
 
 def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
@@ -93,11 +101,7 @@ def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
     solved = int(m.ins_solution_status) in _SOLVED
     kind = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if hasattr(m, "position_type") else Fix.ESTIMATED
     _place(epoch, m, rank, kind if solved else Fix.NONE)
-    epoch.tell(
-        "velocity",
-        rank,
-        {f"vel_{a}_mps": getattr(m, f"{d}_vel") for a, d in zip("enu", ("east", "north", "up"), strict=True)},
-    )
+    epoch.tell("velocity", rank, dict(zip(_VELOCITY, (m.east_vel, m.north_vel, m.up_vel), strict=True)))
 
 
 def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
@@ -114,11 +118,22 @@ def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
         epoch.tell("accuracy", rank, variances | {"cov_en_m2": 0.0, "cov_eu_m2": 0.0, "cov_nu_m2": 0.0})
 
 
-def _velocity(epoch: Epoch, m: Any) -> None:
+def _velocity(m: Any) -> dict[str, float]:
     """BESTVEL: speed over ground, its direction, and the vertical speed."""
-    if int(m.status) == 0:
-        course = np.radians(m.ground_track)
-        east, north = m.horizontal_speed * np.sin(course), m.horizontal_speed * np.cos(course)
-        epoch.tell(
-            "velocity", max(_RANKS.values()), {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": m.z}
-        )
+    course = np.radians(m.ground_track)
+    east, north = m.horizontal_speed * np.sin(course), m.horizontal_speed * np.cos(course)
+    return dict(zip(_VELOCITY, (float(east), float(north), float(m.z)), strict=True))
+
+
+def _give(velocities: list[Epoch], epochs: list[Epoch]) -> None:
+    """The velocity of each epoch between the two of BESTVEL around it: "latency" is how much older it is."""
+    if not velocities or not epochs:
+        return
+    told = sorted((epoch.t_ns or 0, *(epoch.gnss[name] for name in _VELOCITY)) for epoch in velocities)
+    at, wanted = np.array([row[0] for row in told]), np.array([epoch.t_ns for epoch in epochs])
+    before = at[np.maximum(np.searchsorted(at, wanted, side="right") - 1, 0)]
+    after = at[np.minimum(np.searchsorted(at, wanted), len(at) - 1)]
+    near = (before <= wanted) & (wanted <= after) & (after - before <= _LONGEST_BETWEEN_NS)
+    between = [np.interp((wanted - at[0]) * 1e-9, (at - at[0]) * 1e-9, [row[i] for row in told]) for i in (1, 2, 3)]
+    for number in np.flatnonzero(near):
+        epochs[number].gnss |= {name: float(v[number]) for name, v in zip(_VELOCITY, between, strict=True)}

@@ -13,7 +13,9 @@ from tempfile import TemporaryDirectory
 
 from schemas.errors import InputError
 
-_BAG_FOLDER = "metadata.yaml"
+BAG_FOLDER = "metadata.yaml"
+_PACKED = (".gz", ".zip")
+_DEEPEST = 3  # archives in archives; one that holds itself has no end
 
 
 @contextmanager
@@ -22,14 +24,14 @@ def unpacked(log: Path) -> Iterator[list[Path]]:
 
     A folder is one log (a bag of ROS 2), in an archive as well. Errors name the archive, not where it was unpacked.
     """
-    if log.suffix.lower() not in (".gz", ".zip"):
+    if log.suffix.lower() not in _PACKED:
         yield [log]
         return
     with TemporaryDirectory() as folder:
         place = Path(folder)
         try:
             _unpack(log, place)
-            yield [inner for found in sorted(place.iterdir()) for inner in _logs(found)]
+            yield [inner for found in sorted(place.iterdir()) for inner in _logs(found, _DEEPEST)]
         except (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
             raise InputError(
                 f"cannot be unpacked: {error}",
@@ -51,13 +53,19 @@ def _unpack(log: Path, place: Path) -> None:
         shutil.copyfileobj(packed, plain)
 
 
-def _logs(path: Path) -> Iterator[Path]:
+def _logs(path: Path, deeper: int) -> Iterator[Path]:
     """The logs at a place of an archive; what the makers of archives leave in them is none."""
     if path.name.startswith((".", "__MACOSX")):
         return
-    if path.is_dir() and not (path / _BAG_FOLDER).exists():
+    if path.suffix.lower() in _PACKED and path.is_file():
+        if not deeper:
+            raise OSError(f"{path.name} is packed too often")
+        inner = path.with_name(path.name + ".unpacked")
+        inner.mkdir()
+        _unpack(path, inner)
+        path, deeper = inner, deeper - 1
+    if path.is_dir() and not (path / BAG_FOLDER).exists():
         for inner in sorted(path.iterdir()):
-            yield from _logs(inner)
+            yield from _logs(inner, deeper)
         return
-    with unpacked(path) as inner_logs:
-        yield from inner_logs
+    yield path

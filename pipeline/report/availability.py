@@ -7,14 +7,13 @@ from math import ceil
 import numpy as np
 import polars as pl
 
-from pipeline.export.places import element_lines_m, ground_of, origin_of, plane_m, thinned
+from pipeline.export.places import element_lines_m, ground_of, origin_of, plane_m
 from pipeline.report.columns import Row
 from pipeline.report.markup import Json
 from schemas.arrays import Floats
 from schemas.run import Site
 
 _PIECES = 400
-_TRACK_POINTS = 3000
 # Each a multiple of the one before, so that pieces of runs go together without their epochs.
 _STEPS_M = (10.0, 50.0, 100.0, 500.0, 1000.0, 5000.0)
 _PLACE = ("solution", "netelement_id", "from_m")
@@ -86,7 +85,7 @@ def availability_map(pieces: pl.DataFrame, hazards: pl.DataFrame, site: Site | N
 
 
 def _track_line(name: str, east: Floats, north: Floats) -> Json:
-    x, y = (np.round(thinned(values, _TRACK_POINTS), 1).tolist() for values in (east, north))
+    x, y = (np.round(values, 1).tolist() for values in (east, north))
     return {"name": name, "x": x, "y": y}
 
 

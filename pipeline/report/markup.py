@@ -225,6 +225,11 @@ def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:
     return {"kind": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
 
 
+def packed_line(name: str, x: npt.ArrayLike, y: npt.ArrayLike) -> Json:
+    """A named line of a drawing."""
+    return {"name": name, "x": packed(x, "f4"), "y": packed(y, "f4")}
+
+
 def script_json(value: Json) -> str:
     """JSON that may stand inside a script element."""
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False, sort_keys=True)

@@ -20,11 +20,10 @@ from pipeline.export.places import (
     plane_m,
     sign_of,
     stretches_of,
-    thinned,
 )
 from pipeline.report.balises import OUTCOMES, outcome
 from pipeline.report.decimate import detail_rows, worst_rows
-from pipeline.report.markup import Json, packed
+from pipeline.report.markup import Json, packed, packed_line
 from schemas.arrays import Floats, Ints, floats
 from schemas.enums import Judgement
 from schemas.run import Site
@@ -33,7 +32,6 @@ STATES = (Judgement.RIGHT.value, Judgement.UNKNOWN.value, Judgement.WRONG.value)
 """From harmless to bad."""
 
 _POINTS = 8000
-_TRACK_POINTS = 3000
 _AROUND_M = 500.0
 
 
@@ -99,10 +97,7 @@ def _track(site: Site, x: Floats, y: Floats) -> list[Json]:
     low = np.array([x[known].min(), y[known].min()]) - _AROUND_M
     high = np.array([x[known].max(), y[known].max()]) + _AROUND_M
     return [
-        {
-            "name": name,
-            **{axis: packed(thinned(line, _TRACK_POINTS), "f4") for axis, line in (("x", east), ("y", north))},
-        }
+        packed_line(name, east, north)
         for name, east, north in element_lines_m(site)
         if (low <= [east.max(), north.max()]).all() and (high >= [east.min(), north.min()]).all()
     ]
@@ -113,7 +108,7 @@ def _axis(x: Floats) -> list[Json]:
     if not len(known):
         return []
     ends = np.array([known.min(), known.max()])
-    return [{"name": "path", "x": packed(ends, "f4"), "y": packed(np.zeros(2), "f4")}]
+    return [packed_line("path", ends, np.zeros(2))]
 
 
 def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:

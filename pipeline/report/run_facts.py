@@ -34,9 +34,7 @@ def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -
         "Date": _span(first),
         "Line": _line(first, tables.epochs),
         "Train": _TRAINS.get(first["vehicle"], "not known"),
-        "Receivers": ", ".join(
-            f"{row['solution']} {number(row['gnss_rate_hz'])} Hz" for row in rows if row["solution"]
-        ),
+        "Receivers": ", ".join(map(_receiver, (row for row in rows if row["solution"]))),
         "Judged by": JUDGES.get(first["evidence"], "nothing: the log has no reference, no reads, no odometer"),
         "Reading of the log": ", ".join(dict.fromkeys(_reading(row) for row in rows)),
         "Program": f"{first['software']}, tables {first['contract']}",

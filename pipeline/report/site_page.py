@@ -8,14 +8,12 @@ from html import escape
 import numpy as np
 import polars as pl
 
-from pipeline.export.places import element_lines_m, ground_of, origin_of, plane_m, thinned
-from pipeline.report.markup import Json, cell, figure, packed, page, script_json, section, table, tiles
+from pipeline.export.places import element_lines_m, ground_of, origin_of, plane_m
+from pipeline.report.markup import Json, cell, figure, packed_line, page, script_json, section, table, tiles
 from pipeline.site.describe import elements_table
 from schemas.arrays import floats
 from schemas.run import Site
 from schemas.version import SOFTWARE
-
-_POINTS = 2000
 
 
 def site_page(name: str, site: Site) -> str:
@@ -70,14 +68,7 @@ def _balise_rows(site: Site) -> list[tuple[object, ...]]:
 
 def _plan(site: Site) -> Json:
     """Lines and marks in metres east and north of the first point."""
-    lines = [
-        {
-            "name": name,
-            **{axis: packed(thinned(line, _POINTS), "f4") for axis, line in (("x", east), ("y", north))},
-        }
-        for name, east, north in element_lines_m(site)
-    ]
-    return {"elements": lines, "balises": _marks(site)}
+    return {"elements": [packed_line(*line) for line in element_lines_m(site)], "balises": _marks(site)}
 
 
 def _marks(site: Site) -> list[Json]:

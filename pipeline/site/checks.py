@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.track.geodesy import points_of
+from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
 from schemas.arrays import Floats
 from schemas.enums import Navigability
@@ -19,15 +20,13 @@ from schemas.run import Finding
 # track; beyond this the path position would be wrong by a position failure, so the site is refused.
 GAP_LIMIT_M = 20.0
 NEAR_ENDS_M = 5.0
-HEIGHT_STEP_M = 0.5
-SHORT_ELEMENT_M = 1.0
+# Two ends that point at each other so far apart are one track with a piece missing; a curve turns less in between.
+FACING_REACH_M = 300.0
+FACING_COSINE = 0.94
 LENGTH_TOLERANCE = 1e-3
-LENGTH_TOLERANCE_M = 0.5
 CHORD_ERROR_M = 0.25
 # Of a finding about one balise: this and its id.
 BALISE_PLACE = "balises: "
-# An end's direction is that of its last metres: single vertices may lie a centimetre apart.
-END_REACH_M = 20.0
 
 
 @dataclass
@@ -123,7 +122,8 @@ def outward(track: Track) -> np.ndarray:
         surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
         for position, line in ((0, surface), (1, surface[::-1])):
             way = np.linalg.norm(line - line[0], axis=1)
-            inside = int(np.argmax(way >= END_REACH_M)) or int(np.argmax(way))
+            # Single vertices may lie a centimetre apart.
+            inside = int(np.argmax(way >= SAMPLE_SPACING_M)) or int(np.argmax(way))
             directions[element, position] = line[inside] - line[0]
     return directions
 
@@ -139,10 +139,10 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
         )
         geometric = geometric_measures_m(latitude, longitude, height)
         length = float(geometric[-1])
-        if length < SHORT_ELEMENT_M:
+        if length < GAP_COUNTS_M:
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
-            if abs(declared - length) > max(LENGTH_TOLERANCE_M, LENGTH_TOLERANCE * length):
+            if abs(declared - length) > max(MEASURE_TOLERANCE_M, LENGTH_TOLERANCE * length):
                 text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
                 found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         error = chord_errors_m(track, part).max(initial=0.0)
@@ -188,34 +188,48 @@ def _check_gaps(track: Track, found: Remarks) -> None:
             found.findings.append(Finding("warning", "links", text, remedy))
         ends = [track.end(track.index[a], position_a), track.end(track.index[b], position_b)]
         step = float(np.abs(np.diff(track.height_m[ends])[0]))
-        if step > HEIGHT_STEP_M:
+        if step > GAP_COUNTS_M:
             text = f"end {position_a} of {a} and end {position_b} of {b} differ by {step:.1f} m in height"
             found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
-def _near_pairs(places: Floats, reach_m: float) -> Iterator[tuple[int, int]]:
-    """Numbers of points no farther apart than this, the lower one first; in order of one axis few are compared."""
-    order = np.argsort(places[:, 0], kind="stable")
-    ordered = places[order]
-    ends = np.searchsorted(ordered[:, 0], ordered[:, 0] + reach_m, side="right")
-    for at, end in enumerate(ends.tolist()):
-        apart_m = np.linalg.norm(ordered[at + 1 : end] - ordered[at], axis=1)
-        for other in order[at + 1 : end][apart_m <= reach_m].tolist():
-            yield min(int(order[at]), other), max(int(order[at]), other)
-
-
 def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
-    """Ends without any relation that lie close to another element's end."""
+    """Free ends from which a train could go on: to a near end of another element, or to one that faces it."""
     ends = [(name, position) for name in track.ids for position in (0, 1)]
     joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
+    free = np.array([end not in joined for end in ends])
     places = end_places(track).reshape(-1, 3)
-    for one, other in sorted(_near_pairs(places, NEAR_ENDS_M)):
-        free = ends[one] not in joined or ends[other] not in joined
-        if free and ends[one][0] != ends[other][0]:
-            gap = float(np.linalg.norm(places[one] - places[other]))
-            (a, position_a), (b, position_b) = ends[one], ends[other]
+    inward = outward(track).reshape(-1, 3)
+    inward /= np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
+    for one, other, gap in _nearly_met(places, inward, free):
+        (a, position_a), (b, position_b) = ends[one], ends[other]
+        if a != b:
             text = f"end {position_a} of {a} and end {position_b} of {b} are {gap:.2f} m apart and not linked"
-            yield Finding("warning", "links", text, "Add the relation, if trains run there.")
+            remedy = "Survey the missing piece, or add the relation, if trains run there."
+            yield Finding("warning", "links", text, remedy)
+
+
+def _nearly_met(places: Floats, inward: Floats, free: np.ndarray) -> list[tuple[int, int, float]]:
+    """Pairs of ends, and how far apart they are."""
+    # It takes long to load, and a replay needs none of it.
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(places).query_pairs(NEAR_ENDS_M, output_type="ndarray")
+    onward = np.einsum("ij,ij->i", inward[near[:, 0]], inward[near[:, 1]]) < 0.0
+    near = near[onward & free[near].any(axis=1)]
+    alone = np.flatnonzero(free)
+    far = alone[cKDTree(places[alone]).query_pairs(FACING_REACH_M, output_type="ndarray")] if len(alone) else near[:0]
+    way = places[far[:, 1]] - places[far[:, 0]]
+    gap = np.linalg.norm(way, axis=1)
+    ahead = [sign * np.einsum("ij,ij->i", inward[far[:, side]], way) for side, sign in ((0, -1.0), (1, 1.0))]
+    facing = (gap > NEAR_ENDS_M) & (np.minimum(*ahead) > gap * FACING_COSINE)
+    nearest: dict[int, int] = {}
+    for row in np.flatnonzero(facing)[np.argsort(gap[facing], kind="stable")].tolist():
+        for end in far[row].tolist():
+            nearest.setdefault(end, row)
+    both = [far[row] for row in set(nearest.values()) if all(nearest[end] == row for end in far[row].tolist())]
+    pairs = sorted({(int(min(pair)), int(max(pair))) for pair in [*near, *both]})
+    return [(one, other, float(np.linalg.norm(places[one] - places[other]))) for one, other in pairs]
 
 
 def _check_balises(track: Track, balises: pl.DataFrame, found: Remarks) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -25,6 +26,8 @@ _SUFFIXES = {"track": (".parquet", ".csv", ".geojson"), "links": (".parquet", ".
 _TABLES = (".parquet", ".csv")
 # GeoJSON and PROJ know these as longitude and latitude on (nearly) the ellipsoid of WGS 84.
 _SAME_AS_WGS84 = (EPSG_WGS84, 4979)
+# Half a UTM zone: lines that cross a border stay in one system.
+_NEIGHBOURS_DEG = 3.0
 
 
 def read_site(path: Path | str) -> Site:
@@ -192,9 +195,26 @@ def _transformed(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.
     if not np.isfinite(longitude).all():
         breaches.append(f"{raw.file}: some positions are outside the area of this coordinate system")
         return frame
+    if _outside(pyproj.CRS(raw.epsg).area_of_use, float(np.median(longitude)), float(np.median(latitude))):
+        text = f"the positions lie far outside the area for which EPSG:{raw.epsg} is made"
+        breaches.append(f"{raw.file}: {text}; easting and northing may be exchanged, or the code be another")
+        return frame
     return frame.with_columns(
         pl.Series("latitude_deg", np.asarray(latitude)), pl.Series("longitude_deg", np.asarray(longitude))
     )
+
+
+def _outside(area: Any, longitude_deg: float, latitude_deg: float) -> bool:
+    """Whether a place is farther from a system's area than neighbours use it; false where the area is not known."""
+    if area is None or area.west > area.east:
+        return False
+    beyond = (
+        area.west - longitude_deg,
+        longitude_deg - area.east,
+        area.south - latitude_deg,
+        latitude_deg - area.north,
+    )
+    return bool(max(beyond) > _NEIGHBOURS_DEG)
 
 
 def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:

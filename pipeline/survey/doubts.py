@@ -3,37 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+import polars as pl
 
+from pipeline.matching.candidates import candidates_of, segments_of
+from pipeline.site.checks import NEAR_ENDS_M
+from pipeline.survey.kilometres import spans
 from pipeline.survey.network import Network
-from pipeline.survey.pieces import Piece
-from pipeline.track.geodesy import points_of
-from pipeline.track.survey import Track, track_of
+from pipeline.survey.pieces import COLUMNS, SAME_TRACK_M, SHAPE_M, Piece
+from pipeline.track.geodesy import earth_centred_m, points_of, way_m
+from pipeline.track.network import Network as Ground
+from pipeline.track.network import network_of
+from pipeline.track.pieces import in_pieces
+from pipeline.track.segments import SAMPLE_SPACING_M
+from pipeline.track.survey import places_along, track_of
 from schemas.arrays import Floats
+from schemas.enums import Navigability
 from schemas.run import Finding
 
 # No track turns by so much at a point; a sideways step of so much on a curve of so small a radius is none either.
 _KINK_DEG = 20.0
 _LEAST_RADIUS_M = 60.0
 _STEP_ASIDE_M = 0.3
-# Tracks lie 3.5 m apart; the branches of the longest switches (radius 1,200 m) part by a metre within 50 m.
-_DOUBLE_M = 1.0
+# The branches of the longest switches (radius 1,200 m) part as far as that within 60 m.
 _DOUBLE_OVER_M = 100.0
-_SAMPLE_M = 2.0
-_NEAR_TRACK_M = 5.0
-_KM_TOLERANCE_M = 20.0
-_KM_TOLERANCE = 0.05
+# A share of the length that is that of the best odometer scale.
+_LONGER = 1e-4
+_UNEVEN = 3.0
 
 
 def doubts(network: Network) -> list[Finding]:
     """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
-    track = track_of(network.track())
-    found = [*_heights(network.elements), *_doubled(track), *_open_ends(network, track)]
+    track = track_of(network.track)
+    in_parts = network_of(in_pieces(track), network.links)
+    found = [*_heights(network.elements), *_doubled(in_parts), *_open_ends(network_of(track, network.links))]
     for element in network.elements:
-        found += [*_kinks(element), *_kilometres(element)]
-    return found
+        found += [*_kinks(element), *_kilometres(element), *_scattered(element)]
+    return [*found, *_corners(network)]
 
 
 def _heights(elements: list[Piece]) -> Iterator[Finding]:
@@ -72,68 +81,107 @@ def _kinks(element: Piece) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "Look whether a point is wrong or out of order.")
 
 
+def _corners(network: Network) -> Iterator[Finding]:
+    """Kinks where two elements meet that a train runs over."""
+    ends: dict[int, list[tuple[int, int]]] = {}
+    for element, pair in enumerate(network.ends.tolist()):
+        for position, node in enumerate(pair):
+            ends.setdefault(node, []).append((element, position))
+    used = network.links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
+    passed = set(used.select("netelement_a", "position_a").iter_rows())
+    for meeting in ends.values():
+        first = network.elements[meeting[0][0]].name, meeting[0][1]
+        if len(meeting) == 2 and meeting[0][0] != meeting[1][0] and first in passed:
+            one, other = (_last_step(network.elements[element], position) for element, position in meeting)
+            columns: dict[str, Any] = {
+                name: np.append(getattr(one, name), getattr(other, name)[::-1][1:]) for name in COLUMNS
+            }
+            yield from _kinks(replace(one, name=f"{one.name}, {other.name}", **columns))
+
+
+def _last_step(element: Piece, position: int) -> Piece:
+    """The last two points before an end, the end last."""
+    return element.take(np.array([1, 0]) if position == 0 else np.array([len(element) - 2, len(element) - 1]))
+
+
 def _kilometres(element: Piece) -> Iterator[Finding]:
-    known = np.flatnonzero(np.isfinite(element.line_km))
-    if len(known) < 2:
-        return
-    surface = points_of(element.latitude_deg, element.longitude_deg).surface
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(surface, axis=0), axis=1))])[known]
-    by_km = np.diff(element.line_km[known]) * 1000.0
-    sign = 1.0 if by_km.sum() >= 0 else -1.0
-    off = np.abs(sign * by_km - np.diff(way))
-    wrong = np.flatnonzero(off > np.maximum(_KM_TOLERANCE_M, _KM_TOLERANCE * np.diff(way)))
-    if len(wrong):
-        row = wrong[int(np.argmax(off[wrong]))]
+    way = way_m(points_of(element.latitude_deg, element.longitude_deg).surface)
+    known, off_m, jumps = spans(element.line_km, way)
+    if jumps.any():
+        row = int(np.argmax(np.where(jumps, off_m, 0.0)))
+        first, last = known[row], known[row + 1]
         text = (
-            f"line kilometre goes from {element.line_km[known[row]]:.3f} to {element.line_km[known[row + 1]]:.3f} "
-            f"over {np.diff(way)[row]:.0f} m of track ({len(wrong)} such places)"
+            f"line kilometre goes from {element.line_km[first]:.3f} to {element.line_km[last]:.3f} "
+            f"over {way[last] - way[first]:.0f} m of track ({jumps.sum()} such places)"
         )
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
 
 
-def _samples(track: Track) -> tuple[Floats, np.ndarray, Floats]:
-    """Places every two metres along all elements, the element of each, and its distance from the nearer end."""
-    places, owner, from_end = [], [], []
-    for element, _, part in track.elements():
-        surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
-        measure = track.measure_m[part]
-        at = np.linspace(measure[0], measure[-1], int((measure[-1] - measure[0]) / _SAMPLE_M) + 2)
-        places.append(np.column_stack([np.interp(at, measure, surface[:, axis]) for axis in range(3)]))
-        owner.append(np.full(len(at), element))
-        from_end.append(np.minimum(at - measure[0], measure[-1] - at))
-    return np.concatenate(places), np.concatenate(owner), np.concatenate(from_end)
+def _scattered(element: Piece) -> Iterator[Finding]:
+    """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
+    level = np.zeros(len(element))
+    height = level if np.isnan(element.height_m).any() else element.height_m
+    flat, solid = (earth_centred_m(element.latitude_deg, element.longitude_deg, h) for h in (level, height))
+    way = way_m(flat)
+    by_plan = _longer_m(flat, way)
+    by_height = max(0.0, min(_longer_m(solid, way) - by_plan, float(way_m(solid)[-1] - way[-1])))
+    if by_plan + by_height > max(SHAPE_M, _LONGER * way[-1]):
+        what, longer_m, remedy = "positions", by_plan, "Export all decimals; do not draw by hand."
+        if by_height > by_plan:
+            what, longer_m, remedy = "heights", by_height, "Mend them, or leave them out with --flat."
+        text = f"{what} scatter: they make the element about {longer_m:.1f} m longer than the track is"
+        yield Finding("warning", f"track: {element.name}", text, remedy)
 
 
-def _doubled(track: Track) -> Iterator[Finding]:
-    places, owner, _ = _samples(track)
-    # Two samples of parallel tracks are at most half a spacing apart along the track.
-    pairs = cKDTree(places).query_pairs(float(np.hypot(_DOUBLE_M, _SAMPLE_M / 2)), output_type="ndarray")
-    pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]]
-    if not len(pairs):
-        return
-    both = np.unique(np.column_stack([pairs[:, 0], owner[pairs[:, 1]]]), axis=0)
-    named, count = np.unique(np.column_stack([owner[both[:, 0]], both[:, 1]]), axis=0, return_counts=True)
-    for (one, other), samples in zip(named.tolist(), count.tolist(), strict=True):
-        if samples * _SAMPLE_M > _DOUBLE_OVER_M:
-            text = f"lies within {_DOUBLE_M:g} m of {track.ids[other]} over {samples * _SAMPLE_M:.0f} m"
+def _longer_m(places: Floats, way: Floats) -> float:
+    """By how much scatter lengthens a line: each point's variance over its spacing.
+
+    The variance is that of its distance from the cubic through two neighbours on either side, which curves and
+    transitions follow; points with neighbours at uneven distances cannot be judged.
+    """
+    if len(way) < 5:
+        return 0.0
+    at = np.stack([way[shift : len(way) - 4 + shift] for shift in range(5)])
+    step = np.diff(at, axis=0)
+    even = step.max(axis=0) < _UNEVEN * step.min(axis=0)
+    weights = np.stack(
+        [
+            np.prod([(at[2] - at[k]) / (at[own] - at[k]) for k in (0, 1, 3, 4) if k != own], axis=0)
+            for own in (0, 1, 3, 4)
+        ]
+    )
+    beside = np.stack([places[shift : len(way) - 4 + shift] for shift in (0, 1, 3, 4)])
+    miss = places[2:-2] - np.einsum("kn,knj->nj", weights, beside)
+    variance_m2 = (miss**2).sum(axis=1) / (1.0 + (weights**2).sum(axis=0))
+    return float((variance_m2 / step.mean(axis=0))[even].sum())
+
+
+def _doubled(ground: Ground) -> Iterator[Finding]:
+    """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
+    track = ground.track
+    along = places_along(track, SAMPLE_SPACING_M)
+    found = candidates_of(points_of(along.latitude_deg, along.longitude_deg), ground, segments_of(track), SAME_TRACK_M)
+    own = along.element[found.step]
+    both = np.column_stack([own, found.element])[own < found.element]
+    pairs, count = np.unique(both, axis=0, return_counts=True)
+    for (one, other), samples in zip(pairs.tolist(), count.tolist(), strict=True):
+        if samples * SAMPLE_SPACING_M > _DOUBLE_OVER_M:
+            whom = "itself" if track.ids[one] == track.ids[other] else track.ids[other]
+            text = f"lies within {SAME_TRACK_M:g} m of {whom} over {samples * SAMPLE_SPACING_M:.0f} m"
             yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
 
 
-def _open_ends(network: Network, track: Track) -> Iterator[Finding]:
+def _open_ends(ground: Ground) -> Iterator[Finding]:
     """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
-    places, owner, from_end = _samples(track)
-    tree = cKDTree(places)
-    count = np.bincount(network.ends.ravel())
-    for element, pair in enumerate(network.ends.tolist()):
-        for position, node in enumerate(pair):
-            row = track.end(element, position)
-            if count[node] > 1:
-                continue
-            end = points_of(track.latitude_deg[row : row + 1], track.longitude_deg[row : row + 1]).surface[0]
-            near = np.array(tree.query_ball_point(end, _NEAR_TRACK_M), dtype=np.int64)
-            near = near[(owner[near] != element) & (from_end[near] > _NEAR_TRACK_M)]
-            for other in np.unique(owner[near]).tolist():
-                away = float(np.linalg.norm(places[near[owner[near] == other]] - end, axis=1).min())
-                text = f"end {position} lies {away:.1f} m from the middle of {track.ids[other]} and is not joined to it"
-                remedy = "Give both lines a point in common there, if it is a switch."
-                yield Finding("warning", f"track: {track.ids[element]}", text, remedy)
+    track = ground.track
+    element, position = np.nonzero(~ground.linked_ends())
+    row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
+    points = points_of(track.latitude_deg[row], track.longitude_deg[row])
+    found = candidates_of(points, ground, segments_of(track), NEAR_ENDS_M)
+    middle = np.minimum(found.along_m, found.left_m) > NEAR_ENDS_M
+    for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
+        end, other = int(found.step[near]), track.ids[int(found.element[near])]
+        beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"
+        text = f"end {position[end]} lies {beside} and is not joined to it"
+        remedy = "Give both lines a point in common there, if it is a switch."
+        yield Finding("warning", f"track: {track.ids[int(element[end])]}", text, remedy)

@@ -30,7 +30,7 @@ def read_geojson(place: str, stem: str, data: bytes) -> Survey:
     railways = any("railway" in tags for tags, _ in features)
     left: dict[str, int] = {}
     for number, (tags, geometry) in enumerate(features):
-        kind = str(tags.get("railway")) if railways else "line"
+        kind = _kind(tags) if railways else "line"
         lines = list(_lines(geometry))
         if geometry.get("type") == "Point" and kind in (*_CROSSINGS, "switch"):
             longitude, latitude, _ = _numbers(f"{place}: feature {number}", geometry.get("coordinates"))
@@ -44,6 +44,11 @@ def read_geojson(place: str, stem: str, data: bytes) -> Survey:
     for kind, count in sorted(left.items()):
         survey.told("note", place, f"{count} lines with railway={kind} are left out: no train runs there")
     return survey
+
+
+def _kind(tags: Mapping[str, Any]) -> str:
+    """The value of `railway`; a railway out of use may have a tag of its own for that."""
+    return next((key for key in ("disused", "abandoned") if tags.get(key) == "yes"), str(tags.get("railway")))
 
 
 def _feature(item: Any) -> tuple[dict[str, Any], Mapping[str, Any]]:

@@ -11,6 +11,12 @@ from schemas.arrays import Floats, Ints
 from schemas.errors import SiteError
 from schemas.run import Finding
 
+# Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.
+SAME_TRACK_M = 1.5
+# Lines and their lengths keep to this.
+SHAPE_M = 0.1
+# Two places that are nearer are one.
+SAME_PLACE_M = 0.05
 # A survey of 100 MB holds some two million points: more is no line that a person checks.
 MOST_BYTES = 100_000_000
 
@@ -72,7 +78,8 @@ def piece_of(place: str, name: str, columns: Mapping[str, Iterable[float | None]
     arrays = {key: known.get(key, np.full(count, np.nan)) for key in COLUMNS}
     latitude, longitude = arrays["latitude_deg"], arrays["longitude_deg"]
     height = arrays["height_m"]
-    wrong = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | (height < -1_000) | (height > 10_000)
+    unknown = (latitude == 0) & (longitude == 0)
+    wrong = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | (height < -1_000) | (height > 10_000) | unknown
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
         raise SiteError(
@@ -80,7 +87,7 @@ def piece_of(place: str, name: str, columns: Mapping[str, Iterable[float | None]
             place=place,
             found=f"latitude {latitude[row]:g}, longitude {longitude[row]:g}, height {height[row]:g}",
             expected="degrees of WGS 84, or x and y with their EPSG code",
-            remedy="Look whether latitude and longitude are exchanged.",
+            remedy="Look whether latitude and longitude are exchanged, or 0, 0 stands for a place that is not known.",
         )
     moved = np.append(True, (np.diff(latitude) != 0) | (np.diff(longitude) != 0)) if count else np.zeros(0, bool)
     return Piece(name, **arrays, recorded=recorded).take(np.flatnonzero(moved))

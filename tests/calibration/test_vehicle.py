@@ -123,9 +123,9 @@ def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     rows = np.floor(track.distance_m / size_m) * size_m if kind == "counts" else track.distance_m + noise
     whole = np.ones(rows.size - 1, dtype=bool)
     align, white_m2_per_s = Configuration().align, track.noise.white_m2_per_s
-    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, align)
-    noise_of_rows = Noise(white_m2_per_s, found, count_step_m(rows, whole, align))
-    return replace(track, distance_m=rows, period_s=0.1, noise=noise_of_rows)
+    counter_m = count_step_m(rows, whole, align)
+    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, counter_m, align)
+    return replace(track, distance_m=rows, period_s=0.1, noise=Noise(white_m2_per_s, found, counter_m))
 
 
 ROWS = [("counts", 5.0), ("noise", 0.5)]

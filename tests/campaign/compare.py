@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pytest
+
 from pipeline.campaign import Plan, RunOutcome, Summary, make_plan
 from schemas.tables import TABLES
 from tests.conftest import SmallTrial
@@ -72,6 +74,21 @@ def wait_for(condition: Callable[[], bool], limit_s: float = 240.0) -> None:
     while not condition():
         assert time.monotonic() < until, "waited in vain"
         time.sleep(0.02)
+
+
+class Hurried:
+    """The clock of a campaign, which a test puts forward: what never ends has had its time at once, on any machine."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, *modules: str) -> None:
+        self._ahead_s = 0.0
+        for module in modules:
+            patch.setattr(f"pipeline.campaign.{module}.time", self)
+
+    def monotonic(self) -> float:
+        return time.monotonic() + self._ahead_s
+
+    def hurry(self, by_s: float) -> None:
+        self._ahead_s += by_s
 
 
 def by_run(summary: Summary) -> dict[str, RunOutcome]:

@@ -17,10 +17,7 @@ from pipeline.results.query import run_sql
 from pipeline.storage.objects import version_of
 from schemas.errors import UsageError
 from tests.campaign.compare import plan_of
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 QUERIES = (
     "SELECT * FROM passages ORDER BY run_id, solution, path_m, balise_id",

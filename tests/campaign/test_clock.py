@@ -8,10 +8,7 @@ import subprocess
 from pathlib import Path
 
 from tests.campaign.compare import ROOT, campaign_bytes, command, result_bytes
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 _YEAR_S = 365.25 * 86400.0
 _2100_S = 4_102_444_800
@@ -45,7 +42,7 @@ def replay(trial: SmallTrial, out: Path, shift_years: float, runs: list[Path], c
     """A campaign in processes whose clock is off and goes back a minute each time somebody looks."""
     (clock / "sitecustomize.py").write_text(_WRONG_CLOCK)
     ended = subprocess.run(
-        command(trial, out, "--jobs", "2", runs=runs),
+        command(trial, out, "--jobs", "1", runs=runs),
         cwd=ROOT,
         text=True,
         capture_output=True,

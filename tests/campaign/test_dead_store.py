@@ -19,10 +19,10 @@ from tests.campaign.compare import by_run, plan_of
 from tests.conftest import SmallTrial
 
 _PATIENCE_S = 1.5
-# Sooner than the patience of a store that is not told otherwise, 45 s, and late enough for a busy machine.
-_SOON_S = 40.0
+# Clients that ask again by themselves wait for 60 s, five times over. A busy machine takes nothing like that.
+_SOON_S = 150.0
 # Of a store that is slow and no more: a busy machine must not make it look dead.
-_LONG_PATIENCE_S, _PAUSE_S = 5.0, 1.1
+_LONG_PATIENCE_S, _PAUSE_S = 15.0, 3.3
 _BLOCKS, _BLOCK = 6, b"x" * (1 << 16)
 _LISTING = b"<ListBucketResult><Name>b</Name><IsTruncated>false</IsTruncated></ListBucketResult>"
 
@@ -103,11 +103,12 @@ def _forget_stores() -> None:
     s3fs.S3FileSystem.clear_instance_cache()
 
 
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize("ill", ["busy", "silent", "broken"], indirect=True)
 def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_path: Path) -> None:
     named = [f"{ill}/far.mcap", str(small_trial.paths[0])]
     begun_s = time.monotonic()
-    summary = run_campaign(make_plan(named, small_trial.site, tmp_path), jobs=2)
+    summary = run_campaign(make_plan(named, small_trial.site, tmp_path))
     assert time.monotonic() - begun_s < _SOON_S
     outcomes = by_run(summary)
     assert outcomes["far"].status is RunStatus.FAILED

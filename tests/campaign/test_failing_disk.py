@@ -25,10 +25,7 @@ from schemas.run import RunLog, RunTables
 from schemas.tables import TABLES
 from tests.campaign.compare import plan_of, result_bytes
 from tests.campaign.disk import Disk, Killed, operations
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 _RUNS = 2
 _MOMENTS = 14

@@ -18,10 +18,7 @@ from schemas.errors import BaliseError, InputError, UsageError
 from schemas.tables import TABLES
 from tests.campaign.compare import result_bytes
 from tests.campaign.flaky import AILMENTS, Flaky
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 BUCKET = "flaky://bucket"
 

@@ -25,7 +25,7 @@ from schemas.config import Configuration, IngestConfig, LdsConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, UsageError
 from schemas.run import RunLog
-from tests.campaign.compare import by_run, campaign_bytes, plan_of, result_bytes
+from tests.campaign.compare import Hurried, by_run, campaign_bytes, plan_of, result_bytes
 from tests.conftest import SmallTrial
 
 
@@ -56,15 +56,6 @@ class Spy:
 
     def end(self, summary: Summary) -> None:
         assert len(self.seen) == len(summary.outcomes)
-
-
-@pytest.fixture(scope="session")
-def undisturbed(small_trial: SmallTrial, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Each run replayed by itself, in this process."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    for path in small_trial.paths:
-        run_campaign(plan_of(small_trial, out, [path]))
-    return out
 
 
 def one_run(trial: SmallTrial, folder: Path) -> Path:
@@ -103,12 +94,13 @@ def test_a_log_is_known_by_what_its_files_hold(small_trial: SmallTrial, tmp_path
         assert run_campaign(plan).skipped == 1
 
 
+@pytest.mark.usefixtures("in_process")
 def test_failed_runs_do_not_stop_the_others(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
     damaged = [tmp_path / f"damaged{number}.mcap" for number in range(3)]
     for path in damaged:
         path.write_bytes(b"\x89MCAP0\r\n cut")
     out = tmp_path / "out"
-    summary = run_campaign(plan_of(small_trial, out, [*damaged, *small_trial.paths]), jobs=2)
+    summary = run_campaign(plan_of(small_trial, out, [*damaged, *small_trial.paths]))
     assert summary.count(RunStatus.OK) == 4
     outcomes = by_run(summary)
     for path in damaged:
@@ -265,13 +257,20 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
     assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
 
 
-def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path) -> None:
+def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.mkfifo(tmp_path / "hanging.mcap")
-    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths])
-    summary = by_run(run_campaign(plan, jobs=2, time_limit_s=5.0))
+    clock = Hurried(monkeypatch, "loop")
+
+    def hurry(run_id: str, age_s: float) -> None:
+        if run_id == "hanging" and age_s > 0.0 and len(spy.seen) == 2:
+            clock.hurry(3600.0)
+
+    plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths[:2]])
+    spy = Spy(hurry)
+    summary = by_run(run_campaign(plan, jobs=2, time_limit_s=3600.0, watches=[spy]))
     assert summary["hanging"].status is RunStatus.FAILED
-    assert "time limit of 5 s" in (summary["hanging"].error or "")
-    assert [summary[f"run{number}"].status for number in range(4)] == [RunStatus.OK] * 4
+    assert "time limit of 3600 s" in (summary["hanging"].error or "")
+    assert [summary[f"run{number}"].status for number in range(2)] == [RunStatus.OK] * 2
 
 
 def test_single_run_is_given_up_too(tmp_path: Path, small_trial: SmallTrial) -> None:

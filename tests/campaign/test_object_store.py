@@ -24,11 +24,8 @@ from pipeline.storage import files
 from schemas.enums import RunStatus
 from schemas.errors import InputError, OutputError
 from schemas.tables import TABLES
-from tests.campaign.compare import by_run, result_bytes
-from tests.campaign.test_local import undisturbed
+from tests.campaign.compare import by_run, result_bytes, wait_for
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 SECRET = "not-for-anybodys-eyes"
 
@@ -106,9 +103,9 @@ def remote_bytes(out: str) -> dict[str, bytes]:
 
 def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -> None:
     plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/out")
-    assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
+    assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 4
     assert remote_bytes(f"{bucket}/out") == result_bytes(undisturbed)
-    again = run_campaign(plan, jobs=2)
+    again = run_campaign(plan, jobs=1)
     assert (again.skipped, again.count(RunStatus.OK)) == (4, 4)
     remote, on_disk = (read_manifest(out) or {} for out in (f"{bucket}/out", undisturbed))
     assert remote["runs"].keys() == {"run0", "run1", "run2", "run3"}
@@ -120,6 +117,7 @@ def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -
     assert runs["run_id"].to_list() == ["run0", "run1", "run2", "run3"]
 
 
+@pytest.mark.usefixtures("in_process")
 def test_catalogue_in_a_store(bucket: str, small_trial: SmallTrial) -> None:
     out = f"{bucket}/catalogued"
     for count in (1, 2):
@@ -153,37 +151,41 @@ def test_what_others_write_is_seen_at_once(bucket: str) -> None:
         files.read_bytes(f"{folder}/3.csv")
 
 
+@pytest.mark.usefixtures("in_process")
 def test_store_that_refuses_now_and_then(
     s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(s3, "refuse_each", 9)
     plan = make_plan([f"{bucket}/runs/run*"], f"{bucket}/site", f"{bucket}/moody")
-    assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
+    assert run_campaign(plan).count(RunStatus.OK) == 4
     monkeypatch.setattr(s3, "refuse_each", 0)
     assert s3.refused > 0
     assert remote_bytes(f"{bucket}/moody") == result_bytes(undisturbed)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_store_that_answers_slowly(s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(s3, "answer_after_s", 0.1)
     plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/slow")
-    assert run_campaign(plan, jobs=2).count(RunStatus.OK) == 4
+    assert run_campaign(plan).count(RunStatus.OK) == 4
     assert remote_bytes(f"{bucket}/slow") == result_bytes(undisturbed)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_log_that_cannot_be_had_now_is_tried_again(
     s3: Moody, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", tmp_path)
     with monkeypatch.context() as patched:
         patched.setattr(s3, "forbidden", "run2/")
-        first = run_campaign(plan, jobs=2)
+        first = run_campaign(plan)
     assert (first.count(RunStatus.OK), first.count(RunStatus.FAILED)) == (3, 1)
     assert "the store refused" in (by_run(first)["run2"].error or "")
-    again = run_campaign(plan, jobs=2)
+    again = run_campaign(plan)
     assert (again.count(RunStatus.OK), again.skipped) == (4, 3)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_logs_are_not_fetched_again(s3: Moody, bucket: str, tmp_path: Path) -> None:
     plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", tmp_path)
     run_campaign(plan)
@@ -233,7 +235,8 @@ def test_store_that_is_not_there(bucket: str, small_trial: SmallTrial) -> None:
 @pytest.fixture
 def _quick_beat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lock, "_BEAT_S", 0.4)
-    monkeypatch.setattr(lock, "_SILENCE_S", 5.0)
+    # Nobody waits for all of it but who finds a lock of a dead campaign.
+    monkeypatch.setattr(lock, "_SILENCE_S", 60.0)
 
 
 @pytest.mark.usefixtures("_quick_beat")
@@ -253,12 +256,13 @@ def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
         storage.write_bytes(place, b"another 0")
         with pytest.raises(OutputError, match="no longer held"):
             lock.check_held(f"{bucket}/taken", own)
-        time.sleep(1.0)
+        wait_for(lambda: not any(getattr(one, "_target", None) is lock._beat for one in threading.enumerate()))
     assert storage.read_many([place]) == {place: b"another 0"}
 
 
 @pytest.mark.usefixtures("_quick_beat")
-def test_lock_of_a_dead_campaign_is_taken_over(bucket: str) -> None:
+def test_lock_of_a_dead_campaign_is_taken_over(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lock, "_SILENCE_S", 1.0)
     storage.write_bytes(f"{bucket}/dead/.lock", b"somebody 7")
     with locked(f"{bucket}/dead"):
         assert b"somebody" not in storage.read_many([f"{bucket}/dead/.lock"])[f"{bucket}/dead/.lock"]

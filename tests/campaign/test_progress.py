@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+import cli
 from pipeline.campaign import Plan, RunOutcome, Summary, progress, tally
 from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
 from pipeline.campaign.tally import Tally
 from schemas.enums import RunStatus, RunVerdict
-from tests.campaign.compare import command, plan_of, run
+from tests.campaign.compare import plan_of
 from tests.conftest import SmallTrial
 
 OK = RunOutcome("a", RunStatus.OK, verdict=RunVerdict.SAFE, seconds=2.0)
@@ -159,12 +160,17 @@ def test_json_lines_for_programs(clock: Clock, plan: Plan) -> None:
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_json_on_both_streams(small_trial: SmallTrial, tmp_path: Path, quiet: bool) -> None:
+@pytest.mark.usefixtures("in_process")
+def test_json_on_both_streams(
+    small_trial: SmallTrial, tmp_path: Path, quiet: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
     flags = ["--json", "--quiet"] if quiet else ["--json"]
-    ended = run(command(small_trial, tmp_path, *flags, runs=small_trial.paths[:2]))
-    result = json.loads(ended.stdout)
+    runs = map(str, small_trial.paths[:2])
+    cli._guarded(["replay", *runs, "--site", str(small_trial.site), "--out", str(tmp_path), *flags], debug=False)
+    said = capfd.readouterr()
+    result = json.loads(said.out)
     assert [row["run_id"] for row in result["runs"]] == ["run0", "run1"]
     assert [row["attempts"] for row in result["runs"]] == [1, 1]
-    lines = [json.loads(line) for line in ended.stderr.splitlines()]
+    lines = [json.loads(line) for line in said.err.splitlines()]
     assert sorted(line["run_id"] for line in lines if line["event"] == "run") == ([] if quiet else ["run0", "run1"])
     assert bool(lines) is not quiet

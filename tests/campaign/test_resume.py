@@ -13,10 +13,7 @@ from pipeline.campaign import make_plan, resume, run_campaign
 from pipeline.results import store
 from schemas.config import Configuration, LdsConfig
 from tests.campaign.compare import plan_of
-from tests.campaign.test_local import undisturbed
 from tests.conftest import SmallTrial
-
-__all__ = ["undisturbed"]
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from pipeline.campaign.worker import replay_one
 from pipeline.results.store import write_config
 from schemas.config import Configuration, to_toml
 from schemas.tables import BANK_MONITORS
+from tests.conftest import Shared
 from tests.docs.blocks import ROOT
 
 BLIND = ("windows_only_early", "windows_only_late")
@@ -26,9 +27,12 @@ RUNS = ("drift_early", "jump_two", "outage_and_slip")
 
 
 @pytest.fixture(scope="session")
-def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(shared: Shared) -> Path:
     """A small site, three runs on it, their result, a receiver log. Not to be changed: see `workplace`."""
-    folder = tmp_path_factory.mktemp("docs")
+    return shared("docs", _fill_workspace)
+
+
+def _fill_workspace(folder: Path) -> None:
     scenario = _with_a_clean_run(load_scenario(ROOT / "tests/golden/golden.toml"))
     write_site(build_site(scenario), folder / "SITE")
     for name in RUNS:
@@ -43,13 +47,15 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(folder / "OUT", folder / "OUT_B")
     _receiver_log(folder / "runs" / "evening", folder)
     _line(folder / "SITE", folder / "line.gpx")
-    return folder
 
 
 @pytest.fixture(scope="session")
-def asked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def asked(shared: Shared) -> Path:
     """A folder with a result `OUT` in which everything went wrong that one may ask for."""
-    folder = tmp_path_factory.mktemp("asked")
+    return shared("asked", _fill_asked)
+
+
+def _fill_asked(folder: Path) -> None:
     scenario = load_scenario(ROOT / "tests/golden/golden.toml")
     write_site(build_site(scenario), folder / "SITE")
     for name in (*RUNS, *BLIND, "jump_without_odometer", "two_solutions"):
@@ -59,11 +65,10 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bank_off = Configuration.model_validate({"monitors": {"disabled": [*BANK_MONITORS, *LINK_MONITORS]}})
     _replay(folder, BLIND, bank_off)
     _replay(folder, (*RUNS, "jump_without_odometer", "two_solutions", "broken"), Configuration())
-    return folder
 
 
 @pytest.fixture
-def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: None) -> Path:
     """A copy of the folder to work in; it is the working directory."""
     folder = tmp_path / "work"
     shutil.copytree(workspace, folder)

@@ -96,6 +96,7 @@ def test_cross_track_faults_need_the_track() -> None:
     assert comparison["first_monitor"].to_list() == [None, "cross_raw"]
 
 
+@pytest.mark.usefixtures("in_process")
 def test_results_do_not_depend_on_the_number_of_jobs() -> None:
     specs = [BankSpec(), BankSpec(alphas=(1.0, 0.1))]
     faults = (Fault("ramp", "range", 5.0),)

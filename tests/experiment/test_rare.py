@@ -104,6 +104,7 @@ def test_probabilities_of_1e_9_are_within_reach(sensors: str) -> None:
     assert result.variance_reduction > 1e5
 
 
+@pytest.mark.usefixtures("in_process")
 def test_results_do_not_depend_on_the_number_of_jobs() -> None:
     system = bank()
     one, two = (missed_detection_probability(system, 60, 0.3, runs=500, seed=8, jobs=jobs) for jobs in (1, 2))

@@ -291,7 +291,7 @@ def test_cut_anywhere(tmp_path, encoding, chunk_size):
     log = read(tmp_path, content)
     assert log.notes.partial_until_ns is None
     heights = set()
-    for end in [*range(0, len(content), 47), *range(len(content) - 40, len(content))]:
+    for end in [*range(0, len(content), 71), *range(len(content) - 40, len(content))]:
         path = samples.save(tmp_path, content[:end])
         try:
             part = read_run(path, CONFIG)
@@ -322,7 +322,7 @@ def test_bit_flips_are_found(tmp_path, encoding):
     for compression in ("zstd", "none"):
         content = samples.log_bytes(samples.run(6), encoding=encoding, compression=compression)
         expected = read(tmp_path, content)
-        for at in range(8, len(content), 37):
+        for at in range(8, len(content), 53):
             flipped = bytearray(content)
             flipped[at] ^= 1 << (at % 8)
             path = samples.save(tmp_path, bytes(flipped))

@@ -80,7 +80,9 @@ def epochs_of(
     ]
     # As matching says it: without a fix no path position, off the track no probability of the path.
     placed, sure = pl.when("fix_valid").then("path_m"), pl.when("on_track").then("gate_probability")
-    return frame.with_columns(series).with_columns(path_m=placed, gate_probability=sure)
+    travelled_m = pl.col("odometer_m").forward_fill().diff().fill_null(0.0).abs().cum_sum()
+    said = frame.with_columns(series)
+    return said.with_columns(path_m=placed, gate_probability=sure, travelled_m=travelled_m)
 
 
 def balises_at(places: dict[str, float], **columns: Any) -> pl.DataFrame:

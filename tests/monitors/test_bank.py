@@ -6,10 +6,10 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.alignment.align import NO_ODOMETER
+from pipeline.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, verdicts
 from pipeline.monitors.bank import MonitorBank
-from pipeline.monitors.series import DISABLED, FIRST_EPOCH, NO_HEIGHT, NO_POSITION, OFF_TRACK
-from pipeline.monitors.single import NO_VALUE, NO_VELOCITY, channel_monitor, doppler_monitor, judged
+from pipeline.monitors.series import FIRST_EPOCH, NO_HEIGHT, OFF_TRACK
+from pipeline.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.tables import BANK_MONITORS
 from tests.align.straight import Straight, align_run, epochs_of, odometer_of, run
@@ -199,7 +199,7 @@ def test_channels_are_compared_where_both_have_a_position():
 
 def test_a_single_monitor_without_value_or_threshold_is_no_pass():
     nothing = np.nan
-    frame = judged(
+    frame = verdicts(
         np.array([1.0, 3.0, nothing, 1.0, 1.0]),
         np.array([2.0, 2.0, 2.0, nothing, 2.0]),
         pl.Series([None, None, None, None, "why"], dtype=pl.String),

@@ -8,10 +8,9 @@ import pytest
 from scipy.stats import chi2
 
 from datasets.constellation import GALILEO, GPS, visible
-from pipeline.monitors.pseudorange import AMBIGUOUS, NO_RANGES_AT_EPOCH, TOO_FEW, pseudorange_monitor
-from pipeline.monitors.series import NO_POSITION
+from pipeline.epochs.verdicts import NO_POSITION
+from pipeline.monitors.pseudorange import AMBIGUOUS, NO_RANGES, NO_RANGES_AT_EPOCH, TOO_FEW, pseudorange_monitor
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows, range_variances_m2
-from pipeline.monitors.single import NO_RANGES
 from schemas.config import Configuration, MonitorConfig
 
 T0 = datetime(2024, 3, 20, 6, 27, tzinfo=UTC)

@@ -167,9 +167,61 @@ def test_weeks_excel_days_halves_of_the_day_and_a_row_of_units(converted):
     assert halves == ["2025-06-13T13:00:00.000", "2025-06-13T00:30:00.000"]
 
 
+@pytest.mark.parametrize(
+    ("text", "latitudes"),
+    [
+        ("sep=;\nt;lat;lon\n1;1.234,5;4\n2;234,25;4\n", [1234.5, 234.25]),
+        ('t,lat,lon\n1,"1,234.5",4\n2,−7.5,4\n', [1234.5, -7.5]),
+        ("t;lat;lon\n1;1 234,5;4\n2;−7;4\n", [1234.5, -7.0]),
+        ('t,lat,lon\n1,"1,234",4\n2,"1,5",4\n', [1.234, 1.5]),
+    ],
+)
+def test_thousands_and_decimal_marks(converted, text, latitudes):
+    fixes = converted(text, factors={"latitude_deg": 1e-2})
+    assert fixes["latitude_deg"].to_list() == pytest.approx([value / 100 for value in latitudes])
+
+
 def test_thousands_are_no_fractions(converted):
-    with pytest.raises(InputError, match="column lat: cannot be latitude_deg"):
+    with pytest.raises(InputError, match=r"column lat: cannot be latitude_deg; found 1,234 in row 1"):
         converted('t,lat,lon\n1,"1,234",4\n')
+
+
+def test_rows_that_do_not_fit_the_header(tmp_path):
+    log = tmp_path / "odo.csv"
+    table = {"topic": "*", "time": "field:t", "fields": {"distance_m": "d", "speed_mps": "v"}}
+    config = settings_from({"ingest": {"odometer": table}}, Configuration, "x").ingest
+    log.write_text("t,d,v\n1,10,1\n2,11\n3,nan,n/a\n4,NaN,\n".replace("n/a", ""))
+    found = gather([log], config)
+    assert found.streams["odometer"].select("distance_m", "speed_mps").rows() == [(10.0, 1.0), (11.0, None)]
+    assert found.dropped == {
+        "end of a row, which is missing (taken as empty)": 1, "row without a value of odometer": 2,
+    }  # fmt: skip
+    log.write_text("Logger 7\nt,d,v\n1,10,1\n")
+    with pytest.raises(
+        InputError, match=r"line 2, .*more values than the header; found 3: t, d, v; expected at most 1"
+    ):
+        gather([log], config)
+
+
+def test_a_table_of_several_recorders_leaves_cells_empty(tmp_path):
+    log = tmp_path / "all.csv"
+    tables = {
+        "gnss": {"topic": "*", "time": "field:t", "fields": PLACE},
+        "odometer": {"topic": "*", "time": "field:t", "fields": {"distance_m": "d"}},
+        "balise_reads": {"topic": "*", "time": "field:t", "fields": {"balise_id": "b"}},
+    }
+    config = settings_from({"ingest": tables}, Configuration, "x").ingest
+    rows = [(s / 4, "50,4" if s % 4 == 0 and not 20 < s < 32 else ",", "X1" if s == 5 else "") for s in range(49)]
+    log.write_text("t,lat,lon,d,b\n" + "".join(f"{t},{place},{t * 10},{read}\n" for t, place, read in rows))
+    found = gather([log], config)
+    fixes = found.streams["gnss"]
+    # A second from 5 s to 8 s has no position: those rows may be an outage and stay.
+    outage = fixes.filter(fixes["latitude_deg"].is_null())["t"].dt.epoch("ms")
+    assert (outage.min(), outage.max(), fixes["latitude_deg"].count()) == (5250, 7750, 11)
+    assert (found.streams["odometer"].height, found.streams["balise_reads"].height) == (49, 1)
+    assert found.dropped["row without a value of gnss"] == 49 - 11 - len(outage)
+    log.write_text("t,lat,lon,d,b\n0,50,4,1,\n1,,,2,\n2,50,4,3,\n")
+    assert gather([log], config).streams["gnss"].height == 3
 
 
 def test_a_draft_can_be_saved_and_used(tmp_path):
@@ -179,5 +231,7 @@ def test_a_draft_can_be_saved_and_used(tmp_path):
     assert gather([log], config).streams["odometer"]["speed_mps"].to_list() == pytest.approx([10.0, 10.5])
     log.write_text("Datum;Zeit;v\n;;m/s\n01.06.2025;12:00:00;36,0\n01.06.2025;12:00:01;37,8\n")
     assert "# date_order" in draft_mapping(log)
+    log.write_text("Zeit;Weg\n13.06.2025 12:00:00;12x4\n")
+    assert "# distance_m: left out, since 'Weg' holds no number in 1 rows, first '12x4'" in draft_mapping(log)
     log.write_text("a,b\n1,2\n")
     assert "No name tells" in draft_mapping(log)

@@ -246,6 +246,13 @@ def test_messages_that_end_before_their_fields_do_are_counted(converted):
     assert (found.run.gnss.height, found.dropped["message that does not fit its definition"]) == (1, 1)
 
 
+def test_a_receiver_without_a_position_does_not_know_the_day(converted):
+    unset = [sentence(f"GPRMC,1200{second:02d}.00,V,,,,,,,060180,,,N") for second in (0, 1)]
+    fixes = converted(*unset, gga("120002.00"), rmc("120002.00"), gga("120003.00", quality="9")).run.gnss
+    assert iso(fixes) == ["2025-06-01T12:00:02", "2025-06-01T12:00:03"]
+    assert fixes["fix"].to_list() == ["autonomous", "sbas"]
+
+
 def test_a_log_without_a_date_says_why(converted):
     with pytest.raises(InputError, match=r"no epoch with a time and a position.*time without a date \(1\)"):
         converted(gga("120000.00"))
@@ -253,7 +260,7 @@ def test_a_log_without_a_date_says_why(converted):
 
 @pytest.mark.parametrize(
     ("mode", "kind"),
-    [(0, "none"), (1, "autonomous"), (2, "differential"), (3, "autonomous"), (4, "rtk_fixed"), (5, "rtk_float"),
+    [(0, "none"), (1, "autonomous"), (2, "differential"), (3, "none"), (4, "rtk_fixed"), (5, "rtk_float"),
      (6, "sbas"), (7, "rtk_fixed"), (8, "rtk_float"), (10, "differential"), (0x86, "sbas"), (9, "none")],
 )  # fmt: skip
 def test_sbf_kinds_of_fix(converted, mode, kind):

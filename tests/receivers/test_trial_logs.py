@@ -22,10 +22,17 @@ HERE = Path("run")
 
 
 def bestposa(seconds: float = 506712.0, status: str = "SOL_COMPUTED", kind: str = "NARROW_INT") -> bytes:
-    body = (
-        f"BESTPOSA,COM1,0,90.0,FINESTEERING,2134,{seconds:.3f},02000020,cdba,16248;{status},{kind},"
-        '51.15043,-114.03068,1094.10,-17.0,WGS84,0.0200,0.0100,0.0300,"",0.000,0.000,16,15,15,0,00,00,00,11'
-    ).encode()
+    place = '51.15043,-114.03068,1094.10,-17.0,WGS84,0.0200,0.0100,0.0300,"",0.000,0.000,16,15,15,0,00,00,00,11'
+    return novatel("BESTPOSA", seconds, f"{status},{kind},{place}")
+
+
+def bestvela(seconds: float, latency_s: float, speed_mps: float) -> bytes:
+    """Eastwards."""
+    return novatel("BESTVELA", seconds, f"SOL_COMPUTED,DOPPLER_VELOCITY,{latency_s},0.0,{speed_mps},90.0,-0.1,0.0")
+
+
+def novatel(name: str, seconds: float, content: str) -> bytes:
+    body = f"{name},COM1,0,90.0,FINESTEERING,2134,{seconds:.3f},02000020,cdba,16248;{content}".encode()
     crc = crc32(body, 0xFFFFFFFF) ^ 0xFFFFFFFF
     return b"#" + body + f"*{crc:08x}\r\n".encode()
 
@@ -42,6 +49,16 @@ def test_novatel_ascii(tmp_path):
     assert [first[f"cov_{a}_m2"] for a in ("nn", "ee", "uu")] == pytest.approx([4e-4, 1e-4, 9e-4])
     assert (second["fix"], second["latitude_deg"]) == ("none", None)
     assert found.dropped == {"damaged message": 1}
+
+
+def test_a_velocity_of_novatel_is_as_old_as_it_says(tmp_path):
+    log = tmp_path / "a.gps"
+    speeds = {506712.0: 10.0, 506713.0: 11.0, 506714.0: 12.0, 506716.0: 14.0}
+    log.write_bytes(b"".join(bestposa(at) + bestvela(at, 0.25, speed) for at, speed in speeds.items()))
+    # A quarter of a second later than told, at 1 m/s2; nothing is known where the next velocity is missing.
+    assert convert([log], "r").run.gnss["vel_e_mps"].to_list() == pytest.approx([10.25, 11.25, None, None])
+    log.write_bytes(b"".join(bestvela(at, 0.0, speed) + bestposa(at) for at, speed in speeds.items()))
+    assert convert([log], "r").run.gnss["vel_e_mps"].to_list() == pytest.approx([10.0, 11.0, 12.0, 14.0])
 
 
 @needs_samples
@@ -94,6 +111,11 @@ def test_packed_logs_and_damaged_archives(tmp_path):
         archive.writestr("day/b.gps", bestposa(506713.0))
         archive.writestr("__MACOSX/._b.gps", b"no log")
     assert convert([tmp_path / "a.gps.gz", tmp_path / "b.zip"], "r").run.gnss.height == 2
+    with zipfile.ZipFile(tmp_path / "outer.zip", "w") as archive:
+        archive.write(tmp_path / "b.zip", "b.zip")
+        archive.writestr("README.txt", "Monday")
+    found = convert([tmp_path / "outer.zip"], "r")
+    assert (found.run.gnss.height, found.dropped) == (1, {"file of an archive that is no log": 1})
     (tmp_path / "c.gz").write_bytes(gzip.compress(bestposa())[:40])
     with pytest.raises(InputError, match=r"c\.gz: cannot be unpacked"):
         convert([tmp_path / "c.gz"], "r")
@@ -112,6 +134,10 @@ def test_sentences_without_a_date_need_one(tmp_path):
     log.write_bytes(sentence(f"GPGGA,235959.50,{place}") + sentence(f"GPGGA,000000.50,{place}"))
     with pytest.raises(InputError, match=r"found NMEA GPGGA \(2\).*--date"):
         gather([log])
+    log.write_bytes(b"$GPGGA,235959.50," + place.encode() + b"\r\n")
+    with pytest.raises(InputError, match="NMEA without checksums cannot be checked"):
+        gather([log])
+    log.write_bytes(sentence(f"GPGGA,235959.50,{place}") + sentence(f"GPGGA,000000.50,{place}"))
     times = gather([log], date=date(2025, 5, 31)).streams["gnss"]["t"].dt.to_string("%FT%T%.3f").to_list()
     assert times == ["2025-05-31T23:59:59.500", "2025-06-01T00:00:00.500"]
 
@@ -137,7 +163,11 @@ def test_several_receivers_make_one_run(tmp_path):
     truth = extended(run, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False).run
     assert truth.gnss.equals(run.gnss)
     assert truth.reference is not None
-    assert truth.reference["sigma_m"].to_list() == pytest.approx([(2.5e-4) ** 0.5] * 3)  # of 0.01 m and 0.02 m
+    told = rover.streams["gnss"].row(0, named=True)
+    ellipse = [[told["cov_ee_m2"], told["cov_en_m2"]], [told["cov_en_m2"], told["cov_nn_m2"]]]
+    assert truth.reference["sigma_m"].to_list() == pytest.approx([np.linalg.eigvalsh(ellipse)[1] ** 0.5] * 3)
+    with pytest.raises(UsageError, match=r"--solution: is empty"):
+        extended(run, HERE, rover, Purpose(" "), FixSigma(), force=False)
     with pytest.raises(UsageError, match=r"has a stream reference already.*--force"):
         extended(truth, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False)
     with pytest.raises(InputError, match="is of another time"):

@@ -124,10 +124,65 @@ def test_doubtful_places_are_told(tmp_path: Path) -> None:
     same = way("same", (100, 0), (105, 3))
     text = told(site_of(written(tmp_path, "d.geojson", kinked, twice, beside, same)))
     assert "track: kink: 2 kinks" in text
-    assert "track: twice: lies within 1 m of kink" in text or "track: kink: lies within 1 m of twice" in text
+    assert "track: twice: lies within 1.5 m of kink" in text or "track: kink: lies within 1.5 m of twice" in text
     assert "end 0 lies 2." in text
     assert "track: same: 1 of its 1 segments stand in the survey already" in text
     assert "no point has a height" in text
+
+
+def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
+    latitude, longitude = degrees(east_m, 0.0 * east_m)
+    pl.DataFrame({"lat": latitude, "lon": longitude, **columns}).write_csv(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("scatter_m", "digits", "cause"), [(0.0, 9, None), (0.0, 5, "positions"), (2.0, 9, "heights"), (0.05, 9, None)]
+)
+def test_a_line_that_scatter_makes_longer_is_told_with_its_cause(
+    tmp_path: Path, scatter_m: float, digits: int, cause: str | None
+) -> None:
+    east = np.arange(0.0, 2001.0, 10.0)
+    latitude, longitude = degrees(east, 0.3 * east)
+    height = 400.0 + 0.02 * east + np.random.default_rng(1).normal(0.0, scatter_m, len(east))
+    survey = tmp_path / "line.csv"
+    pl.DataFrame({"lat": latitude.round(digits), "lon": longitude.round(digits), "height": height}).write_csv(survey)
+    said = [word for word in ("positions", "heights") if f"{word} scatter: they make" in told(site_of(survey))]
+    assert said == ([] if cause is None else [cause])
+
+
+def test_a_piece_that_is_missing_is_told_and_two_tracks_side_by_side_are_no_gap(tmp_path: Path) -> None:
+    one, other = way("a", (0, 0), (500, 0)), way("b", (560, 0), (900, 0))
+    beside = way("c", (0, 4.5), (500, 4.5))
+    gaps = [
+        line
+        for line in told(site_of(written(tmp_path, "g.geojson", one, other, beside))).splitlines()
+        if "apart" in line
+    ]
+    assert len(gaps) == 1
+    assert "end 1 of a and end 0 of b are 60.00 m apart and not linked" in gaps[0]
+
+
+def test_a_corner_between_two_lines_and_a_line_over_itself_are_told(tmp_path: Path) -> None:
+    bent = written(tmp_path, "b.geojson", way("a", (0, 0), (500, 0)), way("b", (500, 0), (600, 80)))
+    assert "track: a, b: 1 kinks; the sharpest turns by 39 degrees" in told(site_of(bent))
+    again = written(tmp_path, "a.geojson", way("a", (0, 0), (500, 0), (500.5, 0.4), (0, 0.4)))
+    assert "track: a: lies within 1.5 m of itself" in told(site_of(again))
+
+
+def test_a_kilometre_that_a_jump_skips_or_repeats_places_no_balise(tmp_path: Path) -> None:
+    east = np.arange(0.0, 2001.0, 10.0)
+    wanted = tmp_path / "wanted.csv"
+    for jump, km, message in ((0.5, 1.2, "no track has line kilometre 1.2"), (-0.5, 0.8, "0.8 is on twice at 800")):
+        survey = track_csv(tmp_path / "twice.csv", east, km=east / 1000 + np.where(east > 1000, jump, 0.0))
+        wanted.write_text(f"balise_id,km\nB1,{km}\n")
+        with pytest.raises(BaliseError, match=message):
+            site_of(survey, balises=str(wanted))
+        wanted.write_text("balise_id,km,kind\nB1,0.25,\n")
+        made = site_of(survey, balises=str(wanted)).balises
+        assert made is not None
+        assert made["measure_m"].to_list() == pytest.approx([250.0], abs=0.01)
+        assert made["kind"].to_list() == ["virtual"]
 
 
 def test_balises_keep_their_spacing_over_joints_and_follow_coordinates_and_kilometres(tmp_path: Path) -> None:
@@ -186,6 +241,7 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
     read = read_site(tmp_path / "one")
     assert read.balises is not None
     assert read.balises["balise_id"].to_list() == ["VB1", "VB2", "VB3"]
+    assert "heights are taken as ellipsoidal" in (tmp_path / "one" / "findings.csv").read_text()
     page = (tmp_path / "one" / "site.html").read_text()
     assert all(word in page for word in ("default-src 'none'", "VB3", "Line 36"))
     assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org/2000/svg", "")
@@ -223,7 +279,35 @@ def test_recorded_passes_make_one_line_and_a_branch_meets_it_at_a_switch() -> No
     assert toe_m == pytest.approx(800.0, abs=30.0)
 
 
+def test_a_later_pass_goes_on_from_the_end_of_the_first() -> None:
+    rng = np.random.default_rng(4)
+    first, second = np.arange(0.0, 1200.0, 4.0), np.arange(1000.0, 2000.0, 4.0)
+    passes = [recorded("a", first, 0.0 * first, rng), recorded("b", second, 0.0 * second, rng)]
+    network = make_network(clean_traces(Survey(passes)), 0.05)
+    assert [element.name for element in network.elements] == ["a", "b"]
+    track = network.track.group_by("netelement_id").agg(pl.col("measure_m").max())
+    assert track["measure_m"].sum() == pytest.approx(1996.0, abs=0.5)
+
+
+def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None:
+    east = np.arange(0.0, 1000.0, 4.0)
+    latitude, longitude = degrees(east, np.where((east >= 400) & (east < 420), 50.0, 0.0))
+    times = pl.Series((np.arange(len(east)) * 200_000_000), dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    points = pl.DataFrame({"t": times, "latitude_deg": latitude, "longitude_deg": longitude})
+    run = tmp_path / "run"
+    run.mkdir()
+    points.with_columns(fix=pl.lit("sbas")).write_parquet(run / "gnss.parquet")
+    points.with_columns(height_m=pl.lit(None, pl.Float64), sigma_m=pl.lit(0.02)).write_parquet(
+        run / "reference.parquet"
+    )
+    site = site_of(run)
+    assert "run: 5 positions to which no train can have come are left out" in told(site)
+    assert site.track["measure_m"].max() == pytest.approx(996.0, abs=0.1)
+
+
 BAD = {
+    "exchanged.csv": ("# epsg: 2056\nx,y\n1260000,2683000\n1260100,2683000\n", "easting and northing may be exchanged"),
+    "origin.csv": ("lat,lon\n50,4\n0,0\n", "point 2 of origin is no place on earth"),
     "entity.gpx": ('<!DOCTYPE gpx [<!ENTITY a "b">]><gpx>&a;</gpx>', "line 1: declares a document type"),
     "half.gpx": ("<gpx><trk>", "not well-formed XML"),
     "nowhere.gpx": ('<gpx><trk><trkseg><trkpt lat="50"/></trkseg></trk></gpx>', "line 1: a coordinate cannot be read"),

@@ -1,0 +1,71 @@
+"""What a monitor says of each epoch: value, threshold, state and reason, for every monitor in the same way."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from schemas.arrays import Bools, Floats
+from schemas.enums import MonitorState
+
+# Reasons that several monitors give.
+DISABLED = "disabled by configuration"
+NO_ODOMETER = "no odometer"
+NO_POSITION = "no position"
+NO_SIGMA = "no standard deviation of the position"
+NO_VALUE = "nothing to compute it from"
+
+States = npt.NDArray[np.int8]
+"""Numbers of states in `STATES`."""
+STATES = [state.value for state in MonitorState]
+PASS, FAIL, NOT_EVALUATED = (
+    STATES.index(state) for state in (MonitorState.PASS, MonitorState.FAIL, MonitorState.NOT_EVALUATED)
+)
+
+
+def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
+    """Beyond its threshold a monitor fails; what is evaluated and cannot be compared is no pass."""
+    failing = ~(np.abs(value) <= threshold)
+    return np.where(evaluated, np.where(failing, FAIL, PASS), NOT_EVALUATED).astype(np.int8)
+
+
+def verdicts(value: Floats, threshold: Floats, reasons: pl.Series, state: States | None = None) -> pl.DataFrame:
+    """`value, threshold, state, reason` per epoch; `reasons`: why a monitor is not evaluated, null where it is.
+
+    `state` where the monitor has told it already. Else what has no reason and yet no value or threshold is not
+    evaluated either: absence is never health.
+    """
+    if state is None:
+        known = np.isfinite(value) & np.isfinite(threshold)
+        state = states_of(value, threshold, known & reasons.is_null().to_numpy())
+    unknown = state == NOT_EVALUATED
+    nothing = pl.Series([None], dtype=pl.String)
+    return pl.DataFrame(
+        {
+            "value": pl.Series(np.where(unknown, np.nan, value), nan_to_null=True),
+            "threshold": pl.Series(np.where(unknown, np.nan, threshold), nan_to_null=True),
+            "state": pl.Series(STATES, dtype=pl.Enum(STATES)).gather(state.astype(np.uint32)),
+            "reason": reasons.cast(pl.String).fill_null(NO_VALUE).zip_with(pl.Series(unknown), nothing),
+        }
+    )
+
+
+def no_verdicts(epochs: int, reason: str) -> pl.DataFrame:
+    """Of a monitor that has nothing to look at in the whole run."""
+    nothing = np.full(epochs, np.nan)
+    return verdicts(nothing, nothing, pl.Series([reason], dtype=pl.String).new_from_index(0, epochs))
+
+
+def of_monitor(name: str, said: pl.DataFrame) -> list[pl.Series]:
+    """The same under the names that they have among the columns of the epochs."""
+    return [column.alias(f"{name}_{column.name}") for column in said]
+
+
+def first_reason(*reasons: tuple[Bools | pl.Series, str | pl.Series]) -> pl.Series:
+    """Per epoch the first reason whose mask holds, null where none does; a reason may be a column itself."""
+    applying = [
+        pl.when(pl.Series(mask)).then(pl.lit(reason, pl.String) if isinstance(reason, str) else reason)
+        for mask, reason in reasons
+    ]
+    return pl.select(pl.coalesce(applying).cast(pl.String).alias("reason")).to_series()

@@ -1,0 +1,119 @@
+"""When a record of positions passes places, and how a second record of the same journey fits it: lag and shift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.plausibility.course import Places
+from pipeline.plausibility.robust import LEAST, MOVES_MPS, explains, regressed, sampled
+from schemas.arrays import Floats, Ints
+from schemas.config import IngestConfig
+
+# Two records are of the same place within so much, and a read of the balise that it names [m].
+_SAME_PLACE_M = 400.0
+READ_M = 60.0
+# Lags found place by place agree within so much [s].
+_BIN_S = 2.0
+
+
+@dataclass(frozen=True)
+class PlaceFit:
+    """How a record of places fits the GNSS: `lag_s` is its stamp of a moment minus the GNSS's.
+
+    `east_m`, `north_m`: the record's place minus the GNSS's. `agreeing`: share of moving epochs that agree then, and
+    `as_recorded` as they are. Steady is what both halves of the run show. `reason`: why nothing is told.
+    """
+
+    lag_s: float = 0.0
+    lag_sigma_s: float = float("inf")
+    east_m: float = 0.0
+    north_m: float = 0.0
+    agreeing: float = 0.0
+    as_recorded: float = 0.0
+    lag_is_steady: bool = True
+    shift_is_steady: bool = True
+    reason: str = ""
+
+    @property
+    def shift_m(self) -> float:
+        return float(np.hypot(self.east_m, self.north_m))
+
+
+def fit_places(gnss: Places, record: Places, config: IngestConfig) -> PlaceFit:
+    """Lag and shift of another record of the same journey; a shift of its clock has to explain more than none."""
+    as_recorded = _refined(gnss, record, 0.0, config)
+    moving = sampled(np.nan_to_num(gnss.speed(gnss.t_s)) > MOVES_MPS, 100)
+    number, passed_s = passes(record, gnss.points.surface[moving], _SAME_PLACE_M)
+    lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()))
+    if lag_s is None or abs(lag_s) <= _BIN_S:
+        return as_recorded
+    shifted = _refined(gnss, record, lag_s, config)
+    before = 0.0 if as_recorded.reason else as_recorded.agreeing
+    return shifted if not shifted.reason and explains(shifted.agreeing, before) else as_recorded
+
+
+def passes(track: Places, places_m: Floats, within_m: float) -> tuple[Ints, Floats]:
+    """Which places at height zero a moving record passes, and when [s]; a place as often as it is passed."""
+    surface = track.points.surface
+    centre = surface.mean(axis=0)
+    points, places = surface - centre, places_m - centre
+    squares = (places**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * places @ points.T
+    inner = squares[:, 1:-1]
+    # Between two rows the train may be half their distance away from both.
+    step_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    near = inner < (within_m + np.maximum(step_m[:-1], step_m[1:])) ** 2
+    place, row = np.nonzero(near & (inner <= squares[:, :-2]) & (inner < squares[:, 2:]))
+    away_m, at_s = np.full(place.size, np.inf), np.full(place.size, np.nan)
+    for begin in (row, row + 1):
+        step, from_m = points[begin + 1] - points[begin], places[place] - points[begin]
+        part = np.clip((from_m * step).sum(axis=1) / np.maximum((step**2).sum(axis=1), 1e-9), 0.0, 1.0)
+        left_m = np.linalg.norm(from_m - part[:, None] * step, axis=1)
+        period_s = track.t_s[begin + 1] - track.t_s[begin]
+        better = (left_m < away_m) & (period_s <= track.limit_s)
+        at_s = np.where(better, track.t_s[begin] + part * period_s, at_s)
+        away_m = np.where(better, left_m, away_m)
+    kept = (away_m < within_m) & (np.nan_to_num(track.speed(at_s)) > MOVES_MPS)
+    return place[kept], at_s[kept]
+
+
+def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
+    """What most of so many passages agree on, with its sigma [s]; None where they do not."""
+    if lags_s.size < 3:
+        return None, np.inf
+    ordered = np.sort(lags_s)
+    counts = np.searchsorted(ordered, lags_s + _BIN_S, "right") - np.searchsorted(ordered, lags_s - _BIN_S, "left")
+    best = int(counts.argmax())
+    if counts[best] < max(0.6 * count, 3):
+        return None, np.inf
+    agreeing = lags_s[np.abs(lags_s - lags_s[best]) <= _BIN_S]
+    return float(np.median(agreeing)), float(np.std(agreeing) / np.sqrt(agreeing.size))
+
+
+def _refined(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -> PlaceFit:
+    """Shift and the rest of the lag by robust regression of what both are apart on the velocity."""
+    t_s = gnss.t_s
+    known = record.known(t_s + lag_s) & record.known(t_s + lag_s + 1.0) & record.known(t_s + lag_s - 1.0)
+    rows = np.flatnonzero(sampled(known))
+    t_s = t_s[rows] + lag_s
+    axes = np.stack([gnss.points.east[rows], gnss.points.north[rows]], axis=1)
+    velocity = np.einsum("ijk,ik->ij", axes, (record.at(t_s + 1.0) - record.at(t_s - 1.0)) / 2.0)
+    apart = np.einsum("ijk,ik->ij", axes, record.at(t_s) - gnss.ecef_m[rows])
+    moves = np.linalg.norm(velocity, axis=1) > MOVES_MPS
+    if moves.sum() < 3 * LEAST:
+        return PlaceFit(reason="hardly any movement in common")
+    velocity, apart = velocity[moves], apart[moves]
+    design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
+    # Along one heading at constant speed a lag and a shift look alike: it is taken for a lag.
+    fit = regressed(design, apart, floor=0.2, told=1e-4)
+    # What is told besides is no disagreement, nor what positions scatter beyond it.
+    bound = 1.5 * config.fit_shift_told_m + config.fit_lag_told_s * np.linalg.norm(velocity, axis=1)
+    agreeing = float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound))
+    before = float(np.mean(np.linalg.norm(apart, axis=1) < bound))
+    # The record is ahead by so much way at its stamp: it stamps a place so much too early.
+    rest_s, east_m, north_m = fit.estimate.tolist()
+    sigma_s = 3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity))
+    return PlaceFit(
+        lag_s - rest_s, sigma_s, east_m, north_m, agreeing, before, fit.steady(0, 1, lag_s), fit.steady(1, 3)
+    )

@@ -1,0 +1,90 @@
+"""One robust regression for every comparison, and what is asked of its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.arrays import Bools, Floats
+
+# Tukey's biweight, 95 % efficient on Gaussian noise (Huber and Ronchetti 2009), after least absolute deviations.
+_BIWEIGHT = 4.685
+_ROUNDS = 12
+# Fewer observations tell nothing, and so do two rivals that agree nearly as well.
+LEAST = 6
+# Slower than this, positions that scatter by some metres may be of a train that stands [m/s].
+MOVES_MPS = 1.0
+
+
+@dataclass(frozen=True)
+class Regression:
+    """`estimate` with `sigma` (inf: not told); `halves`: the estimates of the first and second half of the run alone.
+
+    `spread`: of what is left [m]; `whole`: every part of the estimate is told.
+    """
+
+    estimate: Floats
+    sigma: Floats
+    spread: float
+    whole: bool
+    halves: tuple[Floats, ...] = ()
+
+    def steady(self, first: int, last: int, zero: float = 0.0) -> bool:
+        """Whether both halves show what this part of the estimate is off `zero`: a drift or fault in one is no lag."""
+        return steady(self.estimate[first:last] - zero, *(half[first:last] - zero for half in self.halves))
+
+
+def steady(whole: Floats, *halves: Floats) -> bool:
+    """Whether every half points the same way as the whole, and by more than half of it."""
+    return all(float(half @ whole) > 0.5 * float(whole @ whole) for half in halves)
+
+
+def regressed(design: Floats, target: Floats, floor: float, told: float = 1e-12) -> Regression:
+    """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
+
+    `floor`: least spread of what is left. Directions whose information is below the share `told` of the best known one
+    stay zero.
+    """
+    half = len(target) // 2
+    halves = [(design[:half], target[:half]), (design[half:], target[half:])]
+    parts = tuple(_solved(*part, floor, told).estimate for part in halves if len(part[1]) >= LEAST)
+    whole = _solved(design, target, floor, told)
+    return Regression(whole.estimate, whole.sigma, whole.spread, whole.whole, parts)
+
+
+def _solved(design: Floats, target: Floats, floor: float, told: float) -> Regression:
+    weight = np.ones(len(target))
+    for number in range(_ROUNDS):
+        weighted = design * weight[:, None, None]
+        normal = np.einsum("nmk,nml->kl", weighted, design)
+        inverse = np.linalg.pinv(normal, rcond=told, hermitian=True)
+        estimate = inverse @ np.einsum("nmk,nm->k", weighted, target)
+        left = np.linalg.norm(target - design @ estimate, axis=1)
+        spread = max(1.4826 * float(np.median(left)), floor)
+        if number < _ROUNDS // 2:
+            weight = floor / np.maximum(left, floor)
+        else:
+            weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
+    rank = int(np.linalg.matrix_rank(normal, tol=told * np.linalg.norm(normal, 2), hermitian=True))
+    sigma = spread * np.sqrt(np.diag(inverse)) if rank == len(estimate) else np.full(len(estimate), np.inf)
+    return Regression(estimate, sigma, spread, rank == len(estimate))
+
+
+def explains(share: float, before: float) -> bool:
+    """Whether a cause explains a misfit: most of the run agrees with it, and it leaves half of the rest at most."""
+    return share >= 0.5 and 1.0 - share <= 0.5 * (1.0 - before)
+
+
+def sampled(rows: Bools, most: int = 800) -> Bools:
+    """At most so many of the true rows, evenly."""
+    chosen = np.flatnonzero(rows)
+    kept = np.zeros_like(rows)
+    kept[chosen[:: max(1, chosen.size // most)]] = True
+    return kept
+
+
+def usual(values: Floats, share: float = 0.5) -> float:
+    """Quantile of what is known; NaN where nothing is."""
+    known = values[np.isfinite(values)]
+    return float(np.quantile(known, share)) if known.size else float("nan")
