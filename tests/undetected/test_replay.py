@@ -150,7 +150,11 @@ def sky() -> tuple[RunLog, Site]:
 
 
 def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[RunLog, Site]) -> None:
-    run, site = sky
+    both, site = sky
+    assert both.satellites is not None
+    run = both.with_streams(
+        gnss=both.gnss.filter(solution="gps"), satellites=both.satellites.filter(pl.col("solution") == "gps")
+    )
     diagnosis, _, _ = diagnosed(run, site, VEHICLE, Configuration(), "gps")
     assert diagnosis.satellites is not None
     low_m, high_m = range_bounds(diagnosis.epochs, diagnosis.satellites, Configuration())
