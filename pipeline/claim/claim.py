@@ -201,8 +201,9 @@ def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahe
     if late:
         said.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
     said.append(
-        "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way without "
-        "balise), start of mission, cold movement and availability: they can only be found broken. `--csv` has the reasons."
+        "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way "
+        "without balise), start of mission, cold movement and availability: they can only be found broken. "
+        "`--csv` has the reasons."
     )
     said.append("Nothing is said of the rear end: the length of the train is not recorded.")
     return said
