@@ -59,8 +59,8 @@ def claim(
     done, twice = distinct(done)
     found: dict[str, Tallies] = defaultdict(dict)
     days: set[tuple[object, ...]] = set()
-    # Which run of a day is its trial is drawn before an error is looked at.
-    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(_name(row))):
+    # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
+    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}")):
         told = _tallies_of(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
             told = _once_a_day(told, (run["solution"], run["t_start"].date()), days)
