@@ -177,7 +177,8 @@ def _open_ends(ground: Ground) -> Iterator[Finding]:
     element, position = np.nonzero(~ground.linked_ends())
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
-    found = candidates_of(points, ground, segments_of(track), NEAR_ENDS_M)
+    # Farther aside is the next track.
+    found = candidates_of(points, ground, segments_of(track), 2 * SAME_TRACK_M)
     middle = np.minimum(found.along_m, found.left_m) > NEAR_ENDS_M
     for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
         end, other = int(found.step[near]), track.ids[int(found.element[near])]
