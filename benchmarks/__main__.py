@@ -23,6 +23,7 @@ MODULES = (
     "interruptions",
     "experiment",
     "relink",
+    "plausibility",
     "line",
     "undetected",
 )

@@ -68,6 +68,17 @@ def _minutes(run: RunLog) -> RunLog:
     return run.with_streams(gnss=run.gnss.with_columns(turned))
 
 
+_HEIGHTS = ("reference.height_m", "gnss.height_m")
+
+
+def _feet(run: RunLog) -> RunLog:
+    return scaled(_R, height_m=3.2808399)(run)
+
+
+def _turned(site: Site, one: str, other: str) -> Site:
+    return replace(site, track=site.track.with_columns(pl.col(one).alias(other), pl.col(other).alias(one)))
+
+
 def moved_site(aside_m: float, along_m: float = 0.0, up_m: float = 0.0) -> Callable[[Site], Site]:
     """A survey moved to the right of the line's general direction, along it, and up."""
 
@@ -233,13 +244,16 @@ def _clocks() -> list[Wrong]:
 
 def _places() -> list[Wrong]:
     survey = ("positions against the survey",)
+    written = ("positions as written",)
     axes = ("latitude_deg", "longitude_deg")
     return [
-        Wrong("latitude and longitude", (*survey, "exchanged"), exchanged(_G, *axes)),
-        Wrong("longitude west", (*survey, "longitude has the wrong sign"), scaled(_G, longitude_deg=-1.0)),
-        Wrong("latitude south", (*survey, "latitude has the wrong sign"), scaled(_G, latitude_deg=-1.0)),
-        Wrong("radians", (*survey, "radians"), scaled(_G, latitude_deg=np.pi / 180, longitude_deg=np.pi / 180)),
-        Wrong("ddmm.mm", (*survey, "minutes"), _minutes),
+        Wrong("latitude and longitude", (*written, "exchanged"), exchanged(_G, *axes)),
+        Wrong("longitude west", (*written, "longitude has the wrong sign"), scaled(_G, longitude_deg=-1.0)),
+        Wrong("latitude south", (*written, "latitude has the wrong sign"), scaled(_G, latitude_deg=-1.0)),
+        Wrong("radians", (*written, "radians"), scaled(_G, latitude_deg=np.pi / 180, longitude_deg=np.pi / 180)),
+        Wrong("ddmm.mm", (*written, "minutes"), _minutes),
+        Wrong("survey: axes", (*written, "in the survey", "exchanged"), site=lambda site: _turned(site, *axes)),
+        Wrong("reference: feet", ("heights", "of the reference", "feet"), _feet, fails=False, needs=_HEIGHTS),
         Wrong("reference: axes", ("reference", "exchanged"), exchanged(_R, *axes), needs=("reference.t",)),
         *(
             Wrong(
@@ -280,6 +294,7 @@ def _vehicles() -> list[Wrong]:
     return [
         Wrong("vehicle file: 2 % more", ("odometer scale of the vehicle file",), vehicle=file(1.02, 0.0), fails=False),
         Wrong("vehicle file: 5 % less", ("odometer scale of the vehicle file",), vehicle=file(0.95, 0.0), fails=False),
+        Wrong("vehicle file: percent", ("odometer scale of the vehicle file", "no odometer"), vehicle=file(100.0, 0.0)),
         Wrong(
             "vehicle file: 1 s",
             ("GNSS latency of the vehicle file",),

@@ -69,30 +69,13 @@ def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int
 
 
 def _fit_with_errors(monitor: str, pieces: list[Floats]) -> SigmaFit:
-    whole = _fit(np.concatenate(pieces))
-    without = np.array(
-        [
-            _fit(np.concatenate([piece for j, piece in enumerate(pieces) if j != i]))
-            for i in range(len(pieces))
-            if len(pieces) > 1
-        ]
-    )
     count = len(pieces)
-    errors = (
-        np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-        if count > 1
-        else np.full(3, np.nan)
-    )
-    return SigmaFit(
-        monitor,
-        sum(len(piece) for piece in pieces),
-        float(whole[0]),
-        float(errors[0]),
-        float(whole[1]),
-        float(errors[1]),
-        float(whole[2]),
-        float(errors[2]),
-    )
+    whole, errors = _fit(np.concatenate(pieces)), np.full(3, np.nan)
+    if count > 1:
+        without = np.array([_fit(np.concatenate(pieces[:left] + pieces[left + 1 :])) for left in range(count)])
+        errors = np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    figures = [figure for pair in zip(whole.tolist(), errors.tolist(), strict=True) for figure in pair]
+    return SigmaFit(monitor, sum(len(piece) for piece in pieces), *figures)
 
 
 def overall_ratio(ratios: Floats) -> float:

@@ -46,17 +46,14 @@ _SUMMED = {
 }
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; above the 3 % of bad odometers.
 _NEAR = 0.045
-# Units so near to 1 that a bad odometer could be taken for them.
-_EXACT = 0.035
-
 # Streams are late by so much besides [s].
 _LATENCY_S = 2.2
 # GPS time is ahead of UTC by so many seconds since (IERS Bulletin C); TAI by 19 s more.
 _LEAPS = {2017.0: 18, 2015.5: 17, 2012.5: 16, 2009.0: 15, 2006.0: 14, 1999.0: 13}
 TAI_OVER_GPS_S = 19
-_DAY_S, _WEEK_S, _HOUR_S = 86_400, 604_800, 3_600
-_ROLL_OVER_WEEKS = 1024
-_HALF_HOUR_S = 1_800
+# Whole ones of these are a cause; clocks on Earth are at most 14 h from each other.
+_UNITS_S = {"time zone or summer time": 3_600, "time zone": 1_800, "roll-over of the GPS week": 1024 * 604_800}
+_DAYS_S = {"wrong week": 604_800, "wrong day, or a roll-over of it": 86_400}
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,8 @@ def explain_factor(factor: float, speed: bool) -> Explained | None:
     """The unit that makes recorded values `factor` times what they should be; the nearest one."""
     units = SPEED_UNITS if speed else WAY_UNITS | _SUMMED
     name, exact = min(units.items(), key=lambda item: abs(factor / item[1] - 1.0))
-    near = _EXACT if abs(exact - 1.0) < 0.15 else _NEAR
+    # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
+    near = min(_NEAR, abs(exact - 1.0) / 3.0)
     return Explained(f"in {name}", exact) if abs(factor / exact - 1.0) <= near else None
 
 
@@ -87,37 +85,32 @@ def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None
 def _lags(size_s: float, t_ns: int) -> Iterator[Explained]:
     """Candidates near a lag, the simplest first."""
     leap_s = leap_seconds(t_ns)
-    seconds = {"": 0, " and GPS time taken as UTC": leap_s}
     yield Explained("GPS time taken as UTC", leap_s)
     yield Explained("TAI taken as GPS time", TAI_OVER_GPS_S)
     yield Explained("TAI taken as UTC", TAI_OVER_GPS_S + leap_s)
-    for more, extra in seconds.items():
-        for sign in (1, -1) if extra else (1,):
-            yield from _calendar(size_s - sign * extra, t_ns, sign * extra, more)
+    for extra_s in (0, leap_s, -leap_s):
+        more = " and GPS time taken as UTC" if extra_s else ""
+        for cause, exact_s in _calendar(size_s - extra_s, t_ns):
+            yield Explained(cause + more, exact_s + extra_s)
 
 
-def _calendar(rest_s: float, t_ns: int, extra_s: int, more: str) -> Iterator[Explained]:
-    """Whole hours, days and weeks near a lag, to which `extra_s` is added."""
-    hours = round(rest_s / _HOUR_S)
-    if 1 <= hours <= 14:
-        yield Explained(f"a time zone or summer time: {hours} h{more}", hours * _HOUR_S + extra_s)
-    halves = round(rest_s / _HALF_HOUR_S)
-    if 1 <= halves <= 28:
-        yield Explained(f"a time zone: {halves / 2:g} h{more}", halves * _HALF_HOUR_S + extra_s)
-    roll_overs = round(rest_s / (_ROLL_OVER_WEEKS * _WEEK_S))
-    if roll_overs >= 1:
-        cause = f"a roll-over of the GPS week: {_ROLL_OVER_WEEKS * roll_overs} weeks{more}"
-        yield Explained(cause, roll_overs * _ROLL_OVER_WEEKS * _WEEK_S + extra_s)
+def _calendar(rest_s: float, t_ns: int) -> Iterator[tuple[str, float]]:
+    """Whole hours, days and weeks near a lag."""
+    for name, unit_s in _UNITS_S.items():
+        count = round(rest_s / unit_s)
+        amount = f"{1024 * count} weeks" if "week" in name else f"{count * unit_s / 3600:g} h"
+        if count >= 1 and (unit_s > 3_600 or rest_s < 14.5 * 3_600):
+            yield f"a {name}: {amount}", count * unit_s
     if (swapped_s := _swapped_s(t_ns)) is not None:
-        yield Explained(f"day and month exchanged{more}", abs(swapped_s) + extra_s)
-    weeks, days = round(rest_s / _WEEK_S), round(rest_s / _DAY_S)
-    if weeks >= 1:
-        yield Explained(f"a wrong week: {weeks} weeks{more}", weeks * _WEEK_S + extra_s)
-    if days >= 1:
-        yield Explained(f"a wrong day, or a roll-over of it: {days} days{more}", days * _DAY_S + extra_s)
-    if days >= 1 and (odd := round((rest_s - days * _DAY_S) / _HOUR_S)):
-        cause = f"a wrong day and a time zone: {days} days {odd:+d} h{more}"
-        yield Explained(cause, days * _DAY_S + odd * _HOUR_S + extra_s)
+        yield "day and month exchanged", abs(swapped_s)
+    for name, unit_s in _DAYS_S.items():
+        if (count := round(rest_s / unit_s)) >= 1:
+            yield f"a {name}: {count} {'weeks' if 'week' in name else 'days'}", count * unit_s
+            if odd := round((rest_s - count * unit_s) / 3_600):
+                yield (
+                    f"a {name}, and a time zone: {count} {'weeks' if 'week' in name else 'days'} {odd:+d} h",
+                    (count * unit_s + odd * 3_600),
+                )
 
 
 def leap_seconds(t_ns: int) -> int:

@@ -72,5 +72,5 @@ def correction(
 
 def _number(value: float) -> str:
     """A number as TOML has it, a float always."""
-    text = repr(round(value, 12)) if abs(value) >= 1e-3 else repr(value)
+    text = repr(round(float(value), 12)) if abs(value) >= 1e-3 else repr(float(value))
     return text if any(sign in text for sign in ".e") else f"{text}.0"

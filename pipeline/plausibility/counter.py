@@ -12,7 +12,7 @@ from schemas.arrays import Floats, runs_of
 _SIGNS = "sign of the odometer's speed against its distance"
 _TURNS = "direction of the counter where the train reverses"
 # The way before and after a stand that tells the heading, and how much of it the counter has to gain as well.
-_HEADING_S, _HEADING_M, _SAME_WAY = 20.0, 40.0, 0.3
+_HEADING_S, _SAME_WAY = 20.0, 0.3
 _OPPOSITE = 0.7
 
 
@@ -59,7 +59,7 @@ def turn_check(gnss: Places, counter: Course, factor: float, lag_s: float) -> Ch
             counter.gained(ends[1] + lag_s, ends[1] + _HEADING_S + lag_s) / factor,
         )
         product = gained[0] * gained[1]
-        told = np.isfinite(cosine) & (sizes[0] > _HEADING_M) & (sizes[1] > _HEADING_M)
+        told = np.isfinite(cosine) & (np.minimum(*sizes) > 2.0 * MOVES_MPS * _HEADING_S)
         for size, way in zip(sizes, gained, strict=True):
             told &= np.abs(np.abs(way) - size) < _SAME_WAY * size
         reversal, onward = told & (cosine < -_OPPOSITE), told & (cosine > _OPPOSITE)

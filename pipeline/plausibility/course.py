@@ -14,18 +14,36 @@ from schemas.enums import Fix
 
 # Two rows a second tell all that is asked here.
 _THIN_S = 0.45
-# A pause of positions or rows that is not bridged.
-_GAP_S = 5.0
+# A pause of so many periods is not bridged, nor is one of SPEED_S.
 _GAP_PERIODS = 3.5
 # Speed over this time: positions that scatter by 2 m give it to 0.7 m/s.
 SPEED_S = 4.0
 
 
 @dataclass(frozen=True)
-class Places:
-    """Positions over time [s], with earth-centred coordinates [m] at the stream's median height."""
+class _Record:
+    """Rows over time [s]."""
 
     t_s: Floats
+
+    @cached_property
+    def limit_s(self) -> float:
+        """A longer pause is not bridged."""
+        return max(SPEED_S, _GAP_PERIODS * float(np.median(np.diff(self.t_s))))
+
+    def known(self, t_s: Floats) -> Bools:
+        """Whether instants lie between two rows that are no farther apart than the limit."""
+        after = np.searchsorted(self.t_s, t_s, side="left")
+        inside = (after < self.t_s.size) & (t_s >= self.t_s[0])
+        after = np.clip(after, 1, self.t_s.size - 1)
+        known: Bools = inside & (self.t_s[after] - self.t_s[after - 1] <= self.limit_s)
+        return known
+
+
+@dataclass(frozen=True)
+class Places(_Record):
+    """Positions over time, with earth-centred coordinates [m] at the stream's median height."""
+
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
@@ -35,16 +53,9 @@ class Places:
     def points(self) -> Points:
         return points_of(self.latitude_deg, self.longitude_deg)
 
-    @cached_property
-    def limit_s(self) -> float:
-        return _limit_s(self.t_s)
-
     def at(self, t_s: Floats) -> Floats:
         """Places by straight lines [m], shape (n, 3)."""
         return np.column_stack([np.interp(t_s, self.t_s, self.ecef_m[:, axis]) for axis in range(3)])
-
-    def known(self, t_s: Floats) -> Bools:
-        return _known(self.t_s, t_s, self.limit_s)
 
     def speed(self, t_s: Floats) -> Floats:
         """Speed over ground [m/s], never negative; NaN where it is not known."""
@@ -63,18 +74,10 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Course:
-    """A counter over time [s], of any unit: speeds already summed up."""
+class Course(_Record):
+    """A counter over time, of any unit: speeds already summed up."""
 
-    t_s: Floats
     way: Floats
-
-    @cached_property
-    def limit_s(self) -> float:
-        return _limit_s(self.t_s)
-
-    def known(self, t_s: Floats) -> Bools:
-        return _known(self.t_s, t_s, self.limit_s)
 
     def speed(self, t_s: Floats) -> Floats:
         """Signed speed in units per second; NaN where it is not known."""
@@ -137,16 +140,3 @@ def _thinned(t_s: Floats) -> Bools:
     slot = np.floor((t_s - t_s[0]) / 0.5 + 1e-6)
     kept: Bools = np.diff(slot, prepend=-1.0) > 0
     return kept
-
-
-def _limit_s(t_s: Floats) -> float:
-    return max(_GAP_S, _GAP_PERIODS * float(np.median(np.diff(t_s))))
-
-
-def _known(rows_s: Floats, t_s: Floats, limit_s: float) -> Bools:
-    """Whether instants lie between two rows that are no farther apart than the limit."""
-    after = np.searchsorted(rows_s, t_s, side="left")
-    inside = (after < rows_s.size) & (t_s >= rows_s[0])
-    after = np.clip(after, 1, rows_s.size - 1)
-    known: Bools = inside & (rows_s[after] - rows_s[after - 1] <= limit_s)
-    return known

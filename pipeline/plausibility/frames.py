@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from schemas.arrays import Floats
 
-Turned = tuple[Floats, Floats]
+_RADIAN_DEG = float(np.degrees(1.0))
 
 
 @dataclass(frozen=True)
 class Slip:
-    """A way to write positions wrongly: how they are mended, and by which part of `[[ingest.correct]]`."""
+    """A way to write positions wrongly; `factors` and `exchanged` mend it, as `[[ingest.correct]]` can, but minutes."""
 
     cause: str
-    mended: Callable[[Floats, Floats], Turned]
-    factors: Mapping[str, float]
+    factors: Mapping[str, float] = field(default_factory=dict)
     exchanged: bool = False
-    by_configuration: bool = True
+    minutes: bool = False
+
+    def mended(self, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
+        """Latitude and longitude [deg] without it."""
+        first, second = (longitude_deg, latitude_deg) if self.exchanged else (latitude_deg, longitude_deg)
+        first, second = first * self.factors.get("latitude_deg", 1.0), second * self.factors.get("longitude_deg", 1.0)
+        return (_from_minutes(first), _from_minutes(second)) if self.minutes else (first, second)
 
 
 def _from_minutes(value: Floats) -> Floats:
@@ -29,27 +34,13 @@ def _from_minutes(value: Floats) -> Floats:
     return np.asarray(whole + (value - whole) * 100.0 / 60.0)
 
 
-_RADIAN_DEG = 57.29577951308232
 SLIPS = (
-    Slip("latitude and longitude are exchanged", lambda lat, lon: (lon, lat), {}, exchanged=True),
-    Slip("longitude has the wrong sign", lambda lat, lon: (lat, -lon), {"longitude_deg": -1.0}),
-    Slip("latitude has the wrong sign", lambda lat, lon: (-lat, lon), {"latitude_deg": -1.0}),
-    Slip(
-        "latitude and longitude have the wrong sign",
-        lambda lat, lon: (-lat, -lon),
-        {"latitude_deg": -1.0, "longitude_deg": -1.0},
-    ),
-    Slip(
-        "positions are in radians",
-        lambda lat, lon: (lat * _RADIAN_DEG, lon * _RADIAN_DEG),
-        {"latitude_deg": _RADIAN_DEG, "longitude_deg": _RADIAN_DEG},
-    ),
-    Slip(
-        "positions are degrees and minutes (ddmm.mm of NMEA), written as decimal degrees",
-        lambda lat, lon: (_from_minutes(lat), _from_minutes(lon)),
-        {},
-        by_configuration=False,
-    ),
+    Slip("latitude and longitude are exchanged", exchanged=True),
+    Slip("longitude has the wrong sign", {"longitude_deg": -1.0}),
+    Slip("latitude has the wrong sign", {"latitude_deg": -1.0}),
+    Slip("latitude and longitude have the wrong sign", {"latitude_deg": -1.0, "longitude_deg": -1.0}),
+    Slip("positions are in radians", {"latitude_deg": _RADIAN_DEG, "longitude_deg": _RADIAN_DEG}),
+    Slip("positions are degrees and minutes (ddmm.mm of NMEA), written as decimal degrees", minutes=True),
 )
 
 # Geographic systems of national surveys, whose coordinates look like WGS 84 and lie 50 to 700 m from it.

@@ -79,9 +79,9 @@ def _lag(pair: PairFit, vehicle: Vehicle, config: IngestConfig) -> Lag:
 
 
 def _base(name: str, fitted: dict[str, PairFit], config: IngestConfig) -> float:
-    """The wheel's own factor as the odometer's other column shows it, if that is one; else 1."""
+    """The factor that both columns of the odometer show, if it is near 1: of the wheel or of drifting positions."""
     others = [abs(pair.factor) for other, pair in fitted.items() if other != name and pair.told]
-    return others[0] if others and abs(others[0] - 1.0) <= config.fit_scale_limit else 1.0
+    return others[0] if others and abs(others[0] - 1.0) <= 2.0 * config.fit_scale_limit else 1.0
 
 
 def _factor_check(name: str, pair: PairFit, base: float, config: IngestConfig) -> Check:
@@ -96,7 +96,7 @@ def _factor_check(name: str, pair: PairFit, base: float, config: IngestConfig) -
             return fits(what, found)
         lines, into = _scale_lines(pair, 1.0), "append to the vehicle file"
         return Check(what, State.MISFIT, found, "a wheel diameter that is set wrongly", lines, into)
-    if pair.constant < _CONSTANT:
+    if pair.constant < _CONSTANT or not pair.other_factor(1.0, config.fit_scale_limit):
         return Check(what, State.MISFIT, f"no constant factor ({found} usually)")
     explained = explain_factor(factor / base, name == "speed")
     if explained is not None:

@@ -91,9 +91,12 @@ class _Windows:
         GNSS way = a counted + b change, for the counter is the less noisy one; a lag of the counter's stamps by
         `d` beyond the assumed one is b = a d.
         """
-        unit = float(np.median(self.size / self.gnss_m))
-        design = np.column_stack([self.size, self.change])[:, None, :] / unit
-        fit = regressed(design, self.gnss_m[:, None], _LEAST_SPREAD_M, start=(1.0, 0.0))
+        ratio = self.size / self.gnss_m
+        unit = float(np.median(ratio))
+        # A counter that is reset seems to run so far that it would weigh more than all the rest.
+        sane = np.abs(np.log(ratio / unit)) < np.log(2.0)
+        design = np.column_stack([self.size, self.change])[sane, None, :] / unit
+        fit = regressed(design, self.gnss_m[sane, None], _LEAST_SPREAD_M)
         halves = tuple(half / unit for half in fit.halves)
         return replace(fit, estimate=fit.estimate / unit, sigma=fit.sigma / unit, halves=halves)
 
@@ -117,8 +120,7 @@ def _clock_lag(gnss: Places, counter: Course) -> tuple[float, str]:
     as_recorded = _agreement(gnss, counter, 0.0, 0.0)
     if as_recorded >= SURELY:
         return 0.0, ""
-    spans = [(float(one.t_s[0]), float(one.t_s[-1])) for one in (gnss, counter)]
-    possible = possible_lags(spans[0], gnss.speed, spans[1], counter.speed)
+    possible = possible_lags(gnss, counter)
     if possible.reason:
         return 0.0, possible.reason
     rated = _rated(gnss, counter, possible)
@@ -175,7 +177,7 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
     ratio = np.abs(windows.counted) / windows.gnss_m
     sign = -1.0 if np.median(windows.counted) < 0 else 1.0
     fit = windows.regressed()
-    (scale, slope), sigma = fit.estimate, _OVERLAP * fit.sigma
+    (scale, slope), sigma = fit.estimate.tolist(), (_OVERLAP * fit.sigma).tolist()
     return PairFit(
         factor=sign / scale,
         factor_sigma=sigma[0] / scale**2,

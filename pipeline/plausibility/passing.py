@@ -9,14 +9,13 @@ import numpy as np
 from pipeline.plausibility.course import Places
 from pipeline.plausibility.robust import LEAST, MOVES_MPS, explains, regressed, sampled
 from schemas.arrays import Floats, Ints
+from schemas.config import IngestConfig
 
 # Two records are of the same place within so much, and a read of the balise that it names [m].
 _SAME_PLACE_M = 400.0
 READ_M = 60.0
 # Lags found place by place agree within so much [s].
 _BIN_S = 2.0
-# Positions agree with the fit if what is left is below this [m], or the way of so many seconds.
-_AGREES_M, _AGREES_S = 12.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -42,15 +41,15 @@ class PlaceFit:
         return float(np.hypot(self.east_m, self.north_m))
 
 
-def fit_places(gnss: Places, record: Places) -> PlaceFit:
+def fit_places(gnss: Places, record: Places, config: IngestConfig) -> PlaceFit:
     """Lag and shift of another record of the same journey; a shift of its clock has to explain more than none."""
-    as_recorded = _refined(gnss, record, 0.0)
+    as_recorded = _refined(gnss, record, 0.0, config)
     moving = sampled(np.nan_to_num(gnss.speed(gnss.t_s)) > MOVES_MPS, 100)
     number, passed_s = passes(record, gnss.points.surface[moving], _SAME_PLACE_M)
     lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()))
     if lag_s is None or abs(lag_s) <= _BIN_S:
         return as_recorded
-    shifted = _refined(gnss, record, lag_s)
+    shifted = _refined(gnss, record, lag_s, config)
     before = 0.0 if as_recorded.reason else as_recorded.agreeing
     return shifted if not shifted.reason and explains(shifted.agreeing, before) else as_recorded
 
@@ -92,7 +91,7 @@ def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
     return float(np.median(agreeing)), float(np.std(agreeing) / np.sqrt(agreeing.size))
 
 
-def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
+def _refined(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -> PlaceFit:
     """Shift and the rest of the lag by robust regression of what both are apart on the velocity."""
     t_s = gnss.t_s
     known = record.known(t_s + lag_s) & record.known(t_s + lag_s + 1.0) & record.known(t_s + lag_s - 1.0)
@@ -108,7 +107,8 @@ def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
     design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
     # Along one heading at constant speed a lag and a shift look alike: it is taken for a lag.
     fit = regressed(design, apart, floor=0.2, told=1e-4)
-    bound = _AGREES_M + _AGREES_S * np.linalg.norm(velocity, axis=1)
+    # What is told besides is no disagreement, nor what positions scatter beyond it.
+    bound = 1.5 * config.fit_shift_told_m + config.fit_lag_told_s * np.linalg.norm(velocity, axis=1)
     agreeing = float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound))
     before = float(np.mean(np.linalg.norm(apart, axis=1) < bound))
     # The record is ahead by so much way at its stamp: it stamps a place so much too early.

@@ -20,10 +20,8 @@ from schemas.run import Site
 
 _REFERENCE = "places of the reference against the positions"
 _SURVEY = "positions against the survey"
-# Named datums are so far from WGS 84 at least, the least known to within some metres.
-_DATUM_M = 30.0
-# No railway is built so far from its survey's height; the geoid lies up to 107 m from the ellipsoid.
-_HEIGHT_TOLD_M, _GEOID_M = 12.0, 107.0
+# The geoid lies up to so far from the ellipsoid.
+_GEOID_M = 107.0
 _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
@@ -34,19 +32,19 @@ def reference_checks(
     record = places_of(reference, epoch_ns)
     if record is None:
         return Lag("reference", reason="hardly any place"), [], False
-    found = fit_places(gnss, record)
+    found = fit_places(gnss, record, config)
     if found.reason:
         return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
     told = abs(found.lag_s) > max(config.fit_lag_told_s, 5.0 * found.lag_sigma_s)
     agrees = explains(found.agreeing, 0.0)
-    small = abs(found.lag_s) <= config.fit_lag_limit_s and agrees and found.lag_is_steady
-    sure = told and (small or explains(found.agreeing, found.as_recorded))
+    small = abs(found.lag_s) <= config.fit_lag_limit_s and agrees
+    sure = told and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
     near = found.shift_m <= config.fit_shift_told_m or not found.shift_is_steady
-    return lag, [_beside_reference(found, near), *_reference_heights(gnss, record, found.lag_s)], near
+    return lag, [_beside_reference(found, near), *_reference_heights(gnss, record, found.lag_s, config)], near
 
 
 def _beside_reference(found: PlaceFit, near: bool) -> Check:
@@ -58,7 +56,7 @@ def _beside_reference(found: PlaceFit, near: bool) -> Check:
     return Check(_REFERENCE, State.MISFIT, words, cause, advice=advice)
 
 
-def _reference_heights(gnss: Places, record: Places, lag_s: float) -> list[Check]:
+def _reference_heights(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -> list[Check]:
     known = np.isfinite(record.height_m)
     if known.sum() < 2 or not np.isfinite(gnss.height_m).any():
         return []
@@ -66,7 +64,7 @@ def _reference_heights(gnss: Places, record: Places, lag_s: float) -> list[Check
     up_m = (
         np.where(record.known(t_s), np.interp(t_s, record.t_s[known], record.height_m[known]), np.nan) - gnss.height_m
     )
-    return _heights("reference", up_m, gnss.height_m, 0.0)
+    return _heights("reference", up_m, gnss.height_m, 0.0, config)
 
 
 def reads_lag(gnss: Places, reads: pl.DataFrame, site: Site, epoch_ns: int, config: IngestConfig) -> Lag:
@@ -103,13 +101,13 @@ def survey_checks(
 ) -> list[Check]:
     """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
     found, datum = _by_datum(fit_survey(gnss, line), gnss, line, config)
-    heights = _heights("survey", found.up_m, found.height_m, vehicle.antenna_height_m)
+    heights = _heights("survey", found.up_m, found.height_m, vehicle.antenna_height_m, config)
     return [_beside(found, datum, config, ("gnss", "reference") if beside_reference else ("gnss",)), *heights]
 
 
 def _by_datum(found: SurveyFit, gnss: Places, line: Line, config: IngestConfig) -> tuple[SurveyFit, Datum | None]:
     """The datum that the survey may be in; between curves a large shift is found only from near it."""
-    if max(found.shift_m, found.aside_m) < _DATUM_M or found.aside_m < config.fit_shift_told_m:
+    if found.aside_m < config.fit_shift_told_m:
         return found, None
     datums = datums_at(float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg)))
     tried = [
@@ -152,14 +150,14 @@ def towards(east_m: float, north_m: float) -> str:
     return f"{abs(east_m):.0f} m {east}, {abs(north_m):.0f} m {north}"
 
 
-def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float) -> list[Check]:
+def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: IngestConfig) -> list[Check]:
     """Heights of the survey or reference, which lie `up_m` above those of the positions; `offset_m`: as they should."""
     what = f"heights against the {other}"
     apart_m, is_steady = steady_median(up_m + offset_m)
     if not np.isfinite(apart_m):
         return []
     words = f"the {other} lies {apart_m:.0f} m above them"
-    if abs(apart_m) <= _HEIGHT_TOLD_M or not is_steady:
+    if abs(apart_m) <= 1.5 * config.fit_shift_told_m or not is_steady:
         return [fits(what, words)]
     ratio, _ = steady_median(height_m / (height_m + up_m + offset_m))
     for stream, factor in (("gnss", ratio), (other, 1.0 / ratio)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,25 +40,21 @@ def steady(whole: Floats, *halves: Floats) -> bool:
     return all(float(half @ whole) > 0.5 * float(whole @ whole) for half in halves)
 
 
-def regressed(
-    design: Floats, target: Floats, floor: float, told: float = 1e-12, start: tuple[float, ...] | None = None
-) -> Regression:
+def regressed(design: Floats, target: Floats, floor: float, told: float = 1e-12) -> Regression:
     """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
 
     `floor`: least spread of what is left. Directions whose information is below the share `told` of the best known one
-    stay zero. `start`: an estimate to begin with, where a few observations weigh as much as all others.
+    stay zero.
     """
     half = len(target) // 2
     halves = [(design[:half], target[:half]), (design[half:], target[half:])]
-    parts = tuple(_solved(*part, floor, told, start).estimate for part in halves if len(part[1]) >= LEAST)
-    whole = _solved(design, target, floor, told, start)
+    parts = tuple(_solved(*part, floor, told).estimate for part in halves if len(part[1]) >= LEAST)
+    whole = _solved(design, target, floor, told)
     return Regression(whole.estimate, whole.sigma, whole.spread, whole.whole, parts)
 
 
-def _solved(design: Floats, target: Floats, floor: float, told: float, start: tuple[float, ...] | None) -> Regression:
+def _solved(design: Floats, target: Floats, floor: float, told: float) -> Regression:
     weight = np.ones(len(target))
-    if start is not None:
-        weight = floor / np.maximum(np.linalg.norm(target - design @ np.array(start), axis=1), floor)
     for number in range(_ROUNDS):
         weighted = design * weight[:, None, None]
         normal = np.einsum("nmk,nml->kl", weighted, design)
@@ -93,7 +88,3 @@ def usual(values: Floats, share: float = 0.5) -> float:
     """Quantile of what is known; NaN where nothing is."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
-
-
-Speed = Callable[[Floats], Floats]
-"""Speed [units/s] at instants [s]; NaN where it is not known."""

@@ -10,7 +10,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.plausibility.axes import fit_velocity
-from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, correction, not_checked
 from pipeline.plausibility.course import Places, places_of
 from pipeline.plausibility.frames import SLIPS, Slip
@@ -34,33 +33,42 @@ def written_checks(
     far_m = 0.0 if line is None else line.far_m(gnss.latitude_deg, gnss.longitude_deg)
     if line is not None and far_m <= _FAR_M:
         return []
-    as_recorded = _witnesses(run, fixes, gnss, epoch_ns, config)
-    if line is None and all(as_recorded.values()):
-        return []
-    words = f"they lie {far_m / 1000.0:.0f} km from every track" if line is not None else "no other stream fits them"
+    recorded = _witnesses(run, fixes, gnss, epoch_ns, config)
+    if line is None:
+        return [] if recorded and all(recorded.values()) else _without_survey(run, fixes, recorded, epoch_ns, config)
+    words = f"they lie {far_m / 1000.0:.0f} km from every track"
     for slip in SLIPS:
         mended = _mended(fixes, slip, epoch_ns)
-        if mended is None or (line is not None and line.far_m(mended.latitude_deg, mended.longitude_deg) > _FAR_M):
+        if mended is None or line.far_m(mended.latitude_deg, mended.longitude_deg) > _FAR_M:
             continue
-        after = _witnesses(run, fixes, mended, epoch_ns, config)
-        if line is None and sum(after.values()) > sum(as_recorded.values()) and all(after.values()):
-            return [_slipped(slip, words, sure="odometer" in after and not as_recorded.get("odometer", True))]
-        if line is not None and sum(after.values()) >= sum(as_recorded.values()):
-            return [_slipped(slip, words, sure=True)]
-        if line is not None:
-            cause = f"in the survey {slip.cause}: odometer, velocity or reference fit the positions as they are"
-            return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="Mend the columns of the site's track.")]
-    if line is None:
-        return []
+        if sum(_witnesses(run, fixes, mended, epoch_ns, config).values()) >= sum(recorded.values()):
+            return [_slipped(slip, words)]
+        cause = f"in the survey {slip.cause}: odometer, velocity or reference fit the positions as they are"
+        return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="Mend the columns of the site's track.")]
     advice = "Check that run and site belong together, and axes and datum of both."
     return [Check(_WHAT, State.MISFIT, words, "run and site of different places", advice=advice)]
 
 
-def _slipped(slip: Slip, words: str, sure: bool) -> Check:
-    if not sure:
+def _without_survey(
+    run: RunLog, fixes: pl.DataFrame, recorded: dict[str, bool], epoch_ns: int, config: IngestConfig
+) -> list[Check]:
+    """The slip that makes every other stream fit, if there is one."""
+    words = "no other stream fits them"
+    for slip in SLIPS:
+        mended = _mended(fixes, slip, epoch_ns)
+        found = {} if mended is None else _witnesses(run, fixes, mended, epoch_ns, config)
+        if not all(found.values()) or sum(found.values()) <= sum(recorded.values()):
+            continue
+        if "odometer" in found and not recorded.get("odometer", False):
+            return [_slipped(slip, words)]
+        # Signs leave the ways as they are: the velocity alone says that they differ.
         cause = f"{slip.cause}, or the velocity has exchanged axes or signs"
-        return Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="A site tells which: name it with --site.")
-    if not slip.by_configuration:
+        return [Check(_WHAT, State.IMPOSSIBLE, words, cause, advice="A site tells which: name it with --site.")]
+    return []
+
+
+def _slipped(slip: Slip, words: str) -> Check:
+    if slip.minutes:
         advice = "Convert the positions: degrees are the whole part plus the rest times 100/60."
         return Check(_WHAT, State.IMPOSSIBLE, words, slip.cause, advice=advice)
     return Check(_WHAT, State.IMPOSSIBLE, words, slip.cause, _lines("gnss", slip))
@@ -77,14 +85,11 @@ def _witnesses(run: RunLog, fixes: pl.DataFrame, gnss: Places, epoch_ns: int, co
     for course in courses_of(run, epoch_ns).values():
         pair = fit_pair(gnss, course)
         if pair.told:
-            factor = abs(pair.factor)
-            unit = any(explain_factor(factor, speed) is not None for speed in (True, False))
-            fits = pair.constant > 0.5 and (abs(factor - 1.0) <= config.fit_scale_limit or unit)
-            found["odometer"] = found.get("odometer", True) and fits
+            fits = pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= config.fit_scale_limit
+            found["odometer"] = found.get("odometer", False) or fits
     velocity = fit_velocity(fixes, gnss, epoch_ns)
     if velocity is not None:
-        near = abs(velocity.ratio - 1.0) <= config.fit_scale_limit or explain_factor(velocity.ratio, True) is not None
-        found["velocity"] = velocity.best == 0 and near
+        found["velocity"] = velocity.best == 0 and abs(velocity.ratio - 1.0) <= config.fit_scale_limit
     if run.reference is not None and (record := places_of(run.reference, epoch_ns)) is not None:
         found["reference"] = apart_m(gnss, record.latitude_deg, record.longitude_deg) < _FAR_M
     return found
@@ -115,7 +120,7 @@ def reference_elsewhere(gnss: Places, reference: pl.DataFrame, epoch_ns: int) ->
     for slip in SLIPS:
         latitude, longitude = slip.mended(record.latitude_deg, record.longitude_deg)
         if np.max(np.abs(latitude)) <= 90.0 and apart_m(gnss, latitude, longitude) < 10.0 * _FAR_M:
-            cause, advice = f"in the reference {slip.cause}", "" if slip.by_configuration else "Convert its positions."
-            lines = _lines("reference", slip) if slip.by_configuration else ""
+            cause, advice = f"in the reference {slip.cause}", "Convert its positions." if slip.minutes else ""
+            lines = "" if slip.minutes else _lines("reference", slip)
             return [Check(what, State.IMPOSSIBLE, words, cause, lines, advice=advice)]
     return [not_checked(what, words)]

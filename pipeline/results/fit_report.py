@@ -11,7 +11,7 @@ from pipeline.plausibility.check import State
 from pipeline.plausibility.fit import Fit, fit_run, lines_of
 from schemas.config import IngestConfig, Vehicle
 from schemas.errors import InputError
-from schemas.run import RunLog, Site
+from schemas.run import RunLog, Site, Stream
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,14 @@ def fit_report(
     run: RunLog, config: IngestConfig, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> FitReport:
     """Every check of every solution; a run that cannot be cleaned has its error as problem."""
+    problems: tuple[str, ...] = ()
     try:
         cleaned, counts = clean(run, config)
     except InputError as error:
-        return FitReport({}, (str(error),))
+        # Recorders of different times: what moves one to the other is told all the same.
+        cleaned, counts, problems = _in_order(run), CleanCounts(), (str(error),)
+        if cleaned.gnss.height < 2:
+            return FitReport({}, problems)
     found = {name: fit_run(cleaned, name, vehicle or Vehicle(), config, site) for name in cleaned.solutions()}
     tables = {"Fit": _checks(found, counts)}
     mending: dict[str, str] = {}
@@ -50,8 +54,14 @@ def fit_report(
     text = "\n".join(f"# {into}\n{lines}" for into, lines in mending.items())
     if text:
         tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
-    failing = found.values() if config.plausibility == "fail" else ()
-    return FitReport(tables, tuple(dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)))
+    failing = found.values() if config.plausibility == "fail" and not problems else ()
+    impossible = dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)
+    return FitReport(tables, problems + tuple(impossible))
+
+
+def _in_order(run: RunLog) -> RunLog:
+    streams: tuple[Stream, ...] = ("gnss", "odometer", "reference", "balise_reads")
+    return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
 
 
 def _checks(found: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:

@@ -10,7 +10,7 @@ import pytest
 from datasets.comma2k19 import comma2k19_run
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site
-from pipeline.calibration.calibrate import calibrate
+from pipeline.calibration.calibrate import Calibration, calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
 from pipeline.stages import replay
 from schemas.config import Configuration, MonitorConfig
@@ -78,10 +78,13 @@ def fault_free() -> tuple[list[RunLog], Site]:
     return [build_run(scenario, run) for run in runs], build_site(scenario)
 
 
-def test_calibration_finds_the_simulated_vehicle(fault_free: tuple[list[RunLog], Site]) -> None:
+@pytest.fixture(scope="module")
+def result(fault_free: tuple[list[RunLog], Site]) -> Calibration:
+    return calibrate(*fault_free)
+
+
+def test_calibration_finds_the_simulated_vehicle(result: Calibration) -> None:
     """The demonstration's vehicle: scale 1.0015, latency 50 ms; receiver and bank agree, so the slope is 1."""
-    logs, site = fault_free
-    result = calibrate(logs, site)
     vehicle = result.vehicle
     assert vehicle.odometer_scale == pytest.approx(1.0015, abs=4 * (vehicle.odometer_scale_sigma or 0))
     assert vehicle.gnss_latency_s == pytest.approx(0.05, abs=4 * (vehicle.gnss_latency_sigma_s or 0))
@@ -94,12 +97,13 @@ def test_calibration_finds_the_simulated_vehicle(fault_free: tuple[list[RunLog],
     assert settings["monitors"]["sigma_slope"] == result.sigma_slope
 
 
-def test_sigmas_of_an_earlier_calibration_do_not_count(fault_free: tuple[list[RunLog], Site]) -> None:
-    logs, site = fault_free
+def test_sigmas_of_an_earlier_calibration_do_not_count(
+    fault_free: tuple[list[RunLog], Site], result: Calibration
+) -> None:
     config = Configuration(monitors=MonitorConfig(sigma_intercept_m=0.5, sigma_slope=2.0, doppler_sigma_mps=0.3))
-    first, again = calibrate(logs[:1], site), calibrate(logs[:1], site, config=config)
-    assert again.sigmas.equals(first.sigmas)
-    assert again.doppler_sigma_mps == pytest.approx(first.doppler_sigma_mps)
+    again = calibrate(*fault_free, config=config)
+    assert again.sigmas.equals(result.sigmas)
+    assert again.doppler_sigma_mps == pytest.approx(result.doppler_sigma_mps)
 
 
 def test_a_noisy_odometer_shows_in_the_sigma_of_the_velocity(fault_free: tuple[list[RunLog], Site]) -> None:
@@ -134,12 +138,12 @@ def test_runs_without_odometer_are_refused(fault_free: tuple[list[RunLog], Site]
         calibrate([logs[0].with_streams(odometer=None)], site)
 
 
-def test_the_solution_is_the_one_named(fault_free: tuple[list[RunLog], Site]) -> None:
+def test_the_solution_is_the_one_named(fault_free: tuple[list[RunLog], Site], result: Calibration) -> None:
     logs, site = fault_free
     renamed = [log.with_streams(gnss=log.gnss.with_columns(solution=pl.lit("galileo"))) for log in logs]
     with pytest.raises(InputError, match="primary: no run has this solution; found galileo"):
         calibrate(renamed, site)
-    assert calibrate(renamed, site, solution="galileo").vehicle == calibrate(logs, site).vehicle
+    assert calibrate(renamed, site, solution="galileo").vehicle == result.vehicle
 
 
 def test_a_recorded_minute_gives_its_known_scale_and_latency() -> None:

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
+from dataclasses import replace
 
+import numpy as np
 import polars as pl
 import pytest
 
 from benchmarks.plausibility import applies, fit_of, told
 from benchmarks.plausibility_trips import Trip, trip
-from benchmarks.plausibility_wrongs import WRONGS, Wrong
+from benchmarks.plausibility_wrongs import WRONGS, Wrong, exchanged, moved_site, scaled, shifted
 from datasets.random_trials import random_trial
 from pipeline.calibration.calibrate import calibrate
 from pipeline.ingest.clean import clean
 from pipeline.ingest.correct import corrected
 from pipeline.plausibility.causes import explain_factor, explain_lag
 from pipeline.plausibility.check import CONFIGURATION, State
-from pipeline.plausibility.fit import fit_run, lines_of
-from pipeline.stages import replay
+from pipeline.plausibility.fit import Fit, fit_run, lines_of
+from pipeline.results.fit_report import fit_report
+from pipeline.stages import replay as replayed
 from schemas.config import Configuration, IngestConfig, Vehicle, settings_from
 from schemas.errors import ConfigError, InputError
+from schemas.run import RunLog, Site
 
 # Short; one with a stop and all streams, one with a reversal, one without a stop.
 SEEDS = (27, 26, 29, 7)
 TRIED = [
     wrong for wrong in WRONGS if wrong.place is None and not wrong.least_hours and "odometer earlier" not in wrong.name
-]
+][::3]
+_AXES = ("latitude_deg", "longitude_deg")
 NOON_NS = 1_741_176_000 * 10**9  # 2025-03-05 12:00 UTC
 
 
@@ -130,11 +136,11 @@ def test_a_replay_of_an_impossible_run_fails_or_is_unproven() -> None:
     assert odometer is not None
     wrong = trial.run.with_streams(odometer=odometer.with_columns(pl.col("distance_m", "speed_mps") * 3.6))
     with pytest.raises(InputError, match=r"km/h.*ingest\.correct = \[\{ stream = \"odometer\""):
-        replay(wrong, trial.site, trial.vehicle)
+        replayed(wrong, trial.site, trial.vehicle)
     with pytest.raises(InputError, match="km/h"):
         calibrate([wrong], trial.site)
     warn = Configuration.model_validate({"ingest": {"plausibility": "warn"}})
-    (row,) = replay(wrong, trial.site, trial.vehicle, warn).runs.to_dicts()
+    (row,) = replayed(wrong, trial.site, trial.vehicle, warn).runs.to_dicts()
     assert row["verdict"] in ("unproven", "unsafe")
     assert "does not fit: odometer" in row["notes"]
 
@@ -142,7 +148,7 @@ def test_a_replay_of_an_impossible_run_fails_or_is_unproven() -> None:
 def test_low_availability_has_its_reason() -> None:
     trial = random_trial(0)
     aside = trial.run.gnss.with_columns(pl.col("latitude_deg") + 0.0004, pl.col("longitude_deg") + 0.0004)
-    (row,) = replay(trial.run.with_streams(gnss=aside), trial.site, trial.vehicle).runs.to_dicts()
+    (row,) = replayed(trial.run.with_streams(gnss=aside), trial.site, trial.vehicle).runs.to_dicts()
     assert row["availability"] < 0.1
     assert "positions against the survey: the survey lies" in row["notes"]
     assert "of the moving time, the rest lost to: " in row["notes"]
@@ -178,3 +184,70 @@ def test_a_correction_of_what_is_not_there_is_refused() -> None:
         config = IngestConfig.model_validate({"correct": [wrong]})
         with pytest.raises(ConfigError, match="correct"):
             corrected(run, config.correct)
+
+
+def _fixed(run: RunLog, fit: Fit) -> RunLog:
+    """The run as the printed lines of configuration make it."""
+    lines = lines_of(fit.misfits)[CONFIGURATION]
+    return corrected(run, settings_from({**tomllib.loads(lines)["ingest"]}, IngestConfig, "the lines").correct)
+
+
+def _fit(run: RunLog, site: Site | None = None, vehicle: Vehicle | None = None) -> Fit:
+    return fit_run(run, "primary", vehicle or Vehicle(), IngestConfig(), site)
+
+
+def test_positions_written_wrongly_are_told_without_a_site(trips: list[Trip]) -> None:
+    run = trips[0].run
+    for change in (exchanged("gnss", *_AXES), scaled("gnss", latitude_deg=np.pi / 180, longitude_deg=np.pi / 180)):
+        found = _fit(change(run))
+        assert [check.what for check in found.misfits] == ["positions as written"]
+        assert _fit(_fixed(change(run), found)).misfits == ()
+    mirrored = _fit(scaled("gnss", longitude_deg=-1.0)(run))
+    assert "or the velocity" in mirrored.impossible[0].cause
+    assert lines_of(mirrored.misfits) == {}, "nobody can tell which of both it is"
+
+
+def test_a_survey_with_exchanged_axes_is_not_taken_for_the_positions_fault(trips: list[Trip]) -> None:
+    track = trips[0].site.track
+    turned = track.with_columns(pl.col(one).alias(other) for one, other in (_AXES, _AXES[::-1]))
+    (check,) = _fit(trips[0].run, replace(trips[0].site, track=turned)).misfits
+    assert check.cause.startswith("in the survey latitude and longitude are exchanged")
+    assert not check.lines
+
+
+def test_a_shifted_survey_moves_positions_and_reference(trips: list[Trip]) -> None:
+    drawn = next(one for one in trips if one.run.reference is not None)
+    moved = moved_site(24.0, 18.0)(drawn.site)
+    found = _fit(drawn.run, moved)
+    assert {"gnss", "reference"} == {
+        line.split('"')[1] for line in found.misfits[0].lines.splitlines() if "stream" in line
+    }
+    assert _fit(_fixed(drawn.run, found), moved).misfits == ()
+
+
+def test_a_unit_is_mended_once(trips: list[Trip]) -> None:
+    vehicle = Vehicle(odometer_scale=1.0 / trips[0].scale, odometer_scale_sigma=2e-4)
+    found = _fit(scaled("odometer", distance_m=0.001)(trips[0].run), trips[0].site, vehicle)
+    assert list(lines_of(found.misfits)) == [CONFIGURATION], "no second line for the vehicle file"
+    percent = vehicle.model_copy(update={"odometer_scale": 100.0})
+    (check,) = _fit(trips[0].run, trips[0].site, percent).impossible
+    assert check.into == "write instead in the vehicle file"
+
+
+def test_a_counter_that_is_reset_is_no_wrong_sign(trips: list[Trip]) -> None:
+    run = trips[0].run
+    assert run.odometer is not None
+    middle = run.odometer.height // 2
+    reset = pl.col("distance_m") - pl.when(pl.int_range(pl.len()) >= middle).then(40_000.0).otherwise(0.0)
+    for sign in (1.0, -1.0):
+        turned = run.odometer.with_columns(distance_m=reset * sign, speed_mps=pl.col("speed_mps") * sign)
+        assert _fit(run.with_streams(odometer=turned)).impossible == ()
+
+
+def test_recorders_of_different_hours_are_told_with_lines(trips: list[Trip]) -> None:
+    run = shifted(7200.0, "odometer")(trips[0].run)
+    report = fit_report(run, IngestConfig())
+    assert "does not overlap" in report.problems[0]
+    assert "shift_s = -7200.0" in report.lines()
+    (inline,) = re.findall(r"ingest\.correct = .*\]", report.problems[0])
+    assert tomllib.loads(inline)["ingest"]["correct"] == [{"stream": "odometer", "shift_s": -7200.0}]
