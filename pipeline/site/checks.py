@@ -13,7 +13,7 @@ import polars as pl
 from pipeline.track.geodesy import points_of
 from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 from schemas.enums import Navigability
 from schemas.run import Finding
 
@@ -217,8 +217,9 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
     counts = np.searchsorted(along, along + reach_m, side="right") - np.arange(len(along)) - 1
     first = np.repeat(np.arange(len(along)), counts)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
-    pairs = order[np.column_stack([first, second])]
-    return pairs[np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1) <= reach_m]
+    pairs: npt.NDArray[np.int64] = order[np.column_stack([first, second])]
+    near: Bools = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1) <= reach_m
+    return pairs[near]
 
 
 def _nearly_met(places: Floats, inward: Floats, free: np.ndarray) -> list[tuple[int, int, float]]:
