@@ -178,13 +178,15 @@ def offset_m(fault: FaultSpec, t_s: Floats, rng: np.random.Generator) -> Floats:
 
 def read_profile(path: str) -> tuple[Floats, Floats]:
     """Times [s] and sizes [m] of a profile; raises `ConfigError` where the file is none."""
-    expected = "CSV with columns t_s (growing) and size_m, numbers in each row"
+    expected = "CSV with columns t_s (growing) and size_m, numbers up to 1e7 in each row"
     try:
         table = pl.read_csv(path, columns=["t_s", "size_m"], schema_overrides={"t_s": pl.Float64, "size_m": pl.Float64})
     except (OSError, pl.exceptions.PolarsError) as error:
-        raise ConfigError("cannot be read as a profile", place=path, found=str(error), expected=expected) from None
+        raise ConfigError(
+            "cannot be read as a profile", place=path, found=str(error).partition("\n")[0], expected=expected
+        ) from None
     values = table.to_numpy()
-    if not values.size or not np.isfinite(values).all() or (np.diff(values[:, 0]) <= 0.0).any():
+    if not values.size or not (np.abs(values) <= _LARGEST).all() or (np.diff(values[:, 0]) <= 0.0).any():
         raise ConfigError("is no profile", place=path, expected=expected)
     return values[:, 0], values[:, 1]
 

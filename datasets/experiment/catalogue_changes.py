@@ -42,10 +42,15 @@ def odometer_late(run: RunLog, site: Site, onset_ns: int, size_s: float) -> tupl
 
 
 def _stamped(frame: pl.DataFrame | None, onset_ns: int, size_s: float) -> pl.DataFrame:
-    if frame is None:
-        raise ValueError("the run of the catalogue has this stream")
     later = pl.col("t") + pl.duration(nanoseconds=round(size_s * _SECOND_NS))
-    return frame.with_columns(t=pl.when(_from(onset_ns)).then(later).otherwise(pl.col("t")))
+    return _there(frame).with_columns(t=pl.when(_from(onset_ns)).then(later).otherwise(pl.col("t")))
+
+
+def _there(frame: pl.DataFrame | None) -> pl.DataFrame:
+    """A stream or list that the journeys of the catalogue have."""
+    if frame is None:
+        raise ValueError("the journey lacks what the fault is about")
+    return frame
 
 
 def _from(onset_ns: int) -> pl.Expr:
@@ -54,10 +59,11 @@ def _from(onset_ns: int) -> pl.Expr:
 
 def map_left(run: RunLog, site: Site, onset_ns: int, size_m: float) -> tuple[RunLog, Site]:
     """From the first net element entered after the onset on, the survey lies `size_m` to the left of the track."""
-    parts = []
     later = _elements_after(run, site, onset_ns)
-    for part in site.track.partition_by("netelement_id", maintain_order=True):
-        parts.append(_moved_left(part, size_m) if part["netelement_id"][0] in later else part)
+    parts = [
+        _moved_left(part, size_m) if part["netelement_id"][0] in later else part
+        for part in site.track.partition_by("netelement_id", maintain_order=True)
+    ]
     return run, Site(pl.concat(parts), site.links, site.balises, site.route)
 
 
@@ -71,18 +77,14 @@ def _moved_left(points: pl.DataFrame, size_m: float) -> pl.DataFrame:
 
 def list_wrong(run: RunLog, site: Site, onset_ns: int, size_m: float) -> tuple[RunLog, Site]:
     """The balise list has every balise of the elements after the onset `size_m` further on than meant."""
-    if site.balises is None:
-        raise ValueError("the site of the catalogue has balises")
     later = pl.col("netelement_id").is_in(_elements_after(run, site, onset_ns))
     moved = pl.when(later).then(pl.col("measure_m") + size_m).otherwise(pl.col("measure_m"))
-    return run, Site(site.track, site.links, site.balises.with_columns(measure_m=moved), site.route)
+    return run, Site(site.track, site.links, _there(site.balises).with_columns(measure_m=moved), site.route)
 
 
 def _elements_after(run: RunLog, site: Site, onset_ns: int) -> list[str]:
     """Linked net elements that begin beyond the train's place at the onset, by the survey point that is nearest."""
-    if run.reference is None:
-        raise ValueError("the run of the catalogue has a reference")
-    here = run.reference.filter(_from(onset_ns)).row(0, named=True)
+    here = _there(run.reference).filter(_from(onset_ns)).row(0, named=True)
     line = site.track.filter(
         pl.col("netelement_id").is_in(site.links["netelement_a"].to_list() + site.links["netelement_b"].to_list())
     )
@@ -94,17 +96,11 @@ def _elements_after(run: RunLog, site: Site, onset_ns: int) -> list[str]:
 
 def read_missing(run: RunLog, site: Site, onset_ns: int, size: float) -> tuple[RunLog, Site]:
     """The next `size` physical balises are not there any more."""
-    reads = _reads(run)
+    reads = _there(run.balise_reads)
     later = reads.filter(_from(onset_ns))[: round(size)]
     return run.with_streams(balise_reads=reads.join(later, on="t", how="anti", maintain_order="left")), site
 
 
 def read_late(run: RunLog, site: Site, onset_ns: int, size_s: float) -> tuple[RunLog, Site]:
     """Physical balises stand further on than listed: they are read `size_s` late."""
-    return run.with_streams(balise_reads=_stamped(_reads(run), onset_ns, size_s)), site
-
-
-def _reads(run: RunLog) -> pl.DataFrame:
-    if run.balise_reads is None:
-        raise ValueError("the run of the catalogue reads physical balises")
-    return run.balise_reads
+    return run.with_streams(balise_reads=_stamped(run.balise_reads, onset_ns, size_s)), site

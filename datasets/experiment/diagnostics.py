@@ -15,11 +15,10 @@ from functools import partial
 import numpy as np
 import polars as pl
 
-from datasets.experiment.bounds import time_columns
 from datasets.experiment.geometry import CONSTELLATIONS, Geometry, default_geometry
 from datasets.experiment.passage import NEVER, Passages, first_passages, joined
 from datasets.experiment.plan import Plan, bank_forms, failure_forms
-from datasets.experiment.tables import Contents, Row, share, table
+from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Ints
 from schemas.config import Configuration

@@ -27,6 +27,7 @@ _THIRD_SMALLER = 2.0 / 3.0
 # From this rate on, every ramp is to be detected; up to this one, spreads are compared.
 _SLOWEST_COVERED_MPS = 0.03
 _FASTEST_COMPARED_MPS = 1.0
+_KEYS = ("constellation", "reading")
 
 STATEMENTS: dict[str, str] = {
     "pmd_zero_0p03": "heading 0, odometer only: no run at 0.03 m/s is undetected at the failure (Fig. 5)",
@@ -50,7 +51,7 @@ def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = 
 
 def shares(by_geometry: pl.DataFrame) -> pl.DataFrame:
     """Share of skies in which each finding holds, with exact bounds; `silent` counts those where it says nothing."""
-    keys = ["finding", "constellation", "reading"]
+    keys = ["finding", *_KEYS]
     counted = by_geometry.group_by(keys, maintain_order=True).agg(
         holds=pl.col("holds").sum(), judged=pl.col("holds").count(), silent=pl.col("holds").null_count()
     )
@@ -81,77 +82,46 @@ def _judge_sky(seed: int, repetitions: int, sky: tuple[int, tuple[Geometry, ...]
 
 def judge(detection: pl.DataFrame) -> pl.DataFrame:
     """`constellation, reading, finding, holds` from the table of detection times of one sky."""
-    keys = ["constellation", "reading"]
+    odometer_only = detection.filter(sensors="odometer")
+    ahead = odometer_only.filter(heading_deg=0.0)
+    pmd, time_s = pl.col("pmd_at_failure"), pl.col("time_to_detect_s")
+    # 0.10 m/s is the middle of the rates; faster ramps are seen within seconds whatever the heading.
+    turned = odometer_only.filter(pl.col("heading_deg").is_in([0.0, 75.0]), rate_mps=0.1).sort("heading_deg")
+    with_track = detection.filter(pl.col("rate_mps") >= _SLOWEST_COVERED_MPS, sensors="odometer_and_track")
+    away = (time_s.last() >= _TWICE * time_s.first()) | (pl.col("detected").last() == 0)
     parts = [
-        _at_failure(detection, 0.03, "pmd_zero_0p03", pl.col("pmd_at_failure") == 0),
-        _at_failure(detection, 0.1, "pmd_zero_0p1", pl.col("pmd_at_failure") == 0),
-        _at_failure(detection, 0.01, "pmd_not_zero_0p01", pl.col("pmd_at_failure") > 0),
-        _dual_ahead(detection, 0.0, "dual_ahead"),
-        _dual_ahead(detection, 0.02, "dual_ahead_from_0p02"),
-        _turning_away(detection),
-        _track_covers(detection),
-        _track_steadies(detection),
+        _holds("pmd_zero_0p03", ahead.filter(rate_mps=0.03), (pmd == 0).first()),
+        _holds("pmd_zero_0p1", ahead.filter(rate_mps=0.1), (pmd == 0).first()),
+        _holds("pmd_not_zero_0p01", ahead.filter(rate_mps=0.01), (pmd > 0).first()),
+        _dual_ahead("dual_ahead", ahead),
+        _dual_ahead("dual_ahead_from_0p02", ahead.filter(pl.col("rate_mps") >= 0.02)),
+        _holds("turning_away", turned, away),
+        _holds("track_covers", with_track, (pl.col("censored") == 0).all()),
+        _track_steadies("track_steadies", detection),
     ]
-    return pl.concat([part.select(*keys, "finding", "holds") for part in parts]).sort("finding", *keys)
+    return pl.concat(parts).sort("finding", *_KEYS)
 
 
-def _at_failure(detection: pl.DataFrame, rate_mps: float, finding: str, holds: pl.Expr) -> pl.DataFrame:
-    odometer_only = (pl.col("sensors") == "odometer") & (pl.col("heading_deg") == 0.0)
-    return detection.filter(odometer_only & (pl.col("rate_mps") == rate_mps)).with_columns(
-        finding=pl.lit(finding), holds=holds
-    )
+def _holds(finding: str, chosen: pl.DataFrame, holds: pl.Expr) -> pl.DataFrame:
+    judged = chosen.group_by(_KEYS, maintain_order=True).agg(holds=holds)
+    return judged.select(*_KEYS, finding=pl.lit(finding), holds="holds")
 
 
-def _dual_ahead(detection: pl.DataFrame, from_mps: float, finding: str) -> pl.DataFrame:
+def _dual_ahead(finding: str, ahead: pl.DataFrame) -> pl.DataFrame:
     """Judged for odometer only, as Fig. 5; null where the failure never happens with one of the two."""
-    times = (
-        detection.filter(
-            (pl.col("sensors") == "odometer") & (pl.col("heading_deg") == 0.0) & (pl.col("rate_mps") >= from_mps)
-        )
-        .pivot("constellation", index=["reading", "rate_mps"], values="time_since_failure_s")
-        .with_columns(ahead=pl.col("gps_galileo") < pl.col("gps"))
+    times = ahead.pivot("constellation", index=["reading", "rate_mps"], values="time_since_failure_s").with_columns(
+        constellation=pl.lit("gps_galileo"), ahead=pl.col("gps_galileo") < pl.col("gps")
     )
-    return (
-        times.group_by("reading", maintain_order=True)
-        .agg(holds=pl.when(pl.col("ahead").null_count() == 0).then(pl.col("ahead").all()))
-        .with_columns(finding=pl.lit(finding), constellation=pl.lit("gps_galileo"))
-    )
+    every = pl.when(pl.col("ahead").null_count() == 0).then(pl.col("ahead").all())
+    return _holds(finding, times, every)
 
 
-def _turning_away(detection: pl.DataFrame) -> pl.DataFrame:
-    """At 0.10 m/s, the middle of the rates; faster ramps are seen within seconds whatever the heading."""
-    odometer_only = detection.filter((pl.col("sensors") == "odometer") & (pl.col("rate_mps") == 0.1))
-    times = pl.col("time_to_detect_s")
-    return (
-        odometer_only.filter(pl.col("heading_deg").is_in([0.0, 75.0]))
-        .sort("heading_deg")
-        .group_by("constellation", "reading", maintain_order=True)
-        .agg(holds=(times.last() >= _TWICE * times.first()) | (pl.col("detected").last() == 0))
-        .with_columns(finding=pl.lit("turning_away"))
-    )
-
-
-def _track_covers(detection: pl.DataFrame) -> pl.DataFrame:
-    with_track = (pl.col("sensors") == "odometer_and_track") & (pl.col("rate_mps") >= _SLOWEST_COVERED_MPS)
-    return (
-        detection.filter(with_track)
-        .group_by("constellation", "reading", maintain_order=True)
-        .agg(holds=(pl.col("censored") == 0).all())
-        .with_columns(finding=pl.lit("track_covers"))
-    )
-
-
-def _track_steadies(detection: pl.DataFrame) -> pl.DataFrame:
+def _track_steadies(finding: str, detection: pl.DataFrame) -> pl.DataFrame:
     compared = pl.col("rate_mps").is_between(_SLOWEST_COVERED_MPS, _FASTEST_COMPARED_MPS)
     spread = (
         detection.filter(compared)
-        .group_by("constellation", "reading", "rate_mps", "sensors", maintain_order=True)
+        .group_by(*_KEYS, "rate_mps", "sensors", maintain_order=True)
         .agg(ratio=pl.col("time_to_detect_s").max() / pl.col("time_to_detect_s").min())
-        .pivot("sensors", index=["constellation", "reading", "rate_mps"], values="ratio")
+        .pivot("sensors", index=[*_KEYS, "rate_mps"], values="ratio")
     )
-    steadier = pl.col("odometer_and_track") <= _THIRD_SMALLER * pl.col("odometer")
-    return (
-        spread.group_by("constellation", "reading", maintain_order=True)
-        .agg(holds=steadier.all())
-        .with_columns(finding=pl.lit("track_steadies"))
-    )
+    return _holds(finding, spread, (pl.col("odometer_and_track") <= _THIRD_SMALLER * pl.col("odometer")).all())

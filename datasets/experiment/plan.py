@@ -90,9 +90,11 @@ def bank_forms(plan: Plan) -> Forms:
         for reading in plan.readings:
             forms += _along(plan, heading, reading)
         if "odometer_and_track" in plan.sensors:
-            forms += _cross(plan, heading)
+            axis = plan.geometry.axes(heading)[1]
+            signals = {"east": axis[0], "north": axis[1], "map_cross": -plan.map_m}
+            forms += _beside(plan, f"cross_{heading:g}", axis, signals, heading)
     if "odometer_and_track" in plan.sensors:
-        forms += _up(plan)
+        forms += _beside(plan, "up", np.array([0.0, 0.0, 1.0]), {"up": 1.0}, None)
     rows, alpha, sigma, slope, members, names = zip(*forms, strict=True)
     return Forms(
         np.array(rows),
@@ -141,24 +143,13 @@ def _along(plan: Plan, heading: float, reading: Reading) -> list[_Form]:
     return [_form(plan, name, axis, alpha, signals, white, members) for alpha in plan.banks[reading]]
 
 
-def _cross(plan: Plan, heading: float) -> list[_Form]:
-    axis = plan.geometry.axes(heading)[1]
-    signals = {"east": axis[0], "north": axis[1], "map_cross": -plan.map_m}
-    return [
-        _form(plan, f"cross_{heading:g}", axis, alpha, signals, (0.0, plan.map_m), _with_track(plan, alpha, heading))
-        for alpha in plan.alphas
-    ]
+def _beside(plan: Plan, name: str, axis: Floats, signals: dict[str, float], heading: float | None) -> list[_Form]:
+    """Across the track, or in height at any heading: against the map."""
+    white = (0.0, plan.map_m)
+    return [_form(plan, name, axis, alpha, signals, white, _with_track(plan, alpha, heading)) for alpha in plan.alphas]
 
 
-def _up(plan: Plan) -> list[_Form]:
-    axis = np.array([0.0, 0.0, 1.0])
-    return [
-        _form(plan, "up", axis, alpha, {"up": 1.0}, (0.0, plan.map_m), _with_track(plan, alpha))
-        for alpha in plan.alphas
-    ]
-
-
-def _with_track(plan: Plan, alpha: float, heading: float | None = None) -> list[bool]:
+def _with_track(plan: Plan, alpha: float, heading: float | None) -> list[bool]:
     """The questions with track, of this heading or all, whose bank has the weight."""
     return [s == "odometer_and_track" and alpha in plan.banks[r] and heading in (None, h) for r, h, s in plan.questions]
 

@@ -16,10 +16,9 @@ import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
-from datasets.experiment.bounds import time_columns
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, default_geometry
 from datasets.experiment.passage import joined
-from datasets.experiment.tables import Contents, Row, share, table
+from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats

@@ -63,53 +63,41 @@ class System(Protocol):
     @property
     def size(self) -> int:
         """How many values there are."""
-        ...
 
     def start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the fault's onset, (states, runs)."""
-        ...
 
     def following(self, state: Floats, rng: np.random.Generator) -> Floats:
         """States at the next epoch."""
-        ...
 
     def values(self, state: Floats) -> Floats:
         """(values, runs)."""
-        ...
 
     def ramp(self, epochs: int, rate_mps: float) -> Floats:
         """What a range ramp adds to the values at epochs 1 .. n, (epochs, values)."""
-        ...
 
     def limits(self, epochs: int, rate_mps: float) -> Limits:
         """Half-spaces around all values without a fail."""
-        ...
 
     def seen(self, values: Floats) -> Floats:
         """Of (..., values) what the limits hold, (..., limits)."""
-        ...
 
     def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
         """Covariance of the values at epochs 1 .. n with a limit at an epoch (from 1), (epochs, values)."""
-        ...
 
     def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
         """Which runs pass at epoch k (from 0) with these values (values, runs)."""
-        ...
 
     def by_lag(self, epochs: int) -> Floats:
         """Covariance of value j at epoch k + lag with value i at k, lags -(n-1) .. n-1; (lags, i, j)."""
-        ...
 
     def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
         """What, times the covariance, brings each run's values (runs, values) to a fail drawn at random, and how many
         fails an epoch has on average.
         """
-        ...
 
     def fails(self, path: Floats) -> int:
         """Fails of one run, (epochs, values)."""
-        ...
 
 
 def most_probable_miss(system: System, epochs: int, rate_mps: float) -> Shift:

@@ -1,17 +1,21 @@
-"""Results of an experiment: shares with their bounds, tables, and all of it on disk."""
+"""Results of an experiment: shares and times with exact bounds, tables, and all of it on disk."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import polars as pl
 from polars import selectors as cs
+from scipy.stats import binom
 
 from pipeline import storage
-from pipeline.figures.bounds import clopper_pearson
+from pipeline.figures.bounds import CONFIDENCE, clopper_pearson
 from pipeline.storage.parquet import parquet_bytes
+from schemas.arrays import Floats
 
 # By name: tables, and pages and pictures under their whole name.
 Contents = Mapping[str, pl.DataFrame | str | bytes]
@@ -22,6 +26,51 @@ def share(name: str, count: int, trials: int) -> Row:
     """`name`, `name_low` and `name_high`: a share and its exact bounds, null without trials."""
     found = clopper_pearson(count, trials)
     return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+
+
+class Expected(NamedTuple):
+    """Mean with its standard error and bounds that hold for any distribution on the known range."""
+
+    mean: float
+    standard_error: float
+    low: float
+    high: float
+    median: float
+    median_low: float
+    median_high: float
+
+
+def expected(values: Floats, least: float, greatest: float, confidence: float = CONFIDENCE) -> Expected | None:
+    """Mean and median of independent values known to lie within [least, greatest]; none without values.
+
+    Mean: empirical Bernstein bound, two-sided (Maurer and Pontil 2009, theorem 4), finite-sample.
+    Median: order statistics with binomial coverage.
+    """
+    n = values.size
+    if n < 2:
+        return None
+    mean, variance = float(values.mean()), float(values.var(ddof=1))
+    log = float(np.log(4.0 / (1.0 - confidence)))
+    half = np.sqrt(2.0 * variance * log / n) + 7.0 * (greatest - least) * log / (3.0 * (n - 1))
+    ordered = np.sort(values)
+    below = int(binom.ppf((1.0 - confidence) / 2.0, n, 0.5))
+    return Expected(
+        mean=mean,
+        standard_error=float(np.sqrt(variance / n)),
+        low=max(least, mean - float(half)),
+        high=min(greatest, mean + float(half)),
+        median=float(np.median(values)),
+        median_low=float(ordered[max(below - 1, 0)]),
+        median_high=float(ordered[min(n - below, n - 1)]),
+    )
+
+
+def time_columns(name: str, times_s: Floats, least: float, greatest: float) -> Row:
+    """`name_s` and its errors and bounds `name_low_s`, ...; nulls without values."""
+    found = expected(times_s, least, greatest)
+    figures = found or (None,) * len(Expected._fields)
+    suffixes = ("", *(f"_{field}" for field in Expected._fields[1:]))
+    return {f"{name}{suffix}_s": figure for suffix, figure in zip(suffixes, figures, strict=True)}
 
 
 def table(rows: list[Row]) -> pl.DataFrame:

@@ -7,9 +7,8 @@ import polars as pl
 import pytest
 
 from datasets.experiment import EXPERIMENTS
-from datasets.experiment.bank import FEWEST_RUNS, compare_banks, rank_banks
+from datasets.experiment.bank import FEWEST_RUNS, compare_banks, rank_banks, recommendation_page
 from datasets.experiment.bank_faults import CATALOGUE, Fault, WhiteNoise, failure_s, fault_response
-from datasets.experiment.bank_text import recommendation_page
 from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.rare_tables import banks, epochs_until, failure_epoch

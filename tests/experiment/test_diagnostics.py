@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 
 from datasets.experiment import passage
-from datasets.experiment.bounds import expected
 from datasets.experiment.diagnostics import detection_times, run_diagnostics, simulate
 from datasets.experiment.findings import judge
 from datasets.experiment.geometry import (
@@ -21,6 +20,7 @@ from datasets.experiment.geometry import (
 from datasets.experiment.passage import NEVER, NoisePaths, first_passages
 from datasets.experiment.plan import SIGNALS, Plan, bank_forms, failure_forms
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
+from datasets.experiment.tables import expected
 from datasets.experiment.workers import generator
 from pipeline.monitors.sight import range_variances_m2
 
