@@ -21,7 +21,8 @@ _AGREES = 0.12
 # Nobody looks for another lag where speeds agree in so much of the run; a journey that repeats itself agrees nearly as
 # well at another one.
 SURELY, _RIVAL = 0.93, 0.05
-# Steps in which a lag is improved; regressed it is as near, or faults of the counter have bent it [s].
+# Steps in which a lag is improved; regressed it is as near, or the second of them where both halves agree, or faults
+# of the counter have bent it [s].
 _CLIMB_S, _NEAR_S = (8.0, 4.0, 2.0, 1.0), 2.0
 # Windows overlap by half. Positions a step apart are known to no better than this [m].
 _OVERLAP, _LEAST_SPREAD_M = 1.5, 0.05
@@ -105,9 +106,10 @@ def fit_pair(gnss: Places, counter: Course) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     coarse_s, clock_reason = _clock_lag(gnss, counter)
     found = _fitted(gnss, counter, coarse_s)
-    if found.lag_told and abs(found.lag_s - coarse_s) < _CLIMB_S[1]:
+    if found.lag_told and abs(found.lag_s - coarse_s) <= _CLIMB_S[1]:
         found = _fitted(gnss, counter, found.lag_s)
-    if coarse_s and not (found.lag_told and abs(found.lag_s - coarse_s) < _NEAR_S):
+    agreed = found.lag_told and all(abs(half_s - found.lag_s) < _CLIMB_S[-1] for _, half_s in found.halves)
+    if coarse_s and abs(found.lag_s - coarse_s) > (_CLIMB_S[1] if agreed else _NEAR_S):
         found = replace(found, lag_s=coarse_s, lag_sigma_s=_CLIMB_S[-1])
     return replace(found, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
@@ -146,7 +148,9 @@ def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[fl
 
 
 def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float) -> float:
-    """Share of the moving time in which both speeds agree at this lag; 0 where they have too little in common."""
+    """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
+    common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
+    """
     begin_s = max(gnss.t_s[0], counter.t_s[0] - lag_s)
     end_s = min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
     shorter_s = min(gnss.t_s[-1] - gnss.t_s[0], counter.t_s[-1] - counter.t_s[0])
@@ -162,7 +166,8 @@ def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float
         return 0.0
     fast, factor = bounds[0] / _SLOW_SHARE, float(np.median(other[both] / one[both]))
     moves = (one > bounds[0]) | (other > bounds[1])
-    return float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * fast)[moves]))
+    share = float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * fast)[moves]))
+    return share * float(end_s - begin_s) / float(shorter_s)
 
 
 def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
