@@ -19,9 +19,14 @@ from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
 from datasets.experiment.plan import SENSORS
 from datasets.experiment.ranges import RangePlan
-from datasets.experiment.rare import Probability, false_alarm_probability, missed_detection_probability, pooled
+from datasets.experiment.rare import (
+    Probability,
+    false_alarm_probability,
+    first_below,
+    missed_detection_probability,
+    pooled,
+)
 from datasets.experiment.rare_ranges import range_system
-from datasets.experiment.rare_rows import first_below
 from datasets.experiment.splitting import System
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.figures.bounds import clopper_pearson
@@ -60,7 +65,7 @@ def counted_misses(system: System, epochs: int, rate_mps: float, runs: int, seed
 def _counted(block: Callable[[int, np.random.Generator], Floats], runs: int, key: tuple[int, int]) -> Probability:
     sizes = in_blocks(runs, _BLOCK)
     parts = [block(size, generator(*key, number)) for number, size in enumerate(sizes)]
-    return pooled(lambda part: part, parts, runs, 1)
+    return pooled(np.concatenate(parts), runs)
 
 
 def agree(sampled: Probability, counted: Probability) -> bool:

@@ -187,8 +187,8 @@ def _some_epoch(diagnosis: Diagnosis, trial: Trial, config: Configuration, rng: 
     parts = windows(rows, times_ns(diagnosis.epochs), diagnosis.fixes_ns)
     if not parts:
         return None
-    start, end = parts[int(rng.integers(len(parts)))]
-    return int(rows.epoch[int(rng.integers(start + 1, end + 1))])
+    chosen = parts[int(rng.integers(len(parts)))]
+    return int(rows.epoch[int(rng.integers(chosen.start + 1, chosen.end + 1))])
 
 
 def _injected(trial: Trial, found: Profile, scale: float, folder: Path) -> pl.DataFrame:

@@ -10,12 +10,15 @@ python -m benchmarks.unnoticed_bank
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
 from datasets.experiment.geometry import TAUS_S, Constellation, Geometry, default_geometry
+from datasets.experiment.linear_bank import BankSpec, linear_bank
+from datasets.experiment.rare import missed_detection_probability
 from pipeline.monitors.axis import AxisSeries, run_axis
 from pipeline.monitors.recursion import ewma_weight
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
@@ -24,7 +27,7 @@ from pipeline.undetected.error import largest_errors
 from pipeline.undetected.shapes import Shape, largest_of_shape
 from pipeline.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Floats
-from schemas.config import threshold_factor
+from schemas.config import MonitorConfig, threshold_factor
 
 BANKS: dict[str, tuple[float, ...]] = {
     "0.1 0.01 0.001": (0.1, 0.01, 0.001),
@@ -91,7 +94,7 @@ def watched_of(offset_m: Floats, sigmas_m: Floats, alphas: Floats) -> Watched:
         t_s=np.arange(size, dtype=np.float64),
         fresh=fresh,
         free=series.border,
-        unseen_m=zero,
+        fastest_m=5.0 * second,
         way_s=second,
         rate_mps=series.rate_mps,
         least_mps=np.maximum(-limit[:, 0], series.rate_mps - 5.0),
@@ -110,9 +113,12 @@ def watched_of(offset_m: Floats, sigmas_m: Floats, alphas: Floats) -> Watched:
 
 
 def bank_figures(
-    constellation: Constellation, name: str, repetitions: int, minutes: tuple[int, ...]
+    constellation: Constellation, name: str, repetitions: int, minutes: tuple[int, ...], *, velocity: bool = False
 ) -> dict[str, object]:
-    """One row of the table: medians of the larger direction at these times, and where the mean bound passes 20 m."""
+    """One row of the table: medians of the larger direction at these times, and where the mean bound passes 20 m.
+
+    `velocity`: it carries the fault, so that the Doppler monitor holds the fault's rate.
+    """
     sky, alphas = default_geometry(constellation), np.array(BANKS[name])
     larger = []
     for repetition in range(repetitions):
@@ -120,12 +126,28 @@ def bank_figures(
             sigmas, rng = along_sigmas_m(sky, heading), np.random.default_rng([9, repetition, int(heading)])
             size = _WARM_S + 60 * minutes[-1] + 1
             rows = watched_of(noise_of(sigmas, size, rng), sigmas, alphas)
-            both = [largest_errors(one, _WARM_S, size - 1).most_m for one in (rows, rows.mirrored())]
+            seen = _with_doppler(rows.since(_WARM_S, size - 1)) if velocity else rows.since(_WARM_S, size - 1)
+            both = [largest_errors(one).most_m for one in (seen, seen.mirrored())]
             larger.append(np.maximum(*both))
     median = np.median(larger, axis=0)
     beyond = np.flatnonzero(median > 20.0)
     told = {f"{minute} min": round(float(median[60 * minute - 1]), 1) for minute in minutes}
-    return {"sky": constellation, "bank": name, **told, "20 m after min": beyond[0] / 60 if beyond.size else None}
+    return {
+        "sky": constellation,
+        "bank": name + " Doppler" * velocity,
+        **told,
+        "20 m after min": beyond[0] / 60 if beyond.size else None,
+    }
+
+
+def _with_doppler(rows: Watched) -> Watched:
+    """The rows with the monitor of the velocity, its noise at zero: a mean over the second before."""
+    limit_mps = threshold_factor(_PROBABILITY) * np.hypot(MonitorConfig().doppler_sigma_mps, _ODOMETER_M)
+    return replace(
+        rows,
+        least_mps=np.maximum(rows.least_mps, rows.rate_mps - limit_mps),
+        most_mps=np.minimum(rows.most_mps, rows.rate_mps + limit_mps),
+    )
 
 
 def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple[int, ...]) -> list[dict[str, object]]:
@@ -140,10 +162,44 @@ def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple
                 rows = watched_of(noise_of(sigmas, _WARM_S + 60 * minutes[-1] + 1, rng), sigmas, alphas)
                 ends = [_WARM_S + 60 * minute for minute in minutes]
                 both = (rows, rows.mirrored())
-                larger.append([max(largest_of_shape(one, _WARM_S, end, shape) for one in both) for end in ends])
+                larger.append([max(largest_of_shape(one.since(_WARM_S, end), shape) for one in both) for end in ends])
         median = np.median(larger, axis=0)
         told.append(
             {"sky": constellation, "shape": shape} | {f"{m} min": v for m, v in zip(minutes, median, strict=True)}
+        )
+    return told
+
+
+def ramp_figures(draws: int) -> list[dict[str, object]]:
+    """Share of draws of noise in which a ramp of ten minutes goes unseen, against the experiment's probability.
+
+    One side counts the draws whose largest unnoticed ramp is as steep, by the linear bounds of this room. The other
+    samples misses (`datasets.experiment.rare`) with the bank's state equations, and shares nothing with it.
+    """
+    seconds, heading = 600, 0.0
+    sky, alphas = default_geometry("gps"), np.array(BANKS["0.1 0.01 0.001"])
+    # The experiment counts headings from the faulty satellite on.
+    sigmas, steepest = along_sigmas_m(sky, float(sky.azimuth_deg[sky.faulty]) + heading), []
+    for draw in range(draws):
+        noise = noise_of(sigmas, _WARM_S + seconds + 1, np.random.default_rng([11, draw]))
+        window = watched_of(noise, sigmas, alphas).since(_WARM_S, _WARM_S + seconds)
+        steepest.append(largest_of_shape(window, "ramp", np.array([1])) / seconds)
+    # The bank of the draws has run for as long since its restart.
+    bank = linear_bank(sky, heading, BankSpec(alphas=(1.0, *alphas.tolist()), age_s=float(_WARM_S)))
+    told: list[dict[str, object]] = []
+    for rate_mps in (0.012, 0.015, 0.018, 0.021, 0.024):
+        share = float(np.mean(np.array(steepest) >= rate_mps))
+        sampled = missed_detection_probability(bank, seconds, rate_mps / abs(float(bank.slope[0])), runs=20_000)
+        deviation = np.hypot(
+            np.sqrt(sampled.value * (1.0 - sampled.value) / draws), sampled.relative_error * sampled.value
+        )
+        told.append(
+            {
+                "ramp m/s": rate_mps,
+                "share unseen": share,
+                "experiment": sampled.value,
+                "sigmas apart": (share - sampled.value) / max(float(deviation), 1e-12),
+            }
         )
     return told
 
@@ -170,8 +226,11 @@ def main() -> None:
     given = parser.parse_args()
     skies: tuple[Constellation, ...] = ("gps", "gps_galileo")
     show_table(pl.DataFrame([bank_figures(sky, name, given.repetitions, MINUTES) for sky in skies for name in BANKS]))
+    doppler = [bank_figures(sky, "0.1 0.01 0.001", given.repetitions, MINUTES[:3], velocity=True) for sky in skies]
+    show_table(pl.DataFrame(doppler), "Where the velocity carries the fault")
     show_table(pl.DataFrame([row for sky in skies for row in shape_figures(sky, given.repetitions, MINUTES[:4])]))
     ranges = [{"sky": sky, **{f"{h:.0f} deg": range_figure(sky, h) for h in HEADINGS_DEG}} for sky in skies]
+    show_table(pl.DataFrame(ramp_figures(100 * given.repetitions)), "Ramps of ten minutes")
     show_table(pl.DataFrame(ranges), "One range at fault, by the pseudorange monitor alone [m]")
     spread = [
         {"sky": sky, **{f"{h:.0f} deg": np.linalg.norm(along_sigmas_m(default_geometry(sky), h)) for h in HEADINGS_DEG}}

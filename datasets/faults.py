@@ -15,7 +15,7 @@ import polars as pl
 from pydantic import Field, model_validator
 
 from schemas.arrays import Bools, Floats
-from schemas.config import NonNegative, Positive, Settings
+from schemas.config import NonNegative, Number, Positive, Settings
 from schemas.errors import ConfigError
 from schemas.inputs import Faults
 
@@ -47,6 +47,10 @@ _NEEDS = {
     FaultKind.SLIDE: "rate_mps",
     FaultKind.SCALE: "scale",
 }
+# Beyond this no fault of a train is meant, and positions are numbers no more [m, s, m/s].
+_LARGEST = 1e7
+_Amount = Annotated[Positive, Field(le=_LARGEST)]
+_Signed = Annotated[Number, Field(ge=-_LARGEST, le=_LARGEST)]
 _QUANTITIES = ("size_m", "rate_mps", "sigma_m", "latency_s", "scale", "profile")
 _ON_ODOMETER = (FaultKind.SLIP, FaultKind.SLIDE, FaultKind.SCALE)
 _GROUPS = ("satellites", "gps", "galileo")
@@ -70,12 +74,12 @@ class FaultSpec(Settings):
     kind: FaultKind
     target: Annotated[str, Field(pattern=_TARGET)] = ""
     start_s: NonNegative | None = None
-    duration_s: Positive | None = None
-    size_m: float | None = None
-    rate_mps: float | None = None
-    sigma_m: Positive | None = None
-    latency_s: Positive | None = None
-    scale: Positive | None = None
+    duration_s: _Amount | None = None
+    size_m: _Signed | None = None
+    rate_mps: _Signed | None = None
+    sigma_m: _Amount | None = None
+    latency_s: _Amount | None = None
+    scale: _Amount | None = None
     profile: str | None = None
     returns: bool = False
     solution: str | None = None

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import polars as pl
 
-from datasets.novatel import FIX_BY_WORD
 from datasets.to_contract import conformed, virtual_balises
 from pipeline.ingest.conform import rows_text
 from pipeline.ingest.csv_text import read_log_table
+from pipeline.ingest.novatel import FIX_BY_WORD
 from pipeline.receivers import Converted
 from pipeline.receivers.csv import CUT_ROW
 from pipeline.site.read import read_site

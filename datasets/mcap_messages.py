@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterator
 
 import dataframely as dy
-import numpy as np
 import polars as pl
 
+from pipeline.export.cdr import Fields, cdr_messages
 from pipeline.export.messages import Topic
 from pipeline.ingest.recipes import OWN_SCHEMAS
 from schemas.inputs import STREAM_SCHEMAS
@@ -89,63 +89,35 @@ def _json_payloads(frame: pl.DataFrame) -> Iterator[bytes]:
 
 def twist_topic(frame: pl.DataFrame) -> Topic:
     """geometry_msgs/TwistStamped in little-endian CDR: speed as linear x."""
-    zeros = np.zeros(frame.height)
-    fields = {"x": ("<f8", _floats(frame["speed_mps"]))}
-    fields |= dict.fromkeys(("y", "z", "roll", "pitch", "yaw"), ("<f8", zeros))
-    return _odometer_topic("geometry_msgs/msg/TwistStamped", frame, _cdr(frame["t"], _FRAME_ID, (), fields))
+    return _odometer_topic("geometry_msgs/msg/TwistStamped", frame, (*_HEAD, *_numbers("twist", 6)))
 
 
 def odometry_topic(frame: pl.DataFrame) -> Topic:
     """nav_msgs/Odometry in little-endian CDR: speed as linear x, variance where the stream has it."""
-    count = frame.height
-    variance = frame["sigma_speed_mps"].fill_null(0.0).to_numpy() ** 2
-    pose = {f"pose {index}": ("<f8", np.full(count, float(index == 6))) for index in range(7)}
-    pose |= {f"pose covariance {index}": ("<f8", np.zeros(count)) for index in range(36)}
-    twist = {f"twist {index}": ("<f8", np.zeros(count)) for index in range(6)}
-    twist["twist 0"] = ("<f8", _floats(frame["speed_mps"]))
-    twist |= {f"twist covariance {index}": ("<f8", np.zeros(count)) for index in range(36)}
-    twist["twist covariance 0"] = ("<f8", variance)
-    messages = _cdr(frame["t"], _FRAME_ID, ("base_link",), pose | twist)
-    return _odometer_topic("nav_msgs/msg/Odometry", frame, messages)
+    pose = (*_numbers("pose", 7), *_numbers("pose covariance", 36))
+    fields = (*_HEAD, ("child", "string"), *pose, *_numbers("twist", 6), *_numbers("twist covariance", 36))
+    return _odometer_topic("nav_msgs/msg/Odometry", frame, fields)
 
 
-def _odometer_topic(name: str, frame: pl.DataFrame, messages: Iterator[bytes]) -> Topic:
+_HEAD: Fields = (("t", "time"), ("frame_id", "string"))
+
+
+def _numbers(name: str, count: int) -> Fields:
+    return tuple((f"{name} {index}", "double") for index in range(count))
+
+
+def _odometer_topic(name: str, frame: pl.DataFrame, fields: Fields) -> Topic:
+    """Speed and its variance from the rows; of the rest the quaternion is that of no turn, and all others are 0."""
+    fixed: dict[str, object] = dict.fromkeys((field for field, _ in fields), 0.0)
+    fixed |= {"pose 6": 1.0, "frame_id": _FRAME_ID, "child": "base_link"}
+    told = frame.select(
+        pl.col("t").to_physical(),
+        pl.col("speed_mps").alias("twist 0"),
+        (pl.col("sigma_speed_mps").fill_null(0.0) ** 2).alias("twist covariance 0"),
+    )
+    messages = cdr_messages(fields, (fixed | row for row in told.iter_rows(named=True)))
     return Topic("/odometer", "cdr", name, "ros2msg", DEFINITIONS[name].encode(), _times_ns(frame), messages)
 
 
 def _times_ns(frame: pl.DataFrame) -> list[int]:
     return frame.to_series(0).to_physical().to_list()
-
-
-def _floats(series: pl.Series) -> np.ndarray:
-    return series.cast(pl.Float64).fill_null(float("nan")).to_numpy()
-
-
-def _cdr(
-    t: pl.Series, frame_id: str, strings: tuple[str, ...], fields: dict[str, tuple[str, np.ndarray]]
-) -> Iterator[bytes]:
-    """Messages that start with a header and go on with fixed fields, laid out by CDR's alignment rules."""
-    head = b"\x00\x01\x00\x00" + bytes(8)
-    for text in (frame_id, *strings):
-        head += bytes(-(len(head) - 4) % 4) + (len(text.encode()) + 1).to_bytes(4, "little") + text.encode() + b"\0"
-    offset, offsets = len(head), []
-    for kind, _ in fields.values():
-        size = np.dtype(kind).itemsize
-        offset += -(offset - 4) % size
-        offsets.append(offset)
-        offset += size
-    layout = np.dtype(
-        {
-            "names": ["head", "sec", "nsec", *fields],
-            "formats": [f"V{len(head)}", "<i4", "<u4", *(kind for kind, _ in fields.values())],
-            "offsets": [0, 4, 8, *offsets],
-            "itemsize": offset,
-        }
-    )
-    rows = np.zeros(len(t), dtype=layout)
-    rows["head"] = np.void(head)
-    rows["sec"], rows["nsec"] = np.divmod(t.to_physical().to_numpy(), SECOND_NS)
-    for name, (_, values) in fields.items():
-        rows[name] = values
-    content = rows.tobytes()
-    return (content[start : start + offset] for start in range(0, len(content), offset))

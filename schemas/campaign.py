@@ -93,6 +93,10 @@ def _campaign_balises_schema() -> type[dy.Schema]:
         "undetected_median_m": real("m", "median of the larger unnoticed error, ahead or behind", min=0),
         "undetected_p95_m": real("m", "95 % of them are below", min=0),
         "undetected_max_m": real("m", "the largest of them", min=0),
+        "physical_before_count": count("passages that a physical balise of the run may lie too far before"),
+        "physical_before_median_m": real("m", "median of how far before it may lie at most", min=0),
+        "physical_before_p05_m": real("m", "5 % of them are below", min=0),
+        "physical_before_min_m": real("m", "the shortest of them", min=0),
     }
     doc = "One row per balise and solution over all runs of the campaign."
     return type("CampaignBalises", (dy.Schema,), {"__doc__": doc, "__module__": __name__, **columns})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -498,6 +499,9 @@ def settings_from(
         raise ConfigError(listed(told(error, kind)), place=place, remedy=remedy) from None
 
 
+_DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}""")
+
+
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """A TOML file as a mapping, or one error."""
     try:
@@ -509,7 +513,10 @@ def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, ob
 def toml_of(content: bytes, place: str, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
     """TOML as a mapping, or one error."""
     try:
-        return tomllib.loads(content.decode())
+        text = content.decode()
+        if _DEEP_KEY.search(text):  # for which the parser takes time and memory that grow with the square of the depth
+            raise ValueError("a key has fifty parts or more")
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also: not UTF-8, an integer of thousands of digits
         raise kind(f"is not TOML: {error}", place=place) from None
 

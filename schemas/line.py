@@ -33,6 +33,9 @@ class LineCriteria(Settings):
     beside_m: Positive = 25.0
     # Distances of balises to propose: DOMAIN section 4.
     spacings_m: tuple[Positive, ...] = (400.0, 1000.0, 2000.0)
+    # Balises in a row lie a spacing apart, give or take this share of it, and never farther apart than the longest.
+    spacing_play: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    longest_m: Positive = 2500.0
     location_accuracy_m: Annotated[NonNegative, Field(le=63)] = 12.0
     # A suitable piece so near a station or signal is taken before others.
     near_m: Positive = 150.0
@@ -97,6 +100,7 @@ class _Pieces(dy.Schema):
 class _PiecesEnd(dy.Schema):
     claimed_wrongly = count("passes on which a wrong position in use claimed this piece; the train was elsewhere")
     unknown = count("further passes that the evidence could not judge")
+    unjudged = count("of these in runs with a reference, which should have told: each upper bound counts them as lost")
     after_alarm = count("further passes without use because of an alarm before the piece")
     loss_share = real("1", "lost or wrong passes of those judged", min=0)
     loss_low = real("1", "exact lower bound (Clopper-Pearson)", min=0)
@@ -153,7 +157,7 @@ class LineBalises(dy.Schema):
     netelement_id = text("net element")
     measure_m = real("m", "measure", nullable=False)
     kind = text("virtual, or physical where no piece is suitable")
-    why = text("of a physical one: class and cause of the piece")
+    why = text("of a physical one: class and cause of the piece, per direction of travel over its net element")
     near = text("station or signal that it serves; empty where none")
     distance_m = real("m", "way from the balise before; null for the first", min=0)
     odometer_confidence_m = real("m", "confidence of the odometer there, 5 m + 5 % of this way", min=0)

@@ -128,6 +128,7 @@ class Passages(dy.Schema):
     undetected_range_behind_m = real("m", "the same behind it", min=0)
     undetected_since = instant("such a fault began after here: the last independent fix", nullable=True)
     undetected_monitors = texts("monitors that hold it so small, first what holds most", nullable=True)
+    physical_before_m = real("m", "a physical balise at most so far before keeps it within the failure limit", min=0)
 
 
 class Alarms(dy.Schema):
@@ -339,7 +340,7 @@ class Runs(dy.Schema):
     undetected_beyond_path_m = real("m", "path position there")
     physical_spacing_m = real("m", "shortest way from a physical balise at any time to one beyond the limit", min=0)
     physical_spacing_s = real("s", "shortest time from such a balise to one beyond the limit", min=0)
-    physical_spacing_starts = count("such balises thought of; null where not computed", nullable=True)
+    physical_spacing_starts = count("such balises tried; null where not computed", nullable=True)
     physical_spacing_reached = count("of these those from which the run reaches the limit", nullable=True)
 
 

@@ -18,11 +18,14 @@ if TYPE_CHECKING:
 class Experiment:
     """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 
-    `config` is the bank to judge, for `rare`, `bank` and `catalogue`; the published experiments refuse one.
+    Its module has `REPETITIONS`, `made(repetitions, seed, jobs, config)`, which gives the contents of the files by
+    name, and `SETTINGS`, if something is fixed beyond that. `configured`: it judges the bank of a configuration; the
+    published experiments have the paper's settings, and silently ignoring others would mislead.
     """
 
+    name: str
     module: str
-    function: str
+    configured: bool = False
 
     def __call__(
         self,
@@ -32,17 +35,32 @@ class Experiment:
         jobs: int = 1,
         config: Configuration | None = None,
     ) -> list[Path]:
-        write = getattr(import_module(f"datasets.experiment.{self.module}"), self.function)
-        written: list[Path] = write(out, repetitions, seed, jobs, config)
-        return written
+        if config is not None and not self.configured:
+            from schemas.errors import UsageError
+
+            raise UsageError(
+                "takes no configuration",
+                place=f"experiment {self.name}",
+                expected="the published settings",
+                remedy="`rare`, `bank` and `catalogue` judge the bank of a configuration.",
+            )
+        from datasets.experiment.tables import write
+
+        module = import_module(f"datasets.experiment.{self.module}")
+        count = repetitions or module.REPETITIONS
+        settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
+        return write(out, module.made(count, seed, jobs, config), settings)
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "diagnostics": Experiment("diagnostics", "write_experiment"),
-    "findings": Experiment("findings", "write_findings"),
-    "pseudorange": Experiment("ranges", "write_ranges"),
-    "thresholds": Experiment("false_alarms", "write_thresholds"),
-    "rare": Experiment("rare_tables", "write_rare"),
-    "bank": Experiment("bank", "write_bank"),
-    "catalogue": Experiment("catalogue", "write_catalogue"),
+    one.name: one
+    for one in (
+        Experiment("diagnostics", "diagnostics"),
+        Experiment("findings", "findings"),
+        Experiment("pseudorange", "ranges"),
+        Experiment("thresholds", "false_alarms"),
+        Experiment("rare", "rare_tables", configured=True),
+        Experiment("bank", "bank", configured=True),
+        Experiment("catalogue", "catalogue", configured=True),
+    )
 }

@@ -8,24 +8,22 @@ is disturbed for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import polars as pl
 
 from datasets.experiment.bank_faults import CATALOGUE, HEADING_DEG, Fault, WhiteNoise, failure_s, fault_response
 from datasets.experiment.bank_text import recommendation_page
-from datasets.experiment.diagnostics import SEED
-from datasets.experiment.geometry import Geometry, default_geometry
+from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import SENSORS
 from datasets.experiment.rare import false_alarm_probability
-from datasets.experiment.tables import write_page, write_tables
+from datasets.experiment.tables import Contents, Row, share, table
 from datasets.experiment.workers import generator
 from pipeline.campaign.workers import mapped
-from pipeline.figures.bounds import clopper_pearson
-from schemas.arrays import Floats
+from schemas.arrays import Ints
 from schemas.config import Configuration, MonitorConfig
 
 REPETITIONS = 200
@@ -37,6 +35,24 @@ _ALARM_RUNS = 200
 _MAP_M = 0.1
 # A train that is stopped by its own diagnosis more often than this is not operated.
 _MOST_ALARMS_PER_H = 0.01
+_SURE = 0.95
+
+
+def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+    """`comparison` by bank and fault, `ranking` with the best first, `recommendation.md`.
+
+    A configured bank enters the comparison beside the candidates.
+    """
+    specs = candidates()
+    if config is not None:
+        specs += [
+            replace(BankSpec.of(config.monitors, sensors, rate_hz), map_m=_MAP_M)
+            for sensors in SENSORS
+            for rate_hz in (1.0, 10.0)
+        ]
+    comparison = compare_banks(list(dict.fromkeys(specs)), repetitions=repetitions, seed=seed, jobs=jobs)
+    ranking = rank_banks(comparison)
+    return {"comparison": comparison, "ranking": ranking, "recommendation.md": recommendation_page(ranking)}
 
 
 def candidates() -> list[BankSpec]:
@@ -55,105 +71,88 @@ def candidates() -> list[BankSpec]:
     ]
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    number: int
-    spec: BankSpec
-    geometry: Geometry
-    faults: tuple[Fault, ...]
-    repetitions: int
-    seed: int
-    budget_s: float
+def compare_banks(
+    specs: Sequence[BankSpec],
+    faults: tuple[Fault, ...] = CATALOGUE,
+    repetitions: int = REPETITIONS,
+    seed: int = 1,
+    jobs: int = 1,
+) -> pl.DataFrame:
+    """One row per bank and fault; GPS alone."""
+    evaluate = partial(_evaluated, faults, repetitions, seed)
+    return table([row for part in mapped(evaluate, list(enumerate(specs)), jobs) for row in part])
 
 
-def _evaluate(candidate: _Candidate) -> list[dict[str, object]]:
-    spec, faults = candidate.spec, candidate.faults
-    bank = linear_bank(candidate.geometry, HEADING_DEG, spec)
-    epochs = int(_horizon_s(candidate) * spec.rate_hz)
-    axes = bank.along_error.size
+def _evaluated(faults: tuple[Fault, ...], repetitions: int, seed: int, candidate: tuple[int, BankSpec]) -> list[Row]:
+    number, spec = candidate
+    bank = linear_bank(default_geometry("gps"), HEADING_DEG, spec)
+    budget_s = Configuration().budget_s
+    horizon_s = _horizon_s(faults, budget_s)
+    first, by = _first_fails(bank, faults, int(horizon_s * spec.rate_hz), repetitions, (seed, number))
+    alarms = false_alarm_probability(bank, int(600 * spec.rate_hz), _ALARM_RUNS, seed)
+    alarms_per_h = float(-np.log1p(-min(alarms.value, 1.0 - 1e-12)) * 6.0)
+    labels: Row = {
+        "bank": number,
+        "alphas": spec.weights_text,
+        "sensors": spec.sensors,
+        "probability": spec.false_alarm_probability,
+        "rate_hz": spec.rate_hz,
+    }
+    return [
+        labels | _row(bank, fault, first[index], by[index], budget_s, horizon_s) | {"false_alarms_per_h": alarms_per_h}
+        for index, fault in enumerate(faults)
+    ]
+
+
+def _horizon_s(faults: tuple[Fault, ...], budget_s: float) -> float:
+    """Until the slowest failure is over its budget, and not longer than the longest."""
+    times = [failure_s(fault, default_geometry("gps")) or 0.0 for fault in faults]
+    return min(max(times) + budget_s + 1.0, _LONGEST_S)
+
+
+def _first_fails(
+    bank: LinearBank, faults: tuple[Fault, ...], epochs: int, repetitions: int, key: tuple[int, int]
+) -> tuple[Ints, Ints]:
+    """When a monitor first fails, and the loudest one then, (faults, repetitions); -1 where none does."""
+    seed, number = key
+    rates = [fault.rates(default_geometry("gps"), bank.along_error.size) for fault in faults]
     responses = np.stack(
-        [fault_response(bank, fault.rates(candidate.geometry, axes), fault.shape, epochs) for fault in faults]
+        [fault_response(bank, rate, fault.shape, epochs) for rate, fault in zip(rates, faults, strict=True)]
     )
-    shaken = WhiteNoise(bank, faults, candidate.repetitions, generator(candidate.seed, 62, candidate.number))
-    first = np.full((len(faults), candidate.repetitions), -1)
+    shaken = WhiteNoise(bank, faults, repetitions, generator(seed, 62, number))
+    first = np.full((len(faults), repetitions), -1)
     by = np.full(first.shape, -1)
-    rng = generator(candidate.seed, 61, candidate.number)
-    for k, noise in enumerate(bank.paths(epochs, candidate.repetitions, rng)):
+    for k, noise in enumerate(bank.paths(epochs, repetitions, generator(seed, 61, number))):
         open_faults = np.flatnonzero((first < 0).any(axis=1))
         if open_faults.size == 0:
             break
         values = noise[None] + responses[open_faults, k][:, :, None] + shaken.step(open_faults)
         ratio = np.abs(values) / bank.threshold[:, None]
         found = (ratio.max(axis=1) > 1.0) & (first[open_faults] < 0)
-        loudest = ratio.argmax(axis=1)
         first[open_faults] = np.where(found, k, first[open_faults])
-        by[open_faults] = np.where(found, loudest, by[open_faults])
-    hours = _alarms_per_h(bank, candidate)
-    return [_row(candidate, bank, fault, first[index], by[index], hours) for index, fault in enumerate(faults)]
+        by[open_faults] = np.where(found, ratio.argmax(axis=1), by[open_faults])
+    return first, by
 
 
-def _horizon_s(candidate: _Candidate) -> float:
-    """Until the slowest failure is over its budget, and not longer than the longest."""
-    times = [failure_s(fault, candidate.geometry) or 0.0 for fault in candidate.faults]
-    return min(max(times) + candidate.budget_s + 1.0, _LONGEST_S)
-
-
-def _alarms_per_h(bank: LinearBank, candidate: _Candidate) -> float:
-    result = false_alarm_probability(bank, int(600 * bank.spec.rate_hz), _ALARM_RUNS, candidate.seed)
-    return float(-np.log1p(-min(result.value, 1.0 - 1e-12)) * 6.0)
-
-
-def _row(
-    candidate: _Candidate, bank: LinearBank, fault: Fault, first: Floats, by: Floats, alarms_per_h: float
-) -> dict[str, object]:
-    spec = candidate.spec
+def _row(bank: LinearBank, fault: Fault, first: Ints, by: Ints, budget_s: float, horizon_s: float) -> Row:
     # A fault is in the data one epoch after it began at the earliest; the negation takes one epoch more.
-    detected_s = np.where(first >= 0, (first + 1) / spec.rate_hz, np.inf)
-    failed_s = failure_s(fault, candidate.geometry)
-    horizon_s = _horizon_s(candidate)
-    judged = failed_s is not None and failed_s + candidate.budget_s <= horizon_s
-    in_time = detected_s + 1.0 / spec.rate_hz <= (failed_s or 0.0) + candidate.budget_s
-    share = clopper_pearson(int(in_time.sum()), in_time.size)
-    missed = clopper_pearson(int((detected_s > (failed_s or 0.0)).sum()), in_time.size)
-    seen = first >= 0
+    epoch_s, runs, seen = 1.0 / bank.spec.rate_hz, first.size, first >= 0
+    detected_s = np.where(seen, (first + 1) / bank.spec.rate_hz, np.inf)
+    failed_s = failure_s(fault, default_geometry("gps"))
+    # Nothing is judged of a fault that makes no failure within the horizon.
+    trials = runs if failed_s is not None and failed_s + budget_s <= horizon_s else 0
+    missed = int((detected_s > (failed_s or 0.0)).sum())
+    in_time = int((detected_s + epoch_s <= (failed_s or 0.0) + budget_s).sum())
     return {
-        "bank": candidate.number,
-        "alphas": ", ".join(f"{alpha:g}" for alpha in spec.weights),
-        "sensors": spec.sensors,
-        "probability": spec.false_alarm_probability,
-        "rate_hz": spec.rate_hz,
         "fault": fault.name,
-        "runs": first.size,
+        "runs": runs,
         "detected": float(seen.mean()),
         "time_to_detect_median_s": float(np.median(detected_s)) if seen.mean() > 0.5 else None,
         "first_monitor": bank.names[np.bincount(by[seen]).argmax()] if seen.any() else None,
         "failure_s": failed_s,
-        "pmd_at_failure": missed.value if judged else None,
-        "pmd_at_failure_low": missed.low if judged else None,
-        "pmd_at_failure_high": missed.high if judged else None,
-        "within_budget": share.value if judged else None,
-        "within_budget_low": share.low if judged else None,
-        "within_budget_high": share.high if judged else None,
-        "false_alarms_per_h": alarms_per_h,
+        **share("pmd_at_failure", missed if trials else 0, trials),
+        **share("within_budget", in_time if trials else 0, trials),
     }
-
-
-def compare_banks(
-    specs: Sequence[BankSpec] | None = None,
-    faults: tuple[Fault, ...] = CATALOGUE,
-    repetitions: int = REPETITIONS,
-    seed: int = SEED,
-    jobs: int = 1,
-) -> pl.DataFrame:
-    """One row per bank and fault."""
-    chosen = list(specs) if specs is not None else candidates()
-    budget_s = Configuration().budget_s
-    tasks = [
-        _Candidate(number, spec, default_geometry("gps"), faults, repetitions, seed, budget_s)
-        for number, spec in enumerate(chosen)
-    ]
-    rows = [row for part in mapped(_evaluate, tasks, jobs) for row in part]
-    return pl.DataFrame(rows, infer_schema_length=None)
 
 
 def rank_banks(comparison: pl.DataFrame) -> pl.DataFrame:
@@ -167,10 +166,10 @@ def rank_banks(comparison: pl.DataFrame) -> pl.DataFrame:
     judged = comparison.group_by(keys, maintain_order=True).agg(
         false_alarms_per_h=pl.col("false_alarms_per_h").first(),
         faults_judged=pl.col("within_budget").count(),
-        faults_in_time=(pl.col("within_budget_low") > 0.95).sum(),
+        faults_in_time=(pl.col("within_budget_low") > _SURE).sum(),
         faults_seen=(pl.col("detected") > 0.5).sum(),
         share_in_time=pl.col("within_budget").mean(),
-        late=pl.col("fault").filter(pl.col("within_budget_low") <= 0.95).str.join(", "),
+        late=pl.col("fault").filter(pl.col("within_budget_low") <= _SURE).str.join(", "),
         unseen=pl.col("fault").filter(pl.col("detected") < 0.5).str.join(", "),
         runs=pl.col("runs").min(),
     )
@@ -200,25 +199,3 @@ def _reason(row: dict[str, object]) -> str:
     if row["unseen"]:
         text += f"; mostly not seen at all: {row['unseen']}"
     return text
-
-
-def write_bank(
-    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
-) -> list[Path]:
-    """`comparison.parquet` by bank and fault, `ranking.parquet` with the best first, `recommendation.md`.
-
-    A configured bank enters the comparison beside the candidates.
-    """
-    count = repetitions or REPETITIONS
-    specs = candidates()
-    if config is not None:
-        specs += [
-            replace(BankSpec.of(config.monitors, sensors, rate_hz), map_m=_MAP_M)
-            for sensors in SENSORS
-            for rate_hz in (1.0, 10.0)
-        ]
-    comparison = compare_banks(list(dict.fromkeys(specs)), repetitions=count, seed=seed, jobs=jobs)
-    ranking = rank_banks(comparison)
-    settings = {"experiment": "bank", "repetitions": count, "seed": seed}
-    written = write_tables(out, {"comparison": comparison, "ranking": ranking}, settings)
-    return [*written, write_page(out / "recommendation.md", recommendation_page(ranking))]

@@ -6,7 +6,7 @@ replay. All begin at 0 s; the train runs at a steady speed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,19 +23,18 @@ Shape = Literal["ramp", "step", "noise"]
 HEADING_DEG = 30.0
 SPEED_MPS = 30.0
 _FAILURE_LIMIT_M = 20.0
-_SHAPES: dict[Kind, Shape] = {"step": "step", "latency": "step", "odometer late": "step", "noise": "noise"}
-_UNITS: dict[Kind, str] = {
-    "ramp": "m/s",
-    "step": "m",
-    "latency": "s",
-    "frozen": "",
-    "slip": "m/s",
-    "slide": "m/s",
-    "scale": "",
-    "odometer late": "s",
-    "noise": "m",
+_KINDS: dict[Kind, tuple[Shape, str, Callable[[float], float]]] = {
+    # Course over time, unit, and the size in GNSS minus odometer: late positions and fast odometers leave GNSS behind.
+    "ramp": ("ramp", "m/s", lambda size: size),
+    "step": ("step", "m", lambda size: size),
+    "noise": ("noise", "m", lambda size: size),
+    "latency": ("step", "s", lambda size: -SPEED_MPS * size),
+    "frozen": ("ramp", "", lambda _: -SPEED_MPS),
+    "slip": ("ramp", "m/s", lambda size: -size),
+    "slide": ("ramp", "m/s", lambda size: size),
+    "scale": ("ramp", "", lambda size: -SPEED_MPS * (size - 1.0)),
+    "odometer late": ("step", "s", lambda size: SPEED_MPS * size),
 }
-_ON_ODOMETER: tuple[Kind, ...] = ("slip", "slide", "scale", "odometer late")
 
 
 @dataclass(frozen=True)
@@ -51,35 +50,19 @@ class Fault:
 
     @property
     def name(self) -> str:
-        return " ".join(part for part in (self.kind, f"{self.size:g}", _UNITS[self.kind], self.target) if part)
+        return " ".join(part for part in (self.kind, f"{self.size:g}", _KINDS[self.kind][1], self.target) if part)
 
     @property
     def shape(self) -> Shape:
-        return _SHAPES.get(self.kind, "ramp")
-
-    @property
-    def moves_position(self) -> bool:
-        """The position is wrong, not the odometer."""
-        return self.kind not in _ON_ODOMETER
+        return _KINDS[self.kind][0]
 
     def rates(self, geometry: Geometry, axes: int) -> Floats:
         """Per axis: the ramp [m/s], the step [m] or the sigma of the noise [m]."""
         if self.target == "range":
             return np.asarray(self.size * (geometry.axes(HEADING_DEG)[:axes] @ geometry.ramp_direction))
         wanted = np.zeros(len(AXES))
-        wanted[AXES.index("along" if self.target == "odometer" else self.target)] = self._size_on_axis()
+        wanted[AXES.index("along" if self.target == "odometer" else self.target)] = _KINDS[self.kind][2](self.size)
         return wanted[:axes]
-
-    def _size_on_axis(self) -> float:
-        """Of GNSS minus odometer: late positions and fast odometers leave the GNSS behind."""
-        sizes: dict[Kind, float] = {
-            "latency": -SPEED_MPS * self.size,
-            "frozen": -SPEED_MPS,
-            "slip": -self.size,
-            "scale": -SPEED_MPS * (self.size - 1.0),
-            "odometer late": SPEED_MPS * self.size,
-        }
-        return sizes.get(self.kind, self.size)
 
 
 def _of(kind: Kind, target: str, *sizes: float) -> tuple[Fault, ...]:
@@ -147,7 +130,7 @@ class WhiteNoise:
 def failure_s(fault: Fault, geometry: Geometry) -> float | None:
     """When the mean along-track error of the position passes the limit [s]; None where it does not."""
     along = abs(float(fault.rates(geometry, 1)[0]))
-    if not fault.moves_position or fault.shape == "noise":
+    if fault.target == "odometer" or fault.shape == "noise":
         return None
     if fault.shape == "step":
         return 0.0 if along > _FAILURE_LIMIT_M else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import binom
@@ -11,8 +11,7 @@ from pipeline.figures.bounds import CONFIDENCE
 from schemas.arrays import Floats
 
 
-@dataclass(frozen=True)
-class Expected:
+class Expected(NamedTuple):
     """Mean with its standard error and bounds that hold for any distribution on the known range."""
 
     mean: float
@@ -47,3 +46,11 @@ def expected(values: Floats, least: float, greatest: float, confidence: float = 
         median_low=float(ordered[max(below - 1, 0)]),
         median_high=float(ordered[min(n - below, n - 1)]),
     )
+
+
+def time_columns(name: str, times_s: Floats, least: float, greatest: float) -> dict[str, object]:
+    """`name_s` and its errors and bounds `name_low_s`, ...; nulls without values."""
+    found = expected(times_s, least, greatest)
+    figures = found or (None,) * len(Expected._fields)
+    suffixes = ("", *(f"_{field}" for field in Expected._fields[1:]))
+    return {f"{name}{suffix}_s": figure for suffix, figure in zip(suffixes, figures, strict=True)}

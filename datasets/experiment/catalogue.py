@@ -7,8 +7,7 @@ fault where it fails at an epoch from the onset on at which it does not fail in 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 
 import polars as pl
 
@@ -16,8 +15,7 @@ from datasets.experiment.catalogue_faults import CatalogueFault, Journey, catalo
 from datasets.experiment.catalogue_tables import faults_table, monitors_table
 from datasets.experiment.catalogue_text import catalogue_page
 from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fault
-from datasets.experiment.diagnostics import SEED
-from datasets.experiment.tables import write_page, write_tables
+from datasets.experiment.tables import Contents, Row
 from datasets.motion import build_motion
 from pipeline.campaign.workers import mapped
 from pipeline.stages import replay
@@ -27,37 +25,31 @@ from schemas.tables import MONITORS
 
 REPETITIONS = 40
 RATE_HZ = 1.0
+SETTINGS = {"rate_hz": RATE_HZ}
 _SOLUTION, _OTHER = "primary", "dual"
 
 
-@dataclass(frozen=True)
-class _Task:
-    """One journey with one noise, and the faults that go into it."""
-
-    journey: Journey
-    number: int
-    faults: tuple[CatalogueFault, ...]
-    seed: int
-    config: Configuration
+def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+    """`catalogue` by fault, `monitors` by fault and monitor, `runs`, and `catalogue.md`."""
+    runs = run_catalogue(repetitions, seed, jobs, config, catalogue())
+    faults, monitors = faults_table(runs), monitors_table(runs)
+    page = catalogue_page(faults, monitors)
+    return {"catalogue": faults, "monitors": monitors, "runs": runs, "catalogue.md": page}
 
 
 def run_catalogue(
-    repetitions: int = REPETITIONS,
-    seed: int = SEED,
+    repetitions: int,
+    seed: int = 1,
     jobs: int = 1,
     config: Configuration | None = None,
-    faults: Sequence[CatalogueFault] | None = None,
+    faults: Sequence[CatalogueFault] = catalogue(),
 ) -> pl.DataFrame:
     """One row per fault and repetition, in the order of the catalogue; see `judged`."""
-    chosen = list(faults) if faults is not None else list(catalogue())
-    settings = compared(config or Configuration())
-    tasks = [
-        _Task(journey, number, tuple(one for one in chosen if one.journey == journey), seed, settings)
-        for journey in dict.fromkeys(one.journey for one in chosen)
-        for number in range(repetitions)
-    ]
-    rows = [row for part in mapped(_replayed, tasks, jobs) for row in part]
-    order = {one.name: place for place, one in enumerate(chosen)}
+    journeys = dict.fromkeys(one.journey for one in faults)
+    tasks = [(journey, number) for journey in journeys for number in range(repetitions)]
+    replayed = partial(_replayed, tuple(faults), seed, compared(config or Configuration()))
+    rows = [row for part in mapped(replayed, tasks, jobs) for row in part]
+    order = {one.name: place for place, one in enumerate(faults)}
     rows.sort(key=lambda row: (order[str(row["fault"])], row["repetition"]))
     return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
 
@@ -70,23 +62,27 @@ def compared(config: Configuration) -> Configuration:
     return config.model_copy(update={"monitors": monitors})
 
 
-def _replayed(task: _Task) -> list[dict[str, object]]:
-    ready = stage(JOURNEYS[task.journey], 1_000 * task.seed + task.number, RATE_HZ)
+def _replayed(
+    faults: tuple[CatalogueFault, ...], seed: int, config: Configuration, task: tuple[Journey, int]
+) -> list[Row]:
+    """One journey with one noise, and each of the faults that go into it."""
+    journey, number = task
+    ready = stage(JOURNEYS[journey], 1_000 * seed + number, RATE_HZ)
     healthy_run, site = with_fault(ready, CatalogueFault("healthy", 0.0, ""))
-    healthy = replay(healthy_run, site, ready.vehicle, task.config)
+    healthy = replay(healthy_run, site, ready.vehicle, config)
     rows = []
-    for fault in task.faults:
+    for fault in (one for one in faults if one.journey == journey):
         run, site = with_fault(ready, fault)
-        tables = replay(run, site, ready.vehicle, task.config)
+        tables = replay(run, site, ready.vehicle, config)
         rows.append(
             {"fault": fault.name, "kind": fault.kind, "size": fault.size, "unit": fault.unit}
-            | {"journey": fault.journey, "repetition": task.number}
-            | judged(ready, tables, None if fault.is_healthy else healthy, task.config)
+            | {"journey": journey, "repetition": number}
+            | judged(ready, tables, None if fault.is_healthy else healthy, config)
         )
     return rows
 
 
-def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: Configuration) -> dict[str, object]:
+def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: Configuration) -> Row:
     """What one replay shows of the fault; times from its onset.
 
     `seen_s`: by monitor when it first failed; `first`: those that failed at the first of these epochs, loudest first.
@@ -162,18 +158,6 @@ def _unsafe(tables: RunTables, ready: Stage, config: Configuration) -> int:
 def _linking_errors(tables: RunTables) -> int:
     ours = tables.passages.filter(pl.col("solution") == _SOLUTION)
     return ours.filter(pl.col("linking_error") != "none").height
-
-
-def write_catalogue(
-    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
-) -> list[Path]:
-    """`catalogue.parquet` by fault, `monitors.parquet` by fault and monitor, `runs.parquet`, and `catalogue.md`."""
-    count = repetitions or REPETITIONS
-    runs = run_catalogue(count, seed, jobs, config)
-    faults, monitors = faults_table(runs), monitors_table(runs)
-    settings = {"experiment": "catalogue", "repetitions": count, "seed": seed, "rate_hz": RATE_HZ}
-    written = write_tables(out, {"catalogue": faults, "monitors": monitors, "runs": runs}, settings)
-    return [*written, write_page(out / "catalogue.md", catalogue_page(faults, monitors))]
 
 
 _SCHEMA: dict[str, pl.DataType | type[pl.DataType]] = {

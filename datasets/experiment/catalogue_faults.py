@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from datasets.experiment.catalogue_changes import (
@@ -23,6 +23,7 @@ Change = Callable[[RunLog, Site, int, float], tuple[RunLog, Site]]
 # The satellite at fault: in view all along, and its errors lie along the line.
 SATELLITE = "G16"
 HEALTHY = "healthy"
+_SLOW_MPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -50,127 +51,86 @@ class CatalogueFault:
 
 def catalogue() -> tuple[CatalogueFault, ...]:
     """All faults; the first ones are none, to show what is no detection."""
-    return (*_healthy(), *_ranges(), *_positions(), *_drifts(), *_receiver(), *_odometer(), *_surroundings())
-
-
-def _healthy() -> list[CatalogueFault]:
     journeys: tuple[Journey, ...] = ("short", "long", "physical")
-    return [CatalogueFault(f"{HEALTHY} {journey}", 0.0, "", journey=journey) for journey in journeys]
+    healthy = [CatalogueFault(f"{HEALTHY} {journey}", 0.0, "", journey=journey) for journey in journeys]
+    return (*healthy, *_ranges(), *_positions(), *_receiver(), *_odometer(), *_surroundings())
+
+
+def _injected(
+    label: str, unit: str, sizes: Sequence[float], kind: str, target: str, quantity: str, **fixed: object
+) -> list[CatalogueFault]:
+    """Faults of a scenario from the onset on, one of each size; slow ramps need the long journey to their failure."""
+    return [
+        CatalogueFault(
+            label,
+            size,
+            unit,
+            ({"kind": kind, "target": target, "start_s": 0.0, quantity: size, **fixed},),
+            journey="long" if kind == "ramp" and abs(size) <= _SLOW_MPS else "short",
+        )
+        for size in sizes
+    ]
+
+
+def _changed(
+    label: str, unit: str, sizes: Sequence[float], change: Change, journey: Journey = "short"
+) -> list[CatalogueFault]:
+    return [CatalogueFault(label, size, unit, change=change, journey=journey) for size in sizes]
 
 
 def _ranges() -> list[CatalogueFault]:
-    ramps = [
-        CatalogueFault(
-            "range ramp", rate, "m/s", (_fault("ramp", SATELLITE, rate_mps=rate),), journey=_journey(rate, 0.1)
-        )
-        for rate in (0.01, 0.03, 0.1, 1.0, 5.0)
+    return [
+        *_injected("range ramp", "m/s", (0.01, 0.03, 0.1, 1.0, 5.0), "ramp", SATELLITE, "rate_mps"),
+        *_injected("range step", "m", (10.0, 30.0, 100.0), "step", SATELLITE, "size_m"),
     ]
-    steps = [
-        CatalogueFault("range step", size, "m", (_fault("step", SATELLITE, size_m=size),))
-        for size in (10.0, 30.0, 100.0)
-    ]
-    return ramps + steps
 
 
 def _positions() -> list[CatalogueFault]:
-    """Common-mode steps: all ranges in accord, as a spoofer makes them."""
-    sizes = {"along": (5.0, 25.0, -25.0, 600.0, 1_200.0), "cross": (3.0, 10.0, 25.0), "up": (5.0, 15.0, 40.0)}
+    """Common-mode steps and drifts: all ranges in accord, as a spoofer makes them."""
     return [
-        CatalogueFault(f"step {axis}", size, "m", (_fault("step", axis, size_m=size),))
-        for axis, chosen in sizes.items()
-        for size in chosen
-    ]
-
-
-def _drifts() -> list[CatalogueFault]:
-    return [
-        CatalogueFault(
-            f"drift {axis}", rate, "m/s", (_fault("ramp", axis, rate_mps=rate),), journey=_journey(abs(rate), 0.1)
-        )
-        for axis, rates in {"along": (0.01, 0.03, 0.1, 0.3, 1.0, -0.3, -1.0), "cross": (0.1, 1.0)}.items()
-        for rate in rates
+        *_injected("step along", "m", (5.0, 25.0, -25.0, 600.0, 1_200.0), "step", "along", "size_m"),
+        *_injected("step cross", "m", (3.0, 10.0, 25.0), "step", "cross", "size_m"),
+        *_injected("step up", "m", (5.0, 15.0, 40.0), "step", "up", "size_m"),
+        *_injected("drift along", "m/s", (0.01, 0.03, 0.1, 0.3, 1.0, -0.3, -1.0), "ramp", "along", "rate_mps"),
+        *_injected("drift cross", "m/s", (0.1, 1.0), "ramp", "cross", "rate_mps"),
     ]
 
 
 def _receiver() -> list[CatalogueFault]:
-    gap = 90.0
+    gap: dict[str, object] = {"kind": "outage", "target": "position", "start_s": 0.0, "duration_s": 90.0}
+    off = _injected(
+        "outage of 90 s, then off by", "m", (10.0, 30.0, 100.0, 300.0, -300.0), "step", "along", "size_m", start_s=90.0
+    )
     return [
-        *(CatalogueFault("latency", s, "s", (_fault("latency", "position", latency_s=s),)) for s in (0.2, 1.0, 3.0)),
-        *(CatalogueFault("clock ahead", s, "s", change=stamps_ahead) for s in (0.2, 1.0, 3.0)),
-        *(CatalogueFault("frozen position", s, "s", change=frozen) for s in (2.0, 10.0)),
-        *(CatalogueFault("outage", s, "s", (_fault("outage", "position", duration_s=s),)) for s in (5.0, 30.0, 90.0)),
-        *(
-            CatalogueFault(
-                "outage of 90 s, then off by",
-                size,
-                "m",
-                (
-                    _fault("outage", "position", duration_s=gap),
-                    _fault("step", "along", after_s=gap, size_m=size),
-                ),
-            )
-            for size in (10.0, 30.0, 100.0, 300.0, -300.0)
-        ),
-        *(CatalogueFault("noise along", m, "m", (_fault("noise", "along", sigma_m=m),)) for m in (1.0, 3.0, 10.0)),
-        *(
-            CatalogueFault(
-                "multipath below 40 deg", m, "m", (_fault("noise", "satellites", sigma_m=m, below_deg=40.0),)
-            )
-            for m in (3.0, 10.0)
-        ),
-        *(
-            CatalogueFault(
-                "one solution drifts along",
-                rate,
-                "m/s",
-                (_fault("ramp", "along", rate_mps=rate, solution="primary"),),
-                journey=_journey(rate, 0.1),
-            )
-            for rate in (0.01, 0.1, 1.0)
+        *_injected("latency", "s", (0.2, 1.0, 3.0), "latency", "position", "latency_s"),
+        *_changed("clock ahead", "s", (0.2, 1.0, 3.0), stamps_ahead),
+        *_changed("frozen position", "s", (2.0, 10.0), frozen),
+        *_injected("outage", "s", (5.0, 30.0, 90.0), "outage", "position", "duration_s"),
+        *(replace(one, injected=(gap, *one.injected)) for one in off),
+        *_injected("noise along", "m", (1.0, 3.0, 10.0), "noise", "along", "sigma_m"),
+        *_injected("multipath below 40 deg", "m", (3.0, 10.0), "noise", "satellites", "sigma_m", below_deg=40.0),
+        *_injected(
+            "one solution drifts along", "m/s", (0.01, 0.1, 1.0), "ramp", "along", "rate_mps", solution="primary"
         ),
     ]
 
 
 def _odometer() -> list[CatalogueFault]:
-    speeds = [
-        CatalogueFault(kind, rate, "m/s", (_fault(kind, "odometer", duration_s=20.0, rate_mps=rate),))
-        for kind in ("slip", "slide")
-        for rate in (0.3, 0.8, 3.0)
-    ]
-    scales = [
-        CatalogueFault("odometer scale", scale, "", (_fault("scale", "odometer", scale=scale),))
-        for scale in (1.001, 1.005, 1.02)
-    ]
     return [
-        *speeds,
-        *scales,
-        *(CatalogueFault("odometer late", s, "s", change=odometer_late) for s in (0.2, 1.0)),
-        CatalogueFault("odometer outage", 20.0, "s", (_fault("outage", "odometer", duration_s=20.0),)),
+        *_injected("slip", "m/s", (0.3, 0.8, 3.0), "slip", "odometer", "rate_mps", duration_s=20.0),
+        *_injected("slide", "m/s", (0.3, 0.8, 3.0), "slide", "odometer", "rate_mps", duration_s=20.0),
+        *_injected("odometer scale", "", (1.001, 1.005, 1.02), "scale", "odometer", "scale"),
+        *_changed("odometer late", "s", (0.2, 1.0), odometer_late),
+        *_injected("odometer outage", "s", (20.0,), "outage", "odometer", "duration_s"),
     ]
 
 
 def _surroundings() -> list[CatalogueFault]:
     """Track, map and balises."""
-    missing = [
-        CatalogueFault("physical balise missing", count, "", change=read_missing, journey="physical")
-        for count in (1.0, 2.0)
-    ]
-    late = [
-        CatalogueFault("physical balise late", s, "s", change=read_late, journey="physical") for s in (0.5, 3.0, 10.0)
-    ]
     return [
-        CatalogueFault("on the parallel track, left", 4.5, "m", (_fault("step", "cross", size_m=4.5),)),
-        *(CatalogueFault("map off to the left", m, "m", change=map_left) for m in (1.0, 5.0, 20.0)),
-        *(CatalogueFault("balise list wrong", m, "m", change=list_wrong) for m in (10.0, 30.0)),
-        *missing,
-        *late,
+        *_injected("on the parallel track, left", "m", (4.5,), "step", "cross", "size_m"),
+        *_changed("map off to the left", "m", (1.0, 5.0, 20.0), map_left),
+        *_changed("balise list wrong", "m", (10.0, 30.0), list_wrong),
+        *_changed("physical balise missing", "", (1.0, 2.0), read_missing, "physical"),
+        *_changed("physical balise late", "s", (0.5, 3.0, 10.0), read_late, "physical"),
     ]
-
-
-def _journey(rate_mps: float, short_from_mps: float) -> Journey:
-    """Slow ramps need the long journey to come to their failure."""
-    return "short" if rate_mps > short_from_mps else "long"
-
-
-def _fault(kind: str, target: str, after_s: float = 0.0, **size: object) -> dict[str, object]:
-    return {"kind": kind, "target": target, "start_s": after_s, **size}

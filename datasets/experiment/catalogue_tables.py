@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.figures.bounds import clopper_pearson
+from datasets.experiment.tables import Row, share, table
 from schemas.tables import MONITORS
 
 
 def faults_table(runs: pl.DataFrame) -> pl.DataFrame:
     """One row per fault, in the order of the runs."""
-    parts = runs.partition_by("fault", maintain_order=True)
-    return pl.DataFrame([_fault_row(part) for part in parts], infer_schema_length=None)
+    return table([_fault_row(part) for part in runs.partition_by("fault", maintain_order=True)])
 
 
-def _fault_row(runs: pl.DataFrame) -> dict[str, object]:
+def _fault_row(runs: pl.DataFrame) -> Row:
     """Of one fault; Pmd is over the runs whose position failed, in time means negated within budget after that."""
     found = runs.filter(pl.col("detected_s").is_not_null())
     failed = runs.filter(pl.col("failure_s").is_not_null())
@@ -25,9 +24,9 @@ def _fault_row(runs: pl.DataFrame) -> dict[str, object]:
     return {
         **{name: runs[name][0] for name in ("fault", "kind", "size", "unit", "journey")},
         "runs": runs.height,
-        **_share("detected", found.height, runs.height),
+        **share("detected", found.height, runs.height),
         "first_monitor": first[0][0] if first else None,
-        "first_monitors": ", ".join(f"{name} {share:.0%}" for name, share in first),
+        "first_monitors": ", ".join(f"{name} {part:.0%}" for name, part in first),
         "time_to_detect_median_s": found["detected_s"].median(),
         "time_to_detect_max_s": found["detected_s"].max(),
         "way_median_m": found["way_m"].median(),
@@ -35,17 +34,12 @@ def _fault_row(runs: pl.DataFrame) -> dict[str, object]:
         "failed": failed.height,
         "failure_median_s": failed["failure_s"].median(),
         "missed_at_failure": missed,
-        **_share("pmd_at_failure", missed, failed.height),
-        **_share("within_budget", in_time, failed.height),
+        **share("pmd_at_failure", missed, failed.height),
+        **share("within_budget", in_time, failed.height),
         "runs_with_unsafe": runs.filter(pl.col("unsafe") > 0).height,
         "unsafe_accepted": int(runs["unsafe"].clip(lower_bound=0).sum()),
         "seen_by_linking_alone": runs.filter(pl.col("detected_s").is_null() & (pl.col("linking_errors") > 0)).height,
     }
-
-
-def _share(name: str, count: int, trials: int) -> dict[str, float | None]:
-    share = clopper_pearson(count, trials)
-    return {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
 
 
 def _ranking(found: pl.DataFrame) -> list[tuple[str, float]]:
@@ -61,17 +55,16 @@ def monitors_table(runs: pl.DataFrame) -> pl.DataFrame:
     `first`: share of runs in which no other failed earlier; `ahead`: in which all others failed later or not at all;
     `alone`: in which none did; `lead_s`: median of how much earlier than the next it failed, where it did.
     """
-    rows = []
-    for part in runs.partition_by("fault", maintain_order=True):
-        table: list[list[float | None]] = part["seen_s"].to_list()
-        for place, monitor in enumerate(MONITORS):
-            row = _monitor_row(monitor, place, table)
-            if row is not None:
-                rows.append({"fault": part["fault"][0], **row})
+    rows = [
+        {"fault": part["fault"][0], **row}
+        for part in runs.partition_by("fault", maintain_order=True)
+        for place, monitor in enumerate(MONITORS)
+        if (row := _monitor_row(monitor, place, part["seen_s"].to_list())) is not None
+    ]
     return pl.DataFrame(rows, schema=_MONITORS_SCHEMA)
 
 
-def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> dict[str, object] | None:
+def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> Row | None:
     """`runs`: by run the seconds to the first failure of each monitor."""
     own, leads, first, alone = [], [], 0, 0
     for seen in runs:
@@ -89,7 +82,7 @@ def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> di
     return {
         "monitor": monitor,
         "runs": len(runs),
-        **_share("seen", len(own), len(runs)),
+        **share("seen", len(own), len(runs)),
         "first": first / len(runs),
         "ahead": (len(leads) + alone) / len(runs),
         "alone": alone / len(runs),
@@ -99,17 +92,10 @@ def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> di
     }
 
 
-_MONITORS_SCHEMA = {
-    "fault": pl.String,
-    "monitor": pl.String,
-    "runs": pl.Int64,
-    "seen": pl.Float64,
-    "seen_low": pl.Float64,
-    "seen_high": pl.Float64,
-    "first": pl.Float64,
-    "ahead": pl.Float64,
-    "alone": pl.Float64,
-    "lead_s": pl.Float64,
-    "time_to_detect_median_s": pl.Float64,
-    "time_to_detect_max_s": pl.Float64,
-}
+_MONITORS_SCHEMA = {"fault": pl.String, "monitor": pl.String, "runs": pl.Int64} | dict.fromkeys(
+    (
+        *("seen", "seen_low", "seen_high", "first", "ahead", "alone", "lead_s"),
+        *("time_to_detect_median_s", "time_to_detect_max_s"),
+    ),
+    pl.Float64,
+)

@@ -7,24 +7,21 @@ failure never happens there).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 
 import polars as pl
 
-from datasets.experiment.diagnostics import SEED, detection_times
-from datasets.experiment.geometry import CONSTELLATIONS, PLACES, Geometry, epochs_of_day, geometry_at
-from datasets.experiment.passage import first_passages
-from datasets.experiment.plan import Plan, bank_forms, failure_forms
-from datasets.experiment.tables import refuse_configuration, write_tables
-from datasets.experiment.workers import generator, in_blocks
+from datasets.experiment.diagnostics import detection_times, passages_of
+from datasets.experiment.geometry import Geometry, skies_of_day
+from datasets.experiment.plan import Plan
+from datasets.experiment.tables import Contents, share
+from datasets.experiment.workers import generator
 from pipeline.campaign.workers import mapped
-from pipeline.figures.bounds import clopper_pearson
 from schemas.config import Configuration
 
 EPOCHS_PER_PLACE = 40
 REPETITIONS = 500
-_BLOCK_REPETITIONS = 250
+SETTINGS = {"epochs_per_place": EPOCHS_PER_PLACE}
 _TWICE = 2.0
 _THIRD_SMALLER = 2.0 / 3.0
 # From this rate on, every ramp is to be detected; up to this one, spreads are compared.
@@ -44,29 +41,11 @@ STATEMENTS: dict[str, str] = {
 }
 
 
-@dataclass(frozen=True)
-class _Sky:
-    number: int
-    seed: int
-    repetitions: int
-    geometries: tuple[Geometry, ...]
-
-
-def skies(per_place: int) -> list[tuple[Geometry, ...]]:
-    """Both constellations at each place and epoch."""
-    return [
-        tuple(geometry_at(place, t_ns, constellation) for constellation in CONSTELLATIONS)
-        for place in PLACES
-        for t_ns in epochs_of_day(place, per_place)
-    ]
-
-
-def findings_by_geometry(
-    per_place: int = EPOCHS_PER_PLACE, repetitions: int = REPETITIONS, seed: int = SEED, jobs: int = 1
-) -> pl.DataFrame:
-    """`place, t, elevation_deg, constellation, reading, finding, holds`, one row per statement and sky."""
-    tasks = [_Sky(number, seed, repetitions, sky) for number, sky in enumerate(skies(per_place))]
-    return pl.concat(mapped(_judge_sky, tasks, jobs))
+def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+    """`findings` (per sky) and `shares`."""
+    skies = list(enumerate(skies_of_day(EPOCHS_PER_PLACE)))
+    by_geometry = pl.concat(mapped(partial(_judge_sky, seed, repetitions), skies, jobs))
+    return {"findings": by_geometry, "shares": shares(by_geometry)}
 
 
 def shares(by_geometry: pl.DataFrame) -> pl.DataFrame:
@@ -75,29 +54,23 @@ def shares(by_geometry: pl.DataFrame) -> pl.DataFrame:
     counted = by_geometry.group_by(keys, maintain_order=True).agg(
         holds=pl.col("holds").sum(), judged=pl.col("holds").count(), silent=pl.col("holds").null_count()
     )
-    estimates = [clopper_pearson(row["holds"], row["judged"]) for row in counted.iter_rows(named=True)]
-    return counted.with_columns(
-        share=pl.Series([e.value for e in estimates], dtype=pl.Float64),
-        share_low=pl.Series([e.low for e in estimates], dtype=pl.Float64),
-        share_high=pl.Series([e.high for e in estimates], dtype=pl.Float64),
-        statement=pl.col("finding").replace_strict(STATEMENTS),
-    ).sort(keys)
+    bounds = [share("share", row["holds"], row["judged"]) for row in counted.iter_rows(named=True)]
+    return (
+        counted.hstack(pl.DataFrame(bounds, schema=dict.fromkeys(("share", "share_low", "share_high"), pl.Float64)))
+        .with_columns(statement=pl.col("finding").replace_strict(STATEMENTS))
+        .sort(keys)
+    )
 
 
-def _judge_sky(sky: _Sky) -> pl.DataFrame:
-    frames = []
-    for index, geometry in enumerate(sky.geometries):
-        plan = Plan(geometry)
-        banks, failures = bank_forms(plan), failure_forms(plan)
-        parts = [
-            detection_times(
-                plan,
-                first_passages(plan, banks, failures, size, generator(sky.seed, sky.number, index, block)),
-            )
-            for block, size in enumerate(in_blocks(sky.repetitions, sky.repetitions))
-        ]
-        frames.extend(parts)
-    geometry = sky.geometries[0]
+def _judge_sky(seed: int, repetitions: int, sky: tuple[int, tuple[Geometry, ...]]) -> pl.DataFrame:
+    """`place, t, elevation_deg, constellation, reading, finding, holds`, one row per statement."""
+    number, geometries = sky
+    plans = [Plan(geometry) for geometry in geometries]
+    frames = [
+        detection_times(plan, passages_of(plan, repetitions, generator(seed, number, index, 0)))
+        for index, plan in enumerate(plans)
+    ]
+    geometry = geometries[0]
     return judge(pl.concat(frames)).select(
         pl.lit(geometry.place).alias("place"),
         pl.lit(geometry.t_ns).cast(pl.Datetime("ns", "UTC")).alias("t"),
@@ -148,18 +121,13 @@ def _dual_ahead(detection: pl.DataFrame, from_mps: float, finding: str) -> pl.Da
 def _turning_away(detection: pl.DataFrame) -> pl.DataFrame:
     """At 0.10 m/s, the middle of the rates; faster ramps are seen within seconds whatever the heading."""
     odometer_only = detection.filter((pl.col("sensors") == "odometer") & (pl.col("rate_mps") == 0.1))
-    return _extremes(odometer_only, pl.col("heading_deg").is_in([0.0, 75.0])).with_columns(
-        finding=pl.lit("turning_away"),
-        holds=(pl.col("last_s") >= _TWICE * pl.col("first_s")) | (pl.col("last_detected") == 0),
-    )
-
-
-def _extremes(detection: pl.DataFrame, chosen: pl.Expr) -> pl.DataFrame:
-    ordered = detection.filter(chosen).sort("heading_deg")
-    return ordered.group_by("constellation", "reading", maintain_order=True).agg(
-        first_s=pl.col("time_to_detect_s").first(),
-        last_s=pl.col("time_to_detect_s").last(),
-        last_detected=pl.col("detected").last(),
+    times = pl.col("time_to_detect_s")
+    return (
+        odometer_only.filter(pl.col("heading_deg").is_in([0.0, 75.0]))
+        .sort("heading_deg")
+        .group_by("constellation", "reading", maintain_order=True)
+        .agg(holds=(times.last() >= _TWICE * times.first()) | (pl.col("detected").last() == 0))
+        .with_columns(finding=pl.lit("turning_away"))
     )
 
 
@@ -187,23 +155,3 @@ def _track_steadies(detection: pl.DataFrame) -> pl.DataFrame:
         .agg(holds=steadier.all())
         .with_columns(finding=pl.lit("track_steadies"))
     )
-
-
-def write_findings(
-    out: Path,
-    repetitions: int | None = None,
-    seed: int = SEED,
-    jobs: int = 1,
-    config: Configuration | None = None,
-    per_place: int = EPOCHS_PER_PLACE,
-) -> list[Path]:
-    """`findings.parquet` (per sky) and `shares.parquet`."""
-    refuse_configuration("findings", config)
-    by_geometry = findings_by_geometry(per_place, repetitions or REPETITIONS, seed, jobs)
-    settings = {
-        "experiment": "findings",
-        "repetitions": repetitions or REPETITIONS,
-        "seed": seed,
-        "epochs_per_place": per_place,
-    }
-    return write_tables(out, {"findings": by_geometry, "shares": shares(by_geometry)}, settings)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,7 @@ SOURCES: tuple[str, ...] = ("ionosphere", "troposphere", "orbit_clock", "user")
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     name: str
     latitude_deg: float
     longitude_deg: float
@@ -62,21 +61,18 @@ class Geometry:
         design = np.hstack([line_of_sight_rows(self.azimuth_deg, self.elevation_deg), clock_columns(self.svs)])
         weight = 1.0 / self.range_variance_m2.sum(axis=1)
         normal = design.T @ (weight[:, None] * design)
-        solved: Floats = np.linalg.solve(normal, design.T * weight)[:3]
-        return solved
+        return np.asarray(np.linalg.solve(normal, design.T * weight)[:3])
 
     @property
     def source_covariances_m2(self) -> Floats:
         """Covariance of the position error by source, shape (sources, 3, 3): S diag(R_j) S'."""
         gain = self.gain
-        covariances: Floats = np.einsum("ai,ij,bi->jab", gain, self.range_variance_m2, gain)
-        return covariances
+        return np.asarray(np.einsum("ai,ij,bi->jab", gain, self.range_variance_m2, gain))
 
     @property
     def ramp_direction(self) -> Floats:
         """East, north, up error per metre of range error of the faulty satellite."""
-        direction: Floats = self.gain[:, self.faulty]
-        return direction
+        return self.gain[:, self.faulty]
 
     def axes(self, heading_deg: float) -> Floats:
         """Unit vectors along, cross (left) and up, rows; heading 0 is towards the faulty satellite."""
@@ -120,6 +116,10 @@ def default_geometry(constellation: Constellation) -> Geometry:
     return geometry_at(BRUSSELS, _DAY_NS + _DEFAULT_SECOND_OF_DAY * 1_000_000_000, constellation)
 
 
-def geometries_of_day(constellation: Constellation, per_place: int = 20) -> list[Geometry]:
-    """Geometries for the shares: `per_place` epochs at each of the two places."""
-    return [geometry_at(place, t_ns, constellation) for place in PLACES for t_ns in epochs_of_day(place, per_place)]
+def skies_of_day(per_place: int) -> list[tuple[Geometry, ...]]:
+    """Both constellations at `per_place` epochs of each of the two places."""
+    return [
+        tuple(geometry_at(place, t_ns, constellation) for constellation in CONSTELLATIONS)
+        for place in PLACES
+        for t_ns in epochs_of_day(place, per_place)
+    ]

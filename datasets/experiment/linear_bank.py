@@ -57,6 +57,10 @@ class BankSpec:
     def weights(self) -> tuple[float, ...]:
         return self.alphas or BANKS[self.reading]
 
+    @property
+    def weights_text(self) -> str:
+        return ", ".join(f"{alpha:g}" for alpha in self.weights)
+
 
 @dataclass(frozen=True)
 class LinearBank:
@@ -92,8 +96,7 @@ class LinearBank:
     @property
     def sigma(self) -> Floats:
         """Of each monitor, long after the restart [m/s]."""
-        diagonal: Floats = np.sqrt(np.diag(self.covariance)[self.sources :])
-        return diagonal
+        return np.asarray(np.sqrt(np.diag(self.covariance)[self.sources :]))
 
     @property
     def threshold(self) -> Floats:

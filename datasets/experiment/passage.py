@@ -8,19 +8,19 @@ at one by one only where their envelope says that a passage is possible, which c
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from datasets.experiment.geometry import SOURCES, TAUS_S
 from datasets.experiment.plan import SIGNALS, Forms, Plan
+from schemas.arrays import Bools, Floats
+from schemas.arrays import Ints as Index
 
-Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
-Bools = npt.NDArray[np.bool_]
-Index = npt.NDArray[np.int64]
 
 BLOCK_EPOCHS = 64
 _FIRST_BLOCK = 4
@@ -35,8 +35,7 @@ _TINY = 1e-12
 _OPEN = np.iinfo(np.int32).max
 
 
-@dataclass(frozen=True)
-class Passages:
+class Passages(NamedTuple):
     """Seconds from onset to the first passage, `NEVER` where there was none within the span.
 
     `detected_s` (questions, rates, repetitions), `failed_s` (headings, rates, repetitions);
@@ -48,13 +47,12 @@ class Passages:
     alarmed_before: Bools
 
 
-def joined(parts: list[Passages]) -> Passages:
-    """Passages of further repetitions, in order."""
-    return Passages(
-        np.concatenate([part.detected_s for part in parts], axis=-1),
-        np.concatenate([part.failed_s for part in parts], axis=-1),
-        np.concatenate([part.alarmed_before for part in parts], axis=-1),
-    )
+P = TypeVar("P", bound=tuple[npt.NDArray[np.generic], ...])
+
+
+def joined(parts: list[P]) -> P:
+    """Passages of further repetitions, in order; those are the last axis of every array."""
+    return type(parts[0])(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
 
 
 class NoisePaths:
@@ -83,11 +81,11 @@ class NoisePaths:
         self._scratch = np.empty_like(self._unit)
 
     @property
-    def weights(self) -> Array:
+    def weights(self) -> Floats:
         """What each basis row has to be multiplied by."""
         return np.append(np.repeat(self._plan.alphas, len(SIGNALS)), [1.0, 1.0])
 
-    def advance(self, epochs: int) -> Array:
+    def advance(self, epochs: int) -> Floats:
         """Basis of the next epochs, shape (epochs, basis, repetitions); valid until the next call."""
         normals = self._rng.standard_normal(out=self._normals[:epochs])
         unit = normals[:, :_ODOMETER]
@@ -101,7 +99,7 @@ class NoisePaths:
         self._filter(basis)
         return basis
 
-    def _signals(self, normals: Array, basis: Array) -> None:
+    def _signals(self, normals: Floats, basis: Floats) -> None:
         """Raw increments (rows of alpha 1) and the horizontal position, written into the basis."""
         position = np.matmul(self._colour, normals[:, :_ODOMETER])
         white = normals[:, _ODOMETER:]
@@ -116,7 +114,7 @@ class NoisePaths:
         basis[:, -2:] = position[:, :2]
         self._position, self._white = position[-1].copy(), white[-1].copy()
 
-    def _filter(self, basis: Array) -> None:
+    def _filter(self, basis: Floats) -> None:
         signals = basis[:, : len(SIGNALS)]
         rows = basis[:, len(SIGNALS) : -2].reshape(len(basis), -1, len(SIGNALS), basis.shape[2])
         before = self._ewma
@@ -129,14 +127,14 @@ class NoisePaths:
 class Watch:
     """Keeps, for every question, rate and repetition, when it was first answered."""
 
-    def __init__(self, plan: Plan, banks: Forms, failures: Forms, weights: Array, repetitions: int) -> None:
+    def __init__(self, plan: Plan, banks: Forms, failures: Forms, weights: Floats, repetitions: int) -> None:
         self._plan = plan
         self._rates = np.array(plan.rates_mps)
         self._banks = banks
         self._rows = np.vstack([banks.rows, failures.rows]) * weights
         self._bounds = csr_array(np.hstack([np.maximum(self._rows, 0.0), np.minimum(self._rows, 0.0)]))
         self._terms = _sparse(self._rows)
-        self._members = _block_diagonal(banks.members, failures.members)
+        self._members = block_diag(banks.members, failures.members).astype(np.bool_)
         self._asked, self._asks = _padded([np.flatnonzero(column) for column in self._members.T])
         patterns, self._pattern_of_form = np.unique(self._members.T, axis=0, return_inverse=True)
         self._patterns = _padded([np.flatnonzero(pattern) for pattern in patterns])
@@ -152,19 +150,19 @@ class Watch:
         """Seconds from onset to the first passage, shape (questions, rates, repetitions)."""
         return np.where(self._first == _OPEN, np.int32(NEVER), self._first)
 
-    def thresholds(self, begin: int, end: int) -> Array:
+    def thresholds(self, begin: int, end: int) -> Floats:
         """Of epochs begin+1 .. end, shape (epochs, forms)."""
         limit = np.broadcast_to(self._failure_limit, (end - begin, self._failure_limit.size))
         return np.hstack([self._banks.threshold[begin:end], limit])
 
-    def responses(self, begin: int, end: int) -> Array:
+    def responses(self, begin: int, end: int) -> Floats:
         """To a ramp of 1 m/s, shape (epochs, forms): 1 - (1 - alpha)^k of an EWMA, k s of the position."""
         elapsed = np.arange(begin + 1, end + 1)[:, None] - self._plan.onset_s
         smooth = (1.0 - (1.0 - self._plan.alphas) ** np.maximum(elapsed, 0))[:, self._banks.alpha]
         drift = np.broadcast_to(elapsed, (end - begin, self._slope.size - self._monitors))
         return np.asarray(np.maximum(np.hstack([smooth, drift]) * self._slope, _TINY))
 
-    def before_onset(self, basis: Array, begin: int) -> None:
+    def before_onset(self, basis: Floats, begin: int) -> None:
         threshold = self.thresholds(begin, begin + len(basis))
         high, low = self._envelope(basis)
         least = threshold.min(axis=0)[:, None]
@@ -174,21 +172,18 @@ class Watch:
             failing = (np.abs(values) > threshold)[:, : self._monitors].any(axis=0)
             self.alarmed[:, index] |= (self._banks.members & failing).any(axis=1)
 
-    def after_onset(self, basis: Array, begin: int) -> None:
+    def after_onset(self, basis: Floats, begin: int) -> None:
         end = begin + len(basis)
         threshold, response = self.thresholds(begin, end), self.responses(begin, end)
         high, low = self._envelope(basis)
         least = threshold.min(axis=0)[:, None]
         reach = np.subtract(least, high, out=high)
         reach /= response[-1][:, None]
-        form, run = np.nonzero(reach <= self._open_for_forms())
-        self._look(basis, form, run, threshold, response, begin)
-        opposite = low < -least
-        if opposite.any():
-            form, run = np.nonzero(opposite)
-            self._look_opposite(basis, form, run, threshold, response, begin)
+        self._look(basis, reach <= self._open_for_forms(), threshold, response, begin, 1.0)
+        # Against the ramp, -m > T + c b: false alarms, likelier for the slower ramp.
+        self._look(basis, low < -least, threshold, response, begin, -1.0)
 
-    def _open_for_forms(self) -> Array:
+    def _open_for_forms(self) -> Floats:
         """Largest rate that some question of the form still waits for, shape (forms, repetitions)."""
         lists, _ = self._patterns
         largest = self._largest_open[lists[:, 0]]
@@ -196,34 +191,28 @@ class Watch:
             np.maximum(largest, self._largest_open[column], out=largest)
         return np.asarray(largest[self._pattern_of_form])
 
-    def _envelope(self, basis: Array) -> tuple[Array, Array]:
+    def _envelope(self, basis: Floats) -> tuple[Floats, Floats]:
         """Upper and lower bound of every form over the block."""
         top, bottom = basis.max(axis=0), basis.min(axis=0)
         return self._bounds @ np.vstack([top, bottom]), self._bounds @ np.vstack([bottom, top])
 
-    def _values(self, basis: Array, form: Index, run: Index) -> Array:
+    def _values(self, basis: Floats, form: Index, run: Index) -> Floats:
         """Forms of runs, epoch by epoch, shape (epochs, pairs)."""
         place, factor = self._terms
-        values: Array = basis[:, place[form, 0], run] * factor[form, 0]
+        values: Floats = basis[:, place[form, 0], run] * factor[form, 0]
         for term in range(1, place.shape[1]):
             values += basis[:, place[form, term], run] * factor[form, term]
         return values
 
-    def _look(self, basis: Array, form: Index, run: Index, threshold: Array, response: Array, begin: int) -> None:
-        """First passages of the chosen pairs, epoch by epoch."""
-        reach = threshold[:, form] - self._values(basis, form, run)
-        reach /= response[:, form]
-        self._keep_earliest(reach, self._rates, form, run, begin)
+    def _look(self, basis: Floats, chosen: Bools, threshold: Floats, response: Floats, begin: int, side: float) -> None:
+        """First passages of the chosen pairs (forms, runs) on this side, epoch by epoch."""
+        form, run = np.nonzero(chosen)
+        if form.size:
+            reach = threshold[:, form] - side * self._values(basis, form, run)
+            reach /= response[:, form]
+            self._keep_earliest(reach, side * self._rates, form, run, begin)
 
-    def _look_opposite(
-        self, basis: Array, form: Index, run: Index, threshold: Array, response: Array, begin: int
-    ) -> None:
-        """Passages against the ramp, -m > T + c b: false alarms, likelier for the slower ramp."""
-        lacking = threshold[:, form] + self._values(basis, form, run)
-        lacking /= response[:, form]
-        self._keep_earliest(lacking, -self._rates, form, run, begin)
-
-    def _keep_earliest(self, series: Array, limits: Array, form: Index, run: Index, begin: int) -> None:
+    def _keep_earliest(self, series: Floats, limits: Floats, form: Index, run: Index, begin: int) -> None:
         """Tell every question that holds the form when `series` (epochs, pairs) first fell below each limit."""
         least = series.min(axis=0)
         pair, rate = np.nonzero(
@@ -260,14 +249,7 @@ def _blocks(begin: int, end: int, shortest: int = BLOCK_EPOCHS) -> Iterator[tupl
         at += size
 
 
-def _block_diagonal(first: Bools, second: Bools) -> Bools:
-    result = np.zeros((first.shape[0] + second.shape[0], first.shape[1] + second.shape[1]), dtype=np.bool_)
-    result[: first.shape[0], : first.shape[1]] = first
-    result[first.shape[0] :, first.shape[1] :] = second
-    return result
-
-
-def _sparse(rows: Array) -> tuple[Index, Array]:
+def _sparse(rows: Floats) -> tuple[Index, Floats]:
     """Columns and factors of the non-zero entries of each row, padded with factor zero."""
     width = int((rows != 0).sum(axis=1).max())
     place = np.argsort(rows == 0, axis=1, kind="stable")[:, :width]

@@ -85,15 +85,23 @@ class Forms:
 
 def bank_forms(plan: Plan) -> Forms:
     """All monitors of all headings and readings (DIAG eq. 1-3, 8, 10-16)."""
-    builder = _Builder(plan)
+    forms = []
     for heading in plan.headings_deg:
         for reading in plan.readings:
-            builder.along(heading, reading)
+            forms += _along(plan, heading, reading)
         if "odometer_and_track" in plan.sensors:
-            builder.cross(heading)
+            forms += _cross(plan, heading)
     if "odometer_and_track" in plan.sensors:
-        builder.up()
-    return builder.forms()
+        forms += _up(plan)
+    rows, alpha, sigma, slope, members, names = zip(*forms, strict=True)
+    return Forms(
+        np.array(rows),
+        np.array(alpha),
+        threshold_factor(plan.false_alarm_probability) * np.column_stack(sigma),
+        np.array(slope),
+        np.array(members).T,
+        names,
+    )
 
 
 def failure_forms(plan: Plan) -> Forms:
@@ -120,75 +128,56 @@ def _towards(slope: float) -> float:
     return -1.0 if slope < 0 else 1.0
 
 
-class _Builder:
-    """Collects forms; the basis is [alpha, signal] with the position at the end."""
+# Row over the basis, index of the weight, sigma by epoch, slope, the questions it answers, name.
+_Form = tuple[Floats, int, Floats, float, list[bool], str]
 
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
-        self._rows: list[Floats] = []
-        self._alpha: list[int] = []
-        self._sigma: list[Floats] = []
-        self._slope: list[float] = []
-        self._members: list[list[bool]] = []
-        self._names: list[str] = []
 
-    def along(self, heading: float, reading: Reading) -> None:
-        axis = self._plan.geometry.axes(heading)[0]
-        white = self._plan.odometer_m if reading == "increments" else 0.0
-        position = self._plan.odometer_m if reading == "position" else 0.0
-        members = [(r, h) == (reading, heading) for r, h, _ in self._plan.questions]
-        for alpha in self._plan.banks[reading]:
-            signals = {"east": axis[0], "north": axis[1], f"odometer_{reading}": -self._plan.odometer_m}
-            self._add(f"along_{reading}_{heading:g}", axis, alpha, signals, white, position, members)
+def _along(plan: Plan, heading: float, reading: Reading) -> list[_Form]:
+    axis = plan.geometry.axes(heading)[0]
+    white = (plan.odometer_m, 0.0) if reading == "increments" else (0.0, plan.odometer_m)
+    signals = {"east": axis[0], "north": axis[1], f"odometer_{reading}": -plan.odometer_m}
+    members = [(r, h) == (reading, heading) for r, h, _ in plan.questions]
+    name = f"along_{reading}_{heading:g}"
+    return [_form(plan, name, axis, alpha, signals, white, members) for alpha in plan.banks[reading]]
 
-    def cross(self, heading: float) -> None:
-        axis = self._plan.geometry.axes(heading)[1]
-        for alpha in self._plan.alphas:
-            members = [
-                h == heading and s == "odometer_and_track" and alpha in self._plan.banks[r]
-                for r, h, s in self._plan.questions
-            ]
-            signals = {"east": axis[0], "north": axis[1], "map_cross": -self._plan.map_m}
-            self._add(f"cross_{heading:g}", axis, alpha, signals, 0.0, self._plan.map_m, members)
 
-    def up(self) -> None:
-        axis = np.array([0.0, 0.0, 1.0])
-        for alpha in self._plan.alphas:
-            members = [s == "odometer_and_track" and alpha in self._plan.banks[r] for r, _, s in self._plan.questions]
-            self._add("up", axis, alpha, {"up": 1.0}, 0.0, self._plan.map_m, members)
+def _cross(plan: Plan, heading: float) -> list[_Form]:
+    axis = plan.geometry.axes(heading)[1]
+    signals = {"east": axis[0], "north": axis[1], "map_cross": -plan.map_m}
+    return [
+        _form(plan, f"cross_{heading:g}", axis, alpha, signals, (0.0, plan.map_m), _with_track(plan, alpha, heading))
+        for alpha in plan.alphas
+    ]
 
-    def _add(
-        self,
-        name: str,
-        axis: Floats,
-        alpha: float,
-        signals: dict[str, float],
-        white_m: float,
-        position_m: float,
-        members: list[bool],
-    ) -> None:
-        plan = self._plan
-        index = int(np.flatnonzero(plan.alphas == alpha)[0])
-        slope = float(axis @ plan.geometry.ramp_direction)
-        row = np.zeros(plan.basis_size)
-        for signal, factor in signals.items():
-            row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _towards(slope)
-        variances = np.einsum("a,jab,b->j", axis, plan.geometry.source_covariances_m2, axis)
-        sigma = bank_sigmas(np.array([alpha]), plan.span_s, variances, TAUS_S, white_m, position_m)[:, 0]
-        self._rows.append(row)
-        self._alpha.append(index)
-        self._sigma.append(sigma)
-        self._slope.append(abs(slope))
-        self._members.append(members)
-        self._names.append(f"{name}_{'raw' if alpha == 1.0 else f'{alpha:g}'}")
 
-    def forms(self) -> Forms:
-        factor = threshold_factor(self._plan.false_alarm_probability)
-        return Forms(
-            np.array(self._rows),
-            np.array(self._alpha),
-            factor * np.column_stack(self._sigma),
-            np.array(self._slope),
-            np.array(self._members).T,
-            tuple(self._names),
-        )
+def _up(plan: Plan) -> list[_Form]:
+    axis = np.array([0.0, 0.0, 1.0])
+    return [
+        _form(plan, "up", axis, alpha, {"up": 1.0}, (0.0, plan.map_m), _with_track(plan, alpha))
+        for alpha in plan.alphas
+    ]
+
+
+def _with_track(plan: Plan, alpha: float, heading: float | None = None) -> list[bool]:
+    """The questions with track, of this heading or all, whose bank has the weight."""
+    return [s == "odometer_and_track" and alpha in plan.banks[r] and heading in (None, h) for r, h, s in plan.questions]
+
+
+def _form(
+    plan: Plan,
+    name: str,
+    axis: Floats,
+    alpha: float,
+    signals: dict[str, float],
+    white_m: tuple[float, float],
+    members: list[bool],
+) -> _Form:
+    """The basis is [alpha, signal] with the position at the end; `white_m`: noise on increments and on position."""
+    index = int(np.flatnonzero(plan.alphas == alpha)[0])
+    slope = float(axis @ plan.geometry.ramp_direction)
+    row = np.zeros(plan.basis_size)
+    for signal, factor in signals.items():
+        row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _towards(slope)
+    variances = np.einsum("a,jab,b->j", axis, plan.geometry.source_covariances_m2, axis)
+    sigma = bank_sigmas(np.array([alpha]), plan.span_s, variances, TAUS_S, *white_m)[:, 0]
+    return row, index, sigma, abs(slope), members, f"{name}_{'raw' if alpha == 1.0 else f'{alpha:g}'}"

@@ -6,76 +6,61 @@ holds; at one place it is a bias, and the alarms there are those of a noncentral
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.special import chdtrc, chdtri
 
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.ranges import HEADINGS_DEG, RangePlan, Statistic, held_rows, statistic
-from datasets.experiment.workers import generator, in_blocks
-from pipeline.campaign.workers import mapped
-from pipeline.figures.bounds import clopper_pearson
-from schemas.arrays import Floats
+from datasets.experiment.tables import Row, share, table
+from datasets.experiment.workers import in_pieces
+from schemas.arrays import Floats, Ints
 
 # Error of the survey across and in height, in its stated sigma; none: drawn anew for every epoch.
 SURVEYS: tuple[float | None, ...] = (None, 0.0, 1.0, 2.0)
 _BLOCK = 50_000
 
 
-@dataclass(frozen=True)
-class _Count:
-    constellation: Constellation
-    probabilities: tuple[float, ...]
-    key: tuple[int, ...]
-    epochs: int
-
-
 def range_alarms(probabilities: tuple[float, ...], epochs: int, seed: int, jobs: int = 1) -> pl.DataFrame:
     """One row per constellation, heading, survey and probability; the epochs are drawn independently."""
-    rows = []
+    rows: list[Row] = []
     for number, constellation in enumerate(CONSTELLATIONS):
-        works = [
-            _Count(constellation, probabilities, (seed, 53, number, block), size)
-            for block, size in enumerate(in_blocks(epochs, _BLOCK))
-        ]
-        counts = np.sum(mapped(_counted, works, jobs), axis=0)
+        count = partial(_counted, constellation, probabilities)
+        counts = np.sum(in_pieces(count, epochs, _BLOCK, (seed, 53, number), jobs), axis=0)
         plan = RangePlan(default_geometry(constellation))
-        for h, heading in enumerate(HEADINGS_DEG):
+        for h, s, p in np.ndindex(counts.shape):
+            heading, survey, probability = HEADINGS_DEG[h], SURVEYS[s], probabilities[p]
             one = statistic(plan, heading)
-            for s, survey in enumerate(SURVEYS):
-                for p, probability in enumerate(probabilities):
-                    share = clopper_pearson(int(counts[h, s, p]), epochs)
-                    rows.append(
-                        {
-                            "constellation": constellation,
-                            "heading_deg": heading,
-                            "survey_error_sigmas": survey,
-                            "intended": probability,
-                            "expected": _expected(plan, one, heading, survey, probability),
-                            "runs": epochs,
-                            "alarms": int(counts[h, s, p]),
-                            "measured": share.value,
-                            "measured_low": share.low,
-                            "measured_high": share.high,
-                            "at_1e_7": _expected(plan, one, heading, survey, 1e-7),
-                        }
-                    )
-    return pl.DataFrame(rows, infer_schema_length=None)
+            rows.append(
+                {
+                    "constellation": constellation,
+                    "heading_deg": heading,
+                    "survey_error_sigmas": survey,
+                    "intended": probability,
+                    "expected": _expected(plan, one, heading, survey, probability),
+                    "runs": epochs,
+                    "alarms": int(counts[h, s, p]),
+                    **share("measured", int(counts[h, s, p]), epochs),
+                    "at_1e_7": _expected(plan, one, heading, survey, 1e-7),
+                }
+            )
+    return table(rows)
 
 
-def _counted(work: _Count) -> npt.NDArray[np.int64]:
+def _counted(
+    constellation: Constellation, probabilities: tuple[float, ...], epochs: int, rng: np.random.Generator
+) -> Ints:
     """Epochs beyond each limit, (headings, surveys, probabilities)."""
-    plan, rng = RangePlan(default_geometry(work.constellation)), generator(*work.key)
+    plan = RangePlan(default_geometry(constellation))
     sigma = np.sqrt(plan.geometry.range_variance_m2.sum(axis=1))[:, None]
-    errors = sigma * rng.standard_normal((sigma.size, work.epochs))
-    drawn = plan.survey_m * rng.standard_normal((2, work.epochs))
-    counts = np.zeros((len(HEADINGS_DEG), len(SURVEYS), len(work.probabilities)), dtype=np.int64)
+    errors = sigma * rng.standard_normal((sigma.size, epochs))
+    drawn = plan.survey_m * rng.standard_normal((2, epochs))
+    counts = np.zeros((len(HEADINGS_DEG), len(SURVEYS), len(probabilities)), dtype=np.int64)
     for h, heading in enumerate(HEADINGS_DEG):
         one, held = statistic(plan, heading), held_rows(plan, heading)
-        limits = chdtri(one.project.shape[0], np.array(work.probabilities))
+        limits = chdtri(one.project.shape[0], np.array(probabilities))
         z = one.project @ errors
         for s, survey in enumerate(SURVEYS):
             off = drawn if survey is None else np.full((2, 1), survey * plan.survey_m)

@@ -7,23 +7,22 @@ looks at these epochs only.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from scipy.special import chdtri
 
-from datasets.experiment.bounds import expected
-from datasets.experiment.diagnostics import SEED
+from datasets.experiment.bounds import time_columns
 from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, default_geometry
-from datasets.experiment.tables import refuse_configuration, write_tables
-from datasets.experiment.workers import generator, in_blocks
-from pipeline.campaign.workers import mapped
-from pipeline.figures.bounds import clopper_pearson
+from datasets.experiment.passage import joined
+from datasets.experiment.tables import Contents, Row, share, table
+from datasets.experiment.workers import in_pieces
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 
 REPETITIONS = 5_000
@@ -46,9 +45,13 @@ class RangePlan:
     failure_limit_m: float = 20.0
     false_alarm_probability: float = 1e-7
 
+    def mean_failure_s(self, heading_deg: float, rate_mps: float) -> float:
+        """When the mean error along the track of a ramp passes the limit [s]; infinite where it never does."""
+        slope = abs(float(self.geometry.axes(heading_deg)[0] @ self.geometry.ramp_direction)) * rate_mps
+        return self.failure_limit_m / slope if slope > 0 else float("inf")
 
-@dataclass(frozen=True)
-class Statistic:
+
+class Statistic(NamedTuple):
     """`value = |project @ r|^2` of range errors r, chi-square with `project.shape[0]` degrees of freedom."""
 
     project: Floats
@@ -78,29 +81,23 @@ def held_rows(plan: RangePlan, heading_deg: float) -> Floats:
     return np.asarray(rows @ plan.geometry.axes(heading_deg)[1:].T)
 
 
-@dataclass(frozen=True)
-class RangePassages:
+class RangePassages(NamedTuple):
     """Seconds to detection (`_UNDETECTED` if never), and whether the failure was not later, by heading, rate, run."""
 
     detected_s: Floats
-    failed_first: npt.NDArray[np.bool_]
+    failed_first: Bools
 
 
-class _RangeErrors:
-    """Unit Gauss-Markov processes of all satellites and sources, at the recording period."""
-
-    def __init__(self, plan: RangePlan, repetitions: int, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self._sigma = np.sqrt(plan.geometry.range_variance_m2.T)[:, :, None]
-        self._phi = np.exp(-plan.period_s / TAUS_S)[:, None, None]
-        self._step = np.sqrt(1.0 - self._phi**2)
-        self._unit = rng.standard_normal((TAUS_S.size, len(plan.geometry.svs), repetitions))
-
-    def advance(self) -> Floats:
-        """Errors at the next recorded epoch [m], shape (satellites, repetitions)."""
-        self._unit *= self._phi
-        self._unit += self._step * self._rng.standard_normal(self._unit.shape)
-        return np.asarray((self._sigma * self._unit).sum(axis=0))
+def _range_errors(plan: RangePlan, repetitions: int, rng: np.random.Generator) -> Iterator[tuple[float, Floats]]:
+    """Time [s] and errors [m] (satellites, repetitions) at each recorded epoch: Gauss-Markov by satellite, source."""
+    sigma = np.sqrt(plan.geometry.range_variance_m2.T)[:, :, None]
+    phi = np.exp(-plan.period_s / TAUS_S)[:, None, None]
+    step = np.sqrt(1.0 - phi**2)
+    unit = rng.standard_normal((TAUS_S.size, len(plan.geometry.svs), repetitions))
+    for epoch in range(1, int(plan.span_s / plan.period_s) + 1):
+        unit *= phi
+        unit += step * rng.standard_normal(unit.shape)
+        yield epoch * plan.period_s, (sigma * unit).sum(axis=0)
 
 
 def range_passages(plan: RangePlan, repetitions: int, rng: np.random.Generator) -> RangePassages:
@@ -110,12 +107,9 @@ def range_passages(plan: RangePlan, repetitions: int, rng: np.random.Generator) 
     along = np.stack([geometry.axes(heading)[0] @ geometry.gain for heading in plan.headings_deg])
     survey = rng.standard_normal((2, repetitions)) * plan.survey_m
     offsets = [held_rows(plan, heading) @ survey for heading in plan.headings_deg]
-    errors = _RangeErrors(plan, repetitions, rng)
     detected = np.full((len(statistics), rates.size, repetitions), float(_UNDETECTED))
     failed_first = np.zeros(detected.shape, dtype=np.bool_)
-    for epoch in range(1, int(plan.span_s / plan.period_s) + 1):
-        t_s = epoch * plan.period_s
-        error = errors.advance()
+    for t_s, error in _range_errors(plan, repetitions, rng):
         for index, one in enumerate(statistics):
             open_runs = detected[index] == _UNDETECTED
             if not open_runs.any():
@@ -130,7 +124,7 @@ def range_passages(plan: RangePlan, repetitions: int, rng: np.random.Generator) 
 
 def _judge(
     plan: RangePlan, one: Statistic, along: Floats, error: Floats, offset: Floats, ramps_m: Floats
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+) -> tuple[Bools, Bools]:
     """Alarm and position failure at ramps of these sizes, shapes (rates, repetitions).
 
     |z + c l|^2 = |z|^2 + 2 c (l.z) + c^2 |l|^2 with z of the noise and l of the faulty satellite.
@@ -143,20 +137,14 @@ def _judge(
     return value > one.threshold, np.abs(position) > plan.failure_limit_m
 
 
-@dataclass(frozen=True)
-class _Piece:
-    plan: RangePlan
-    key: tuple[int, ...]
-    repetitions: int
-
-
-def _simulate_piece(piece: _Piece) -> RangePassages:
-    return range_passages(piece.plan, piece.repetitions, generator(*piece.key))
+def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+    """`pseudorange`."""
+    return {"pseudorange": run_ranges(repetitions, seed, jobs)}
 
 
 def run_ranges(
     repetitions: int = REPETITIONS,
-    seed: int = SEED,
+    seed: int = 1,
     jobs: int = 1,
     plans: tuple[RangePlan, ...] | None = None,
 ) -> pl.DataFrame:
@@ -166,34 +154,22 @@ def run_ranges(
         for name in CONSTELLATIONS
         for period_s in (1.0, 10.0, 30.0)
     )
-    pieces = [
-        _Piece(plan, (seed, 77, number, block), size)
-        for number, plan in enumerate(plans)
-        for block, size in enumerate(in_blocks(repetitions, _BLOCK_REPETITIONS))
-    ]
-    results = mapped(_simulate_piece, pieces, jobs)
-    blocks = len(results) // len(plans)
-    return pl.concat([_table(plan, results[at * blocks : (at + 1) * blocks]) for at, plan in enumerate(plans)])
+    rows = []
+    for number, plan in enumerate(plans):
+        pieces = in_pieces(partial(range_passages, plan), repetitions, _BLOCK_REPETITIONS, (seed, 77, number), jobs)
+        found = joined(pieces)
+        rows += [
+            _row(plan, heading, rate, found.detected_s[h, r], found.failed_first[h, r])
+            for h, heading in enumerate(plan.headings_deg)
+            for r, rate in enumerate(plan.rates_mps)
+        ]
+    return table(rows)
 
 
-def _table(plan: RangePlan, parts: list[RangePassages]) -> pl.DataFrame:
-    detected = np.concatenate([part.detected_s for part in parts], axis=-1)
-    failed_first = np.concatenate([part.failed_first for part in parts], axis=-1)
-    rows = [
-        _row(plan, heading, rate, detected[h, r], failed_first[h, r])
-        for h, heading in enumerate(plan.headings_deg)
-        for r, rate in enumerate(plan.rates_mps)
-    ]
-    return pl.DataFrame(rows, infer_schema_length=None)
-
-
-def _row(
-    plan: RangePlan, heading: float, rate: float, detected_s: Floats, failed_first: npt.NDArray[np.bool_]
-) -> dict[str, object]:
-    found = detected_s != _UNDETECTED
-    missed = clopper_pearson(int(failed_first.sum()), failed_first.size)
-    time = expected(np.where(found, detected_s, plan.span_s), 0.0, plan.span_s)
-    slope = abs(float(plan.geometry.axes(heading)[0] @ plan.geometry.ramp_direction)) * rate
+def _row(plan: RangePlan, heading: float, rate: float, detected_s: Floats, failed_first: Bools) -> Row:
+    found, failed = detected_s != _UNDETECTED, int(failed_first.sum())
+    time = time_columns("time_to_detect", np.where(found, detected_s, plan.span_s), 0.0, plan.span_s)
+    mean_failure_s = plan.mean_failure_s(heading, rate)
     return {
         "constellation": plan.geometry.constellation,
         "period_s": plan.period_s,
@@ -201,22 +177,8 @@ def _row(
         "rate_mps": rate,
         "repetitions": failed_first.size,
         "censored": int((~found).sum()),
-        "time_to_detect_s": None if time is None else time.mean,
-        "time_to_detect_low_s": None if time is None else time.low,
-        "time_to_detect_high_s": None if time is None else time.high,
-        "mean_failure_s": plan.failure_limit_m / slope if slope > 0 else None,
-        "missed_at_failure": int(failed_first.sum()),
-        "pmd_at_failure": missed.value,
-        "pmd_at_failure_low": missed.low,
-        "pmd_at_failure_high": missed.high,
+        **{name: time[name] for name in ("time_to_detect_s", "time_to_detect_low_s", "time_to_detect_high_s")},
+        "mean_failure_s": mean_failure_s if np.isfinite(mean_failure_s) else None,
+        "missed_at_failure": failed,
+        **share("pmd_at_failure", failed, failed_first.size),
     }
-
-
-def write_ranges(
-    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
-) -> list[Path]:
-    """`pseudorange.parquet`."""
-    refuse_configuration("pseudorange", config)
-    table = run_ranges(repetitions or REPETITIONS, seed, jobs)
-    settings = {"experiment": "pseudorange", "repetitions": repetitions or REPETITIONS, "seed": seed}
-    return write_tables(out, {"pseudorange": table}, settings)

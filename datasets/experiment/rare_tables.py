@@ -1,30 +1,37 @@
-"""Rare events of a bank: when a missed detection has become as rare as railways ask, and false alarms."""
+"""Rare events of a bank and of the pseudorange monitor, which is alone on its ranges.
+
+When a missed detection has become as rare as railways ask, and how often healthy monitors alarm.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import polars as pl
 
-from datasets.experiment.diagnostics import SEED
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
 from datasets.experiment.plan import READINGS, SENSORS
+from datasets.experiment.ranges import RangePlan
 from datasets.experiment.rare import (
+    SMALLEST,
     false_alarm_probability,
+    figures,
+    first_below,
     missed_detection_probability,
 )
-from datasets.experiment.rare_range_tables import range_table
-from datasets.experiment.rare_rows import figures, first_below
-from datasets.experiment.tables import write_tables
+from datasets.experiment.rare_ranges import miss_at_one_epoch, range_system
+from datasets.experiment.splitting import System
+from datasets.experiment.tables import Contents, Row, table
 from schemas.config import Configuration
 
-RUNS = 20_000
+REPETITIONS = 20_000
 TARGETS: tuple[float, ...] = (1e-4, 1e-9)
 _RATES_MPS = (0.01, 0.03, 0.1, 1.0)
 _TRANSIENT_RATES_MPS = (0.1, 1.0)
+# Ramps in a range, and how often residuals are recorded for them; the first time that a period comes alarms are asked.
+_RANGES_ASKED: tuple[tuple[float, float], ...] = ((0.01, 10.0), (0.01, 30.0), (0.1, 1.0), (0.1, 10.0))
 _SEARCH_RUNS = 500
 _FAILURE_LIMIT_M = 20.0
 _LONGEST_S = 10_000
@@ -34,21 +41,28 @@ _ALARM_SHARE = 20
 # Seconds since the restart at the onset of a fault; none: long ago.
 AGES_S: tuple[float | None, ...] = (0.0, 10.0, 60.0, 300.0, None)
 
+_Bank = tuple[Constellation, LinearBank]
 
-def banks(config: Configuration | None, rate_hz: float = 1.0) -> Iterator[tuple[Constellation, BankSpec, LinearBank]]:
+
+def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+    """`missed`, `transients`, `false_alarms`, `pseudorange`; `repetitions` are the sampled runs."""
+    return {
+        "missed": missed_table(repetitions, seed, jobs, config),
+        "transients": transient_table(repetitions, seed, jobs, config),
+        "false_alarms": alarm_table(repetitions, seed, jobs, config),
+        "pseudorange": range_table(repetitions, seed, jobs, config),
+    }
+
+
+def banks(config: Configuration | None, rate_hz: float = 1.0) -> Iterator[_Bank]:
     """Both constellations and sensor sets, heading 0: the configured bank, or those of both readings."""
-    specs = [
-        spec
-        for sensors in SENSORS
-        for spec in (
-            [BankSpec.of(config.monitors, sensors, rate_hz)]
-            if config is not None
-            else [BankSpec(reading=reading, sensors=sensors, rate_hz=rate_hz) for reading in READINGS]
-        )
-    ]
     for constellation in CONSTELLATIONS:
-        for spec in specs:
-            yield constellation, spec, linear_bank(default_geometry(constellation), 0.0, spec)
+        for sensors in SENSORS:
+            specs = [BankSpec(reading=reading, sensors=sensors, rate_hz=rate_hz) for reading in READINGS]
+            if config is not None:
+                specs = [BankSpec.of(config.monitors, sensors, rate_hz)]
+            for spec in specs:
+                yield constellation, linear_bank(default_geometry(constellation), 0.0, spec)
 
 
 def failure_epoch(bank: LinearBank, rate_mps: float) -> int:
@@ -58,111 +72,116 @@ def failure_epoch(bank: LinearBank, rate_mps: float) -> int:
     return int(min(seconds, _LONGEST_S) * bank.spec.rate_hz)
 
 
-def epochs_until(bank: LinearBank, rate_mps: float, targets: Sequence[float], seed: int, jobs: int) -> list[int | None]:
+def epochs_until(
+    system: System, rate_mps: float, targets: Sequence[float], seed: int, jobs: int, period_s: float
+) -> list[int | None]:
     """Epochs after which the missed-detection probability is below each target; None if not within the span."""
     return first_below(
-        lambda epochs: missed_detection_probability(bank, epochs, rate_mps, _SEARCH_RUNS, seed, jobs).value,
+        lambda epochs: missed_detection_probability(system, epochs, rate_mps, _SEARCH_RUNS, seed, jobs).value,
         targets,
-        int(_LONGEST_S * bank.spec.rate_hz),
+        int(_LONGEST_S / period_s),
     )
 
 
-def missed_table(
-    runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
-) -> pl.DataFrame:
+def _times_asked(
+    system: System, rate_mps: float, failure: int, seed: int, jobs: int, period_s: float
+) -> list[tuple[str, int]]:
+    """What is asked of a ramp, and after how many epochs: at the failure, and when a miss is as rare as the targets."""
+    found = zip(TARGETS, epochs_until(system, rate_mps, TARGETS, seed, jobs, period_s), strict=True)
+    return [("failure", failure), *((f"{target:g}", epochs) for target, epochs in found if epochs is not None)]
+
+
+def missed_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
     """Pmd at the mean failure, and the time that makes it as rare as each target, with the error of the estimate."""
-    rows = []
-    for (constellation, _, bank), rate in _asked(config):
+    asked = [(one, rate) for one in banks(config) for rate in _RATES_MPS]
+    # At 10 Hz the faster ramps of GPS, since slow ones differ little from 1 Hz.
+    asked += [(one, rate) for one in _fast(config) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS]
+    rows: list[Row] = []
+    for (constellation, bank), rate in asked:
         at_failure = failure_epoch(bank, rate)
-        asked = [("failure", at_failure)]
-        for target, epochs in zip(TARGETS, epochs_until(bank, rate, TARGETS, seed, jobs), strict=True):
-            if epochs is not None:
-                asked.append((f"{target:g}", epochs))
-        for reason, epochs in asked:
+        for reason, epochs in _times_asked(bank, rate, at_failure, seed, jobs, 1.0 / bank.spec.rate_hz):
             missed = missed_detection_probability(bank, epochs, rate, runs, seed, jobs)
             rows.append(_missed_row(constellation, bank, rate, epochs, reason) | figures(missed))
-    return pl.DataFrame(rows)
+    return table(rows)
 
 
-def _missed_row(
-    constellation: Constellation, bank: LinearBank, rate: float, epochs: int, reason: str
-) -> dict[str, object]:
+def _fast(config: Configuration | None) -> list[_Bank]:
+    return [one for one in banks(config, _FAST_HZ) if one[0] == "gps"]
+
+
+def _missed_row(constellation: Constellation, bank: LinearBank, rate: float, epochs: int, reason: str) -> Row:
     """What was asked: a ramp of this rate [m/s] on a bank, so many epochs after its onset."""
-    spec = bank.spec
     return {
-        "constellation": constellation,
-        "reading": spec.reading,
-        "alphas": _weights(spec),
-        "sensors": spec.sensors,
-        "rate_hz": spec.rate_hz,
+        **_bank_row(constellation, bank.spec),
         "rate_mps": rate,
         "chosen_for": reason,
-        "time_s": epochs / spec.rate_hz,
-        "mean_failure_s": failure_epoch(bank, rate) / spec.rate_hz,
+        "time_s": epochs / bank.spec.rate_hz,
+        "mean_failure_s": failure_epoch(bank, rate) / bank.spec.rate_hz,
     }
 
 
-def _weights(spec: BankSpec) -> str:
-    return ", ".join(f"{alpha:g}" for alpha in spec.weights)
+def _bank_row(constellation: Constellation, spec: BankSpec) -> Row:
+    return {
+        "constellation": constellation,
+        "reading": spec.reading,
+        "alphas": spec.weights_text,
+        "sensors": spec.sensors,
+        "rate_hz": spec.rate_hz,
+    }
 
 
-def transient_table(
-    runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
-) -> pl.DataFrame:
+def transient_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
     """Pmd of a fault that begins soon after a restart beside one long after, at the time that makes the latter 1e-4.
 
     Thresholds are exact at every age (DOMAIN section 3), so false alarms do not depend on it; misses do.
     """
-    rows = []
-    for constellation, spec, bank in banks(config):
+    rows: list[Row] = []
+    for constellation, bank in banks(config):
         for rate in _TRANSIENT_RATES_MPS if constellation == "gps" else ():
-            epochs = epochs_until(bank, rate, (max(TARGETS),), seed, jobs)[0]
+            (epochs,) = epochs_until(bank, rate, (max(TARGETS),), seed, jobs, 1.0 / bank.spec.rate_hz)
             for age_s in AGES_S if epochs is not None else ():
-                young = linear_bank(default_geometry(constellation), 0.0, replace(spec, age_s=age_s))
+                young = linear_bank(default_geometry(constellation), 0.0, replace(bank.spec, age_s=age_s))
                 missed = missed_detection_probability(young, epochs or 0, rate, runs, seed, jobs)
                 row = _missed_row(constellation, young, rate, epochs or 0, "transient")
                 rows.append({"age_s": age_s, **row, **figures(missed)})
-    return pl.DataFrame(rows, infer_schema_length=None)
+    return table(rows)
 
 
-def _asked(config: Configuration | None) -> Iterator[tuple[tuple[Constellation, BankSpec, LinearBank], float]]:
-    """Banks and ramps; at 10 Hz the faster ramps of GPS, since slow ones differ little from 1 Hz."""
-    for one in banks(config):
-        yield from ((one, rate) for rate in _RATES_MPS)
-    for one in banks(config, _FAST_HZ):
-        yield from ((one, rate) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS and one[0] == "gps")
-
-
-def alarm_table(runs: int = RUNS, seed: int = SEED, jobs: int = 1, config: Configuration | None = None) -> pl.DataFrame:
+def alarm_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
     """Probability that a healthy bank alarms at least once within an hour."""
-    rows = []
-    chosen = [*banks(config), *(one for one in banks(config, _FAST_HZ) if one[0] == "gps")]
-    for constellation, spec, bank in chosen:
-        result = false_alarm_probability(bank, int(_HOUR_S * spec.rate_hz), max(runs // _ALARM_SHARE, 20), seed, jobs)
-        rows.append(
-            {
-                "constellation": constellation,
-                "reading": spec.reading,
-                "alphas": _weights(spec),
-                "sensors": spec.sensors,
-                "rate_hz": spec.rate_hz,
-                "false_alarm_probability": spec.false_alarm_probability,
-                "horizon_s": float(_HOUR_S),
-                **figures(result),
-            }
-        )
-    return pl.DataFrame(rows)
+    rows: list[Row] = []
+    for constellation, bank in [*banks(config), *_fast(config)]:
+        spec = bank.spec
+        result = false_alarm_probability(bank, int(_HOUR_S * spec.rate_hz), _alarm_runs(runs), seed, jobs)
+        asked = {"false_alarm_probability": spec.false_alarm_probability, "horizon_s": float(_HOUR_S)}
+        rows.append(_bank_row(constellation, spec) | asked | figures(result))
+    return table(rows)
 
 
-def write_rare(
-    out: Path, repetitions: int | None = None, seed: int = SEED, jobs: int = 1, config: Configuration | None = None
-) -> list[Path]:
-    """`missed`, `transients`, `false_alarms`, `pseudorange`; `repetitions` are the sampled runs."""
-    runs = repetitions or RUNS
-    tables = {
-        "missed": missed_table(runs, seed, jobs, config),
-        "transients": transient_table(runs, seed, jobs, config),
-        "false_alarms": alarm_table(runs, seed, jobs, config),
-        "pseudorange": range_table(runs, seed, jobs, config),
-    }
-    return write_tables(out, tables, {"experiment": "rare", "repetitions": runs, "seed": seed})
+def _alarm_runs(runs: int) -> int:
+    return max(runs // _ALARM_SHARE, 20)
+
+
+def range_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
+    """The same of the pseudorange monitor, heading 0: misses, and alarms within an hour."""
+    rows: list[Row] = []
+    for constellation in CONSTELLATIONS:
+        periods = []
+        for rate, period_s in _RANGES_ASKED:
+            plan = RangePlan(default_geometry(constellation), period_s=period_s)
+            if config is not None:
+                plan = replace(plan, false_alarm_probability=config.monitors.false_alarm_probability)
+            system = range_system(plan, 0.0)
+            labels = {"constellation": constellation, "period_s": period_s}
+            failure_s = min(plan.mean_failure_s(0.0, rate), float(_LONGEST_S))
+            for reason, epochs in _times_asked(system, rate, int(failure_s / period_s), seed, jobs, period_s):
+                missed = missed_detection_probability(system, epochs, rate, runs, seed, jobs)
+                time_s = epochs * period_s
+                at_most = max(miss_at_one_epoch(system, rate * time_s), SMALLEST)
+                asked = {"event": "missed_detection", "rate_mps": rate, "chosen_for": reason, "time_s": time_s}
+                rows.append(labels | asked | {"mean_failure_s": failure_s, "at_most": at_most} | figures(missed))
+            if period_s not in periods:
+                alarm = false_alarm_probability(system, int(_HOUR_S / period_s), _alarm_runs(runs), seed, jobs)
+                rows.append(labels | {"event": "false_alarm", "time_s": float(_HOUR_S), **figures(alarm)})
+            periods.append(period_s)
+    return table(rows)

@@ -1,4 +1,4 @@
-"""Results of an experiment on disk: one Parquet per table and the settings that made them."""
+"""Results of an experiment: shares with their bounds, tables, and all of it on disk."""
 
 from __future__ import annotations
 
@@ -7,43 +7,37 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import polars as pl
+from polars import selectors as cs
 
+from pipeline import storage
+from pipeline.figures.bounds import clopper_pearson
 from pipeline.storage.parquet import parquet_bytes
-from schemas.config import Configuration
-from schemas.errors import OutputError, UsageError
+
+# By name: tables, and pages and pictures under their whole name.
+Contents = Mapping[str, pl.DataFrame | str | bytes]
+Row = dict[str, object]
 
 
-def refuse_configuration(experiment: str, config: Configuration | None) -> None:
-    """A published experiment has the paper's settings; silently ignoring others would mislead."""
-    if config is not None:
-        raise UsageError(
-            "takes no configuration",
-            place=f"experiment {experiment}",
-            expected="the published settings",
-            remedy="`rare`, `bank` and `catalogue` judge the bank of a configuration.",
-        )
+def share(name: str, count: int, trials: int) -> Row:
+    """`name`, `name_low` and `name_high`: a share and its exact bounds, null without trials."""
+    found = clopper_pearson(count, trials)
+    return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
 
 
-def write_tables(out: Path, tables: Mapping[str, pl.DataFrame], settings: Mapping[str, object]) -> list[Path]:
-    """`NAME.parquet` for every table and `settings.json`; the same content gives the same bytes."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        written = []
-        for name, frame in tables.items():
-            path = out / f"{name}.parquet"
-            path.write_bytes(parquet_bytes(frame))
-            written.append(path)
-        path = out / "settings.json"
-        path.write_text(json.dumps(dict(settings), indent=2, sort_keys=True) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error.strerror}", place=str(out)) from None
-    return [*written, path]
+def table(rows: list[Row]) -> pl.DataFrame:
+    """The rows as a table; a column of which no row knows anything is one of numbers."""
+    return pl.DataFrame(rows, infer_schema_length=None).with_columns(cs.by_dtype(pl.Null).cast(pl.Float64))
 
 
-def write_page(path: Path, text: str) -> Path:
-    """A page of text beside the tables."""
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error.strerror}", place=str(path)) from None
-    return path
+def write(out: Path, contents: Contents, settings: Mapping[str, object]) -> list[Path]:
+    """Every content and `settings.json`, which made them; the same content gives the same bytes."""
+    files = {**contents, "settings.json": json.dumps(dict(settings), indent=2, sort_keys=True) + "\n"}
+    for name, content in files.items():
+        if isinstance(content, pl.DataFrame):
+            content = parquet_bytes(content)
+        storage.write_bytes(_path(out, name), content.encode() if isinstance(content, str) else content)
+    return [_path(out, name) for name in files]
+
+
+def _path(out: Path, name: str) -> Path:
+    return out / (name if "." in name else f"{name}.parquet")

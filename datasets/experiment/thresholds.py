@@ -11,16 +11,18 @@ probability that a way really gives at a sky is 2 Q(k_T T_way / T_exact).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 from scipy.special import ndtr
 
-from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, geometries_of_day
+from datasets.experiment.geometry import CONSTELLATIONS, TAUS_S, Geometry, skies_of_day
 from datasets.experiment.passage import BLOCK_EPOCHS, NoisePaths
 from datasets.experiment.plan import BANKS, HEADINGS_DEG, READINGS, Plan, Reading, bank_forms
 from datasets.experiment.sigmas import limit_sigmas
+from datasets.experiment.tables import table
 from datasets.experiment.workers import generator
 from pipeline.calibration.sigmas import overall_ratio
 from schemas.arrays import Floats
@@ -33,44 +35,16 @@ _CALIBRATION_S = 3_600
 _AXES = ("along", "cross", "up")
 
 
-@dataclass(frozen=True)
-class SkyMonitor:
-    """Exact long-term sigmas of one axis of a sky and heading, by alpha, beside sigma_x."""
+class SkySigmas(NamedTuple):
+    """Of one axis over skies and headings: sigma_x of the position [m] (skies,), exact long-term sigmas of its
+    monitors [m/s] (skies, alphas).
+    """
 
-    constellation: str
-    heading_deg: float
-    axis: str
-    sigma_x_m: float
+    sigma_x_m: Floats
     sigma_mps: Floats
 
 
-def sky_monitors(reading: Reading, per_place: int) -> list[SkyMonitor]:
-    """All skies of the day, headings and axes."""
-    alphas = np.array(BANKS[reading])
-    monitors = []
-    for constellation in CONSTELLATIONS:
-        for geometry in geometries_of_day(constellation, per_place):
-            covariances = geometry.source_covariances_m2
-            for heading in HEADINGS_DEG:
-                axes = geometry.axes(heading)
-                variances = np.einsum("ai,jik,ak->aj", axes, covariances, axes)
-                sigma_x = float(np.sqrt(variances[0].sum()))
-                for axis, name in enumerate(_AXES):
-                    white, position = _white_noise(reading, axis)
-                    sigma = limit_sigmas(alphas, variances[axis], TAUS_S, white, position)
-                    monitors.append(SkyMonitor(constellation, heading, name, sigma_x, sigma))
-    return monitors
-
-
-def _white_noise(reading: Reading, axis: int) -> tuple[float, float]:
-    """White noise on increments and on position of an axis [m]."""
-    if axis > 0:
-        return 0.0, 1.0
-    return (0.05, 0.0) if reading == "increments" else (0.0, 0.05)
-
-
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """sigma_monitor = intercept + slope sigma_x."""
 
     intercept_mps: float
@@ -80,13 +54,43 @@ class Line:
         return self.intercept_mps + self.slope_per_s * sigma_x_m
 
 
-def regression_lines(monitors: list[SkyMonitor]) -> dict[tuple[str, int], Line]:
+def sky_sigmas(reading: Reading, per_place: int) -> dict[str, SkySigmas]:
+    """By axis, over all skies of the day and headings."""
+    alphas = np.array(BANKS[reading])
+    variances = np.array(
+        [
+            _variances(sky[number], heading)
+            for number in range(len(CONSTELLATIONS))
+            for sky in skies_of_day(per_place)
+            for heading in HEADINGS_DEG
+        ]
+    )
+    sigma_x = np.array([np.sqrt(one[0].sum()) for one in variances])
+    found = {}
+    for axis, name in enumerate(_AXES):
+        white = _white_noise(reading, axis)
+        sigmas = [limit_sigmas(alphas, one, TAUS_S, *white) for one in variances[:, axis]]
+        found[name] = SkySigmas(sigma_x, np.array(sigmas))
+    return found
+
+
+def _variances(geometry: Geometry, heading_deg: float) -> Floats:
+    """Of the position error by axis and source [m2], (axes, sources)."""
+    axes = geometry.axes(heading_deg)
+    return np.asarray(np.einsum("ai,jik,ak->aj", axes, geometry.source_covariances_m2, axes))
+
+
+def _white_noise(reading: Reading, axis: int) -> tuple[float, float]:
+    """White noise on increments and on position of an axis [m]."""
+    if axis > 0:
+        return 0.0, 1.0
+    return (0.05, 0.0) if reading == "increments" else (0.0, 0.05)
+
+
+def regression_lines(skies: dict[str, SkySigmas]) -> dict[tuple[str, int], Line]:
     """One line per axis and alpha, least squares over all skies and headings (DIAG eq. 17 and below)."""
     lines = {}
-    for axis in _AXES:
-        chosen = [one for one in monitors if one.axis == axis]
-        sigma_x = np.array([one.sigma_x_m for one in chosen])
-        sigmas = np.array([one.sigma_mps for one in chosen])
+    for axis, (sigma_x, sigmas) in skies.items():
         for index in range(sigmas.shape[1]):
             slope, intercept = np.polyfit(sigma_x, sigmas[:, index], 1)
             lines[axis, index] = Line(float(intercept), float(slope))
@@ -96,14 +100,11 @@ def regression_lines(monitors: list[SkyMonitor]) -> dict[tuple[str, int], Line]:
 def regression_table(per_place: int = _PER_PLACE) -> pl.DataFrame:
     """How the regressed sigma compares with the exact one over skies, and what that does to false alarms at 1e-7."""
     factor = threshold_factor(EXTRAPOLATED)
-    rows = []
+    rows: list[dict[str, object]] = []
     for reading in READINGS:
-        monitors = sky_monitors(reading, per_place)
-        lines = regression_lines(monitors)
-        for (axis, index), line in lines.items():
-            chosen = [one for one in monitors if one.axis == axis]
-            exact = np.array([one.sigma_mps[index] for one in chosen])
-            ratio = line.sigma_mps(np.array([one.sigma_x_m for one in chosen])) / exact
+        skies = sky_sigmas(reading, per_place)
+        for (axis, index), line in regression_lines(skies).items():
+            ratio = line.sigma_mps(skies[axis].sigma_x_m) / skies[axis].sigma_mps[:, index]
             real = two_sided(factor * np.maximum(ratio, 0.0))
             rows.append(
                 {
@@ -112,7 +113,7 @@ def regression_table(per_place: int = _PER_PLACE) -> pl.DataFrame:
                     "alpha": BANKS[reading][index],
                     "intercept_mps": line.intercept_mps,
                     "slope_per_s": line.slope_per_s,
-                    "skies": len(chosen),
+                    "skies": ratio.size,
                     "ratio_least": float(ratio.min()),
                     "ratio_median": float(np.median(ratio)),
                     "ratio_greatest": float(ratio.max()),
@@ -120,7 +121,7 @@ def regression_table(per_place: int = _PER_PLACE) -> pl.DataFrame:
                     "false_alarm_worst": float(real.max()),
                 }
             )
-    return pl.DataFrame(rows)
+    return table(rows)
 
 
 def two_sided(factor: Floats) -> Floats:
@@ -146,21 +147,16 @@ def calibrated_ratios(plan: Plan, seed: int, runs: int = _CALIBRATION_RUNS) -> F
 def regressed_ratios(plan: Plan) -> Floats:
     """Regressed over exact long-term sigma of each monitor of the plan, from the lines over all skies."""
     forms = bank_forms(plan)
-    axes = plan.geometry.axes(0.0)
-    variances = np.einsum("ai,jik,ak->aj", axes, plan.geometry.source_covariances_m2, axes)
+    variances = _variances(plan.geometry, 0.0)
     sigma_x = np.sqrt(variances[:1].sum(axis=1))
     ratios = []
-    lines = {reading: regression_lines(sky_monitors(reading, _PER_PLACE)) for reading in READINGS}
+    lines = {reading: regression_lines(sky_sigmas(reading, _PER_PLACE)) for reading in READINGS}
     for name, alpha in zip(forms.names, plan.alphas[forms.alpha], strict=True):
         axis = _AXES.index(name.split("_", 1)[0])
-        reading: Reading = next((r for r in READINGS if f"along_{r}" in name), _reading_with(float(alpha)))
-        white, position = _white_noise(reading, axis)
-        exact = limit_sigmas(np.array([alpha]), variances[axis], TAUS_S, white, position)
+        # Across and up, sigmas do not depend on the odometer: any reading serves whose bank has this weight.
+        with_weight = [r for r in READINGS if float(alpha) in BANKS[r]]
+        reading: Reading = next((r for r in READINGS if f"along_{r}" in name), with_weight[0])
+        exact = limit_sigmas(np.array([alpha]), variances[axis], TAUS_S, *_white_noise(reading, axis))
         line = lines[reading][_AXES[axis], BANKS[reading].index(float(alpha))]
         ratios.append(float((line.sigma_mps(sigma_x) / exact)[0]))
     return np.array(ratios)
-
-
-def _reading_with(alpha: float) -> Reading:
-    """A reading whose bank has this weight: across and up, sigmas do not depend on the odometer."""
-    return next(reading for reading in READINGS if alpha in BANKS[reading])

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
 import numpy as np
+
+from pipeline.campaign.workers import mapped
+
+T = TypeVar("T")
 
 
 def generator(*key: int) -> np.random.Generator:
@@ -13,3 +21,15 @@ def generator(*key: int) -> np.random.Generator:
 def in_blocks(total: int, size: int) -> list[int]:
     """Sizes of blocks that make up `total`."""
     return [min(size, total - at) for at in range(0, total, size)]
+
+
+def in_pieces(
+    work: Callable[[int, np.random.Generator], T], total: int, size: int, key: tuple[int, ...], jobs: int
+) -> list[T]:
+    """`work` of every block of `total` runs, each with a stream of its own: the same for any number of jobs."""
+    return mapped(partial(_piece, work, key), list(enumerate(in_blocks(total, size))), jobs)
+
+
+def _piece(work: Callable[[int, np.random.Generator], T], key: tuple[int, ...], block: tuple[int, int]) -> T:
+    number, runs = block
+    return work(runs, generator(*key, number))

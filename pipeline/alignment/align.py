@@ -8,7 +8,7 @@ import polars as pl
 from pipeline.alignment.estimates import Estimates, stamp_jitter_s
 from pipeline.alignment.learning import learn
 from pipeline.epochs.verdicts import NO_ODOMETER, first_reason
-from pipeline.monitors.along import most_scatter_m
+from pipeline.monitors.axis import most_scatter_m
 from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns

@@ -11,16 +11,21 @@ import polars as pl
 from pipeline.alignment.estimates import Estimates
 from pipeline.alignment.odometer_filter import FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.epochs.timeline import gap_limit_s
-from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
-from pipeline.monitors.axis import AxisSeries, error_model, run_axis
+from pipeline.monitors.axis import (
+    BLOCK,
+    FIRST_BLOCK,
+    AlongEpochs,
+    AxisSeries,
+    along_series,
+    error_model,
+    most_scatter_m,
+    run_axis,
+)
 from pipeline.monitors.recursion import AxisState
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, Vehicle
-
-# Positions learned at once: few after a restart, for what lies behind an alarm is learned in vain; then more.
-_FIRST_BLOCK, _BLOCK = 2048, 8192
 
 
 def learn(
@@ -109,7 +114,7 @@ class _Learner:
         """Learn block by block; returns the state in use at the first failing epoch, and its position."""
         bank: AxisState | None = None
         use_from, joints = np.array([begin]), state.joint[None]
-        position, block = begin, _FIRST_BLOCK
+        position, block = begin, FIRST_BLOCK
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
             current = _in_use(use_from, position)
@@ -127,7 +132,7 @@ class _Learner:
                 self._put(np.array([alarm]), held[None])
                 # Of what the block's last state has still to settle the alarm knows nothing: it may lie behind it.
                 return FilterState(held, self._times[alarm], state.origin_m), alarm
-            position, block = end, min(2 * block, _BLOCK)
+            position, block = end, min(2 * block, BLOCK)
         return state, position
 
     def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
@@ -209,9 +214,9 @@ class _Learner:
 
         The number of positions if it never goes on. What may settle is how far the position is from its place then.
         """
-        begin = position = max(alarm - 1, 0)
+        begin = position = alarm - 1  # the first position of all cannot fail
         bank: AxisState | None = None
-        away_m, failed_s, block = np.zeros(1), np.full(1, -np.inf), _FIRST_BLOCK
+        away_m, failed_s, block = np.zeros(1), np.full(1, -np.inf), FIRST_BLOCK
         while position < self._rows.size:
             end = min(position + block, self._rows.size)
             t_s, series = self._t_s[position:end], self._series(position, end, begin)
@@ -226,7 +231,7 @@ class _Learner:
             if back.size:
                 first = int(back[0])
                 return position + first, float(away_m[first] ** 2 + variance_m2[first])
-            position, block = end, min(2 * block, _BLOCK)
+            position, block = end, min(2 * block, BLOCK)
         return self._rows.size, 0.0
 
     def _drift_m2(self, anchor: int, begin: int, end: int, scale_sigma: float) -> Floats:

@@ -135,11 +135,11 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 
 def _earlier(job: RunJob) -> RunOutcome:
     """The outcome of a run that is complete already."""
-    runs = store.read_table(job.out, "runs", job.run_id).collect()
+    runs = store.tables_of(job.out, "runs", [job.run_id])
     outcome = replace(outcome_of(job, runs, 0, 0.0), skipped=True)
     if not outcome.hazards:
         return outcome
-    return with_faults(outcome, store.read_table(job.out, "hazards", job.run_id).collect())
+    return with_faults(outcome, store.tables_of(job.out, "hazards", [job.run_id]))
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:

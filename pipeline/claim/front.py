@@ -17,7 +17,7 @@ import polars as pl
 from pipeline.claim.areas import Placed, placed
 from pipeline.claim.tally import codes
 from pipeline.epochs.clock import Clock
-from schemas.arrays import Bools, Floats, Ints, flags, floats
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
 from schemas.enums import Judgement, PassageStatus, VehicleFigures
 
@@ -53,6 +53,12 @@ class Front:
     def output(self) -> Bools:
         """The unit says where the train is."""
         return np.isfinite(self.path_m)
+
+    @property
+    def silent_s(self) -> Floats:
+        """How long the log holds nothing after what each epoch holds [s]."""
+        steps = np.diff(self.clock.t_ns, append=self.clock.t_ns[-1:]) / NS_PER_S
+        return np.where(self.clock.held_s > 0, 0.0, steps)
 
     @property
     def least_m(self) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,10 +19,11 @@ KMH_PER_MPS = 3.6
 
 
 class Method(Settings):
-    """How events and speeds are counted; no requirement."""
+    """How events, speeds and trials are counted; no requirement."""
 
     event_gap_s: Positive
     speed_window_s: Positive
+    independent: Literal["run", "day"] = "run"
 
 
 class AreaLimits(Settings):

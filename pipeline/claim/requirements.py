@@ -1,26 +1,36 @@
-"""Each requirement of a profile on one solution of one run, as counts that add up."""
+"""Each requirement of a profile: its words, how it is counted on one solution of one run, what the counts show."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import polars as pl
 
 from pipeline.claim.areas import AREA_TYPES, NO_AREA
 from pipeline.claim.front import Front
-from pipeline.claim.profile import KMH_PER_MPS, Profile
-from pipeline.claim.speed import speed_errors
-from pipeline.claim.tally import BROKEN, NOT_KNOWN, Tally, codes, tally
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints
-from schemas.enums import BaliseKind, PassageStatus
+from pipeline.claim.profile import KMH_PER_MPS, AreaLimits, Profile
+from pipeline.claim.speed import SpeedErrors, speed_errors
+from pipeline.claim.tally import (
+    BROKEN,
+    NOT_KNOWN,
+    S_PER_H,
+    Shown,
+    Tally,
+    codes,
+    of_always,
+    of_availability,
+    of_rate,
+    of_share,
+    tally,
+)
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
+from schemas.enums import AreaType, BaliseKind, PassageStatus
 
 ALL = "all"
-Key = tuple[str, str]
-Tallies = dict[Key, Tally]
 
 
 @dataclass(frozen=True)
@@ -34,163 +44,272 @@ class Ride:
     profile: Profile
 
     def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
-        """Of the epochs `where` a requirement applies."""
-        clock = self.front.clock
-        rows = np.flatnonzero(where)
-        sizes = None if size is None else size[rows]
-        return tally(
-            self.name, clock.t_ns[rows], clock.held_s[rows], code[rows], self.profile.method.event_gap_s, sizes
-        )
+        """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
+        clock, silent = self.front.clock, self.front.silent_s
+        rows = np.flatnonzero(where | ((silent > 0) & np.append(where[1:], False)))
+        here = where[rows]
+        held, told = np.where(here, clock.held_s[rows], 0.0), np.where(here, code[rows], NOT_KNOWN)
+        sizes = None if size is None else np.where(here, size[rows], np.nan)
+        return tally(self.name, clock.t_ns[rows], held, told, self.profile.method.event_gap_s, sizes, silent[rows])
+
+    def inside(self, kind: AreaType) -> Bools:
+        """Epochs with an estimated front end in areas of this type."""
+        inside: Bools = self.front.output & (self.front.where.area == AREA_TYPES.index(kind))
+        return inside
+
+    @cached_property
+    def limit_m(self) -> Floats:
+        """MAPO and MAPU at each epoch; NaN outside all areas."""
+        limits = np.full(self.front.front_m.size, np.nan)
+        for kind, demanded in self.profile.areas.items():
+            here = self.front.where.area == AREA_TYPES.index(kind)
+            limits[here] = demanded.limits_m(self.front.where.track_speed_mps[here])
+        return limits
+
+    @cached_property
+    def beyond(self) -> dict[str, tuple[Ints, Floats]]:
+        """The intervals claimed, and the errors known, against MAPO and MAPU: codes and sizes."""
+        front, limit_m, none = self.front, self.limit_m, np.inf
+        with np.errstate(invalid="ignore"):
+            claimed = [codes(width <= limit_m, width > limit_m) for width in (front.over_m, front.under_m)]
+        return {
+            "mapo_claimed": (claimed[0], front.over_m),
+            "mapu_claimed": (claimed[1], front.under_m),
+            "mapo": (_asked(front.within(limit_m, none), limit_m), front.low_m),
+            "mapu": (_asked(front.within(none, limit_m), limit_m), -front.high_m),
+        }
+
+    @cached_property
+    def speeds(self) -> SpeedErrors:
+        return speed_errors(self.front, self.profile.method.speed_window_s)
+
+    @cached_property
+    def safe(self) -> Ints:
+        """The train between min and max safe front end."""
+        return self.front.within(self.front.over_m, self.front.under_m)
+
+    def outside(self) -> Tally:
+        """Time with an estimated front end outside all areas."""
+        nowhere = self.front.output & (self.front.where.area == NO_AREA)
+        return self.tally(np.full(nowhere.size, NOT_KNOWN), nowhere)
+
+
+Key = tuple[str, str]
+Tallies = dict[Key, Tally]
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One requirement: its limit in words, what is demanded, how a run counts, how counts become a finding."""
+
+    name: str
+    applies_to: str
+    limit: str
+    demanded: str
+    clause: str
+    shown: Callable[[Tally], Shown]
+    count: Callable[[Ride], Tally]
+
+    @property
+    def key(self) -> Key:
+        return self.name, self.applies_to
 
 
 def tallies(ride: Ride) -> Tallies:
-    """Every requirement that a recording can speak of; keys are requirement and what it applies to."""
-    parts: tuple[Callable[[Ride], Tallies], ...] = (_by_area, _slow, _safe, _after_balise, _speed, _rest)
-    return {key: found for part in parts for key, found in part(ride).items()}
+    """Every requirement on one ride."""
+    return {one.key: one.count(ride) for one in requirements(ride.profile)}
 
 
-def limits_m(front: Front, profile: Profile) -> Floats:
-    """MAPO and MAPU at each epoch [m]; NaN outside all areas."""
-    limits = np.full(front.front_m.size, np.nan)
-    for kind, demanded in profile.areas.items():
-        here = front.where.area == AREA_TYPES.index(kind)
-        limits[here] = demanded.limits_m(front.where.track_speed_mps[here])
-    return limits
+def requirements(profile: Profile) -> list[Requirement]:
+    """The requirements of a profile in their order."""
+    rate = profile.failure_rate
+    return [
+        *(one for kind, area in profile.areas.items() for one in _of_area(kind, area, profile)),
+        _rate("safe_front_end", ALL, rate.aim_per_h, profile, lambda ride: ride.front.output),
+        _rate("safe_front_end_bound", ALL, rate.bound_per_h, profile, lambda ride: ride.front.output),
+        *(one for kind in profile.slow.area_types for one in _slow(kind, profile)),
+        *_after_balise(profile),
+        *_speed(profile),
+        *_start(profile),
+        *_operation(profile),
+    ]
 
 
-def _by_area(ride: Ride) -> Tallies:
-    front, limit = ride.front, limits_m(ride.front, ride.profile)
-    beyond = _beyond(ride, limit)
-    safe = front.within(front.over_m, front.under_m)
-    found: Tallies = {}
-    for kind, demanded in ride.profile.areas.items():
-        here = front.output & (front.where.area == AREA_TYPES.index(kind))
-        found |= {(name, kind.value): ride.tally(code, here, size) for name, (code, size) in beyond.items()}
-        found["safe_front_end", kind.value] = ride.tally(safe, here, front.least_m)
-        close = front.within(demanded.accuracy_m, demanded.accuracy_m)
-        found["front_accuracy", kind.value] = ride.tally(close, here, front.least_m)
-    return found
+def _always(
+    name: str, applies_to: str, limit: str, clause: str, count: Callable[[Ride], Tally] = lambda _: Tally()
+) -> Requirement:
+    return Requirement(name, applies_to, limit, "always", clause, of_always, count)
 
 
-def _beyond(ride: Ride, limit_m: Floats) -> dict[str, tuple[Ints, Floats]]:
-    """The intervals claimed, and the errors known, against MAPO and MAPU: codes and sizes."""
-    front, none = ride.front, np.inf
-    with np.errstate(invalid="ignore"):
-        claimed = [codes(width <= limit_m, width > limit_m) for width in (front.over_m, front.under_m)]
-    return {
-        "mapo_claimed": (claimed[0], front.over_m),
-        "mapu_claimed": (claimed[1], front.under_m),
-        "mapo": (_asked(front.within(limit_m, none), limit_m), front.low_m),
-        "mapu": (_asked(front.within(none, limit_m), limit_m), -front.high_m),
-    }
+def _share(
+    name: str, applies_to: str, limit: str, share: float, clause: str, count: Callable[[Ride], Tally]
+) -> Requirement:
+    return Requirement(name, applies_to, limit, f"p >= {share:g}", clause, lambda found: of_share(found, share), count)
 
 
-def _asked(code: Ints, limit_m: Floats) -> Ints:
-    return np.where(np.isfinite(limit_m), code, NOT_KNOWN)
+def _rate(
+    name: str, applies_to: str, rate_per_h: float, profile: Profile, where: Callable[[Ride], Bools]
+) -> Requirement:
+    def count(ride: Ride) -> Tally:
+        return ride.tally(ride.safe, where(ride), ride.front.least_m)
+
+    demanded, clause = f"< {rate_per_h:g} /h", profile.failure_rate.clause
+    return Requirement(name, applies_to, "own CI", demanded, clause, lambda found: of_rate(found, rate_per_h), count)
 
 
-def _slow(ride: Ride) -> Tallies:
+def _asked(code: Ints, limit: Floats) -> Ints:
+    return np.where(np.isfinite(limit), code, NOT_KNOWN)
+
+
+def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Requirement]:
+    def exceeded(ride: Ride, name: str) -> Tally:
+        code, size = ride.beyond[name]
+        return ride.tally(code, ride.inside(kind), size)
+
+    def close(ride: Ride) -> Tally:
+        code = ride.front.within(area.accuracy_m, area.accuracy_m)
+        return ride.tally(code, ride.inside(kind), ride.front.least_m)
+
+    limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
+    return [
+        *(
+            _always(name, kind.value, limit, area.limit_clause, partial(exceeded, name=name))
+            for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu")
+        ),
+        _rate("safe_front_end", kind.value, profile.failure_rate.aim_per_h, profile, lambda ride: ride.inside(kind)),
+        _share(
+            "front_accuracy", kind.value, f"{area.accuracy_m:g} m", area.accuracy_share, area.accuracy_clause, close
+        ),
+    ]
+
+
+def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
     """Safe and precise operation at low speed: claimed and known."""
-    front, slow = ride.front, ride.profile.slow
-    found: Tallies = {}
-    for kind in slow.area_types:
-        here = front.output & (front.where.area == AREA_TYPES.index(kind))
-        here &= np.abs(front.speed_mps) * KMH_PER_MPS < slow.below_kmh
-        width = np.maximum(front.over_m, front.under_m)
-        found["slow_claimed", kind.value] = ride.tally(codes(width <= slow.limit_m, width > slow.limit_m), here, width)
-        found["slow_front_end", kind.value] = ride.tally(front.within(slow.limit_m, slow.limit_m), here)
-        found["slow_accuracy", kind.value] = ride.tally(front.within(slow.accuracy_m, slow.accuracy_m), here)
-    return found
+    slow = profile.slow
+
+    def here(ride: Ride) -> Bools:
+        return ride.inside(kind) & (np.abs(ride.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
+
+    def claimed(ride: Ride) -> Tally:
+        width = np.maximum(ride.front.over_m, ride.front.under_m)
+        return ride.tally(codes(width <= slow.limit_m, width > slow.limit_m), here(ride), width)
+
+    def known(ride: Ride, limit_m: float) -> Tally:
+        return ride.tally(ride.front.within(limit_m, limit_m), here(ride))
+
+    limit, close = f"{slow.limit_m:g} m", f"{slow.accuracy_m:g} m"
+    accurate = partial(known, limit_m=slow.accuracy_m)
+    return [
+        _always("slow_claimed", kind.value, limit, slow.clause, claimed),
+        _always("slow_front_end", kind.value, limit, slow.clause, partial(known, limit_m=slow.limit_m)),
+        _share("slow_accuracy", kind.value, close, slow.accuracy_share, slow.clause, accurate),
+    ]
 
 
-def _safe(ride: Ride) -> Tallies:
-    """The train between min and max safe front end, wherever it is; and time outside all areas."""
-    front = ride.front
-    code = front.within(front.over_m, front.under_m)
-    nowhere = front.output & (front.where.area == NO_AREA)
-    return {
-        ("safe_front_end", ALL): ride.tally(code, front.output, front.least_m),
-        ("safe_front_end_bound", ALL): ride.tally(code, front.output, front.least_m),
-        ("no_area", ALL): ride.tally(np.full(code.size, NOT_KNOWN), nowhere),
-    }
+def _after_balise(profile: Profile) -> list[Requirement]:
+    """The first estimate after each balise accepted; physical ones, and virtual ones as if they were.
+
+    Where it comes late or not at all nobody knows what it would have been.
+    """
+    after = profile.after_balise
+
+    def count(ride: Ride, kind: BaliseKind) -> Tally:
+        front, limit = ride.front, after.limit_m(ride.front.speed_mps)
+        code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
+        faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > after.to_kmh, False)
+        at_ns = _passed(ride.passages, kind)
+        rows = _first_after(front, at_ns)
+        at_ns, rows = at_ns[~faster[rows]], rows[~faster[rows]]
+        # Each balise weighs the same, whatever time its epoch holds.
+        counts = tally(ride.name, at_ns, np.zeros(rows.size), code[rows], profile.method.event_gap_s)
+        held, known = np.append(front.clock.held_s, 0.0)[rows], code[rows] != NOT_KNOWN
+        return replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
+
+    near = f"{after.fixed_m:g} m, from {after.below_kmh:g} km/h {after.offset_m:g} m + {after.per_mps_s:g} s·v"
+    return [
+        _share("after_balise", kind.value, near, after.share, after.clause, partial(count, kind=kind))
+        for kind in (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
+    ]
 
 
-def _after_balise(ride: Ride) -> Tallies:
-    """The first estimate after each balise accepted; physical ones, and virtual ones as if they were."""
-    status, kinds = (ride.passages[name].cast(pl.String) for name in ("status", "kind"))
-    front, demanded = ride.front, ride.profile.after_balise
-    limit = demanded.limit_m(front.speed_mps)
-    code = _asked(front.within(limit, limit), limit)
-    found: Tallies = {}
-    for kind in (BaliseKind.PHYSICAL.value, BaliseKind.VIRTUAL.value):
-        accepted = ride.passages.filter((status == PassageStatus.ACCEPTED.value) & (kinds == kind))
-        rows = _first_after(front, _passed(accepted))
-        here = np.zeros(code.size, dtype=np.bool_)
-        here[rows] = True
-        found["after_balise", kind] = ride.tally(code, here & front.output & np.isfinite(limit))
-    return found
-
-
-def _passed(passages: pl.DataFrame) -> Ints:
-    """When each balise was passed as far as known [ns], in order."""
-    at = passages.select(t=pl.coalesce("t_offered", "t_true")).drop_nulls()
+def _passed(passages: pl.DataFrame, kind: BaliseKind) -> Ints:
+    """When each accepted balise of a kind was passed as far as known [ns], in order."""
+    status, kinds = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
+    accepted = passages.filter((status == PassageStatus.ACCEPTED.value) & (kinds == kind.value))
+    at = accepted.select(t=pl.coalesce("t_offered", "t_true")).drop_nulls()
     return np.sort(at["t"].dt.timestamp("ns").to_numpy())
 
 
 def _first_after(front: Front, at_ns: Ints) -> Ints:
-    """The epoch at or right after each instant, where no gap lies between."""
-    row = np.searchsorted(front.clock.t_ns, at_ns)
-    row, at_ns = row[row < front.clock.t_ns.size], at_ns[row < front.clock.t_ns.size]
-    near = front.clock.t_ns[row] - at_ns <= front.clock.limit_s * NS_PER_S
-    return np.unique(row[near])
+    """The epoch at or right after each instant; one beyond the last where there is none, or a gap lies between."""
+    t_ns = front.clock.t_ns
+    row = np.searchsorted(t_ns, at_ns)
+    late = np.append(t_ns, np.iinfo(np.int64).max)[row] - at_ns > front.clock.limit_s * NS_PER_S
+    return np.where(late, t_ns.size, row)
 
 
-def _speed(ride: Ride) -> Tallies:
-    found, method = speed_errors(ride.front, ride.profile.method.speed_window_s), ride.profile.method
-    safe, close = ride.profile.safe_speed.limit_kmh(found.speed_kmh), ride.profile.speed.limit_kmh(found.speed_kmh)
-    asked, none = np.isfinite(safe), np.full(safe.size, np.inf)
+def _speed(profile: Profile) -> list[Requirement]:
+    safe, speed = profile.safe_speed, profile.speed
 
-    def counted(code: Ints, where: Bools) -> Tally:
-        rows = np.flatnonzero(where)
-        return tally(ride.name, found.t_ns[rows], found.length_s[rows], code[rows], method.event_gap_s)
+    def over(ride: Ride) -> Tally:
+        limit = safe.limit_kmh(ride.speeds.speed_kmh)
+        return _of_windows(ride, ride.speeds.within(limit, np.full(limit.size, np.inf)), np.isfinite(limit))
 
-    return {
-        ("maso", ALL): counted(found.within(safe, none), asked),
-        ("masu", ALL): counted(found.within(none, safe), asked),
-        ("speed_accuracy", ALL): counted(found.within(close, close), np.ones(safe.size, dtype=np.bool_)),
-    }
+    def under(ride: Ride) -> Tally:
+        limit = safe.limit_kmh(ride.speeds.speed_kmh)
+        return _of_windows(ride, ride.speeds.within(np.full(limit.size, np.inf), limit), np.isfinite(limit))
+
+    def close(ride: Ride) -> Tally:
+        limit = speed.limit_kmh(ride.speeds.speed_kmh)
+        return _of_windows(ride, ride.speeds.within(limit, limit), np.isfinite(limit))
+
+    margin = f"{safe.low_kmh:g} km/h to {safe.below_kmh:g}, {safe.high_kmh:g} at {safe.at_kmh:g} km/h"
+    near = f"{speed.fixed_kmh:g} km/h to {speed.to_kmh:g} km/h, {speed.above_share:.0%} above"
+    return [
+        _always("maso", ALL, margin, safe.clause, over),
+        _always("masu", ALL, margin, safe.clause, under),
+        _share("speed_accuracy", ALL, near, speed.share, speed.clause, close),
+    ]
 
 
-def _rest(ride: Ride) -> Tallies:
-    """Start of mission, availability, way without physical balises: one trial per run each, none ever proved."""
-    front, profile = ride.front, ride.profile
-    begun = ride.epochs["in_use"].fill_null(value=False).to_numpy()
-    linked = (ride.epochs["tvb"].fill_null(value=False) | ride.epochs["lrvb_id"].is_not_null()).to_numpy()
-    at_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
-    nothing_s = _first_s(at_s, linked)
-    longest = float(at_s[-1]) if at_s.size else 0.0
-    lost = _unavailable(front, limits_m(front, profile))
-    worst_s = _most_within_s(front, lost, profile.availability.within_s)
-    operating = np.flatnonzero(front.output)
-    since = np.arange(lost.size) >= (operating[0] if operating.size else lost.size)
-    held, out = front.clock.held_s * since, worst_s >= profile.availability.outside_s
-    return {
-        ("start", "last position"): Tally(trials=1, worst=_first_s(at_s, begun)),
-        ("start", "cold movement"): Tally(),
-        ("start", "nothing known"): replace(
-            _one(broken=max(nothing_s or 0.0, 0.0 if nothing_s is not None else longest) > profile.start.nothing_s),
-            worst=nothing_s,
-        ),
-        ("cold_movement", ALL): Tally(),
-        ("availability", ALL): replace(
-            _one(broken=out),
-            held_s=float(held.sum()),
-            known_s=float(held[~lost].sum()),
-            worst=worst_s,
-            longest_s=longest,
-        ),
-        ("way_without_balise", ALL): _ways(ride),
-    }
+def _of_windows(ride: Ride, code: Ints, where: Bools) -> Tally:
+    """Of windows of speed, and of the gaps of the log between them, in order of time."""
+    found, gaps = ride.speeds, np.flatnonzero(ride.front.silent_s > 0)
+    gap_s, nothing = ride.front.silent_s[gaps], np.zeros(gaps.size)
+    t_ns = np.concatenate((found.t_ns, ride.front.clock.t_ns[gaps]))
+    held_s = np.concatenate((found.length_s, nothing))
+    silent_s = np.concatenate((np.zeros(found.t_ns.size), gap_s))
+    told = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
+    order = np.argsort(t_ns, kind="stable")
+    rows = order[np.concatenate((where, gap_s > 0))[order]]
+    gap = ride.profile.method.event_gap_s
+    return tally(ride.name, t_ns[rows], held_s[rows], told[rows], gap, silent_s=silent_s[rows])
+
+
+def _start(profile: Profile) -> list[Requirement]:
+    """Start of mission: times from the log's begin, which is no switch-on."""
+    start = profile.start
+
+    def first(ride: Ride) -> Tally:
+        return Tally(trials=1, worst=_first_s(ride, flags(ride.epochs, "in_use")))
+
+    def nothing(ride: Ride) -> Tally:
+        worst = _first_s(ride, flags(ride.epochs, "tvb") | ride.epochs["lrvb_id"].is_not_null().to_numpy())
+        waited = (ride.front.clock.duration_s or 0.0) if worst is None else worst
+        return replace(_one(broken=waited > start.nothing_s), worst=worst)
+
+    moved = profile.cold_movement
+    return [
+        _always("start", "last position", f"{start.last_position_s:g} s", start.clause, first),
+        _always("start", "cold movement", f"{start.cold_movement_s:g} s", start.clause),
+        _always("start", "nothing known", f"{start.nothing_s:g} s", start.clause, nothing),
+        _always("cold_movement", ALL, f"{moved.detected_h:g} h", moved.clause),
+    ]
+
+
+def _first_s(ride: Ride, there: Bools) -> float | None:
+    t_ns = ride.front.clock.t_ns
+    return float((t_ns[there][0] - t_ns[0]) / NS_PER_S) if there.any() else None
 
 
 def _one(broken: bool) -> Tally:
@@ -198,48 +317,51 @@ def _one(broken: bool) -> Tally:
     return Tally(trials=1, broken=int(broken), events=int(broken), possible=1)
 
 
-def _first_s(at_s: Floats, there: Bools) -> float | None:
-    return float(at_s[there][0]) if there.any() else None
+def _operation(profile: Profile) -> list[Requirement]:
+    """Availability, and ways without physical balises: none is ever proved."""
+    asked, way_m = profile.availability, profile.way.without_balise_m
+    outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
+    demanded = f"p >= {asked.share:g}"
+
+    def shown(found: Tally) -> Shown:
+        return of_availability(found, asked.share, asked.outside_s)
+
+    return [
+        Requirement("availability", ALL, outside, demanded, asked.clause, shown, _availability),
+        _always("way_without_balise", ALL, f"{way_m / 1000:g} km", profile.way.clause, _ways),
+    ]
 
 
-def _unavailable(front: Front, limit_m: Floats) -> Bools:
-    """No output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out."""
+def _availability(ride: Ride) -> Tally:
+    """Time lost once there was an output; broken where so much of it lies within so long.
+
+    Lost is no output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out.
+    """
+    front, asked = ride.front, ride.profile.availability
     with np.errstate(invalid="ignore"):
-        wide: Bools = front.over_m + front.under_m > 2.0 * limit_m
-    return ~front.output | wide
-
-
-def _most_within_s(front: Front, lost: Bools, within_s: float) -> float:
-    """Most time lost in any window of `within_s`, once there was an output [s]."""
-    operating = np.flatnonzero(front.output)
-    if not operating.size:
-        return 0.0
-    rows = slice(operating[0], None)
-    t_s = (front.clock.t_ns[rows] - front.clock.t_ns[0]) / NS_PER_S
-    held = np.where(lost[rows], front.clock.held_s[rows], 0.0)
-    until = np.cumsum(held)
-    before = np.searchsorted(t_s, t_s - within_s)
-    return float((until - until[before] + held[before]).max())
+        lost: Bools = ~front.output | (front.over_m + front.under_m > 2.0 * ride.limit_m)
+    held = front.clock.held_s * (np.cumsum(front.output) > 0)
+    t_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
+    until = np.cumsum(np.where(lost, held, 0.0))
+    before = np.concatenate(([0.0], until))[np.searchsorted(t_s, t_s - asked.within_s)]
+    worst_s = float((until - before).max(initial=0.0))
+    return replace(
+        _one(broken=worst_s >= asked.outside_s),
+        held_s=float(held.sum()),
+        known_s=float(held[~lost].sum()),
+        worst=worst_s,
+        longest_s=front.clock.duration_s or 0.0,
+    )
 
 
 def _ways(ride: Ride) -> Tally:
     """Ways of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on one."""
     odometer = ride.epochs["odometer_m"].cast(pl.Float64).to_numpy()
     way = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))
-    physical = ride.passages.filter(
-        (pl.col("kind").cast(pl.String) == BaliseKind.PHYSICAL.value)
-        & (pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value)
-    )
-    cuts = np.searchsorted(ride.front.clock.t_ns, _passed(physical))
+    cuts = np.searchsorted(ride.front.clock.t_ns, _passed(ride.passages, BaliseKind.PHYSICAL))
     bounds = np.unique(np.concatenate(([0], cuts, [way.size])))
-    beyond = [code for code, _ in _beyond(ride, limits_m(ride.front, ride.profile)).values()]
-    broken = np.logical_or.reduce([code == BROKEN for code in beyond])
+    broken = np.logical_or.reduce([code == BROKEN for code, _ in ride.beyond.values()])
     lengths = [float(way[min(last, way.size - 1)] - way[first]) for first, last in pairwise(bounds)]
     long = [number for number, length in enumerate(lengths) if length >= ride.profile.way.without_balise_m]
     bad = sum(bool(broken[bounds[number] : bounds[number + 1]].any()) for number in long)
     return Tally(trials=len(long), broken=bad, events=bad, possible=len(long), worst=max(lengths, default=None))
-
-
-def run_name(run: dict[str, Any]) -> str:
-    """What draws the trial of a run."""
-    return f"{run['run_id']}\n{run['solution']}"

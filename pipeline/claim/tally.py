@@ -1,8 +1,8 @@
 """Counts of a requirement that add up over runs, and what they show.
 
-A run is one trial of a share: of its epochs one is drawn, without a look at its error, because epochs of a run err
-together. Weaker evidence turns what is kept or broken into what is not known; that counts as broken before anything is
-called `met`, and as kept before anything is called `not met`.
+A run is one trial of a share: of its time one instant is drawn, without a look at its error, because epochs of a run
+err together. A gap of the log is time of which nobody knows. Weaker evidence turns what is kept or broken into what is
+not known; that counts as broken before anything is called `met`, and as kept before anything is called `not met`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,11 @@ from pipeline.figures.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
+from pipeline.line import fewest
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 S_PER_H = 3600.0
 KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
-# Runs that a search for how many are still needed goes up to.
-_MOST_RUNS = 1 << 40
 
 
 class Finding(StrEnum):
@@ -76,40 +75,64 @@ def codes(kept: Bools, broken: Bools) -> Ints:
     return np.where(broken, BROKEN, np.where(kept, KEPT, NOT_KNOWN)).astype(np.int64)
 
 
-def tally(run: str, t_ns: Ints, held_s: Floats, code: Ints, gap_s: float, size: Floats | None = None) -> Tally:
-    """Of the epochs of one run to which a requirement applies; `run` draws the epoch that is its trial."""
+def tally(
+    run: str,
+    t_ns: Ints,
+    held_s: Floats,
+    code: Ints,
+    gap_s: float,
+    size: Floats | None = None,
+    silent_s: Floats | None = None,
+) -> Tally:
+    """Of the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
+
+    `silent_s`: how long the log holds nothing after each epoch's own time `held_s`; nobody knows what was then.
+    """
     if code.size == 0:
         return Tally()
-    trial = int(code[drawn(run, code.size)])
+    silent = np.zeros(code.size) if silent_s is None else silent_s
+    trial = _trial(run, held_s, silent, code)
     known = code != NOT_KNOWN
     sizes = size[known & np.isfinite(size)] if size is not None else np.empty(0)
+    doubtful = (code != KEPT) | (silent > 0)
+    until_ns = t_ns + np.where(silent > 0, (held_s + silent) * NS_PER_S, 0).astype(np.int64)
     return Tally(
         trials=1,
         kept=int(trial == KEPT),
         broken=int(trial == BROKEN),
-        events=len(clusters_s(t_ns[code == BROKEN], gap_s)),
-        possible=sum(int(span_s // gap_s) + 1 for span_s in clusters_s(t_ns[code != KEPT], gap_s)),
+        events=len(clusters_s(t_ns[code == BROKEN], t_ns[code == BROKEN], gap_s)),
+        possible=sum(int(span_s // gap_s) + 1 for span_s in clusters_s(t_ns[doubtful], until_ns[doubtful], gap_s)),
         held_s=float(held_s.sum()),
         known_s=float(held_s[known].sum()),
         worst=float(sizes.max()) if sizes.size else None,
     )
 
 
-def clusters_s(t_ns: Ints, gap_s: float) -> list[float]:
-    """Lengths [s] of the groups of instants that lie no more than `gap_s` apart."""
-    if t_ns.size == 0:
+def clusters_s(from_ns: Ints, to_ns: Ints, gap_s: float) -> list[float]:
+    """Lengths [s] of the groups of stretches that lie no more than `gap_s` apart; in order of time."""
+    if from_ns.size == 0:
         return []
-    apart = np.flatnonzero(np.diff(t_ns) > gap_s * NS_PER_S)
-    first = t_ns[np.concatenate(([0], apart + 1))]
-    last = t_ns[np.concatenate((apart, [t_ns.size - 1]))]
+    apart = np.flatnonzero(from_ns[1:] - to_ns[:-1] > gap_s * NS_PER_S)
+    first = from_ns[np.concatenate(([0], apart + 1))]
+    last = to_ns[np.concatenate((apart, [to_ns.size - 1]))]
     lengths: list[float] = ((last - first) / NS_PER_S).tolist()
     return lengths
 
 
-def drawn(run: str, size: int) -> int:
-    """One of `size` epochs by chance, always the same for the same run, whatever the epochs hold."""
-    digest = hashlib.sha256(run.encode()).digest()
-    return int.from_bytes(digest[:8], "big") * size >> 64
+def _trial(run: str, held_s: Floats, silent_s: Floats, code: Ints) -> int:
+    """The code of one instant by chance; of one epoch where none of them holds for any time."""
+    # What an epoch holds, then what is silent after it, one after the other.
+    lengths = np.column_stack([held_s, silent_s]).ravel()
+    codes_of = np.column_stack([code, np.full(code.size, NOT_KNOWN)]).ravel()
+    if not lengths.any():
+        lengths, codes_of = np.ones(code.size), code
+    until = np.cumsum(lengths)
+    return int(codes_of[np.searchsorted(until, drawn(run) * until[-1], side="right")])
+
+
+def drawn(run: str) -> float:
+    """A number from 0 to below 1 by chance, always the same for the same run."""
+    return int.from_bytes(hashlib.sha256(run.encode()).digest()[:6], "big") / (1 << 48)
 
 
 @dataclass(frozen=True)
@@ -132,23 +155,17 @@ def of_share(found: Tally, share: float) -> Shown:
         return Shown(Finding.MET, measured, 0.0)
     finding = Finding.NOT_MET if most is not None and most < share else Finding.NOT_SHOWN
     hours = found.held_s / found.trials / S_PER_H
-    return Shown(finding, measured, runs_needed(found, share) * hours if hours > 0 else None)
+    needed = runs_needed(found, share)
+    return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
 
 
-def runs_needed(found: Tally, share: float) -> int:
+def runs_needed(found: Tally, share: float) -> int | None:
     """Further runs, all kept, that show the share."""
 
     def shown(more: int) -> bool:
         return (clopper_pearson(found.kept + more, found.trials + more).low or 0.0) >= share
 
-    high = 1
-    while not shown(high) and high < _MOST_RUNS:
-        high *= 2
-    low = high // 2
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if shown(middle) else (middle, high)
-    return high
+    return fewest(shown)
 
 
 def of_rate(found: Tally, rate_per_h: float) -> Shown:

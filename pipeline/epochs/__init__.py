@@ -1,5 +1,5 @@
-"""How long an epoch lasts, what a gap is, when a condition held, and which monitors failed when.
+"""How long an epoch lasts, what a gap is, when a condition held, what monitors say, and which failed when.
 
-In: times of epochs and flags on them. Out: shares of time, outages, the failure log with its alarm episodes.
+In: times of epochs, flags on them, values of monitors. Out: shares of time, outages, verdicts, the failure log.
 Touches no file and knows no other room of the pipeline.
 """

@@ -131,7 +131,7 @@ def coverages(reference: ReferencePlaces | None, odometer: Odometry | None, conf
 
 
 def lost_spans(reference: ReferencePlaces | None, config: HazardConfig) -> list[tuple[int, int]]:
-    """Times at which the reference was heard and lay nowhere [ns]: nobody knows where the train was then."""
+    """Times at which the reference was heard and lay nowhere [ns], ends left out: nobody knows where the train was."""
     if reference is None:
         return []
     gap_ns = round(config.reference_gap_s * NS_PER_S)
@@ -140,7 +140,7 @@ def lost_spans(reference: ReferencePlaces | None, config: HazardConfig) -> list[
         after = int(np.searchsorted(reference.t_ns, t_ns))
         before_ns = int(reference.t_ns[after - 1]) if after else t_ns
         after_ns = int(reference.t_ns[after]) if after < reference.t_ns.size else t_ns
-        spans.append((max(before_ns, t_ns - gap_ns), min(after_ns, t_ns + gap_ns)))
+        spans.append((max(before_ns, t_ns - gap_ns) + 1, min(after_ns, t_ns + gap_ns)))
     return spans
 
 
@@ -162,15 +162,11 @@ def disputed_by(one: Coverage, reference: ReferencePlaces, reads: list[Anchor], 
     return count
 
 
-def facing_of(
-    reference: ReferencePlaces | None, covered: list[Coverage], odometer: Odometry | None, least_m: float
-) -> set[int]:
+def facing_of(reference: ReferencePlaces, covered: list[Coverage], odometer: Odometry, least_m: float) -> set[int]:
     """Oriented net elements over which the train ran as the odometer counted up, by the reference.
 
     `least_m`: so much way together says which way the odometer counts (DOMAIN section 2).
     """
-    if reference is None or odometer is None:
-        return set()
     found: set[int] = set()
     for one in covered:
         part = slice(one.first, one.last + 1)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.evidence.routes import Place
 from pipeline.odometry import Odometry, Way
-from schemas.arrays import Floats, Ints
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence
 
@@ -53,16 +54,19 @@ class Anchor:
 Interval = tuple[Floats, Floats]
 
 
-def driven_m(odometer: Odometry, since_ns: int, t_ns: Ints) -> Floats:
-    """Way driven from an instant to others, turns included [m]."""
-    driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(np.array([since_ns])))
+def driven_m(odometer: Odometry, since_ns: Ints, t_ns: Ints) -> Floats:
+    """Way driven from instants to others, turns included [m]."""
+    driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(since_ns))
     return driven
 
 
-def beside_anchor(odometer: Odometry, anchor: Anchor, at_m: float, t_ns: Ints, trust: Trust) -> Interval:
-    """Least and largest coordinate on one side of an anchor; NaN where the odometer does not reach."""
-    centre = at_m + _from(odometer, anchor, t_ns).distance_m
-    half = trust.beside_m(driven_m(odometer, anchor.t_ns, t_ns), anchor.sigma_m)
+def carried(odometer: Odometry, since_ns: Ints, at_m: Floats, sigma_m: float, t_ns: Ints, trust: Trust) -> Interval:
+    """Least and largest coordinate on one side of anchors of this sigma; NaN where the odometer does not reach.
+
+    Of each instant `t_ns` the anchor: when it was, and its coordinate.
+    """
+    centre = at_m + odometer.between(since_ns, t_ns).distance_m
+    half = trust.beside_m(driven_m(odometer, since_ns, t_ns), sigma_m)
     return centre - half, centre + half
 
 
@@ -97,3 +101,52 @@ def closes(odometer: Odometry, anchors: tuple[Anchor, Anchor], apart_m: float, t
 
 def _from(odometer: Odometry, anchor: Anchor, t_ns: Ints) -> Way:
     return odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns)
+
+
+def carried_forward(
+    accepted_ns: Ints,
+    path_m: Floats,
+    t_ns: Ints,
+    odometer: Odometry,
+    stood: Sequence[tuple[int, int]],
+    trust: Trust,
+    limit_m: float,
+) -> Interval:
+    """Least and largest path position of the train [m], NaN where no accepted balise reaches.
+
+    5 m + 5 % of the way since the last balise accepted (`accepted_ns`, in order, at `path_m` of the solution's own
+    path), never bridged. It can show that something was wrong, never that it was right. A balise that was accepted
+    beyond the limit by the one before is no anchor. `odometer` grows with the path.
+    """
+    used = _consistent(accepted_ns, path_m, odometer, trust, limit_m)
+    low, high = np.full((2, t_ns.size), np.nan)
+    if used.size:
+        last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
+        rows = np.flatnonzero(last >= 0)
+        own = used[last[rows]]
+        found = carried(odometer, accepted_ns[own], path_m[own], 0.0, t_ns[rows], trust)
+        void = _stood_since(accepted_ns[own], t_ns[rows], stood)
+        low[rows], high[rows] = (np.where(void, np.nan, values) for values in found)
+    return low, high
+
+
+def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometry, trust: Trust, limit_m: float) -> Ints:
+    """Accepted balises, but for those that the odometer since the one before puts beyond the limit."""
+    used: list[int] = []
+    for number in range(path_m.size):
+        here = slice(number, number + 1)
+        if used:
+            before = np.array(used[-1:])
+            low, high = carried(odometer, accepted_ns[before], path_m[before], 0.0, accepted_ns[here], trust)
+            if path_m[number] < low[0] - limit_m or path_m[number] > high[0] + limit_m:
+                continue
+        if odometer.known_at(accepted_ns[here])[0]:
+            used.append(number)
+    return np.array(used, dtype=np.int64)
+
+
+def _stood_since(begin_ns: Ints, t_ns: Ints, stood: Sequence[tuple[int, int]]) -> Bools:
+    void = np.zeros(t_ns.size, dtype=np.bool_)
+    for from_ns, until_ns in stood:
+        void |= (t_ns >= from_ns) & (begin_ns <= until_ns)
+    return void

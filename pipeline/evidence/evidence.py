@@ -17,7 +17,7 @@ from pipeline.evidence.anchors import (
     lost_spans,
     read_anchors,
 )
-from pipeline.evidence.carrying import Anchor, Interval, Trust, beside_anchor, between_anchors, closes
+from pipeline.evidence.carrying import Anchor, Interval, Trust, between_anchors, carried, closes
 from pipeline.evidence.gaps import Gap, Way, gaps_of
 from pipeline.evidence.routes import Route
 from pipeline.odometry import Odometry
@@ -77,7 +77,7 @@ class Evidence:
 
         `stood`: when the odometer stood although the train may have moved; there nothing is carried from one side.
         """
-        kind, void = np.full(t_ns.size, NOTHING), _within(t_ns, self.unknown)
+        kind, void = np.full(t_ns.size, NOTHING), within_spans(t_ns, self.unknown)
         alternatives: list[Alternative] = []
         rivals: list[tuple[Ints, Ints]] = []
         for coverage in self.covered:
@@ -145,14 +145,15 @@ class Evidence:
             return between_anchors(self.odometer, (gap.begin, gap.end), ends, t_ns, self.trust)
         (anchor,) = gap.anchors
         at_m = way.begin_m if way.end_m is None else way.end_m
-        return beside_anchor(self.odometer, anchor, at_m or 0.0, t_ns, self.trust)
+        since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m or 0.0)
+        return carried(self.odometer, since_ns, from_m, anchor.sigma_m, t_ns, self.trust)
 
 
-def _within(t_ns: Ints, spans: Sequence[Span]) -> Bools:
-    """Instants of the spans, both ends left out."""
+def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
+    """Instants of the spans, their ends left out."""
     inside = np.zeros(t_ns.size, dtype=np.bool_)
     for begin_ns, end_ns in spans:
-        inside |= (t_ns > begin_ns) & (t_ns < end_ns)
+        inside |= (t_ns >= begin_ns) & (t_ns < end_ns)
     return inside
 
 
@@ -188,18 +189,14 @@ def evidence_of(
         disputed = sum(counts.values())
         for one in [one for one in covered if counts[one]]:
             covered.remove(one)
-            unknown.append((int(reference.t_ns[one.first]) - 1, int(reference.t_ns[one.last]) + 1))
+            unknown.append((int(reference.t_ns[one.first]), int(reference.t_ns[one.last]) + 1))
     apart = [one for one in read if not any(c.begin.t_ns <= one.t_ns <= c.end.t_ns for c in covered)]
     borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
     gaps: list[Gap] = []
     if odometer is not None and borders:
-        gaps = gaps_of(
-            borders,
-            facing_of(reference, covered, odometer, config.matching.orientation_distance_m),
-            odometer,
-            network,
-            trust,
-        )
+        least_m = config.matching.orientation_distance_m
+        facing = set() if reference is None else facing_of(reference, covered, odometer, least_m)
+        gaps = gaps_of(borders, facing, odometer, network, trust)
     contradicted = sum(_contradicts(gap, odometer, trust) for gap in gaps)
     return Evidence(
         reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted, tuple(unknown), disputed

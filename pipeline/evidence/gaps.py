@@ -8,14 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.evidence.carrying import Anchor, Trust, driven_m
+from pipeline.evidence.carrying import Anchor, Trust, carried, driven_m
 from pipeline.evidence.routes import Chain, Place, along_m, chains_between, extended
 from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
 
-# How finely the odometer is looked at for how far the train went beyond an anchor before it turned.
-LOOK_S = 1.0
 _SAME_M = 0.01
 
 
@@ -69,7 +67,7 @@ def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, trust: 
     length_m = float(odometer.between(np.array([a.t_ns]), np.array([b.t_ns])).distance_m[0])
     if np.isnan(length_m):
         return [Gap(a.t_ns, b.t_ns, a, None, []), Gap(a.t_ns, b.t_ns, None, b, [])]
-    way_m = float(driven_m(odometer, a.t_ns, np.array([b.t_ns]))[0])
+    way_m = float(driven_m(odometer, np.array([a.t_ns]), np.array([b.t_ns]))[0])
     slack_m = float(trust.beside_m(np.array(way_m), 0.0)) + trust.factor * (a.sigma_m + b.sigma_m)
     ways = _ways_of_length(a, b, length_m, slack_m, network, trust.routes)
     if ways == []:
@@ -151,7 +149,7 @@ def _reaching(gap: Gap, sheets: set[bool], odometer: Odometry, network: Network,
 
 def _turned(gap: Gap, odometer: Odometry, trust: Trust) -> bool:
     """The train went to and fro in the gap by more than the odometer's own error."""
-    t_ns = _looks(gap)
+    t_ns = _looks(gap, odometer)
     for anchor in gap.anchors[:1]:
         way = odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns).distance_m
         known = way[np.isfinite(way)]
@@ -166,8 +164,9 @@ def _branches(chain: Chain, network: Network) -> bool:
     return any(len(network.successors[side]) > 1 for one in chain.oriented for side in (one, one ^ 1))
 
 
-def _looks(gap: Gap) -> Ints:
-    count = int((gap.end_ns - gap.begin_ns) / (LOOK_S * NS_PER_S)) + 2
+def _looks(gap: Gap, odometer: Odometry) -> Ints:
+    """Instants at which to look how far the train went before it turned; a speed is a mean over such a time."""
+    count = int((gap.end_ns - gap.begin_ns) / (odometer.config.speed_window_s * NS_PER_S)) + 2
     return np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
 
 
@@ -181,12 +180,12 @@ def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
 
 def _reach_m(gap: Gap, way: Way, odometer: Odometry, trust: Trust) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
-    t_ns = _looks(gap)
+    t_ns = _looks(gap, odometer)
     places = [at_m for at_m in (way.begin_m, way.end_m) if at_m is not None]
     least, most = min(places), max(places)
     for anchor, at_m in zip(gap.anchors, places, strict=True):
-        at = at_m + odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns).distance_m
-        slack = trust.beside_m(driven_m(odometer, anchor.t_ns, t_ns), anchor.sigma_m)
-        if np.isfinite(at).any():
-            least, most = min(least, float(np.nanmin(at - slack))), max(most, float(np.nanmax(at + slack)))
+        since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
+        low, high = carried(odometer, since_ns, from_m, anchor.sigma_m, t_ns, trust)
+        if np.isfinite(low).any():
+            least, most = min(least, float(np.nanmin(low))), max(most, float(np.nanmax(high)))
     return least, most

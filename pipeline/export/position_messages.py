@@ -49,7 +49,6 @@ _NAVSAT_STATUS: Mapping[str, int] = {
     Fix.NONE: -1, Fix.AUTONOMOUS: 0, Fix.SBAS: 1, Fix.DIFFERENTIAL: 2, Fix.RTK_FLOAT: 2, Fix.RTK_FIXED: 2,
     Fix.ESTIMATED: 0,
 }  # fmt: skip
-_GPS_SERVICE = 1
 
 
 def location_fix_topic(topic: str, gnss: pl.DataFrame, frame_id: str) -> Topic:
@@ -73,7 +72,7 @@ def navsatfix_topic(topic: str, gnss: pl.DataFrame, frame_id: str) -> Topic:
     """One sensor_msgs/NavSatFix per row of `gnss`; an unknown position or height is NaN."""
     rows = (
         row
-        | {"frame_id": frame_id, "status": _NAVSAT_STATUS[row["fix"]], "service": _GPS_SERVICE, "type": kind}
+        | {"frame_id": frame_id, "status": _NAVSAT_STATUS[row["fix"]], "service": 1, "type": kind}  # SERVICE_GPS
         | {f"covariance {place}": value for place, value in enumerate(covariance)}
         for row, covariance, kind in _with_covariance(gnss)
     )

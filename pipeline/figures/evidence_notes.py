@@ -7,7 +7,7 @@ import polars as pl
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED
 from pipeline.epochs.clock import Clock, met
 from pipeline.epochs.verdicts import NO_ODOMETER
-from pipeline.monitors.along import most_scatter_m
+from pipeline.monitors.axis import most_scatter_m
 from schemas.config import Configuration
 from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures
 

@@ -49,13 +49,17 @@ def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: f
 
 
 def undetected_spread() -> dict[str, pl.Expr]:
-    """Of the passages of one balise: the larger of both directions, over those where it is known."""
-    larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
+    """Of the passages of one balise: the larger of both directions, and how far before a physical one may lie."""
+    larger, before = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m"), pl.col("physical_before_m")
     return {
         "undetected_count": larger.count().cast(pl.Int64),
         "undetected_median_m": larger.median(),
         "undetected_p95_m": larger.quantile(0.95, interpolation="higher"),
         "undetected_max_m": larger.max(),
+        "physical_before_count": before.count().cast(pl.Int64),
+        "physical_before_median_m": before.median(),
+        "physical_before_p05_m": before.quantile(0.05, interpolation="lower"),
+        "physical_before_min_m": before.min(),
     }
 
 

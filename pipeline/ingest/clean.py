@@ -84,18 +84,11 @@ def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame,
     """Positions without placeholders, and how many these were, by solution."""
     if not {"fix", *_PLACE} <= set(gnss.columns):
         return gnss, {}
-    names = gnss["solution"].unique().to_list()
-    counts: dict[str, int] = {}
-    for name in names:
-        part = gnss if len(names) == 1 else gnss.filter(pl.col("solution") == name)
-        marked, counts[name] = without_placeholders(part, config)
-        if counts[name]:
-            row = pl.int_range(pl.len()).over("solution")
-            kinds = marked.select("solution", row.alias("_row"), pl.col("fix").alias("_fix"))
-            joined = gnss.with_columns(row.alias("_row")).join(
-                kinds, on=["solution", "_row"], how="left", maintain_order="left"
-            )
-            gnss = joined.with_columns(pl.coalesce("_fix", "fix").alias("fix")).drop("_row", "_fix")
+    parts = gnss.with_row_index("_row").partition_by("solution", maintain_order=True)
+    marked = [(part["solution"][0], *without_placeholders(part, config)) for part in parts]
+    counts = {name: count for name, _, count in marked}
+    if any(counts.values()):
+        gnss = pl.concat([part for _, part, _ in marked]).sort("_row").drop("_row")
     return gnss, counts
 
 

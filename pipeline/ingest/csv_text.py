@@ -8,6 +8,7 @@ import codecs
 import csv
 import io
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,8 +57,10 @@ def read_log_table(log: Path, infer: bool) -> LogTable:
         return _whole_rows(log.read_bytes(), infer)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", place=str(log)) from None
-    except (ValueError, pl.exceptions.PolarsError) as error:
-        _refuse_long_rows(_lines(log.read_bytes()), log)
+    except (ValueError, csv.Error, pl.exceptions.PolarsError) as error:
+        if isinstance(error, pl.exceptions.ComputeError):
+            with suppress(csv.Error):
+                _refuse_long_rows(_lines(log.read_bytes()), log)
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -11,6 +10,7 @@ import polars as pl
 
 from pipeline.ingest.clean import StreamCounts, stamp_counts
 from pipeline.ingest.generic import UndecodableError, decoder_for
+from pipeline.ingest.guesses import NAMES, columns_in, mapping_lines, word_of
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
@@ -220,21 +220,6 @@ def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
     )
 
 
-# Names that loggers give to what a stream needs, by column.
-_GUESSES: dict[Stream, dict[str, str]] = {
-    "gnss": {
-        "latitude_deg": r"lat(itude)?(_deg)?",
-        "longitude_deg": r"lo?ng?(itude)?(_deg)?",
-        "height_m": r"(alt(itude)?|height|hgt)(_m)?",
-    },
-    "odometer": {
-        "speed_mps": r"(speed|velocity|v)(_mps)?",
-        "distance_m": r"(distance|odometer|dist)(_m)?",
-    },
-}
-_NEEDED = {"gnss": {"latitude_deg", "longitude_deg"}, "odometer": set()}
-
-
 def starting_config(topics: Sequence[TopicSummary]) -> str:
     """Configuration text that maps what is left over, as far as names allow a guess; to be checked."""
     parts = [part for topic in topics if topic.stream is None and topic.fields for part in (_suggestion(topic),)]
@@ -244,26 +229,17 @@ def starting_config(topics: Sequence[TopicSummary]) -> str:
 
 
 def _suggestion(topic: TopicSummary) -> str:
-    for stream, guesses in _GUESSES.items():
-        found = {column: path for column, name in guesses.items() if (path := _named(topic.fields, name))}
-        if found and _NEEDED[stream] <= set(found):
-            pairs = ", ".join(f'{column} = "{path}"' for column, path in found.items())
-            return (
-                f'[[ingest.{stream}]]\ntopic = "{topic.topic}"\nfields = {{ {pairs} }}\n'
-                'time = "auto"  # or "log", "publish", "field:PATH"\n'
-                f"# other fields: {_others(topic.fields, set(found.values()))}\n"
-            )
+    numbers = [path for path, kind in topic.fields.items() if kind in ("int", "float")]
+    words = {path: word_of(path.split(".")[-1]) for path in sorted(numbers, key=lambda path: (path.count("."), path))}
+    for stream in NAMES:
+        time = ['time = "auto"  # or "log", "publish", "field:PATH"']
+        if lines := mapping_lines(stream, topic.topic, words, time, None, {}):
+            used = set(columns_in(stream, words).values())
+            return "\n".join([*lines, f"# other fields: {_others(topic.fields, used)}\n"])
     return (
         f'# [[ingest.STREAM]]\n# topic = "{topic.topic}"  # {topic.schema or "no schema"}\n'
         f"# fields: {_others(topic.fields, set())}\n"
     )
-
-
-def _named(fields: Mapping[str, str], pattern: str) -> str | None:
-    """The field of that name, the outermost first."""
-    numbers = [path for path, kind in fields.items() if kind in ("int", "float")]
-    fitting = [path for path in numbers if re.fullmatch(pattern, path.split(".")[-1], re.IGNORECASE)]
-    return min(fitting, key=lambda path: (path.count("."), path), default=None)
 
 
 def _others(fields: Mapping[str, str], used: set[str]) -> str:

@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel, Schema
-from pipeline.ingest.ros_message import DefinitionError, message_reader
+from pipeline.ingest.ros_message import Definition, DefinitionError, RosWalk, parse_definitions, short_name
 from schemas.errors import InputError
 
 Value = Any
@@ -75,11 +75,11 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    read = _made(_ros_reader, channel)
+    definitions, name = _made(_ros_definitions, channel)
 
     def checked(payload: bytes) -> Value:
         try:
-            return read(payload)
+            return RosWalk(payload, definitions).message(name)
         except DefinitionError as error:
             raise UndecodableError(f"not the CDR message of its schema: {error}") from None
 
@@ -105,8 +105,11 @@ def _protobuf_class(schema: Schema) -> Any:
     return GetMessageClass(pool.FindMessageTypeByName(schema.name))
 
 
-def _ros_reader(schema: Schema) -> Decode:
-    return message_reader(schema.name, schema.data.decode())
+def _ros_definitions(schema: Schema) -> tuple[Mapping[str, Definition], str]:
+    definitions, name = parse_definitions(schema.name, schema.data.decode()), short_name(schema.name)
+    if name not in definitions:
+        raise DefinitionError(f"no definition of {schema.name}")
+    return definitions, name
 
 
 _SCHEMA_ENCODINGS = {"protobuf": "protobuf", "cdr": "ros2msg"}

@@ -17,19 +17,7 @@ from schemas.arrays import Bools
 Words = npt.NDArray[np.uint64]
 
 
-@dataclass(frozen=True)
-class Repeated:
-    """One value for many messages."""
-
-    value: float | str | bool | None
-    count: int
-    dtype: pl.DataType
-
-    def series(self) -> pl.Series:
-        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, self.count)
-
-
-Values = npt.NDArray[Any] | pl.Series | Repeated
+Values = npt.NDArray[Any] | pl.Series
 
 
 class UnfitError(Exception):
@@ -180,7 +168,7 @@ class Constant:
         return 0  # takes no bytes of the message
 
     def values(self, rows: Rows) -> Values:
-        return Repeated(self.value, rows.count, self.dtype)
+        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, rows.count)
 
 
 Field = Fixed | Flag | Varint | Text | Constant

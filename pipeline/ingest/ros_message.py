@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -87,67 +87,32 @@ def _member(line: str, package: str) -> Member | None:
     return Member(match["name"], kind, int(size[1:-1]) if size[1:-1].isdigit() else 0)
 
 
-def message_reader(name: str, text: str) -> Callable[[bytes], dict[str, Any]]:
-    """Reads one message to a dict; raises `DefinitionError` where the message does not follow its definition."""
-    definitions = parse_definitions(name, text)
-    if short_name(name) not in definitions:
-        raise DefinitionError(f"no definition of {name}")
+class RosWalk:
+    """One message of CDR, front to back, as a dict; numbers are aligned to their size, counted from behind the header.
 
-    def read(payload: bytes) -> dict[str, Any]:
-        if len(payload) < HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
-            raise DefinitionError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
-        return _Reader(payload, definitions).message(short_name(name), 0)
+    What it meets on its way goes to `on_number`, `on_length` and `on_text`, with their places in the message. Raises
+    `DefinitionError` where the message does not follow its definition.
+    """
 
-    return read
-
-
-class _Reader:
-    """One message, front to back; numbers are aligned to their size, counted from the end of the header."""
+    most_elements: int | None = None  # of an array of messages
 
     def __init__(self, payload: bytes, definitions: Mapping[str, Definition]) -> None:
-        self._payload = payload
+        if len(payload) < HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
+            raise DefinitionError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
+        self.payload = payload
+        self.little = bool(payload[1])
         self._definitions = definitions
         self._at = HEADER_SIZE
-        self._little = bool(payload[1])
 
-    def message(self, name: str, depth: int) -> dict[str, Any]:
-        if name not in self._definitions or depth > DEEPEST:
-            raise DefinitionError(f"no definition of {name}")
-        members = self._definitions[name]
-        if not members:
-            self._take(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
-        return {member.name: self._member(member, depth) for member in members}
+    def on_number(self, path: str, kind: str, offset: int, count: int | None) -> None:
+        """A number or flag, or an array of `count` of them."""
 
-    def _member(self, member: Member, depth: int) -> Any:
-        if member.count is None:
-            return self._value(member.type, depth)
-        count = member.count or self._numbers("u4", 1)[0]
-        if member.type in PRIMITIVES:
-            values = self._numbers(PRIMITIVES[member.type], count)
-            return [bool(value) for value in values] if member.type == "bool" else values
-        return [self._value(member.type, depth) for _ in range(count)]
+    def on_length(self, offset: int) -> None:
+        """A length, which shapes what follows."""
 
-    def _value(self, kind: str, depth: int) -> Any:
-        if kind in PRIMITIVES:
-            value = self._numbers(PRIMITIVES[kind], 1)[0]
-            return bool(value) if kind == "bool" else value
-        if kind == "string":
-            return self._text()
-        if kind == "wstring":
-            raise DefinitionError("wide text is not read")
-        return self.message(kind, depth + 1)
-
-    def _numbers(self, kind: str, count: int) -> Sequence[Any]:
-        if not count:
-            return []
-        size = int(kind[1])
-        values = array(_CODES[kind], self._take(size * count, size))
-        if self._little != (sys.byteorder == "little"):
-            values.byteswap()
-        return values
-
-    def _text(self) -> str:
-        content = self._take(self._numbers("u4", 1)[0], 1)
+    def on_text(self, path: str, offset: int, length: int) -> str:
+        """A text with its closing zero, which programs leave out where there is no text."""
+        content = self.payload[offset : offset + length]
         if content and content[-1]:
             raise DefinitionError("a text has no closing zero")
         try:
@@ -155,9 +120,52 @@ class _Reader:
         except UnicodeDecodeError:
             raise DefinitionError("a text is not UTF-8") from None
 
-    def _take(self, size: int, alignment: int) -> bytes:
+    def message(self, name: str, path: str = "", depth: int = 0) -> dict[str, Any]:
+        if name not in self._definitions or depth > DEEPEST:
+            raise DefinitionError(f"no definition of {name}")
+        members = self._definitions[name]
+        if not members:
+            self._take(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
+        return {m.name: self._member(m, f"{path}.{m.name}" if path else m.name, depth) for m in members}
+
+    def _member(self, member: Member, path: str, depth: int) -> Any:
+        if member.count is None:
+            return self._value(member.type, path, depth)
+        count = member.count or self._length()
+        if member.type in PRIMITIVES:
+            return self._numbers(member.type, path, count) if count else []
+        if self.most_elements is not None and count > self.most_elements:
+            raise DefinitionError("too many elements")
+        return [self._value(member.type, f"{path}[{index}]", depth) for index in range(count)]
+
+    def _value(self, kind: str, path: str, depth: int) -> Any:
+        if kind in PRIMITIVES:
+            return self._numbers(kind, path, None)[0]
+        if kind == "string":
+            length = self._length()
+            return self.on_text(path, self._take(length, 1), length)
+        if kind == "wstring":
+            raise DefinitionError("wide text is not read")
+        return self.message(kind, path, depth + 1)
+
+    def _numbers(self, kind: str, path: str, count: int | None) -> Sequence[Any]:
+        code = PRIMITIVES[kind]
+        size = int(code[1])
+        offset = self._take(size * (1 if count is None else count), size)
+        self.on_number(path, kind, offset, count)
+        values = array(_CODES[code], self.payload[offset : self._at])
+        if self.little != (sys.byteorder == "little"):
+            values.byteswap()
+        return [bool(value) for value in values] if kind == "bool" else values
+
+    def _length(self) -> int:
+        offset = self._take(4, 4)
+        self.on_length(offset)
+        return int.from_bytes(self.payload[offset : self._at], "little" if self.little else "big")
+
+    def _take(self, size: int, alignment: int) -> int:
         start = self._at + -(self._at - HEADER_SIZE) % alignment
-        if start + size > len(self._payload):
+        if start + size > len(self.payload):
             raise DefinitionError("the message ends too early")
         self._at = start + size
-        return self._payload[start : self._at]
+        return start

@@ -20,6 +20,7 @@ _LEAP_UTC_NS = np.array(
 # The same moments on the GPS scale: by then the new second has been counted.
 _LEAP_GPS_NS = _LEAP_UTC_NS + np.arange(1, len(_LEAPS) + 1, dtype=np.int64) * 1_000_000_000
 
+WEEK_NS = 7 * 86_400 * 1_000_000_000
 # IS-GPS-200, 3.3.4: GPS time starts at 1980-01-06T00:00:00 UTC.
 GPS_EPOCH_NS = int(datetime(1980, 1, 6, tzinfo=UTC).timestamp()) * 1_000_000_000
 
@@ -28,3 +29,8 @@ def utc_from_gps(t_ns: Ints) -> Ints:
     """UTC of stamps whose calendar runs on GPS time (no leap seconds) [ns since 1970]."""
     leaps = np.searchsorted(_LEAP_GPS_NS, t_ns, side="right")
     return t_ns - leaps.astype(np.int64) * 1_000_000_000
+
+
+def utc_of_week(week: int, tow_ns: int) -> int:
+    """UTC of a time of the week on the GPS scale [ns since 1970]."""
+    return int(utc_from_gps(np.array([GPS_EPOCH_NS + week * WEEK_NS + tow_ns], dtype=np.int64))[0])

@@ -11,12 +11,11 @@ import polars as pl
 from pipeline.epochs.clock import met, unambiguous
 from pipeline.epochs.timeline import crossing_gap_ns
 from pipeline.evidence import Evidence as AllEvidence
-from pipeline.evidence.accused import carried_forward
+from pipeline.evidence.carrying import carried_forward
 from pipeline.evidence.evidence import KINDS
 from pipeline.evidence.routes import Route, routes_of_path
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, margins_m, with_own_anchors
-from pipeline.judge.moving import stood_spans
-from pipeline.judge.states import odometer_beyond_confidence
+from pipeline.judge.states import odometer_beyond_confidence, stood_spans
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns

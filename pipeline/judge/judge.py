@@ -9,23 +9,20 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import failure_log
-from pipeline.evidence.evidence import KINDS, NOTHING
-from pipeline.evidence.gaps import LOOK_S
+from pipeline.evidence.evidence import KINDS, NOTHING, within_spans
 from pipeline.evidence.routes import Place
 from pipeline.judge.across import errors_across, healthy_across
 from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series, find_episodes
 from pipeline.judge.hazards import Draft, drafts_of
-from pipeline.judge.in_use import in_use_s
 from pipeline.judge.judgement import WRONG, judgement_words
 from pipeline.judge.jumps import find_jumps, steps_of
-from pipeline.judge.moving import moving_by_evidence, within_spans
 from pipeline.judge.offers import Offers
 from pipeline.judge.passages import Found, passages_table
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.rows import failures_table, hazards_table
-from pipeline.judge.states import lds_states
+from pipeline.judge.states import in_use_s, lds_states, moving_by_evidence
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
 from schemas.enums import Evidence
 
@@ -136,10 +133,10 @@ def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, i
 
 def _look_at(bench: Bench) -> Ints:
     """The instants of the positions, and others between those that are far apart."""
-    at_ns = bench.at_ns
-    long = np.flatnonzero(np.diff(at_ns) > 1.5 * LOOK_S * NS_PER_S)
+    at_ns, step_ns = bench.at_ns, round(bench.config.align.speed_window_s * NS_PER_S)
+    long = np.flatnonzero(np.diff(at_ns) > 1.5 * step_ns)
     between = [
-        np.arange(begin, end, round(LOOK_S * NS_PER_S), dtype=np.int64)[1:]
+        np.arange(begin, end, step_ns, dtype=np.int64)[1:]
         for begin, end in zip(at_ns[long].tolist(), at_ns[long + 1].tolist(), strict=True)
     ]
     return np.unique(np.concatenate([at_ns, *between]))

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from pipeline.evidence.evidence import NOTHING, within_spans
 from pipeline.judge.bench import Bench
 from pipeline.judge.judgement import judgement_words
-from pipeline.judge.moving import within_spans
 from pipeline.judge.offers import Offers
 from pipeline.judge.passings import Passing
 from schemas.arrays import Bools, Floats, Ints, floats, ints
@@ -41,12 +41,11 @@ def passages_table(
     """
     stamps = bench.t_ns[np.isfinite(bench.path_m)]
     passages = _with_unoffered(bench, passings, forward, stamps)
-    offered = _of_crossings(passages, offers, found)
     t_true = _assigned(passages, passings)
     positioned = _within_gap(stamps, ints(t_true), bench.gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
         t_true.cast(pl.Datetime("ns", "UTC")).alias("t_true"),
-        *offered,
+        *_of_crossings(passages, offers, found),
         pl.Series("_positioned", positioned),
         pl.Series("_suspect", _inside(passages, spans)),
         _speeds(passages, t_true, bench),
@@ -54,25 +53,25 @@ def passages_table(
     return _with_failures(frame).select(Passages.column_names())
 
 
-def _of_crossings(passages: pl.DataFrame, offers: Offers, found: Found) -> list[pl.Series]:
+def _of_crossings(passages: pl.DataFrame, offers: Offers, found: Found) -> pl.DataFrame:
     """Judgement, error, hazard and insertion of the crossing that each passage rests on."""
-    order = np.argsort(offers.crossing_id)
-    own = passages["crossing_id"].fill_null(-1).to_numpy()
-    index = np.searchsorted(offers.crossing_id[order], own).clip(0, max(order.size - 1, 0))
-    row = order[index] if order.size else np.zeros(own.size, dtype=np.int64)
-    joined = (offers.crossing_id[row] == own) if order.size else np.zeros(own.size, dtype=np.bool_)
-    virtual = (passages["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value).to_numpy()
-
-    def taken(values: pl.Series, known: Bools) -> pl.Series:
-        filled = values.gather(row) if order.size else values.clear(own.size)
-        return pl.select(pl.when(pl.Series(known)).then(filled).alias(values.name)).to_series()
-
-    return [
-        taken(judgement_words(offers.judged.code), joined & virtual),
-        taken(pl.Series("location_error_m", found.known_m, nan_to_null=True), joined),
-        taken(pl.Series("hazard_id", found.hazard), joined & (found.hazard[row] >= 0) if order.size else joined),
-        taken(pl.Series("_inserted", found.inserted), joined).fill_null(value=False),
-    ]
+    judged = pl.DataFrame(
+        [
+            pl.Series("crossing_id", offers.crossing_id, dtype=pl.Int64),
+            judgement_words(offers.judged.code),
+            pl.Series("location_error_m", found.known_m, nan_to_null=True),
+            pl.Series("hazard_id", found.hazard).replace(NOTHING, None),
+            pl.Series("_inserted", found.inserted),
+            pl.Series("_virtual", offers.virtual),
+        ]
+    )
+    told = passages.select("crossing_id").join(judged, on="crossing_id", how="left", maintain_order="left")
+    return told.select(
+        pl.when("_virtual").then("judgement"),
+        "location_error_m",
+        "hazard_id",
+        pl.col("_inserted").fill_null(value=False),
+    )
 
 
 def _assigned(passages: pl.DataFrame, passings: dict[str, list[Passing]]) -> pl.Series:

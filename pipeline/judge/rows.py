@@ -12,9 +12,9 @@ from pipeline.evidence.evidence import KINDS
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, Series
 from pipeline.judge.hazards import Draft, rate_mps, size_m
-from pipeline.judge.in_use import reaction_s
 from pipeline.judge.judgement import UNKNOWN, WRONG
 from pipeline.judge.offers import Offers
+from pipeline.judge.states import reaction_s
 from pipeline.judge.suspect import suspect_of
 from schemas.arrays import NS_PER_S
 from schemas.conform import dtypes

@@ -1,13 +1,15 @@
-"""The state of the reactive LDS per epoch (DOMAIN section 4; TVB section 4)."""
+"""What holds at each epoch: position in use, train moving, state of the reactive LDS (DOMAIN sections 4 and 5)."""
 
 from __future__ import annotations
 
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.clock import met, trusted
+from pipeline.epochs.timeline import crossing_gap_ns, nominal_period_s
 from pipeline.judge.judgement import RIGHT, WRONG, Judgements
-from schemas.arrays import Bools, Floats, Ints, flags
-from schemas.config import LdsConfig
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, spans_of, times_ns
+from schemas.config import Configuration, LdsConfig
 from schemas.enums import LdsState
 
 _STATES = tuple(LdsState)
@@ -46,3 +48,84 @@ def odometer_beyond_confidence(
     allowed = lds.odometer_fixed_m + lds.odometer_share * np.abs(counted) + half_m[rows] + half_from
     beyond[rows] = np.abs(counted - moved) > allowed
     return beyond
+
+
+def reaction_s(t_ns: Ints, config: Configuration) -> float:
+    """From detection to negation [s]: as configured, else one epoch."""
+    if config.hazards.reaction_s is not None:
+        return config.hazards.reaction_s
+    return nominal_period_s(t_ns) or 0.0
+
+
+def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
+    """For how long each epoch stands for a position in use [s]: from the epoch before, for a fault may be that old.
+
+    At most max(1.5 periods, `crossing_gap_s`), the first epoch for one period; of a negated time only what comes
+    before the reaction.
+    """
+    t_ns = times_ns(epochs)
+    usable = met(epochs, trusted(config))
+    period_s = nominal_period_s(t_ns) or 0.0
+    end_s = (t_ns - t_ns[:1]) / NS_PER_S
+    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), crossing_gap_ns(t_ns, config.lds) / NS_PER_S)
+    blocked = np.zeros(t_ns.size)
+    for from_s, until_s in _negated_spans(end_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
+        blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)
+    held: Floats = np.clip(end_s - begin_s - blocked, 0.0, None)
+    return np.where(usable, held, 0.0)
+
+
+def _negated_spans(t_s: Floats, negated: Bools, delay_s: float) -> list[tuple[float, float]]:
+    """From each detection plus the reaction to the return [s]."""
+    firsts, lasts = runs_of(negated)
+    until = np.append(t_s, np.inf)[lasts + 1]
+    return list(zip((t_s[firsts] + delay_s).tolist(), until.tolist(), strict=True))
+
+
+def stood_spans(
+    t_ns: Ints, path_m: Floats, odometer_moves: Bools, known: Bools, limit_m: float
+) -> list[tuple[int, int]]:
+    """Times in which the odometer stood while positions left their place by more than the limit [ns].
+
+    `odometer_moves`: per epoch, up to the next one; `known`: where it says anything. Whether the train moved there
+    nobody knows by the odometer.
+    """
+    found = []
+    for first, last in spans_of(known & ~odometer_moves):
+        rows = slice(first, min(last + 2, t_ns.size))
+        places = path_m[rows][np.isfinite(path_m[rows])]
+        if places.size and float(np.abs(places - places[0]).max()) > limit_m:
+            found.append((int(t_ns[rows][0]), int(t_ns[rows][-1])))
+    return found
+
+
+def moving_by_evidence(
+    t_ns: Ints,
+    train_m: Floats,
+    noise_m: Floats,
+    odometer_moves: Bools,
+    known: Bools,
+    stood: list[tuple[int, int]],
+    deadband_mps: float,
+    window_s: float,
+) -> tuple[Bools, Bools]:
+    """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
+
+    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over `window_s` it moved where it came
+    farther than the dead band and that noise allow. It also tells where the odometer stands or is silent.
+    """
+    ahead = np.searchsorted(t_ns, t_ns + round(window_s * NS_PER_S)).clip(0, t_ns.size - 1)
+    with np.errstate(invalid="ignore"):
+        came_m = np.abs(train_m[ahead] - train_m)
+        by_reference = came_m > deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S + noise_m + noise_m[ahead]
+    told = np.isfinite(came_m)
+    moves, sure = by_reference | (odometer_moves & known), told | known
+    for begin_ns, end_ns in stood:
+        sure &= told | (t_ns < begin_ns) | (t_ns >= end_ns)
+    return _held(moves[:-1], t_ns.size), _held(sure[:-1], t_ns.size)
+
+
+def _held(steps: Bools, size: int) -> Bools:
+    """Nothing follows upon the last epoch, which stays as it was before."""
+    last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
+    return np.concatenate([steps, last])[:size]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.evidence.evidence import KINDS
+from pipeline.evidence.evidence import KINDS, within_spans
 from pipeline.judge.bench import Bench
-from pipeline.judge.moving import within_spans
 from schemas.arrays import NS_PER_S, Ints, floats
 from schemas.enums import Evidence, Suspect
 

@@ -8,11 +8,10 @@ import polars as pl
 
 from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.columns import epoch_columns
-from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time
+from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time, reads_of
 from pipeline.lds.journey import journey_of
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
-from pipeline.lds.reads import reads_of
 from pipeline.lds.relink import Held
 from schemas.config import Configuration
 from schemas.enums import BaliseKind

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -12,48 +10,50 @@ import polars as pl
 from pipeline.figures.bounds import clopper_pearson
 from pipeline.line.pieces import Pieces
 from pipeline.line.spans import FIRST_LOSS, State
+from pipeline.line.trials import fewest
 from schemas.conform import conform
 from schemas.line import LOSSES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
 
-# More passes than any line sees: a limit that needs more is not asked for by counting.
-_MOST_PASSES = 10_000_000
 KEYS = ["piece", "growing"]
+_TRIALS = ["bad", "passes", "wrong_in_use", "unjudged"]
 
 
 def piece_classes(
     passes: pl.DataFrame, undetected: pl.DataFrame, pieces: Pieces, criteria: LineCriteria
 ) -> pl.DataFrame:
     """`LinePieces` of the passes of all runs (with `run_id`); `undetected`: `piece, largest_undetected_m`."""
-    told = {(row["piece"], row["growing"]): row for row in _counted(passes, criteria).iter_rows(named=True)}
-    errors = dict(undetected.select("piece", "largest_undetected_m").iter_rows())
-    names = pieces.names
-    rows = []
-    for piece, name in enumerate(names):
-        for growing in (True, False):
-            place = {
-                "piece": piece,
-                "netelement_id": name,
-                "from_m": float(pieces.from_m[piece]),
-                "to_m": float(pieces.to_m[piece]),
-                "direction": (LineDirection.GROWING if growing else LineDirection.FALLING).value,
-                "largest_undetected_m": errors.get(piece),
-            }
-            rows.append({**place, **_judged(told.get((piece, growing), _NOTHING), criteria)})
-    return conform(
-        pl.DataFrame(
-            rows,
-            schema_overrides={"largest_undetected_m": pl.Float64, "passes_needed": pl.Int64},
-            infer_schema_length=None,
-        ),
-        LinePieces,
+    places = pl.DataFrame(
+        {
+            "piece": np.arange(len(pieces.element)),
+            "netelement_id": pieces.names,
+            "from_m": pieces.from_m,
+            "to_m": pieces.to_m,
+        }
+    ).join(pl.DataFrame({"growing": [True, False]}), how="cross")
+    side = pl.when("growing").then(pl.lit(LineDirection.GROWING.value)).otherwise(pl.lit(LineDirection.FALLING.value))
+    counted = (
+        places.join(_counted(passes, criteria), on=KEYS, how="left", maintain_order="left")
+        .join(undetected, on="piece", how="left", maintain_order="left")
+        .with_columns(
+            pl.col(pl.UInt32).cast(pl.Int64).fill_null(0),
+            pl.col("monitors", "hours_of_day").fill_null(""),
+            direction=side,
+        )
+        .with_columns(bad=pl.col("lost") + pl.col("wrong_in_use"))
+        .with_columns(passes=pl.col("right") + pl.col("bad"))
     )
+    return conform(_judged(counted, criteria), LinePieces)
 
 
 def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Independent passes: each run, or the worst of a day."""
     if criteria.independent == "pass":
         return passes
-    dated = passes.with_columns(day=pl.col("t").dt.date(), judged=_judged_state())
+    # Loss, then what the evidence should have shown, then right, then what says nothing.
+    state = pl.col("state").replace_strict({int(State.UNKNOWN): 2, int(State.RIGHT): 1}, default=0)
+    dated = passes.with_columns(
+        day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
+    )
     worst = dated.sort("judged", "state", "cause", descending=[True, True, False]).group_by(
         *KEYS, "day", maintain_order=True
     )
@@ -61,17 +61,13 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
 
 
-def _judged_state() -> pl.Expr:
-    """Loss, then right, then what nobody knows."""
-    state = pl.col("state")
-    return pl.when(state >= int(FIRST_LOSS)).then(2).when(state == int(State.RIGHT)).then(1).otherwise(0)
-
-
 def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+    """Counts per piece and direction; hours of the day are those of all right passes."""
     state, cause = pl.col("state"), pl.col("cause")
     right, wrong = state == int(State.RIGHT), state == int(State.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
-    hours = pl.col("t").dt.hour()
+    hour = pl.col("t").dt.strftime("%H").unique()
+    hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
     return (
         trials(passes, criteria)
         .group_by(KEYS)
@@ -80,114 +76,94 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
             lost=lost.sum(),
             wrong_in_use=wrong.sum(),
             claimed_wrongly=pl.col("claimed").sum(),
-            unknown=(state == int(State.UNKNOWN)).sum(),
+            unknown=state.is_between(int(State.UNSEEN), int(State.UNKNOWN)).sum(),
+            unjudged=(state == int(State.UNKNOWN)).sum(),
             after_alarm=(state == int(State.AFTER_ALARM)).sum(),
             wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
             unsafe=(cause == LineCause.UNSAFE_ACCEPTANCE.value).sum(),
             days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),
-            hours=hours.filter(right).unique().sort(),
             monitors=pl.col("monitor").drop_nulls(),
             **{f"lost_{one.value}": (cause == one.value).sum() for one in LOSSES},
         )
+        .with_columns(pl.col("monitors").map_elements(_by_frequency, return_dtype=pl.String))
+        .join(hours, on=KEYS, how="left")
     )
 
 
-_NOTHING: dict[str, Any] = {
-    **dict.fromkeys(("right", "lost", "wrong_in_use", "claimed_wrongly", "unknown", "after_alarm", "days"), 0),
-    **dict.fromkeys(("wrong_track", "unsafe"), 0),
-    **{f"lost_{one.value}": 0 for one in LOSSES},
-    "hours": [],
-    "monitors": [],
-}
+def _by_frequency(names: pl.Series) -> str:
+    return " ".join(name for name, _ in sorted(Counter(names).items(), key=lambda one: (-one[1], one[0])))
 
 
-def _judged(counts: dict[str, Any], criteria: LineCriteria) -> dict[str, Any]:
-    """Counts of one piece and direction with bounds and class."""
-    bad = counts["lost"] + counts["wrong_in_use"]
-    number = counts["right"] + bad
-    share = clopper_pearson(bad, number, criteria.confidence)
-    unsafe = clopper_pearson(counts["wrong_in_use"], number, criteria.confidence)
-    decided, cause = _class(counts, share.low, share.high, criteria)
-    needed = None if decided is PieceClass.UNSUITABLE else passes_needed(bad, number, criteria)
-    monitors = [name for name, _ in sorted(Counter(counts["monitors"]).items(), key=lambda one: (-one[1], one[0]))]
-    return {
-        **{name: counts[name] for name in _NOTHING if name not in ("wrong_track", "unsafe", "hours", "monitors")},
-        "piece_class": decided.value,
-        "cause": cause.value,
-        "monitors": " ".join(monitors),
-        "passes": number,
-        "loss_share": share.value,
-        "loss_low": share.low,
-        "loss_high": share.high,
-        "unsafe_high": unsafe.high,
-        "passes_needed": needed,
-        "hours": len(counts["hours"]),
-        "hours_of_day": " ".join(f"{hour:02d}" for hour in counts["hours"]),
+def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+    """With bounds, class and cause: what was not judged counts against each bound."""
+    cases = counted.select(_TRIALS).unique()
+    bounds = [_bounds(bad, number, wrong, lost, criteria) for bad, number, wrong, lost in cases.iter_rows()]
+    schema = dict.fromkeys(("loss_share", "loss_low", "loss_high", "unsafe_high"), pl.Float64)
+    told = pl.concat(
+        [cases, pl.DataFrame(bounds, schema=schema | {"passes_needed": pl.Int64}, orient="row")], how="horizontal"
+    )
+    misleading = (pl.col("wrong_in_use") > 0) | (pl.col("claimed_wrongly") > 0)
+    unsuitable = misleading | (pl.col("loss_low") > criteria.loss_limit).fill_null(value=False)
+    shown = (pl.col("loss_high") <= criteria.loss_limit).fill_null(value=False)
+    hours = pl.col("hours") >= criteria.hours_least
+    classed = (
+        pl.when(unsuitable)
+        .then(pl.lit(PieceClass.UNSUITABLE.value))
+        .when(shown & hours)
+        .then(pl.lit(PieceClass.SUITABLE.value))
+        .otherwise(pl.lit(PieceClass.UNKNOWN.value))
+    )
+    return counted.join(told, on=_TRIALS, how="left", maintain_order="left").with_columns(
+        piece_class=classed,
+        cause=_cause(unsuitable, shown, hours),
+        passes_needed=pl.when(~unsuitable).then("passes_needed"),
+    )
+
+
+def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
+    """What speaks most against a piece, the first that applies."""
+    lost = pl.concat_list(f"lost_{one.value}" for one in LOSSES).list.arg_max()
+    most_lost = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    some = {
+        name: pl.col(name) > 0 for name in ("unsafe", "wrong_in_use", "wrong_track", "lost", "right", "after_alarm")
     }
+    order: list[tuple[pl.Expr, LineCause | pl.Expr]] = [
+        (some["unsafe"], LineCause.UNSAFE_ACCEPTANCE),
+        ((pl.col("claimed_wrongly") > 0) & ~some["wrong_in_use"], LineCause.CLAIMED_WRONGLY),
+        (some["wrong_in_use"] & some["wrong_track"], LineCause.WRONG_TRACK),
+        (some["wrong_in_use"], LineCause.WRONG),
+        (unsuitable, most_lost),
+        (shown & hours, LineCause.NONE),
+        (shown, LineCause.FEW_HOURS),
+        (pl.col("unjudged") > pl.col("lost"), LineCause.NOT_JUDGED),
+        (some["lost"], most_lost),
+        (some["right"], LineCause.FEW_PASSES),
+        (some["after_alarm"], LineCause.AFTER_ALARM),
+        (pl.col("unknown") > 0, LineCause.NOT_JUDGED),
+    ]
+    return pl.coalesce(
+        *(pl.when(when).then(cause if isinstance(cause, pl.Expr) else pl.lit(cause.value)) for when, cause in order),
+        pl.lit(LineCause.NO_PASS.value),
+    )
 
 
-def _class(
-    counts: dict[str, Any], low: float | None, high: float | None, criteria: LineCriteria
-) -> tuple[PieceClass, LineCause]:
-    """One wrong position in use decides; else the bounds of the share of passes lost."""
-    if counts["wrong_in_use"] or counts["claimed_wrongly"]:
-        return PieceClass.UNSUITABLE, _misleading_cause(counts)
-    if low is not None and low > criteria.loss_limit:
-        return PieceClass.UNSUITABLE, _most_lost(counts)
-    if high is None or high > criteria.loss_limit:
-        return PieceClass.UNKNOWN, _open_cause(counts)
-    if len(counts["hours"]) < criteria.hours_least:
-        return PieceClass.UNKNOWN, LineCause.FEW_HOURS
-    return PieceClass.SUITABLE, LineCause.NONE
-
-
-def _misleading_cause(counts: dict[str, Any]) -> LineCause:
-    if counts["unsafe"]:
-        return LineCause.UNSAFE_ACCEPTANCE
-    if not counts["wrong_in_use"]:
-        return LineCause.CLAIMED_WRONGLY
-    return LineCause.WRONG_TRACK if counts["wrong_track"] else LineCause.WRONG
-
-
-def _most_lost(counts: dict[str, Any]) -> LineCause:
-    return max(LOSSES, key=lambda cause: int(counts[f"lost_{cause.value}"]))
-
-
-def _open_cause(counts: dict[str, Any]) -> LineCause:
-    if counts["lost"]:
-        return _most_lost(counts)
-    if counts["right"]:
-        return LineCause.FEW_PASSES
-    if counts["after_alarm"]:
-        return LineCause.AFTER_ALARM
-    return LineCause.NOT_JUDGED if counts["unknown"] else LineCause.NO_PASS
+def _bounds(
+    bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria
+) -> tuple[float | None, float | None, float | None, float | None, int | None]:
+    """Share lost with its bounds, upper bound of the share wrong in use, further right passes needed."""
+    low, high, unsafe = (
+        clopper_pearson(events, number + unjudged, criteria.confidence)
+        for events in (bad, bad + unjudged, wrong + unjudged)
+    )
+    share = bad / number if number else None
+    return share, low.low, high.high, unsafe.high, passes_needed(bad + unjudged, number + unjudged, criteria)
 
 
 def passes_needed(bad: int, number: int, criteria: LineCriteria) -> int | None:
     """Further right passes until the upper bound of the share lost keeps the limit; None beyond all reason."""
-    return _needed(bad, number, criteria.loss_limit, criteria.confidence)
 
-
-@lru_cache(maxsize=4096)
-def _needed(bad: int, number: int, limit: float, confidence: float) -> int | None:
     def kept(more: int) -> bool:
-        high = clopper_pearson(bad, number + more, confidence).high
-        return high is not None and high <= limit
+        high = clopper_pearson(bad, number + more, criteria.confidence).high
+        return high is not None and high <= criteria.loss_limit
 
-    most = 1
-    while not kept(most):
-        most *= 2
-        if most > _MOST_PASSES:
-            return None
-    # `kept` turns true once and stays so.
-    low = -1
-    while most - low > 1:
-        middle = (low + most) // 2
-        low, most = (low, middle) if middle >= 0 and kept(middle) else (middle, most)
-    return most
-
-
-def classes_array(table: pl.DataFrame, growing: bool) -> np.ndarray[Any, np.dtype[np.object_]]:
-    """Class of each piece in one direction, in order of the pieces."""
-    side = (LineDirection.GROWING if growing else LineDirection.FALLING).value
-    return table.filter(pl.col("direction") == side).sort("piece")["piece_class"].cast(pl.String).to_numpy()
+    return fewest(kept)

@@ -18,6 +18,7 @@ from schemas.line import LineCause, LineCriteria
 from schemas.run import Site
 
 CAUSES = {
+    State.UNSEEN: LineCause.NOT_JUDGED,
     State.UNKNOWN: LineCause.NOT_JUDGED,
     State.AFTER_ALARM: LineCause.AFTER_ALARM,
     State.ALARM: LineCause.ALARM,
@@ -124,7 +125,7 @@ def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
 
 
 def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.DataFrame:
-    """One row per piece and direction; a right one that saw too little of the piece becomes unknown."""
+    """One row per piece and direction; a right one that saw too little of the piece is not seen."""
     worst = hits.group_by("piece", "growing").agg(
         state=pl.col("state").max(),
         seen_m=pl.col("end_m").max() - pl.col("begin_m").min(),
@@ -132,7 +133,7 @@ def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.Dat
     )
     length_m = (pieces.to_m - pieces.from_m)[worst["piece"].to_numpy()]
     short = (pl.col("state") == int(State.RIGHT)) & (pl.col("seen_m") < criteria.coverage * pl.Series(length_m))
-    state = pl.when(short).then(int(State.UNKNOWN)).otherwise(pl.col("state"))
+    state = pl.when(short).then(int(State.UNSEEN)).otherwise(pl.col("state"))
     return _rows(worst.with_columns(state=state))
 
 
@@ -211,7 +212,7 @@ def _merged(rows: pl.DataFrame) -> pl.DataFrame:
     both = worst.join(claims, on=["piece", "growing"], how="left")
     lone = rows.filter("claimed").join(own, on=["piece", "growing"], how="anti").unique(["piece", "growing"])
     kept = both.with_columns(claimed=pl.col("has_claim").fill_null(value=False)).drop("has_claim")
-    return pl.concat([kept, lone.with_columns(state=pl.lit(int(State.UNKNOWN)).cast(pl.Int64))])
+    return pl.concat([kept, lone.with_columns(state=pl.lit(int(State.UNSEEN)).cast(pl.Int64))])
 
 
 def _with_monitors(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:

@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.figures.bounds import clopper_pearson
-from pipeline.line.classes import KEYS, classes_array
+from pipeline.line.classes import KEYS
 from pipeline.line.pieces import Pieces
-from pipeline.line.spans import FIRST_LOSS, State
+from pipeline.line.spans import State
 from pipeline.site.windows import window_findings
 from pipeline.track.network import Network, network_of
 from schemas.arrays import Bools, Floats, floats
@@ -23,8 +23,6 @@ from schemas.run import Site
 
 # Directions of travel, ahead along the ways that the elements form or against it.
 MODES = {"both": (True, False), "ahead": (True,), "back": (False,)}
-# Of 2.5 km between balises DOMAIN section 4 knows no more.
-LONGEST_M = 2500.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,8 @@ def _travelled(line: Line) -> Bools:
 
 def _allowed(line: Line, sides: Sequence[bool], growing: Bools) -> Bools:
     """Pieces suitable in every one of these directions along their ways."""
-    rising, falling = (classes_array(line.table, side) == PieceClass.SUITABLE.value for side in (True, False))
+    suitable = (line.table["piece_class"].cast(pl.String) == PieceClass.SUITABLE.value).to_numpy()
+    rising, falling = suitable[0::2], suitable[1::2]
     good = {True: np.where(growing, rising, falling), False: np.where(growing, falling, rising)}
     allowed: Bools = np.logical_and.reduce([good[ahead] for ahead in sides])
     return allowed
@@ -151,23 +150,25 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
 
 
 def _walk(line: Line, way: Sequence[_Place], allowed: Bools, spacing_m: float) -> Iterator[_Set]:
-    """At each step the best piece from half to one and a half spacings on; where none is allowed a physical one.
+    """At each step the best piece about a spacing on; where none is allowed a physical one.
 
     Best is near a station or signal, then at the spacing itself.
     """
     at_m = np.array([place.at_m for place in way])
     good = allowed[[place.piece for place in way]]
-    near, longest_m = _near(line), min(1.5 * spacing_m, LONGEST_M)
+    spacing_m = min(spacing_m, line.criteria.longest_m)
+    near, play_m = _near(line), line.criteria.spacing_play * spacing_m
+    longest_m = min(spacing_m + play_m, line.criteria.longest_m)
     last_m, begun, limit_m = float(at_m[0]) - spacing_m, False, float(at_m[-1])
     while last_m + spacing_m <= limit_m:
-        inside = (at_m >= last_m + 0.5 * spacing_m) & (at_m <= last_m + longest_m)
+        inside = (at_m >= last_m + spacing_m - play_m) & (at_m <= last_m + longest_m)
         choice = _best(way, np.flatnonzero(inside & good), last_m + spacing_m, near)
         virtual = choice is not None
         index = int(np.argmin(np.abs(at_m - last_m - spacing_m))) if choice is None else choice
         distance_m = float(at_m[index]) - last_m if begun else None
         since = tuple(place.piece for place in way if last_m < place.at_m <= at_m[index])
         yield _Set(way[index].piece, virtual, distance_m, near.get(way[index].piece, ("", 0.0))[0], since)
-        last_m, begun = max(float(at_m[index]), last_m + 0.5 * spacing_m), True
+        last_m, begun = max(float(at_m[index]), last_m + spacing_m - play_m), True
 
 
 def _best(
@@ -223,12 +224,8 @@ def _named(line: Line, placed: Sequence[_Set]) -> pl.DataFrame:
 
 
 def _balises(line: Line, name: str, placed: Sequence[_Set]) -> pl.DataFrame:
-    worst = {
-        piece: " and ".join(sorted({f"{kind}: {cause}" for kind, cause in zip(kinds, causes, strict=True)}))
-        for piece, kinds, causes in line.table.group_by("piece")
-        .agg(pl.col("piece_class").cast(pl.String), pl.col("cause").cast(pl.String))
-        .iter_rows()
-    }
+    why = pl.format("{} {}: {}", "direction", "piece_class", "cause").str.join(", ")
+    worst = dict(line.table.group_by("piece").agg(why).iter_rows())
     proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
     errors = dict(line.table.group_by("piece").agg(pl.col("largest_undetected_m").max()).iter_rows())
     distance = pl.Series([one.distance_m for one in placed], dtype=pl.Float64)
@@ -267,9 +264,11 @@ def _figures(
     wanted = pl.DataFrame(sides, schema=schema, orient="row")
     told = line.table.with_columns(growing=pl.col("direction").cast(pl.String) == LineDirection.GROWING.value)
     lost = wanted.join(told, on=KEYS).group_by("ahead").agg(pl.col("loss_share").sum(), pl.col("loss_high").sum())
-    decided = (pl.col("state") >= int(FIRST_LOSS)) | (pl.col("state") == int(State.RIGHT))
+    decided = (pl.col("state") >= int(State.UNKNOWN)) | (pl.col("state") == int(State.RIGHT))
     judged = line.passes.filter(decided).join(wanted, on=KEYS)
-    journeys = judged.group_by("run_id").agg(wrong=(pl.col("state") == int(State.WRONG_IN_USE)).any())
+    # What the evidence should have told and did not may have been wrong.
+    maybe = pl.col("state").is_in([int(State.UNKNOWN), int(State.WRONG_IN_USE)])
+    journeys = judged.group_by("run_id").agg(wrong=maybe.any())
     distances: Floats = np.array([one.distance_m for one in placed if one.distance_m is not None])
     longest_m = float(distances.max()) if len(distances) else None
     served = {one.near for one in placed if one.near and one.virtual}

@@ -35,10 +35,10 @@ def _evidence(runs: pl.DataFrame) -> Iterator[str]:
 
 def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
     needed, most = passes_needed(0, 0, criteria), max(table["passes"].to_list(), default=0)
-    if needed is not None and most < needed:
+    if needed is None or most < needed:
         yield (
-            f"Too few passes: a piece has {most} at most, and {needed} without a loss are needed to show that no more "
-            f"than {criteria.loss_limit:.0%} are lost. Nothing can be suitable yet."
+            f"Too few passes: a piece has {most} at most, and {needed or 'more than can be'} without a loss are needed "
+            f"to show that no more than {criteria.loss_limit:.0%} are lost. Nothing can be suitable yet."
         )
     if criteria.independent == "pass":
         yield 'Passes of one day count as independent; `independent = "day"` counts them as one.'

@@ -17,14 +17,15 @@ class State(IntEnum):
 
     RIGHT = 0
     AFTER_ALARM = 1
-    UNKNOWN = 2
-    ALARM = 3
-    CONFIDENCE = 4
-    AMBIGUOUS = 5
-    OUTAGE = 6
-    WRONG = 7
-    WRONG_TRACK = 8
-    WRONG_IN_USE = 9
+    UNSEEN = 2
+    UNKNOWN = 3
+    ALARM = 4
+    CONFIDENCE = 5
+    AMBIGUOUS = 6
+    OUTAGE = 7
+    WRONG = 8
+    WRONG_TRACK = 9
+    WRONG_IN_USE = 10
 
 
 FIRST_LOSS = State.ALARM
@@ -75,7 +76,8 @@ def spans_of(epochs: pl.DataFrame, states: Ints, max_width_m: float) -> pl.DataF
     likely, `direction, state, t, one, other` (net elements of the two positions).
 
     Between two places that are known nothing but a pure outage is told of what lies between: the rest is unknown, for
-    nobody knows on which piece it was. So is a place known less closely than `max_width_m`.
+    nobody knows on which piece it was. So is a place known less closely than `max_width_m`. What was wrong at an end
+    of such a way, or of an outage, was wrong there and not along it: a row of its own.
     """
     direction = directions_of(epochs)
     low, high = true_path_m(epochs, direction)
@@ -83,10 +85,14 @@ def spans_of(epochs: pl.DataFrame, states: Ints, max_width_m: float) -> pl.DataF
     t_ns, names = times_ns(epochs), epochs["netelement_id"]
     here, there = placed[:-1], placed[1:]
     state = np.maximum(states[here], states[there])
-    outage = np.diff(t_ns)[here] > linking_gap_s(nominal_period_s(t_ns) or 0.0) * NS_PER_S if len(here) else here > 0
-    state = np.where(outage & (there == here + 1), np.maximum(state, State.OUTAGE), state)
+    silent = (t_ns[there] - t_ns[here] > linking_gap_s(nominal_period_s(t_ns) or 0.0) * NS_PER_S) & (there == here + 1)
     between = np.flatnonzero(there > here + 1)
-    state[between] = [_between(states[here[row] : there[row] + 1]) for row in between]
+    state[silent] = State.OUTAGE
+    state[between] = [_between(states[here[row] + 1 : there[row]]) for row in between]
+    apart = silent | (there > here + 1)
+    ends = np.unique(np.concatenate([here[apart], there[apart]]))
+    ends = ends[states[ends] >= State.WRONG]
+    here, there, state = (np.concatenate(pair) for pair in ((here, ends), (there, ends), (state, states[ends])))
     wide = np.maximum((high - low)[here], (high - low)[there]) > max_width_m
     state = np.where(wide & (state < State.WRONG), int(State.UNKNOWN), state)
     middle = 0.5 * (low + high)
@@ -105,9 +111,6 @@ def spans_of(epochs: pl.DataFrame, states: Ints, max_width_m: float) -> pl.DataF
     )
 
 
-def _between(states: Ints) -> int:
-    """What is known of a stretch whose inner epochs have no known place."""
-    inner, ends = states[1:-1], max(int(states[0]), int(states[-1]))
-    if (inner == State.OUTAGE).all():
-        return max(State.OUTAGE, ends)
-    return max(State.UNKNOWN, ends if ends >= State.WRONG else 0)
+def _between(inner: Ints) -> int:
+    """What is known of a way whose inner epochs have no known place."""
+    return int(State.OUTAGE if (inner == State.OUTAGE).all() else State.UNKNOWN)

@@ -16,11 +16,13 @@ from pipeline.line.passes import Ground, passes_of
 from pipeline.line.pieces import Pieces, middles, pieces_of
 from pipeline.line.proposals import Line, proposals, site_balises
 from pipeline.line.remarks import remarks
-from pipeline.line.spans import EPOCH_COLUMNS
+from pipeline.line.spans import EPOCH_COLUMNS, State
+from pipeline.line.trials import distinct
 from pipeline.results.store import check_site, complete_runs, completed_runs, read_config, read_table
 from pipeline.storage import write_bytes
 from schemas.arrays import floats
 from schemas.config import Configuration, to_toml
+from schemas.enums import Evidence
 from schemas.errors import InputError, UsageError
 from schemas.line import LineCriteria
 from schemas.run import Site
@@ -58,7 +60,7 @@ def write_line(
 
     `points`: stations and signals (`name, netelement_id, measure_m`). Raises `UsageError` for results of another site.
     """
-    runs = _runs(out, site, solution)
+    runs, twice = distinct(_runs(out, site, solution))
     pieces = pieces_of(site, criteria.piece_m)
     ground = Ground.of(site, pieces, middles(site, pieces))
     passes, undetected = passes_of_runs(out, runs, ground, criteria)
@@ -66,8 +68,8 @@ def write_line(
     lds = (read_config(out) or Configuration()).lds
     line = Line(site, pieces, table, passes, _known_points(points, pieces), criteria, lds)
     figures, balises = proposals(line)
-    told = remarks(runs, passes, table, figures, criteria)
-    found = LineResult(table, figures, balises, tuple(told), ())
+    told = (*twice, *remarks(runs, passes, table, figures, criteria))
+    found = LineResult(table, figures, balises, told, ())
     return LineResult(table, figures, balises, tuple(told), tuple(_write(found, to or out / "line", line)))
 
 
@@ -104,11 +106,14 @@ def passes_of_runs(
     """The passes of all runs with `run_id`; and the largest undetected error by piece, where the tables have it."""
     config = read_config(out) or Configuration()
     parts, errors = [], []
-    for run, solution in runs.select("run_id", "solution").iter_rows():
+    for run, solution, evidence in runs.select("run_id", "solution", "evidence").iter_rows():
         own = pl.col("solution") == solution
         epochs = read_table(out, "epochs", run).select(EPOCH_COLUMNS).filter(own).collect()
         passages, alarms = (read_table(out, name, run).filter(own).collect() for name in ("passages", "alarms"))
         found = passes_of(epochs, passages, alarms, ground, criteria, config)
+        if evidence != Evidence.REFERENCE.value:
+            # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
+            found = found.with_columns(pl.col("state").replace(int(State.UNKNOWN), int(State.UNSEEN)))
         parts.append(found.with_columns(run_id=pl.lit(run)))
         errors.append(_undetected(passages, ground.pieces))
     return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())

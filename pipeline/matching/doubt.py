@@ -13,7 +13,7 @@ from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
 from pipeline.track.network import Network
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
 
 # What ended a stretch of doubt: a balise read, a switch taken, positions (tracks that part, offsets), or nothing.
@@ -61,11 +61,10 @@ def stretches(
     `pinned`: per epoch the element that a balise read proves, -1 without one.
     """
     probability = np.minimum(doubt.posterior, doubt.gate)
-    unsure = np.concatenate([[False], probability < config.ambiguity_probability, [False]])
-    edges = np.flatnonzero(np.diff(unsure.astype(np.int8)))
     epoch, ids = trellis.steps.epoch, trellis.network.track.ids
     rows = []
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for begin, last in spans_of(probability < config.ambiguity_probability):
+        end = last + 1
         worst = begin + int(np.argmin(probability[begin:end]))
         other = int(doubt.other[worst])
         until = int(epoch[end]) - 1 if end < len(trellis) else len(fixes) - 1
@@ -93,11 +92,6 @@ def _over_switch(network: Network, one: int, other: int) -> bool:
     forward = any(edge.to == other for edge in network.successors[one])
     ends = (one, other ^ 1) if forward else (one ^ 1, other)
     return any(len(network.successors[end]) > 1 for end in ends)
-
-
-def no_doubt() -> pl.DataFrame:
-    """The path is never in doubt."""
-    return pl.DataFrame(schema=AMBIGUOUS_COLUMNS)
 
 
 def _on_path(trellis: Trellis, decoded: Decoded, step: Ints) -> Bools:

@@ -14,7 +14,6 @@ import polars as pl
 from pipeline.matching.fixes import Fixes
 from pipeline.track.leg import segments_at
 from pipeline.track.path import TravelledPath
-from pipeline.track.segments import Feet
 from schemas.arrays import Floats, Ints
 from schemas.config import MatchingConfig, Vehicle
 from schemas.enums import SigmaSource
@@ -22,16 +21,12 @@ from schemas.enums import SigmaSource
 
 @dataclass(frozen=True)
 class Assignment:
-    """What the search found per epoch: leg, a hint at the passage [m], and how sure it is.
-
-    `feet`, where the search already has them, are the epochs' nearest places on the one leg.
-    """
+    """What the search found per epoch: leg, a hint at the passage [m], and how sure it is."""
 
     leg: Ints
-    near_path_m: Floats | None
+    near_path_m: Floats
     path_probability: Floats
     gate_probability: Floats
-    feet: Feet | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ def epoch_frame(
     `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
     track too (`on_track` false), and goes on straight beyond the ends of the path.
     """
-    feet = found.feet or path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
+    feet = path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
     places = path.places(found.leg, feet, fixes.height_m)
     path_m = places.path_m - vehicle.gnss_antenna_ahead_m
     element, measure_m = path.locate_index(found.leg, path_m)

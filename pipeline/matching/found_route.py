@@ -77,7 +77,7 @@ def _row(found: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools, 
 
 def _rivals(found: Match, rows: Ints, least: float) -> str:
     """Elements off the path that are possible at some of these epochs."""
-    if found.posterior is None or len(rows) == 0:
+    if len(rows) == 0:
         return ""
     highest = _highest(found.posterior, int(rows[0]), int(rows[-1]))
     ids, own = found.path.track.ids, set(found.path.elements())

@@ -20,8 +20,6 @@ from pipeline.matching.steps import Steps
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
-# Two surveys never end at the same place [m].
-_ENDS_SIGMA_M = 1.0
 # Log-likelihood that leaves next to nothing.
 _RULED_OUT = -50.0
 
@@ -79,7 +77,8 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
         # A survey's error may as well stay what it is: only the position's own error is sure to return.
         keep=np.sqrt(1.0 - fast_m2 * renewed[:, None] / (variance + survey_m2[:, None])),
         renewed_m2=2.0 * (config.sigma_doubt**2) * survey_m2,
-        fixed=_ends(candidates, gnss_m2 + survey_m2 + _ENDS_SIGMA_M**2, config)
+        # Two surveys never end at the same place.
+        fixed=_ends(candidates, gnss_m2 + survey_m2 + config.survey_sigma_default_m**2, config)
         + direct * share_new
         - _time_off(steps, candidates, off, config),
         direct=direct,

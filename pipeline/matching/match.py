@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.matching.chain import path_on_chain, whole_chain
-from pipeline.matching.doubt import no_doubt
 from pipeline.matching.epochs import Assignment, epoch_frame
 from pipeline.matching.find import find_path
 from pipeline.matching.fixes import Fixes, fixes_of
@@ -16,7 +14,6 @@ from pipeline.matching.resolution import digit_noise
 from pipeline.matching.rivals import Posterior, Rivals, rivals_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import polarity
-from pipeline.track.leg import leg_of
 from pipeline.track.network import network_of
 from pipeline.track.path import TravelledPath
 from pipeline.track.pieces import in_pieces
@@ -33,7 +30,7 @@ class Match:
     """Epochs on the path, the path, and when it was in doubt.
 
     `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
-    possible at the steps of the search; none where nothing was to be searched. `odometer_sign`: of the recorded
+    possible at the steps of the search. `odometer_sign`: of the recorded
     odometer against growing path, set here and nowhere else.
     """
 
@@ -41,8 +38,8 @@ class Match:
     path: TravelledPath
     ambiguous: pl.DataFrame
     antenna_ahead_m: float
-    posterior: Posterior | None = None
-    odometer_sign: int = 1
+    posterior: Posterior
+    odometer_sign: int
 
     def rivals(self, limit: float) -> Rivals:
         """Per epoch the net elements whose posterior reaches `limit` there, the path's own among them."""
@@ -94,15 +91,13 @@ def _path(
     site: Site,
     config: MatchingConfig,
     balise_reads: pl.DataFrame | None,
-) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior | None]:
-    """A route or a site that leaves no choice needs no search, unless it comes back to where it was."""
+) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior]:
+    """The path over the network, or over nothing but the given route."""
     track = track_of(site.track)
-    visits = whole_chain(track, site.links) if site.route is None else visits_of(track, site.route)
-    if visits is not None:
-        leg = leg_of(track, visits)
-        if not leg.returns:
-            return *path_on_chain(fixes, odometry, track, leg, config), no_doubt(), None
-    network = network_of(in_pieces(track), site.links) if visits is None else network_along(track, visits)
+    if site.route is None:
+        network = network_of(in_pieces(track), site.links)
+    else:
+        network = network_along(track, visits_of(track, site.route))
     pinned = pins_of(fixes, site, network.track, balise_reads)
     return find_path(fixes, odometry, network, pinned, config)
 

@@ -36,7 +36,7 @@ def match_reference(
     prove net elements. A route holds only as far as the reference lies on it. Path positions and heights are those of
     the place that the reference gives, which is the GNSS antenna: the caller takes off its lever arm.
     """
-    fixes = _as_fixes(reference, hazards.reference_sigma_m)
+    fixes = as_fixes(reference, hazards.reference_sigma_m)
     aside_m = max(float(np.median(np.sqrt(floats(fixes, "cov_ee_m2")))), hazards.reference_aside_m)
     own = config.model_copy(update={"cross_bias_sigma_m": aside_m, "on_track_bias_m": aside_m})
     sites = [site] if site.route is None else [site, replace(site, route=None)]
@@ -56,7 +56,7 @@ def _placed(found: Match) -> int:
     return int(flags(found.epochs, "on_track").sum())
 
 
-def _as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:
+def as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:
     """The samples as a `gnss` stream whose covariance is theirs."""
     variance = pl.col("sigma_m").fill_null(sigma_default_m).clip(lower_bound=_LEAST_SIGMA_M) ** 2
     return reference.select(

@@ -55,19 +55,15 @@ def posterior_of(trellis: Trellis, found: Found) -> Posterior:
     return Posterior(trellis.steps.epoch, first, (keys % count).astype(np.int64), probability)
 
 
-def rivals_of(posterior: Posterior | None, epochs: pl.DataFrame, path: TravelledPath, limit: float) -> Rivals:
-    """Elements of a posterior of at least `limit` at the steps on both sides of each epoch, and its own.
-
-    Without a posterior (one chain, a given route) only its own, none where it has no position.
-    """
+def rivals_of(posterior: Posterior, epochs: pl.DataFrame, path: TravelledPath, limit: float) -> Rivals:
+    """Elements of a posterior of at least `limit` at the steps on both sides of each epoch, and its own."""
     ids = tuple(dict.fromkeys(path.track.ids))
     index = {name: number for number, name in enumerate(ids)}
     names = epochs["netelement_id"].replace_strict(index, default=None, return_dtype=pl.Int64)
     rows = np.flatnonzero(names.is_not_null().to_numpy())
     pairs = [np.column_stack([rows, names.drop_nulls().to_numpy()])]
-    if posterior is not None:
-        number = np.array([index[name] for name in path.track.ids], dtype=np.int64)
-        pairs += [_at_steps(posterior, number, side, limit) for side in _sides(posterior, epochs.height)]
+    number = np.array([index[name] for name in path.track.ids], dtype=np.int64)
+    pairs += [_at_steps(posterior, number, side, limit) for side in _sides(posterior, epochs.height)]
     keys = np.unique(np.concatenate(pairs) @ np.array([len(ids), 1]))
     return Rivals(ids, np.searchsorted(keys // len(ids), np.arange(epochs.height + 1)), keys % len(ids))
 

@@ -17,16 +17,13 @@ from pipeline.epochs.verdicts import (
     states_of,
     verdicts,
 )
-from pipeline.monitors.axis import AxisSeries, run_axis
+from pipeline.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, run_axis
 from pipeline.monitors.recursion import AxisState
 from pipeline.monitors.series import FIRST_EPOCH, Axis, axes_of
 from schemas.arrays import Bools, Floats
 from schemas.config import Configuration
 from schemas.enums import MonitorState
 from schemas.tables import SCALES
-
-# Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
-_FIRST_BLOCK, _BLOCK = 2048, 8192
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ class _AxisBank:
         self.state = np.full((epochs, width), NOT_EVALUATED, dtype=np.int8, order="F")
         self._series = axis.series
         self._done = 0
-        self._block = _BLOCK
+        self._block = BLOCK
         self._carry: AxisState | None = None
 
     def advance(self, epoch: int) -> int:
@@ -68,7 +65,7 @@ class _AxisBank:
             part = self._series.between(self._done, end)
             value, sigma, self._carry = run_axis(part, self._alphas, self._carry)
             self._store(part, value, self._factor * sigma)
-            self._done, self._block = end, min(2 * self._block, _BLOCK)
+            self._done, self._block = end, min(2 * self._block, BLOCK)
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats) -> None:
@@ -86,7 +83,7 @@ class _AxisBank:
             self._series = replace(self._series, fresh=fresh)
         self._done = row
         self._carry = None
-        self._block = _FIRST_BLOCK
+        self._block = FIRST_BLOCK
 
     def record(self) -> AxisRecord:
         return AxisRecord(self._series, self.value, self.threshold, self._enabled)

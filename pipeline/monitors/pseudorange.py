@@ -18,6 +18,7 @@ from scipy.special import chdtri
 
 from pipeline.epochs.clock import met, unambiguous
 from pipeline.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
+from pipeline.monitors.axis import BLOCK
 from pipeline.monitors.sight import line_of_sight_rows, range_variances_m2
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
@@ -26,9 +27,7 @@ NO_RANGES = "no satellites stream"
 NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
 TOO_FEW = "too few satellites to test the ranges"
 AMBIGUOUS = "the track is ambiguous"
-_LEAST_SURVEY_SIGMA_M = 1e-3
 _RIDGE = 1e-13
-_CHUNK = 8192
 
 
 def pseudorange_monitor(epochs: pl.DataFrame, satellites: pl.DataFrame | None, config: Configuration) -> pl.DataFrame:
@@ -110,7 +109,7 @@ def _track_of(epochs: pl.DataFrame, config: Configuration) -> _Track:
     level = np.cos(rise)
     zero = np.zeros_like(angle)
     survey_m = np.where(np.isfinite(survey_m), survey_m, config.matching.survey_sigma_default_m)
-    survey_m = np.hypot(np.maximum(survey_m, _LEAST_SURVEY_SIGMA_M), np.nan_to_num(chord_m))
+    survey_m = np.hypot(np.maximum(survey_m, config.matching.offset_floor_m), np.nan_to_num(chord_m))
     matched = flags(epochs, "on_track") & np.isfinite(cross_m) & np.isfinite(heading)
     sure = met(epochs, unambiguous(config))
     known = np.isfinite(vertical_m)
@@ -156,8 +155,8 @@ def equations_of(epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configu
 def _chunks(ranges: _Ranges, track: _Track) -> Iterator[Equations]:
     usable = np.flatnonzero(track.usable)
     chosen = usable[np.isin(usable, ranges.epoch)]
-    for begin in range(0, chosen.size, _CHUNK):
-        yield _equations(ranges, track, chosen[begin : begin + _CHUNK])
+    for begin in range(0, chosen.size, BLOCK):
+        yield _equations(ranges, track, chosen[begin : begin + BLOCK])
 
 
 def _equations(ranges: _Ranges, track: _Track, epochs: Ints) -> Equations:

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.epochs.verdicts import NO_POSITION, NO_SIGMA, first_reason
-from pipeline.monitors.along import AlongEpochs, along_series
-from pipeline.monitors.axis import AxisSeries, Source, errors_of, time_steps
+from pipeline.monitors.axis import AlongEpochs, AxisSeries, Source, along_series, errors_of, time_steps
 from pipeline.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.config import Configuration

@@ -11,9 +11,6 @@ import numpy as np
 from schemas.arrays import Bools, Floats
 from schemas.config import AlignConfig
 
-# Within so many of them a row is where the train stood; a counter's edges are 1.7 of its own apart from their middle.
-_NEAR_SIGMAS = 2.0
-
 
 def hysteresis_m(sigma_m: Floats, config: AlignConfig) -> Floats:
     """By how much the distance may leave what is held of it before it has moved [m]."""
@@ -114,7 +111,8 @@ def evenly_driven(
     for gap in np.flatnonzero(stood & (gaps > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
         stood_m = float(np.median(distance_m[between]))
-        near = np.abs(distance_m[between] - stood_m) <= _NEAR_SIGMAS * sigma_m[between]
+        # So many of its deviations are the edges of a count from its middle.
+        near = np.abs(distance_m[between] - stood_m) <= np.sqrt(3.0) * sigma_m[between]
         last = between.start + int(np.flatnonzero(near)[-1]) if near.any() else between.start
         at_s.insert(gap + 1, float(t_s[last]))
         at_m.insert(gap + 1, stood_m)

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.odometry.curves import filled_in
 from pipeline.odometry.driven import driven_m, driven_or_left_m, evenly_driven, hysteresis_m, moving_steps
 from pipeline.odometry.quantisation import NO_QUANTISATION, QuantisationNoise, count_step_m, quantisation_noise
-from pipeline.odometry.rows import leaps, ways_between
+from pipeline.odometry.rows import filled_in, leaps, ways_between
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns, truths
 from schemas.config import AlignConfig, Configuration, Vehicle
 

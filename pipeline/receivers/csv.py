@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
 from pipeline.ingest.breaches import refuse
@@ -21,7 +23,14 @@ CUT_ROW = "row that breaks off at the end of the file"
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _UNITS_ROW = "row of units"
 _SHORT_ROW = "end of a row, which is missing (taken as empty)"
-_NO_VALUE = "row of the odometer without distance and speed"
+# What rows of a stream are for. Of positions, so few tell no usual step; a longer one than so many lacks an epoch.
+_VALUES: dict[Stream, tuple[str, ...]] = {
+    "gnss": ("latitude_deg", "longitude_deg"),
+    "odometer": ("distance_m", "speed_mps"),
+    "reference": ("latitude_deg", "longitude_deg"),
+    "balise_reads": ("balise_id",),
+}
+_FEWEST, _USUAL_STEPS = 3, 1.5
 # Decimal mark, and what may separate thousands beside it.
 _MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
 
@@ -39,10 +48,13 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
     log = read_log_table(path, infer=True)
     table = with_points(log)
     streams: dict[Stream, pl.DataFrame] = {}
+    empty: Counter[str] = Counter()
     for name in STREAMS:
         for mapping in mappings_of(config, name):
             if mapping.topic in (path.name, path.stem, "*"):
-                frame = _mapped(table, mapping, name, path)
+                mapped = _mapped(table, mapping, name, path)
+                frame = mapped.filter(_told(mapped, name, "fix" in mapping.fields))
+                empty[f"row without a value of {name}"] += mapped.height - frame.height
                 streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
     if not streams:
         raise InputError(
@@ -52,13 +64,28 @@ def read_csv(path: Path, config: IngestConfig) -> tuple[dict[Stream, pl.DataFram
             expected=f'a table [ingest.gnss] with topic = "{path.name}"',
             remedy="Give a mapping by --config; `balise inspect` of the file prints a draft.",
         )
-    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short}
-    if "odometer" in streams:
-        rows = streams["odometer"].height
-        values = pl.col([name for name in ("distance_m", "speed_mps") if name in streams["odometer"].columns])
-        streams["odometer"] = streams["odometer"].filter(pl.any_horizontal(values.is_not_null()))
-        left[_NO_VALUE] = rows - streams["odometer"].height
+    left = {CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short} | empty
     return streams, {reason: count for reason, count in left.items() if count}
+
+
+def _told(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
+    """Rows that tell something of a stream: tables of several recorders leave cells empty.
+
+    An empty position may as well be an outage, which a kind of fix would say. Without one it is none where the
+    positions around it follow each other as they usually do.
+    """
+    names = [name for name in _VALUES.get(stream, ()) if name in frame.columns]
+    if not names:
+        return pl.repeat(True, frame.height, eager=True)
+    told = frame.select(pl.any_horizontal(pl.col(names).is_not_null())).to_series()
+    if stream != "gnss" or told.sum() < _FEWEST or told.all():
+        return told if stream != "gnss" else pl.repeat(True, frame.height, eager=True)
+    t_ns = frame["t"].to_physical().fill_null(0).to_numpy()
+    at = np.sort(t_ns[told.to_numpy()])
+    after = at.searchsorted(t_ns).clip(1, at.size - 1)
+    steps = np.diff(at)
+    between = (t_ns > at[0]) & (t_ns < at[-1]) & (steps[after - 1] <= _USUAL_STEPS * np.median(steps))
+    return told | has_fix | pl.Series(~between)
 
 
 def with_points(log: LogTable) -> pl.DataFrame:

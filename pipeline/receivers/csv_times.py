@@ -8,14 +8,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.stamps import time_source
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
 from schemas.config import StreamMapping
 from schemas.errors import InputError
 
 # Whole numbers below are seconds, above nanoseconds; between them lie milliseconds and microseconds. More seconds
 # than these do not fit into nanoseconds.
 _MOST_SECONDS, _LEAST_NANOSECONDS = 9 * 10**9, 10**17
-_WEEK_S, _WEEK_NS = 604_800.0, 604_800_000_000_000
 # Before the second of these weeks lies August 1999: smaller numbers are weeks counted modulo 1024.
 _LEAST_WEEK, _MOST_WEEK = 1024, 9999
 # Days of Excel in the years 1954 and 2119.
@@ -80,15 +79,15 @@ def _week_and_seconds(week: pl.Series, tow: pl.Series, mapping: StreamMapping, p
     whole = ~week.is_between(_LEAST_WEEK, _MOST_WEEK).fill_null(True)
     _refuse(whole, week, place, "holds no GPS week", f"{_LEAST_WEEK} to {_MOST_WEEK}", "Write the whole week number.")
     _refuse(
-        ~seconds.is_between(0.0, _WEEK_S).fill_null(True),
+        ~seconds.is_between(0.0, WEEK_NS / 1e9).fill_null(True),
         tow,
         place,
         "holds no seconds of a week",
-        f"0 to {_WEEK_S:g} s",
+        f"0 to {WEEK_NS / 1e9:g} s",
         "Give the seconds per unit: factors = { t = 1e-3 } for milliseconds.",
     )
     in_week = (seconds * 1e6).round().cast(pl.Int64) * 1000
-    t_ns = GPS_EPOCH_NS + week.cast(pl.Int64) * _WEEK_NS + in_week
+    t_ns = GPS_EPOCH_NS + week.cast(pl.Int64) * WEEK_NS + in_week
     return _on_scale(t_ns, mapping.model_copy(update={"time_scale": "gps"}))
 
 

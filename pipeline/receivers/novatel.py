@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.ingest.novatel import FIX_BY_CODE
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.ingest.timescale import utc_of_week
 from pipeline.receivers.epochs import Epoch, Gathered
 from schemas.enums import Fix
 
@@ -32,7 +32,6 @@ _COARSE = 100  # "GPS reference time status": below it the time is approximate o
 _WGS84 = 61
 # "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
 _SOLVED = (2, 3, 6, 7)
-_WEEK_MS = 604_800_000
 _VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
 _LONGEST_BETWEEN_NS = 1_500_000_000  # between two velocities at 1 Hz, one of them late
 
@@ -65,8 +64,7 @@ def decode(gathered: Gathered, m: Any, raw: bytes) -> None:
     if name == "BESTVEL" and int(m.status):
         return
     epoch = gathered.at((name if name == "BESTVEL" else "", week, ms), name if name in _RANKS else "", raw)
-    gps_ns = GPS_EPOCH_NS + (week * _WEEK_MS + ms) * 1_000_000
-    epoch.t_ns = int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0])
+    epoch.t_ns = utc_of_week(week, ms * 1_000_000)
     if name == "BESTVEL":
         epoch.t_ns -= round(m.latency * 1e9)
         epoch.gnss |= _velocity(m)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
 from pipeline.receivers.earth_fixed import earth_fixed, east_north_up, geodetic
 from schemas.arrays import Floats, Ints
 from schemas.enums import Fix
@@ -29,7 +29,10 @@ _QUALITY = {
 }  # fmt: skip
 _SCALES = ("GPST", "UTC", "JST")
 _JST_NS = 9 * 3600 * 1_000_000_000
-_WEEK_NS = 604_800_000_000_000
+_TOGETHER = (
+    ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef"), ("e-baseline", "n-baseline", "u-baseline"),
+    ("vx", "vy", "vz"),
+)  # fmt: skip
 _DATE = re.compile(r"\d{4}/\d\d?/\d\d?")
 _GEOID = "height over the geoid: left empty, since the file has no separation"
 CUT_ROW = "row that breaks off at the end of the file"
@@ -84,6 +87,10 @@ def _layout(comments: list[str], path: Path) -> _Layout:
         words = re.split(r"[\s,;]+", line.lstrip("% ").strip())
         if words[0] in _SCALES and {"Q", "ns"} <= set(words):
             names = tuple(re.sub(r"\(.*\)$", "", word) for word in words[1:])
+            lacking = [n for group in _TOGETHER if {*group} & {*names} for n in group if n not in names]
+            if lacking:
+                found, remedy = ", ".join(names), "Let RTKLIB write the file again."
+                raise InputError(f"has no column {', '.join(lacking)}", place=str(path), found=found, remedy=remedy)
             return _Layout(words[0], names, "(d'" in line, "\n".join(comments))
     raise InputError(
         "has no line that names its columns",
@@ -123,7 +130,7 @@ def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
         week = pl.Series(words[:, 0]).cast(pl.Int64, strict=False)
         tow = pl.Series(words[:, 1]).cast(pl.Float64, strict=False)
         in_week = (tow * 1e6).round().cast(pl.Int64, strict=False) * 1000  # RTKLIB writes microseconds at most
-        told = GPS_EPOCH_NS + week.set(~week.is_between(0, 9999), None) * _WEEK_NS + in_week
+        told = GPS_EPOCH_NS + week.set(~week.is_between(0, 9999), None) * WEEK_NS + in_week
     if told.null_count():
         row = int(told.is_null().arg_max() or 0)
         raise InputError(

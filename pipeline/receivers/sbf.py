@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.ingest.recipes_drivers import SBF_FIXES
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.ingest.timescale import utc_of_week
 from pipeline.receivers.earth_fixed import east_north_up, geodetic, local_velocity
 from pipeline.receivers.epochs import Epoch, Gathered
 from schemas.enums import Fix
 
-_WEEK_MS = 604_800_000
 _NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
 _DO_NOT_USE = -2e10
 _SBAS_PRNS = range(120, 159)
@@ -36,8 +35,7 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
         return
     position = message.identity if message.identity in _POSITIONS else ""
     epoch = gathered.at((week, tow_ms), position, raw)
-    gps_ns = GPS_EPOCH_NS + (week * _WEEK_MS + tow_ms) * 1_000_000
-    epoch.t_ns = int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0])
+    epoch.t_ns = utc_of_week(week, tow_ms * 1_000_000)
     decoder(epoch, message)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.receivers import ubx_early
 from pipeline.receivers.epochs import Epoch, Gathered, satellite_name
-from pipeline.receivers.ubx_fields import accuracy, calendar_ns, covariance, fix_of, place, velocity
+from pipeline.receivers.ubx_fields import accuracy, calendar_ns, covariance, fix_of, place, satellites_of, velocity
 from schemas.enums import Fix
 
 _SYSTEMS = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
@@ -95,27 +95,17 @@ def _sbas(_: Gathered, epoch: Epoch, m: Any) -> None:
 
 
 def _satellites(_: Gathered, epoch: Epoch, m: Any) -> None:
-    rows: list[dict[str, Any]] = []
-    for index in range(1, m.numSvs + 1):
-        value = {name: getattr(m, f"{name}_{index:02d}") for name in _SATELLITE_FIELDS}
-        system = _SYSTEMS_BY_NAME.get(str(value["gnssId"]), _SYSTEMS.get(value["gnssId"], "X"))
-        rows.append(
-            {
-                "sv": satellite_name(system, value["svId"]),
-                "azimuth_deg": float(value["azim"]),
-                "elevation_deg": float(value["elev"]),
-                "residual_m": value["prRes"] if value["svUsed"] else None,
-                "used": bool(value["svUsed"]),
-            }
-        )
-    epoch.satellites = [row for row in rows if abs(row["elevation_deg"]) <= _HORIZON_TO_ZENITH_DEG]
+    epoch.satellites = satellites_of(m, m.numSvs, _name, ("gnssId", "svId"), 1.0)
 
 
-_HORIZON_TO_ZENITH_DEG = 90.0
+def _name(system: Any, number: int) -> str:
+    """pyubx2 gives systems by name or by number."""
+    return satellite_name(_SYSTEMS_BY_NAME.get(str(system), _SYSTEMS.get(system, "X")), number)
+
+
 _HALF_WEEK_MS = 302_400_000
 # Messages of one epoch may round its time, and know another number of leap seconds before they have been received.
 _SAME_MOMENT_NS = 60_000_000_000
-_SATELLITE_FIELDS = ("gnssId", "svId", "azim", "elev", "prRes", "svUsed")
 _POSITIONS = ("NAV-PVT", "NAV-PVAT", "NAV-SOL", "NAV-POSLLH")
 _DECODERS = {
     "NAV-PVT": _position,

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from pipeline.ingest.timescale import utc_of_week
 from pipeline.receivers.earth_fixed import geodetic, local_velocity
 from pipeline.receivers.epochs import Epoch, Gathered, satellite_name
-from pipeline.receivers.ubx_fields import accuracy, calendar_ns, fix_of, place, velocity
+from pipeline.receivers.ubx_fields import accuracy, calendar_ns, fix_of, place, satellites_of, velocity
 
 # What each tells gives way to what a message of higher rank tells of the same epoch; NAV-PVT is above all of these.
 _STATUS, _SOL, _SINGLE, HIGHEST_RANK = 0, 1, 2, 2
-_WEEK_NS = 604_800_000_000_000
 _CM = 1e-2
 # Numbers of satellites in NAV-SVINFO: first of the system, last, letter, number of the first.
 _SVIDS = (
@@ -38,15 +35,12 @@ def time_ns(m: Any) -> tuple[int, int] | None:
         t_ns = calendar_ns(m, m.sec) if m.validUTC else None
         return None if t_ns is None else (_SINGLE, t_ns)
     if m.identity == "NAV-SOL":
-        return (_SOL, _from_gps(m)) if m.wknSet and m.towSet else None
-    if m.identity == "NAV-TIMEGPS":
-        return (_SOL, _from_gps(m)) if m.towValid and m.weekValid else None
-    return None
-
-
-def _from_gps(m: Any) -> int:
-    gps_ns = GPS_EPOCH_NS + m.week * _WEEK_NS + m.iTOW * 1_000_000 + m.fTOW
-    return int(utc_from_gps(np.array([gps_ns], dtype=np.int64))[0])
+        known = m.wknSet and m.towSet
+    elif m.identity == "NAV-TIMEGPS":
+        known = m.towValid and m.weekValid
+    else:
+        return None
+    return (_SOL, utc_of_week(m.week, m.iTOW * 1_000_000 + m.fTOW)) if known else None
 
 
 def solution(_: Gathered, epoch: Epoch, m: Any) -> None:
@@ -79,21 +73,8 @@ def motion(_: Gathered, epoch: Epoch, m: Any) -> None:
 
 def satellites(_: Gathered, epoch: Epoch, m: Any) -> None:
     """NAV-SVINFO: azimuth and elevation [deg], residual [cm]; NAV-SAT of the same epoch tells the same."""
-    if epoch.satellites:
-        return
-    for index in range(1, m.numCh + 1):
-        value = {name: getattr(m, f"{name}_{index:02d}") for name in ("svid", "azim", "elev", "prRes", "svUsed")}
-        name = _name(value["svid"])
-        if name is not None and abs(value["elev"]) <= 90:
-            epoch.satellites.append(
-                {
-                    "sv": name,
-                    "azimuth_deg": float(value["azim"]),
-                    "elevation_deg": float(value["elev"]),
-                    "residual_m": value["prRes"] * _CM if value["svUsed"] else None,
-                    "used": bool(value["svUsed"]),
-                }
-            )
+    if not epoch.satellites:
+        epoch.satellites = satellites_of(m, m.numCh, _name, ("svid",), _CM)
 
 
 def _name(svid: int) -> str | None:

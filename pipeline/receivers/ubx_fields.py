@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -51,3 +52,27 @@ def accuracy(horizontal_m: float, vertical_m: float) -> dict[str, float]:
 def covariance(ee: float, en: float, eu: float, nn: float, nu: float, uu: float) -> dict[str, float]:
     names = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
     return dict(zip(names, (ee, en, eu, nn, nu, uu), strict=True))
+
+
+def satellites_of(
+    m: Any, count: int, name_of: Callable[..., str | None], names: tuple[str, ...], residual_m: float
+) -> list[dict[str, Any]]:
+    """The rows of NAV-SAT and NAV-SVINFO whose satellite is known and above or below a horizon.
+
+    `names`: fields that make the name, `residual_m`: the unit of the residual.
+    """
+    rows: list[dict[str, Any]] = []
+    for index in range(1, count + 1):
+        value = {name: getattr(m, f"{name}_{index:02d}") for name in (*names, "azim", "elev", "prRes", "svUsed")}
+        name, elevation_deg = name_of(*(value[name] for name in names)), float(value["elev"])
+        if name is not None and abs(elevation_deg) <= 90.0:
+            rows.append(
+                {
+                    "sv": name,
+                    "azimuth_deg": float(value["azim"]),
+                    "elevation_deg": elevation_deg,
+                    "residual_m": value["prRes"] * residual_m if value["svUsed"] else None,
+                    "used": bool(value["svUsed"]),
+                }
+            )
+    return rows

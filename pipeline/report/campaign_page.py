@@ -72,9 +72,8 @@ _PLOTS = (
     ("location", "Location error at virtual balises", "Positive: offered early. Offers by what became of them."),
     ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; crosses are hazards."),
 )  # fmt: skip
-_RANK = {RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
-_FAILED_RANK = 1
-_SHORT = 12
+# What comes first in the list of runs; failed ones, which have no verdict, after the unsafe.
+_RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
 
 
 def campaign_page(campaign: Campaign, made: Made) -> str:
@@ -144,7 +143,7 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
     runs = (
         known_counts(campaign.runs)
         .with_columns(
-            order=pl.col("verdict").cast(pl.String).replace_strict(_RANK, default=_FAILED_RANK),
+            order=pl.col("verdict").cast(pl.String).replace_strict(_RANK),
             hazards=pl.sum_horizontal(HAZARD_COUNTS, ignore_nulls=False),
         )
         .sort(
@@ -161,7 +160,8 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
 
     def digest(row: Row) -> Cell:
         whole = row["input_digest"]
-        return Cell(whole[:_SHORT], whole, f'<span title="{escape(whole)}">{escape(whole[:_SHORT])}</span>')
+        short = whole[:12]
+        return Cell(short, whole, f'<span title="{escape(whole)}">{escape(short)}</span>')
 
     special = {
         "verdict": verdict,

@@ -37,9 +37,8 @@ from schemas.run import RunTables, Site
 from schemas.tables import TABLES
 
 _PAGES_PER_PROCESS = 20
-# Bytes at the end of a page that hold what it was made from.
+# The end of a page: what it was made from.
 _MARK = "<!-- {} -->\n"
-_MARK_BYTES = 100
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def _end_of(path: Path) -> bytes:
     """The last bytes of a file; none of one that cannot be read, which is written anew."""
     try:
         with path.open("rb") as file:
-            file.seek(max(path.stat().st_size - _MARK_BYTES, 0))
+            file.seek(max(path.stat().st_size - len(_MARK.format("0" * 64)), 0))
             return file.read()
     except OSError:
         return b""

@@ -126,10 +126,11 @@ def _earlier(out: Address) -> Manifest:
 
 
 def own_file_names(out: Address) -> list[str]:
-    """What belongs to no single run: the configuration and the campaign's tables, from the result's folder on."""
+    """What belongs to no single run: the settings and the campaign's tables, from the result's folder on."""
     campaign = join(out, "campaign")
     there = files.list_dir(campaign) if files.exists(campaign) else []
-    return ["config.toml", *(f"campaign/{name}" for name in there if re.fullmatch(r"\w+\.parquet", name))]
+    settings = ["config.toml", *(["vehicle.toml"] if files.exists(join(out, "vehicle.toml")) else [])]
+    return [*settings, *(f"campaign/{name}" for name in there if re.fullmatch(r"\w+\.parquet", name))]
 
 
 def contents_of(places: list[str]) -> dict[str, bytes]:

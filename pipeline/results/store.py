@@ -25,6 +25,8 @@ PREFIX = "balise."
 _MARKER = "runs"
 # Of 255 bytes that file systems allow, `run_id=` takes seven.
 LONGEST_NAME = 248
+# Files read before they become one frame.
+_AT_ONCE = 256
 
 
 def table_address(out: Address, table: str, run_id: str) -> Address:
@@ -101,10 +103,8 @@ def scan_runs(out: Address, table: str, runs: Sequence[str]) -> pl.LazyFrame:
 
     def parts(columns: list[str], predicate: pl.Expr | None) -> Iterator[pl.DataFrame]:
         asked = _asked(runs, predicate)
-        contents = storage.read_many([str(table_address(out, table, run)) for run in asked]) if is_url(out) else {}
-        for run in asked:
-            place = table_address(out, table, run)
-            yield _table_of(contents.get(str(place)) if is_url(out) else Path(place), table, run, columns)
+        for at in range(0, len(asked), _AT_ONCE):
+            yield tables_of(out, table, asked[at : at + _AT_ONCE], columns)
 
     return source_of({"run_id": pl.String(), **dtypes(TABLES[table])}, parts)
 
@@ -118,19 +118,28 @@ def _asked(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
     return frame["run_id"].to_list()
 
 
-def _table_of(source: bytes | Path | None, table: str, run: str, columns: Sequence[str]) -> pl.DataFrame:
-    if source is None:
-        raise _unreadable(table, run, "no such object")
+def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[str] | None = None) -> pl.DataFrame:
+    """These columns (all) of one table of these runs, read now. Raises `UsageError` as `scan_runs`."""
+    wanted = ["run_id", *dtypes(TABLES[table])] if columns is None else columns
+    run = ""
 
     def own(found: Mapping[str, pl.DataType]) -> list[str]:
         _check_columns(table, run, found)
-        return [name for name in columns if name != "run_id"]
+        return [name for name in wanted if name != "run_id"]
 
+    places = [str(table_address(out, table, run)) for run in runs]
+    contents = storage.read_many(places) if is_url(out) else {}
+    reader = parquet.Reader(own)
     try:
-        frame = parquet.read_parquet(source, own)
+        for run, place in zip(runs, places, strict=True):
+            if is_url(out) and place not in contents:
+                raise _unreadable(table, run, "no such object")
+            reader.add(contents[place] if is_url(out) else Path(place))
+        frame = reader.frame()
     except parquet.ParquetError as error:
         raise _unreadable(table, run, str(error)) from None
-    return frame.with_columns(run_id=pl.lit(run)).select(columns)
+    names = pl.Series("run_id", [run for run, height in zip(runs, reader.heights, strict=True) for _ in range(height)])
+    return frame.with_columns(names.cast(pl.String)).select(wanted)
 
 
 def _unreadable(table: str, run_id: str, reason: str) -> UsageError:

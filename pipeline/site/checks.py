@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.track.geodesy import points_of
+from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
 from schemas.arrays import Floats
 from schemas.enums import Navigability
@@ -22,15 +23,10 @@ NEAR_ENDS_M = 5.0
 # Two ends that point at each other so far apart are one track with a piece missing; a curve turns less in between.
 FACING_REACH_M = 300.0
 FACING_COSINE = 0.94
-HEIGHT_STEP_M = 0.5
-SHORT_ELEMENT_M = 1.0
 LENGTH_TOLERANCE = 1e-3
-LENGTH_TOLERANCE_M = 0.5
 CHORD_ERROR_M = 0.25
 # Of a finding about one balise: this and its id.
 BALISE_PLACE = "balises: "
-# An end's direction is that of its last metres: single vertices may lie a centimetre apart.
-END_REACH_M = 20.0
 
 
 @dataclass
@@ -126,7 +122,8 @@ def outward(track: Track) -> np.ndarray:
         surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
         for position, line in ((0, surface), (1, surface[::-1])):
             way = np.linalg.norm(line - line[0], axis=1)
-            inside = int(np.argmax(way >= END_REACH_M)) or int(np.argmax(way))
+            # Single vertices may lie a centimetre apart.
+            inside = int(np.argmax(way >= SAMPLE_SPACING_M)) or int(np.argmax(way))
             directions[element, position] = line[inside] - line[0]
     return directions
 
@@ -142,10 +139,10 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
         )
         geometric = geometric_measures_m(latitude, longitude, height)
         length = float(geometric[-1])
-        if length < SHORT_ELEMENT_M:
+        if length < GAP_COUNTS_M:
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
-            if abs(declared - length) > max(LENGTH_TOLERANCE_M, LENGTH_TOLERANCE * length):
+            if abs(declared - length) > max(MEASURE_TOLERANCE_M, LENGTH_TOLERANCE * length):
                 text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
                 found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         error = chord_errors_m(track, part).max(initial=0.0)
@@ -191,7 +188,7 @@ def _check_gaps(track: Track, found: Remarks) -> None:
             found.findings.append(Finding("warning", "links", text, remedy))
         ends = [track.end(track.index[a], position_a), track.end(track.index[b], position_b)]
         step = float(np.abs(np.diff(track.height_m[ends])[0]))
-        if step > HEIGHT_STEP_M:
+        if step > GAP_COUNTS_M:
             text = f"end {position_a} of {a} and end {position_b} of {b} differ by {step:.1f} m in height"
             found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 

@@ -10,17 +10,15 @@ import numpy as np
 from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.track.geodesy import points_of
 from pipeline.track.network import Network, network_of
-from pipeline.track.survey import Track, track_of
-from schemas.arrays import Floats, Ints
+from pipeline.track.segments import SAMPLE_SPACING_M
+from pipeline.track.survey import Track, places_along, track_of
+from schemas.arrays import Floats
 from schemas.config import MatchingConfig
 from schemas.enums import BaliseKind
 from schemas.run import Finding, Site
 
-# Tracks are compared at places this far apart [m]; where they part or cross, a shorter stretch is no parallel track.
-_SPACING_M = 20.0
+# Where tracks part or cross, a shorter stretch is no parallel track [m].
 _SHORTEST_M = 100.0
-# So far past its end an element is still beside [m]: two surveys never end at the same place.
-_END_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -59,14 +57,16 @@ def most_claimed(apart_m: float, survey_m: float, config: MatchingConfig) -> flo
 def _stretches(network: Network, config: MatchingConfig) -> Iterator[_Stretch]:
     """Per pair of elements the parts of the first that lie too near the second."""
     track = network.track
-    element, measure_m = _places(track)
+    along = places_along(track, SAMPLE_SPACING_M)
+    element, measure_m = along.element, along.measure_m
     survey_m = _survey_m(track, config)
     odds = np.log(config.ambiguity_probability / (1.0 - config.ambiguity_probability))
     limit_m = np.sqrt(2.0 * odds * (config.cross_bias_sigma_m**2 + survey_m**2))
-    points = points_of(*_degrees(track, element, measure_m))
+    points = points_of(along.latitude_deg, along.longitude_deg)
     found = candidates_of(points, network, segments_of(track), float(limit_m.max()))
     own = element[found.step]
-    near = (found.beyond_m <= _END_M) & (own < found.element)
+    # Two surveys never end at the same place.
+    near = (found.beyond_m <= config.survey_sigma_default_m) & (own < found.element)
     near &= found.distance_m < limit_m[own]
     pairs, row = own[near] * network.count + found.element[near], found.step[near]
     apart_m = found.distance_m[near]
@@ -102,28 +102,6 @@ def _remedy(site: Site, network: Network, stretch: _Stretch) -> str:
     if any(len(network.successors[one]) > 1 for one in oriented):
         told.append("a switch taken at its end")
     return f"To tell the two apart: {', '.join(told)}."
-
-
-def _places(track: Track) -> tuple[Ints, Floats]:
-    """Places along every element: its number and the measure [m]."""
-    numbers, measures = [], []
-    for number, _, part in track.elements():
-        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
-        at_m = np.linspace(low, high, max(2, round((high - low) / _SPACING_M) + 1))
-        numbers.append(np.full(len(at_m), number))
-        measures.append(at_m)
-    return np.concatenate(numbers), np.concatenate(measures)
-
-
-def _degrees(track: Track, element: Ints, measure_m: Floats) -> tuple[Floats, Floats]:
-    """Latitude and longitude of places along elements."""
-    latitude, longitude = np.empty((2, len(element)))
-    for number, _, part in track.elements():
-        rows = slice(*np.searchsorted(element, [number, number + 1]).tolist())
-        at_m = measure_m[rows]
-        latitude[rows] = np.interp(at_m, track.measure_m[part], track.latitude_deg[part])
-        longitude[rows] = np.interp(at_m, track.measure_m[part], track.longitude_deg[part])
-    return latitude, longitude
 
 
 def _survey_m(track: Track, config: MatchingConfig) -> Floats:

@@ -6,22 +6,24 @@ from collections.abc import Iterable
 
 import polars as pl
 
-# Residual over its sigma from which an element counts as inconsistent.
-CONSISTENCY_LIMIT = 3.0
-# Position errors last about this long [s] (DIAG Table 1, user): a shorter passage is one observation.
-_ERROR_TAU_S = 100.0
+from schemas.config import MatchingConfig
+
+_DEFAULTS = MatchingConfig()
 _AXES = {"cross": ("cross_track_m", "sigma_cross_m"), "vertical": ("vertical_m", "sigma_up_m")}
 
 
-def survey_findings(epochs: Iterable[pl.DataFrame], track: pl.DataFrame | None = None) -> pl.DataFrame:
+def survey_findings(
+    epochs: Iterable[pl.DataFrame], track: pl.DataFrame | None = None, config: MatchingConfig = _DEFAULTS
+) -> pl.DataFrame:
     """Residuals per net element and axis over many runs, those that do not fit their sigma marked.
 
-    `epochs` holds `epochs` tables, one run each; `track`, where the site is at hand, gives the survey's own
-    sigma. Columns: `netelement_id, axis (cross, vertical), runs, epochs, residual_m` (cross positive left of
-    the element's own sense), `sigma_m` of that residual with the survey's, `ratio, inconsistent`. An antenna
-    off the train's middle shows on all elements of a run, to opposite sides on runs in opposite directions.
+    `epochs` holds `epochs` tables, one run each; `track`, where the site is at hand, gives the survey's own sigma;
+    beyond `on_track_sigmas` an element is inconsistent. Columns: `netelement_id, axis (cross, vertical), runs,
+    epochs, residual_m` (cross positive left of the element's own sense), `sigma_m` of that residual with the
+    survey's, `ratio, inconsistent`. An antenna off the train's middle shows on all elements of a run, to opposite
+    sides on runs in opposite directions.
     """
-    passages = [_passages(frame) for frame in epochs]
+    passages = [_passages(frame, config) for frame in epochs]
     if not passages:
         return pl.DataFrame(schema=SURVEY_COLUMNS)
     weight = 1.0 / pl.col("variance_m2")
@@ -40,7 +42,7 @@ def survey_findings(epochs: Iterable[pl.DataFrame], track: pl.DataFrame | None =
     return (
         merged.with_columns(variance.sqrt().alias("sigma_m"))
         .with_columns((pl.col("residual_m").abs() / pl.col("sigma_m")).alias("ratio"))
-        .with_columns((pl.col("ratio") > CONSISTENCY_LIMIT).alias("inconsistent"))
+        .with_columns((pl.col("ratio") > config.on_track_sigmas).alias("inconsistent"))
         .sort("ratio", "netelement_id", "axis", descending=[True, False, False])
         .select(*SURVEY_COLUMNS)
     )
@@ -58,10 +60,11 @@ SURVEY_COLUMNS: dict[str, type[pl.DataType]] = {
 }
 
 
-def _passages(epochs: pl.DataFrame) -> pl.DataFrame:
+def _passages(epochs: pl.DataFrame, config: MatchingConfig) -> pl.DataFrame:
     """Median residual of one run on each element, with its variance.
 
-    Several solutions are one observation: they share the sky, the antenna and mostly the ranges.
+    A passage shorter than `noise_tau_s` is one observation, and so are several solutions: they share the sky, the
+    antenna and mostly the ranges.
     """
     used = epochs.filter(pl.col("on_track") & pl.col("netelement_id").is_not_null())
     # The sense in which the run's path goes over the element, from where both positions grow.
@@ -75,7 +78,7 @@ def _passages(epochs: pl.DataFrame) -> pl.DataFrame:
             pl.lit(axis).alias("axis"),
             pl.len().cast(pl.Int64).alias("epochs"),
             (pl.col(residual).median() * turn).alias("residual_m"),
-            ((pl.col(sigma) ** 2).mean() / (1.0 + seconds / (2.0 * _ERROR_TAU_S))).alias("variance_m2"),
+            ((pl.col(sigma) ** 2).mean() / (1.0 + seconds / (2.0 * config.noise_tau_s))).alias("variance_m2"),
         )
         parts.append(part)
     return (

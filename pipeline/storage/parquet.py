@@ -62,18 +62,53 @@ def _reading() -> Iterator[None]:
 
 def read_parquet(source: bytes | Path, choose: Callable[[Schema], Sequence[str]] | None = None) -> pl.DataFrame:
     """The table; of all its columns and their types `choose` says which are read. Raises `ParquetError`."""
-    with _reading():
-        place = pa.BufferReader(source) if isinstance(source, bytes) else source
-        file = pq.ParquetFile(place, page_checksum_verification=True)
-        names = list(file.schema_arrow.names)
+    reader = Reader(choose)
+    reader.add(source)
+    return reader.frame()
+
+
+class Reader:
+    """Tables of one kind from many files, one below the other: a frame of each would take most of the time.
+
+    `choose` is asked of each kind of columns that comes which of them are read, in which order, and may refuse them.
+    """
+
+    def __init__(self, choose: Callable[[Schema], Sequence[str]] | None = None) -> None:
+        self._choose = choose
+        self._tables: list[pa.Table] = []
+        self._kind: pa.Schema | None = None
+        self._wanted: list[str] = []
+        self.heights: list[int] = []
+
+    def add(self, source: bytes | Path) -> None:
+        """Read one more. Raises `ParquetError`."""
+        with _reading():
+            place = pa.BufferReader(source) if isinstance(source, bytes) else source
+            file = pq.ParquetFile(place, page_checksum_verification=True)
+            kind = file.schema_arrow.remove_metadata()
+            # What polars makes of a column stands in the field's metadata.
+            if self._kind is None or not kind.equals(self._kind, check_metadata=True):
+                self._wanted = self._names(kind)
+                self._kind = kind
+            self.heights.append(file.metadata.num_rows)
+            if self._wanted:
+                self._tables.append(file.read(columns=self._wanted).replace_schema_metadata(None))
+
+    def frame(self) -> pl.DataFrame:
+        """All that was read, in order. Raises `ParquetError`."""
+        if not self._tables:
+            return pl.DataFrame(height=sum(self.heights))
+        with _reading():
+            whole = self._tables[0] if len(self._tables) == 1 else pa.concat_tables(self._tables).combine_chunks()
+            return pl.DataFrame(pl.from_arrow(whole)).select(self._wanted)
+
+    def _names(self, kind: pa.Schema) -> list[str]:
+        names = list(kind.names)
         if len(set(names)) < len(names):
             raise ValueError("two columns have the same name")
         # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
-        empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], file.schema_arrow)))
-        wanted = list(names if choose is None else choose(dict(empty.schema)))
-        if not wanted:
-            return pl.DataFrame(height=file.metadata.num_rows)
-        return pl.DataFrame(pl.from_arrow(file.read(columns=wanted))).select(wanted)
+        empty = pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], kind)))
+        return list(names if self._choose is None else self._choose(dict(empty.schema)))
 
 
 def metadata_of(content: bytes) -> dict[str, str]:

@@ -10,23 +10,21 @@ import polars as pl
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.site.tables import RawTable, typed_table
 from pipeline.survey.kilometres import measures_at
 from pipeline.survey.network import Network
-from pipeline.survey.pieces import Survey
+from pipeline.survey.pieces import SAME_TRACK_M, Survey
 from pipeline.survey.sources import content_of_survey
 from pipeline.survey.tables import placed_table
 from pipeline.track.geodesy import points_of
-from pipeline.track.segments import Polyline, downhill
+from pipeline.track.network import network_of
 from pipeline.track.survey import Track, track_of
 from schemas.errors import SiteError
 from schemas.inputs import Balises
 
 # Lists give the track's axis or the marker beside it; farther is another line, or another system of coordinates.
 _FAR_M = 10.0
-# Two tracks that differ by less in their distance cannot be told by a balise's coordinates.
-_TELLS_M = 1.5
-_SAMPLE_M = 20.0
 
 
 def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
@@ -34,7 +32,7 @@ def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
 
     So the spacing holds over joints and switches; where two ways meet again it begins anew.
     """
-    track = track_of(network.track())
+    track = track_of(network.track)
     from_start = _from_start_m(network.ends, track.length_m)
     rows: list[dict[str, Any]] = []
     for element, name in enumerate(track.ids):
@@ -84,7 +82,7 @@ def balises_of_list(path: Path, network: Network, epsg: int | None, survey: Surv
     """
     place = str(path)
     table = placed_table(place, content_of_survey(path), epsg)
-    track = track_of(network.track())
+    track = track_of(network.track)
     if "balise_id" not in table.columns:
         table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
     kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
@@ -103,12 +101,7 @@ class _Placer:
 
     def __init__(self, place: str, network: Network, track: Track, survey: Survey) -> None:
         self.place, self.network, self.track, self.survey = place, network, track, survey
-        surface = points_of(track.latitude_deg, track.longitude_deg).surface
-        inner = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:] - 1)
-        self.vertex = inner
-        self.line = Polyline(surface[inner], surface[inner + 1])
-        self.element = np.searchsorted(track.first, inner, side="right") - 1
-        self.tree, self.segment = self.line.samples
+        self.ground, self.segments = network_of(track, network.links), segments_of(track)
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
         given = {key for key, value in row.items() if value is not None}
@@ -126,33 +119,19 @@ class _Placer:
 
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
-        near = self.tree.query_ball_point(point.surface[0], 2 * _SAMPLE_M)
-        nearest: dict[int, tuple[float, float]] = {}
-        for element in sorted({int(self.element[self.segment[sample]]) for sample in near}):
-            own = np.array([self.segment[s] for s in near if self.element[self.segment[s]] == element])
-            nearest[element] = self._foot(point, own)
+        near = candidates_of(point, self.ground, self.segments, 2 * _FAR_M)
+        ranked = sorted(zip(near.distance_m.tolist(), near.element.tolist(), near.along_m.tolist(), strict=True))
         wanted = row.get("netelement_id")
-        ranked = sorted((away, element, measure) for element, (away, measure) in nearest.items())
         if wanted is not None:
             ranked = [one for one in ranked if self.track.ids[one[1]] == wanted]
         if not ranked or ranked[0][0] > _FAR_M:
-            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {_SAMPLE_M:g} m"
+            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * _FAR_M:g} m"
             raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {_FAR_M:g} m")
         self._tell_rival(row, ranked)
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
-    def _foot(self, point: Any, segments: np.ndarray) -> tuple[float, float]:
-        """Distance and measure of the nearest place of one element."""
-        several = point.take(np.zeros(len(segments), dtype=np.int64))
-        feet = downhill(several, self.line, segments, self.element)
-        best = int(np.argmin(feet.distance_m))
-        row = int(self.vertex[feet.segment[best]])
-        share = float(np.clip(feet.fraction[best], 0.0, 1.0))
-        low, high = self.track.measure_m[row], self.track.measure_m[row + 1]
-        return float(feet.distance_m[best]), float(low + share * (high - low))
-
     def _tell_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
-        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + _TELLS_M]
+        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + SAME_TRACK_M]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
         for _, other, _ in near:
             if not nodes & set(self.network.ends[other].tolist()):

@@ -8,13 +8,18 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from scipy.spatial import cKDTree
 
+from pipeline.matching.candidates import candidates_of, segments_of
+from pipeline.site.checks import NEAR_ENDS_M
 from pipeline.survey.kilometres import spans
 from pipeline.survey.network import Network
-from pipeline.survey.pieces import COLUMNS, Piece
-from pipeline.track.geodesy import earth_centred_m, points_of
-from pipeline.track.survey import Track, track_of
+from pipeline.survey.pieces import COLUMNS, SAME_TRACK_M, SHAPE_M, Piece
+from pipeline.track.geodesy import earth_centred_m, points_of, way_m
+from pipeline.track.network import Network as Ground
+from pipeline.track.network import network_of
+from pipeline.track.pieces import in_pieces
+from pipeline.track.segments import SAMPLE_SPACING_M
+from pipeline.track.survey import places_along, track_of
 from schemas.arrays import Floats
 from schemas.enums import Navigability
 from schemas.run import Finding
@@ -23,21 +28,18 @@ from schemas.run import Finding
 _KINK_DEG = 20.0
 _LEAST_RADIUS_M = 60.0
 _STEP_ASIDE_M = 0.3
-# Tracks lie 3.5 m apart; the branches of the longest switches (radius 1,200 m) part by a metre within 50 m.
-_DOUBLE_M = 1.0
+# The branches of the longest switches (radius 1,200 m) part as far as that within 60 m.
 _DOUBLE_OVER_M = 100.0
-_SAMPLE_M = 2.0
-_NEAR_TRACK_M = 5.0
-# Lengths are right to this; a share of the length is that of the best odometer scale.
-_LONGER_M = 0.1
+# A share of the length that is that of the best odometer scale.
 _LONGER = 1e-4
 _UNEVEN = 3.0
 
 
 def doubts(network: Network) -> list[Finding]:
     """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
-    track = track_of(network.track())
-    found = [*_heights(network.elements), *_doubled(track), *_open_ends(network, track)]
+    track = track_of(network.track)
+    in_parts = network_of(in_pieces(track), network.links)
+    found = [*_heights(network.elements), *_doubled(in_parts), *_open_ends(network_of(track, network.links))]
     for element in network.elements:
         found += [*_kinks(element), *_kilometres(element), *_scattered(element)]
     return [*found, *_corners(network)]
@@ -103,7 +105,7 @@ def _last_step(element: Piece, position: int) -> Piece:
 
 
 def _kilometres(element: Piece) -> Iterator[Finding]:
-    way = _way_m(points_of(element.latitude_deg, element.longitude_deg).surface)
+    way = way_m(points_of(element.latitude_deg, element.longitude_deg).surface)
     known, off_m, jumps = spans(element.line_km, way)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))
@@ -115,19 +117,15 @@ def _kilometres(element: Piece) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
 
 
-def _way_m(places: Floats) -> Floats:
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
-
-
 def _scattered(element: Piece) -> Iterator[Finding]:
     """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
     level = np.zeros(len(element))
     height = level if np.isnan(element.height_m).any() else element.height_m
     flat, solid = (earth_centred_m(element.latitude_deg, element.longitude_deg, h) for h in (level, height))
-    way = _way_m(flat)
+    way = way_m(flat)
     by_plan = _longer_m(flat, way)
-    by_height = max(0.0, min(_longer_m(solid, way) - by_plan, float(_way_m(solid)[-1] - way[-1])))
-    if by_plan + by_height > max(_LONGER_M, _LONGER * way[-1]):
+    by_height = max(0.0, min(_longer_m(solid, way) - by_plan, float(way_m(solid)[-1] - way[-1])))
+    if by_plan + by_height > max(SHAPE_M, _LONGER * way[-1]):
         what, longer_m, remedy = "positions", by_plan, "Export all decimals; do not draw by hand."
         if by_height > by_plan:
             what, longer_m, remedy = "heights", by_height, "Mend them, or leave them out with --flat."
@@ -158,52 +156,32 @@ def _longer_m(places: Floats, way: Floats) -> float:
     return float((variance_m2 / step.mean(axis=0))[even].sum())
 
 
-def _samples(track: Track) -> tuple[Floats, np.ndarray, Floats]:
-    """Places every two metres along all elements, the element of each, and its distance from either end."""
-    places, owner, from_ends = [], [], []
-    for element, _, part in track.elements():
-        surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
-        measure = track.measure_m[part]
-        at = np.linspace(measure[0], measure[-1], int((measure[-1] - measure[0]) / _SAMPLE_M) + 2)
-        places.append(np.column_stack([np.interp(at, measure, surface[:, axis]) for axis in range(3)]))
-        owner.append(np.full(len(at), element))
-        from_ends.append(np.column_stack([at - measure[0], measure[-1] - at]))
-    return np.concatenate(places), np.concatenate(owner), np.concatenate(from_ends)
-
-
-def _doubled(track: Track) -> Iterator[Finding]:
-    places, owner, from_ends = _samples(track)
-    # Two samples of parallel tracks are at most half a spacing apart along the track.
-    pairs = cKDTree(places).query_pairs(float(np.hypot(_DOUBLE_M, _SAMPLE_M / 2)), output_type="ndarray")
-    again = np.abs(from_ends[pairs[:, 0], 0] - from_ends[pairs[:, 1], 0]) > _DOUBLE_OVER_M
-    pairs = pairs[(owner[pairs[:, 0]] != owner[pairs[:, 1]]) | again]
-    if not len(pairs):
-        return
-    both = np.unique(np.column_stack([pairs[:, 0], owner[pairs[:, 1]]]), axis=0)
-    named, count = np.unique(np.column_stack([owner[both[:, 0]], both[:, 1]]), axis=0, return_counts=True)
-    for (one, other), samples in zip(named.tolist(), count.tolist(), strict=True):
-        if samples * _SAMPLE_M > _DOUBLE_OVER_M:
-            whom = "itself" if one == other else track.ids[other]
-            text = f"lies within {_DOUBLE_M:g} m of {whom} over {samples * _SAMPLE_M:.0f} m"
+def _doubled(ground: Ground) -> Iterator[Finding]:
+    """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
+    track = ground.track
+    along = places_along(track, SAMPLE_SPACING_M)
+    found = candidates_of(points_of(along.latitude_deg, along.longitude_deg), ground, segments_of(track), SAME_TRACK_M)
+    own = along.element[found.step]
+    both = np.column_stack([own, found.element])[own < found.element]
+    pairs, count = np.unique(both, axis=0, return_counts=True)
+    for (one, other), samples in zip(pairs.tolist(), count.tolist(), strict=True):
+        if samples * SAMPLE_SPACING_M > _DOUBLE_OVER_M:
+            whom = "itself" if track.ids[one] == track.ids[other] else track.ids[other]
+            text = f"lies within {SAME_TRACK_M:g} m of {whom} over {samples * SAMPLE_SPACING_M:.0f} m"
             yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
 
 
-def _open_ends(network: Network, track: Track) -> Iterator[Finding]:
+def _open_ends(ground: Ground) -> Iterator[Finding]:
     """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
-    places, owner, from_ends = _samples(track)
-    from_end = from_ends.min(axis=1)
-    tree = cKDTree(places)
-    count = np.bincount(network.ends.ravel())
-    for element, pair in enumerate(network.ends.tolist()):
-        for position, node in enumerate(pair):
-            row = track.end(element, position)
-            if count[node] > 1:
-                continue
-            end = points_of(track.latitude_deg[row : row + 1], track.longitude_deg[row : row + 1]).surface[0]
-            near = np.array(tree.query_ball_point(end, _NEAR_TRACK_M), dtype=np.int64)
-            near = near[(owner[near] != element) & (from_end[near] > _NEAR_TRACK_M)]
-            for other in np.unique(owner[near]).tolist():
-                away = float(np.linalg.norm(places[near[owner[near] == other]] - end, axis=1).min())
-                text = f"end {position} lies {away:.1f} m from the middle of {track.ids[other]} and is not joined to it"
-                remedy = "Give both lines a point in common there, if it is a switch."
-                yield Finding("warning", f"track: {track.ids[element]}", text, remedy)
+    track = ground.track
+    element, position = np.nonzero(~ground.linked_ends())
+    row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
+    points = points_of(track.latitude_deg[row], track.longitude_deg[row])
+    found = candidates_of(points, ground, segments_of(track), NEAR_ENDS_M)
+    middle = np.minimum(found.along_m, found.left_m) > NEAR_ENDS_M
+    for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
+        end, other = int(found.step[near]), track.ids[int(found.element[near])]
+        beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"
+        text = f"end {position[end]} lies {beside} and is not joined to it"
+        remedy = "Give both lines a point in common there, if it is a switch."
+        yield Finding("warning", f"track: {track.ids[int(element[end])]}", text, remedy)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +15,13 @@ from pipeline.storage.writing import replace_files
 from pipeline.survey.balises import balises_every, balises_of_list
 from pipeline.survey.doubts import doubts
 from pipeline.survey.network import Network, make_network
-from pipeline.survey.pieces import Survey
+from pipeline.survey.pieces import SAME_PLACE_M, Survey
 from pipeline.survey.sources import read_surveys
 from pipeline.survey.trace import clean_traces
 from schemas.config import Configuration, Vehicle
 from schemas.errors import SiteError, UsageError
 from schemas.run import Finding, Site
 
-JOIN_M = 0.05
 _FILES = ("track", "links", "balises", "route")
 
 
@@ -34,7 +33,7 @@ class Wish:
     spacing_m: float | None = None
     balise_list: Path | None = None
     epsg: int | None = None
-    join_m: float = JOIN_M
+    join_m: float = SAME_PLACE_M
     flat: bool = False
 
 
@@ -63,14 +62,13 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     Raises `SiteError`.
     """
     survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config))
+    if wish.flat:
+        survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
     network = make_network(survey, wish.join_m)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
-    if wish.flat:
-        for element in network.elements:
-            element.height_m[:] = np.nan
     balises = _balises(wish, network, survey)
-    track = network.track()
+    track = network.track
     found = remarks(track, network.links, balises, None, {})
     if found.breaches:
         raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))

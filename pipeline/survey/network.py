@@ -14,33 +14,31 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pipeline.site.checks import outward
-from pipeline.survey.pieces import COLUMNS, Piece, Survey
+from pipeline.survey.pieces import COLUMNS, SAME_PLACE_M, Piece, Survey
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import geometric_measures_m, track_of
-from schemas.arrays import Floats, Ints
+from schemas.arrays import Floats, Ints, spans_of
 from schemas.enums import Navigability
 from schemas.inputs import Links
 
 # OpenStreetMap writes seven decimals of a degree: equal positions are the same node.
 _NODE_DEG = 1e-7
-_SAME_PLACE_M = 0.05
 # A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
 # tram curve of 20 m. At a switch the branches lie within some 12 degrees (1:4.5); maps draw it up to 45.
 _MOST_AT_SWITCH_DEG = 45.0
-_MOST_AT_JOINT_DEG = 90.0
 
 
 @dataclass(frozen=True)
 class Network:
-    """Net elements with the nodes at their two ends, and the links between ends."""
+    """Net elements with the nodes at their two ends, and the links between ends.
+
+    `track`: the table of their points, with `line_km` beside the contract's columns.
+    """
 
     elements: list[Piece]
     ends: Ints
     links: pl.DataFrame
-
-    def track(self) -> pl.DataFrame:
-        """The track table, with `line_km` beside the contract's columns."""
-        return track_table(self.elements)
+    track: pl.DataFrame
 
 
 def make_network(survey: Survey, join_m: float) -> Network:
@@ -56,18 +54,18 @@ def make_network(survey: Survey, join_m: float) -> Network:
     switches = _nodes_at(pieces, nodes, survey.switches_deg)
     crossings = _crossings(pieces, nodes, switches, survey)
     elements, ends = _cut(pieces, nodes, crossings)
-    links = _links(elements, ends, crossings, switches, survey) if elements else Links.create_empty()
-    return Network(elements, ends, links)
+    if not elements:
+        return Network([], ends, Links.create_empty(), pl.DataFrame())
+    track = _track_table(elements)
+    return Network(elements, ends, _links(track, ends, crossings, switches, survey), track)
 
 
-def track_table(elements: list[Piece]) -> pl.DataFrame:
+def _track_table(elements: list[Piece]) -> pl.DataFrame:
     """Points of the elements in order, measures along their geometry; null for what is not known."""
-    parts = []
-    for piece in elements:
-        measure = geometric_measures_m(piece.latitude_deg, piece.longitude_deg, piece.height_m)
-        columns = {name: pl.Series(getattr(piece, name)).fill_nan(None) for name in COLUMNS}
-        parts.append(pl.DataFrame({"netelement_id": [piece.name] * len(piece), "measure_m": measure, **columns}))
-    return pl.concat(parts)
+    measures = [geometric_measures_m(one.latitude_deg, one.longitude_deg, one.height_m) for one in elements]
+    columns = {name: np.concatenate([getattr(one, name) for one in elements]) for name in COLUMNS}
+    names = list(itertools.chain.from_iterable([one.name] * len(one) for one in elements))
+    return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
 
 
 def _nodes(pieces: list[Piece], join_m: float) -> list[Ints]:
@@ -114,16 +112,10 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
             survey.told("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")
-        for first, last in _runs(new):
-            kept.append(piece.take(np.arange(first, last + 1)))
-            kept_nodes.append(own[first : last + 1])
+        for first, last in spans_of(new):
+            kept.append(piece.take(np.arange(first, last + 2)))
+            kept_nodes.append(own[first : last + 2])
     return kept, kept_nodes
-
-
-def _runs(wanted: np.ndarray) -> Iterator[tuple[int, int]]:
-    """First and one beyond the last of each unbroken row of true values."""
-    turns = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(np.int64), [0]])))
-    yield from zip(turns[::2].tolist(), turns[1::2].tolist(), strict=True)
 
 
 def _crossings(pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey) -> set[int]:
@@ -162,7 +154,7 @@ def _nodes_at(pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[flo
     latitude = np.concatenate([piece.latitude_deg for piece in pieces])
     longitude = np.concatenate([piece.longitude_deg for piece in pieces])
     wanted = points_of(*np.array(places_deg).T).surface
-    row = cKDTree(points_of(latitude, longitude).surface).query(wanted, distance_upper_bound=_SAME_PLACE_M)[1]
+    row = cKDTree(points_of(latitude, longitude).surface).query(wanted, distance_upper_bound=SAME_PLACE_M)[1]
     return set(np.concatenate(nodes)[row[row < len(latitude)]].tolist())
 
 
@@ -187,14 +179,14 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
-def _links(elements: list[Piece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
+def _links(table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
     """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
     arms: dict[int, list[tuple[int, int]]] = {}
     for element, pair in enumerate(ends.tolist()):
         for position, node in enumerate(pair):
             arms.setdefault(node, []).append((element, position))
-    directions = outward(track_of(track_table(elements)))
-    names = [element.name for element in elements]
+    track = track_of(table)
+    directions, names = outward(track), track.ids
     rows: list[tuple[str, int, str, int, str]] = []
     for node, meeting in arms.items():
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
@@ -217,7 +209,7 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool) -> set[tuple[i
         (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
         for one, other in itertools.combinations(range(len(units)), 2)
     }
-    most = _MOST_AT_JOINT_DEG if len(units) == 2 else _MOST_AT_SWITCH_DEG
+    most = 90.0 if len(units) == 2 else _MOST_AT_SWITCH_DEG
     possible = {pair for pair, turn in turns.items() if turn <= most}
     ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
     two_by_two = ways == [2, 2, 2, 2]

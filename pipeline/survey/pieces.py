@@ -11,6 +11,12 @@ from schemas.arrays import Floats, Ints
 from schemas.errors import SiteError
 from schemas.run import Finding
 
+# Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.
+SAME_TRACK_M = 1.5
+# Lines and their lengths keep to this.
+SHAPE_M = 0.1
+# Two places that are nearer are one.
+SAME_PLACE_M = 0.05
 # A survey of 100 MB holds some two million points: more is no line that a person checks.
 MOST_BYTES = 100_000_000
 

@@ -8,6 +8,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.run import read_run
+from pipeline.matching.fixes import fixes_of
+from pipeline.matching.reference import as_fixes
+from pipeline.matching.steps import believable, travelled
 from pipeline.survey.pieces import Survey, piece_of
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Fix
@@ -31,6 +34,12 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
         expected = "a stream `reference`, or positions with fix `rtk_fixed`"
         raise SiteError("has no position better than GNSS alone", place=str(path), expected=expected)
     survey = Survey()
+    fixes = fixes_of(as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
+    reached = believable(fixes, fixes.valid, travelled(fixes, None), config.matching)
+    if (jumped := points.height - len(reached)) > 0:
+        text = f"{jumped} positions to which no train can have come are left out"
+        survey.told("warning", f"track: {run.run_id}", text, "Look at the recording there.")
+    points = points[reached]
     height = points["height_m"].fill_null(np.nan) - vehicle.antenna_height_m
     columns = {"latitude_deg": points["latitude_deg"], "longitude_deg": points["longitude_deg"], "height_m": height}
     survey.pieces.append(piece_of(str(path), run.run_id, {**columns, "sigma_m": points["sigma_m"]}, recorded=True))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.survey.pieces import COLUMNS, Piece, Survey
-from pipeline.track.geodesy import earth_centred_m, points_of
-from schemas.arrays import Floats, Ints
+from pipeline.survey.pieces import COLUMNS, SAME_TRACK_M, SHAPE_M, Piece, Survey
+from pipeline.track.geodesy import earth_centred_m, points_of, way_m
+from schemas.arrays import Floats, Ints, spans_of
 
 # A stop shrinks to one point: the next counts that is as far away, and farther than the noise reaches.
 _STEP_M = 1.0
@@ -19,13 +19,9 @@ _STEP_SIGMAS = 6.0
 # Farther than any train gets in a second or two, and than ten usual steps: nothing was recorded in between.
 _GAP_M = 100.0
 _GAP_STEPS = 10.0
-# Tracks lie 3.5 m and more apart, RTK scatters by centimetres.
-_SAME_TRACK_M = 1.5
-# Behind a switch of 300 m radius the branch is 1.5 m aside after 30 m: there the toe is looked for.
+# Behind a switch of 300 m radius the branch is 1.5 m aside after 30 m: there the toe is looked for. What is shorter is
+# the noise of a pass that was left out.
 _TOE_M = 30.0
-# Shorter ones are the noise of a pass that was left out.
-_LEAST_M = 20.0
-_THIN_M = 0.1
 # Douglas and Peucker take time quadratic in the worst case: on so many points at once it stays linear.
 _BLOCK = 2000
 
@@ -90,8 +86,9 @@ def _new_track(piece: Piece, name: str, survey: Survey) -> list[Piece]:
     known = list(survey.pieces)
     for lap in _laps(piece):
         covered = _covered(_surface(lap), known)
-        for first, last in _stretches(~covered):
-            if _length_m(lap.take(np.arange(first, last + 1))) >= _LEAST_M:
+        way = way_m(_surface(lap))
+        for first, last in spans_of(~covered):
+            if way[last] - way[first] >= _TOE_M:
                 parts.append(_with_toes(lap, first, last, known))
         known = [*survey.pieces, *parts]
         if covered.any():
@@ -104,7 +101,7 @@ def _new_track(piece: Piece, name: str, survey: Survey) -> list[Piece]:
 def _laps(piece: Piece) -> Iterator[Piece]:
     """A pass cut where it turns back or comes to where it was, so that each lap covers a place once."""
     places = _surface(piece)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+    way = way_m(places)
     rows = np.arange(len(piece))
     if len(piece) < 3:
         yield piece
@@ -121,7 +118,7 @@ def _laps(piece: Piece) -> Iterator[Piece]:
 
 def _was_here(tree: cKDTree, places: Floats, way: Floats, row: int) -> bool:
     """Whether an earlier row, more than two toes back along the way, lies within a step of this one."""
-    near = np.array(tree.query_ball_point(places[row], _SAME_TRACK_M), dtype=np.int64)
+    near = np.array(tree.query_ball_point(places[row], SAME_TRACK_M), dtype=np.int64)
     return bool((way[row] - way[near[near < row]] > 2 * _TOE_M).any())
 
 
@@ -130,13 +127,7 @@ def _covered(places: Floats, known: list[Piece]) -> np.ndarray:
     if not known:
         return np.zeros(len(places), dtype=bool)
     tree = cKDTree(np.concatenate([_dense(_surface(piece)) for piece in known]))
-    return np.asarray(tree.query(places)[0] <= _SAME_TRACK_M)
-
-
-def _stretches(wanted: np.ndarray) -> list[tuple[int, int]]:
-    """First and last row of each unbroken row of true values."""
-    turns = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(np.int64), [0]])))
-    return list(zip(turns[::2].tolist(), (turns[1::2] - 1).tolist(), strict=True))
+    return np.asarray(tree.query(places)[0] <= SAME_TRACK_M)
 
 
 def _with_toes(lap: Piece, first: int, last: int, known: list[Piece]) -> Piece:
@@ -178,21 +169,17 @@ def _joined(one: Piece | None, other: Piece | None) -> Piece:
     return replace(given[0], **columns)
 
 
-def _length_m(piece: Piece) -> float:
-    return float(np.linalg.norm(np.diff(_surface(piece), axis=0), axis=1).sum())
-
-
 def _dense(places: Floats) -> Floats:
     """Points at most a metre apart along a line."""
     if len(places) < 2:
         return places
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+    way = way_m(places)
     at = np.linspace(0.0, way[-1], int(way[-1]) + 2)
     return np.column_stack([np.interp(at, way, places[:, axis]) for axis in range(3)])
 
 
 def _thinned(piece: Piece, held: np.ndarray) -> Piece:
-    """Without points whose leaving out moves the line by less than `_THIN_M`; those held stay."""
+    """Without points whose leaving out moves the line by less than `SHAPE_M`; those held stay."""
     height = np.zeros(len(piece)) if np.isnan(piece.height_m).any() else piece.height_m
     places = earth_centred_m(piece.latitude_deg, piece.longitude_deg, height)
     kept = held.copy()
@@ -202,7 +189,7 @@ def _thinned(piece: Piece, held: np.ndarray) -> Piece:
         low, high = spans.pop()
         away = _off_chord_m(places[low : high + 1])
         worst = int(np.argmax(away))
-        if away[worst] > _THIN_M:
+        if away[worst] > SHAPE_M:
             kept[low + worst] = True
             spans += [(low, low + worst), (low + worst, high)]
     return piece.take(np.flatnonzero(kept))

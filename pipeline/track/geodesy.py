@@ -55,6 +55,11 @@ def distances_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", steps, steps)))
 
 
+def way_m(places: Floats) -> Floats:
+    """Distance of each of some places from the first of them, along the line that they make [m]."""
+    return np.concatenate([np.zeros(min(1, len(places))), np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+
+
 def distance_m(latitude_a_deg: float, longitude_a_deg: float, latitude_b_deg: float, longitude_b_deg: float) -> float:
     """Straight distance of two places on the ellipsoid [m]; for what is near."""
     pair = np.array([latitude_a_deg, latitude_b_deg]), np.array([longitude_a_deg, longitude_b_deg])

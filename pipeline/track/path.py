@@ -12,11 +12,10 @@ import polars as pl
 from pipeline.track.geodesy import Points
 from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.track.segments import Feet, no_feet
-from pipeline.track.survey import Track
+from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
 from schemas.arrays import Bools, Floats, Ints
 
 Objects = npt.NDArray[np.object_]
-MEASURE_TOLERANCE_M = 0.5
 BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
     "leg": pl.Int32,
     "balise_id": pl.String,

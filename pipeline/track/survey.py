@@ -59,6 +59,29 @@ def track_of(frame: pl.DataFrame) -> Track:
     return Track(ids=tuple(index), index=index, first=first, length_m=length_m, **columns)
 
 
+@dataclass(frozen=True)
+class Along:
+    """Places along all elements, in order: element number and measure [m] of each, degrees."""
+
+    element: Ints
+    measure_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+
+
+def places_along(track: Track, spacing_m: float) -> Along:
+    """Places about so far apart on every element, its two ends among them."""
+    columns: list[list[Floats]] = [[], [], [], []]
+    for number, _, part in track.elements():
+        low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+        at_m = np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
+        degrees = (np.interp(at_m, track.measure_m[part], of[part]) for of in (track.latitude_deg, track.longitude_deg))
+        for column, values in zip(columns, (np.full(len(at_m), float(number)), at_m, *degrees), strict=True):
+            column.append(values)
+    element, *others = (np.concatenate(column) for column in columns)
+    return Along(element.astype(np.int64), *others)
+
+
 def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Distance from the first point along one element [m]: 3-D where every height is known."""
     flat = np.zeros_like(latitude_deg)

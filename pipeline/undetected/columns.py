@@ -17,7 +17,7 @@ from pipeline.undetected.levels import bounded, with_channel
 from pipeline.undetected.ranges import range_bounds
 from pipeline.undetected.spacing import largest_spacing
 from pipeline.undetected.watched import Watched, watched
-from pipeline.undetected.windows import windows
+from pipeline.undetected.windows import Window, windows
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import dtypes
@@ -60,18 +60,18 @@ class Undetected:
 class _Both:
     """Errors along growing path and against it at each row [m], NaN at the first row.
 
-    `start`: the row after which they began, else -1. `paid_m`, `outright`: what holds the larger (`error.Errors`).
+    `since_ns`: when they began at the earliest, else -1. `paid_m`, `outright`: what holds the larger (`error.Errors`).
     """
 
     up_m: Floats
     down_m: Floats
-    start: Ints
+    since_ns: Ints
     paid_m: Floats
     outright: Bools
 
 
 def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
-    kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith("undetected_")}
+    kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
     return pl.DataFrame({name: [None] * rows for name in kinds}, schema=kinds)
 
 
@@ -90,12 +90,14 @@ def undetected_of(
     found = _both(rows, parts)
     ranges = diagnosis.satellites
     of_range = None if ranges is None else _both(_with_ranges(rows, epochs, ranges, config), parts)
-    spacing = largest_spacing(rows, _way_m(rows, epochs), config)
+    spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
     return Undetected(
         _at_epochs(rows, found, facing),
-        _at_passages(at, rows, found, of_range, facing, t_ns, _names(diagnosis.bank, config)),
+        _at_passages(at, rows, found, of_range, facing, _names(diagnosis.bank, config)).with_columns(
+            physical_before_m=pl.Series(np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan), nan_to_null=True)
+        ),
         spacing,
     )
 
@@ -108,18 +110,18 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
     return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other)
 
 
-def _both(rows: Watched, parts: list[tuple[int, int]]) -> _Both:
+def _both(rows: Watched, parts: list[Window]) -> _Both:
     up, down = np.full(rows.rows, np.nan), np.full(rows.rows, np.nan)
-    began = np.full(rows.rows, -1)
+    since_ns = np.full(rows.rows, -1)
     paid, outright = np.zeros((rows.rows, 1 + rows.weight.shape[1])), np.zeros(rows.rows, dtype=np.bool_)
-    mirrored = rows.mirrored()
-    for start, end in parts:
-        ahead, behind = largest_errors(rows, start, end), largest_errors(mirrored, start, end)
-        part, worse = slice(start + 1, end + 1), ahead.most_m >= behind.most_m
-        up[part], down[part], began[part] = ahead.most_m, behind.most_m, start
+    for window in parts:
+        seen = rows.since(window.start, window.end, window.since_s)
+        ahead, behind = largest_errors(seen), largest_errors(seen.mirrored())
+        part, worse = slice(window.start + 1, window.end + 1), ahead.most_m >= behind.most_m
+        up[part], down[part], since_ns[part] = ahead.most_m, behind.most_m, window.since_ns
         paid[part] = np.where(worse[:, None], ahead.paid_m, behind.paid_m)
         outright[part] = np.where(worse, ahead.outright, behind.outright)
-    return _Both(up, down, began, paid, outright)
+    return _Both(up, down, since_ns, paid, outright)
 
 
 def _with_ranges(rows: Watched, epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Watched:
@@ -176,15 +178,15 @@ def rows_of_passages(
 
 
 def _at_passages(
-    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, t_ns: Ints, names: list[str]
+    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, names: list[str]
 ) -> pl.DataFrame:
-    known = (at >= 0) & (found.start[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
+    known = (at >= 0) & (found.since_ns[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
     at = np.where(known, at, 0)
     values = dict(zip(EPOCH_COLUMNS, _taken(found, at, known, rows, facing), strict=True))
     nothing = np.full((2, at.size), np.nan)
     ranges = nothing if of_range is None else _taken(of_range, at, known, rows, facing)
     values |= dict(zip(RANGE_COLUMNS, ranges, strict=True))
-    since = [int(t_ns[rows.epoch[found.start[row]]]) if yes else None for row, yes in zip(at, known, strict=True)]
+    since = [int(found.since_ns[row]) if yes else None for row, yes in zip(at, known, strict=True)]
     holding = [_holding(found, row, names) if yes else None for row, yes in zip(at.tolist(), known, strict=True)]
     return pl.DataFrame([pl.Series(name, one, nan_to_null=True) for name, one in values.items()]).with_columns(
         undetected_since=pl.Series(since, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),

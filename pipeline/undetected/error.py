@@ -11,18 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.undetected.growth import Growth, growth_of
+from pipeline.undetected.growth import Growth, growth_of, horizons
 from pipeline.undetected.shares import best_shares
 from pipeline.undetected.stretch import Stretch, stretch_after
 from pipeline.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Bools, Floats, Ints
 
-# A test of the position itself is looked back at over so many seconds, in steps that grow by this factor.
+# A test of the position itself is looked back at over so many seconds.
 _LOOK_BACK_S = 60.0
-_LAGS_GROW = 1.4
 
 
 Grow = Callable[[Stretch], Growth]
+# How many rows to look back over, and the split of these rows.
+After = list[tuple[int, Floats]]
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,15 @@ class Errors:
     outright: Bools
 
 
-def largest_errors(rows: Watched, start: int, end: int, grow: Grow = growth_of) -> Errors:
-    """The largest error ahead at the rows (start, end] of a fault that began after row `start`."""
-    window = rows.between(start, end + 1)
+def largest_errors(window: Watched, grow: Grow = growth_of, after: After | None = None) -> Errors:
+    """The largest error ahead at all rows but the first, of a fault that began after the first (`Watched.since`).
+
+    `after`: splits to look back at tests of the position with, by default the best ones here; any of them is a bound.
+    """
     most = np.zeros(window.rows)
     paid = np.zeros((window.rows, 1 + window.weight.shape[1]))
     outright = np.zeros(window.rows, dtype=np.bool_)
-    after_level = _after_levels(window)
+    after_level = _after_levels(window, splits_after(window) if after is None else after)
     begins = [0, *(1 + np.flatnonzero(window.fresh[1:] | window.free[1:])).tolist()]
     for begin, beyond in zip(begins, [*begins[1:], window.rows], strict=True):
         if begin:
@@ -60,7 +63,7 @@ def largest_errors(rows: Watched, start: int, end: int, grow: Grow = growth_of) 
 def _across(window: Watched, row: int, most_m: Floats) -> float:
     """The fault at a row to which the bank did not see the way, or at a re-link inside one."""
     if window.fresh[row]:
-        unseen = float(window.unseen_m[row])
+        unseen = float(window.fastest_m[row])
     else:
         stretch = stretch_after(window, row - 1, row, known=row == 1)
         unseen = float(growth_of(stretch).most_m[0]) + _learned_m(window, row)
@@ -74,13 +77,11 @@ def _learned_m(window: Watched, row: int) -> float:
     return float(window.learned_m[row] + late_m)
 
 
-def _after_levels(window: Watched) -> Floats:
+def _after_levels(window: Watched, splits: After) -> Floats:
     """What tests of the position itself leave at each row [m]: their own bound, or one before and the growth since."""
     best = window.high_m.copy()
     best[0] = np.inf
-    if not np.isfinite(best).any():
-        return best
-    for lag, shares in _splits_after(window):
+    for lag, shares in splits:
         begins = np.flatnonzero(np.isfinite(window.high_m[:-lag]))
         begins = begins[(begins > 0) & _unbroken(window, begins, lag)]
         if begins.size:
@@ -95,19 +96,18 @@ def _unbroken(window: Watched, begins: Ints, lag: int) -> Bools:
     return unbroken
 
 
-def _splits_after(window: Watched) -> list[tuple[int, Floats]]:
+def splits_after(window: Watched) -> After:
     """Splits for stretches whose averages at the start are not known, as a longest stretch in the middle has them."""
+    if not np.isfinite(window.high_m[1:]).any():
+        return []
     edges = np.append(np.flatnonzero(window.fresh | (np.arange(window.rows) == 0)), window.rows)
     longest = int(np.argmax(np.diff(edges)))
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
     period_s = max(float(np.median(np.diff(window.t_s[first : last + 1]))) if last > first else 1.0, 1e-3)
     most = min(last - first - 1, int(_LOOK_BACK_S / period_s))
     middle = (first + last - most) // 2
-    found, lag = [], 1.0
-    while lag <= most:
-        found.append((int(lag), best_shares(stretch_after(window, middle, middle + int(lag), known=False))))
-        lag = max(lag + 1, _LAGS_GROW * lag)
-    return found
+    lags = [1, *horizons(most)] if most > 0 else []
+    return [(lag, best_shares(stretch_after(window, middle, middle + lag, known=False))) for lag in lags]
 
 
 def _growth_at(window: Watched, begins: Ints, lag: int, shares: Floats) -> Floats:

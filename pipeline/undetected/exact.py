@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 _TOLERANCE = 1e-9
-# A bound within this share of itself is reached.
-_REACHED = 1e-6
+# A profile keeps by this share within its thresholds, so that rounding does not carry it over them; a bound that is so
+# near is reached.
+MARGIN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -36,15 +37,15 @@ class Optimum:
     binding: tuple[int, ...]
 
 
-def largest_profile(rows: Watched, start: int, end: int, margin: float = 0.0) -> Optimum:
-    """The profile with the largest error ahead at row `end` of a fault that began after row `start`.
+def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
+    """The profile with the largest error ahead at the last row of a fault that began after the first.
 
     `margin`: every threshold smaller by this share. Raises `BaliseError` where the solver finds none: no fault is a
     profile, so that is a defect.
     """
     from scipy.optimize import linprog  # only who asks for a profile solves the whole
 
-    program = _Program(rows.between(start, end + 1), margin)
+    program = _Program(window, margin)
     goal = np.zeros(program.width)
     goal[program.fault(program.window.rows - 1)] = -1.0
     found = linprog(
@@ -87,7 +88,7 @@ class _Program:
 
     def _bounds(self) -> tuple[Floats, Floats]:
         window, part = self.window, slice(1, None)
-        most = window.learned_m + np.where(window.fresh, window.unseen_m, 0.0)
+        most = window.learned_m + np.where(window.fresh, window.fastest_m, 0.0)
         inside = 1.0 - self._margin
         watched = (~window.fresh)[part]
         columns_low = [np.where(watched, inside * window.least_mps[part] / self._scale[part], 0.0)]
@@ -151,7 +152,7 @@ class _Program:
     def binding(self, solution: Floats) -> tuple[int, ...]:
         """Which bounds the profile reaches, by how many rows do."""
         inside = np.isfinite(self.low) & np.isfinite(self.high)
-        margin = _REACHED * np.maximum(1.0, np.abs(np.where(inside, self.high, 1.0)))
+        margin = MARGIN * np.maximum(1.0, np.abs(np.where(inside, self.high, 1.0)))
         reached = (solution >= self.high - margin) | (solution <= self.low + margin)
         rows = reached.reshape(-1, self._per_row)
         watched = ~self.window.fresh[1:]

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.undetected.shares import best_shares
+from pipeline.undetected.shares import GROWTH, best_shares
 from pipeline.undetected.stretch import Stretch, paid_m
 from schemas.arrays import Floats
-
-# The best split up to one row is good up to the rows around it too; the next one is sought so much farther on.
-_FARTHER = 1.3
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,11 @@ def _splits(stretch: Stretch) -> Iterator[Floats]:
 
 
 def horizons(rows: int) -> list[int]:
-    """Numbers of rows up to which the best split is sought, the last one all of them; one row needs none."""
+    """Numbers of rows up to which the best split is sought, the last one all of them; one row needs none.
+
+    The best split up to one row is good up to the rows around it too.
+    """
     found = [2]
     while found[-1] < rows:
-        found.append(min(max(found[-1] + 1, int(_FARTHER * found[-1])), rows))
+        found.append(min(max(found[-1] + 1, int((1.0 + GROWTH) * found[-1])), rows))
     return found if rows > 1 else []

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.undetected.columns import Diagnosis, rows_of, rows_of_passages
 from pipeline.undetected.error import largest_errors
-from pipeline.undetected.exact import largest_profile
+from pipeline.undetected.exact import MARGIN, largest_profile
 from pipeline.undetected.shapes import largest_of_shape
 from pipeline.undetected.watched import Watched
 from pipeline.undetected.windows import windows
@@ -17,9 +17,6 @@ from schemas.arrays import NS_PER_S, Ints, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.tables import SCALES
-
-# Thresholds are taken so much smaller, that rounding does not carry the profile over them.
-MARGIN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -44,25 +41,25 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
     rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(diagnosis.epochs)
     row = int(np.searchsorted(rows.epoch, epoch))
-    start = next((low for low, high in windows(rows, t_ns, diagnosis.fixes_ns) if low < row <= high), None)
-    if start is None or row >= rows.rows or rows.epoch[row] != epoch:
+    window = next((one for one in windows(rows, t_ns, diagnosis.fixes_ns) if one.start < row <= one.end), None)
+    if window is None or row >= rows.rows or rows.epoch[row] != epoch:
         raise UsageError(
             "has no fault to look for",
             place=f"epoch {epoch}",
             expected="an epoch with a position and an odometer, not negated, after the last independent fix",
         )
     against = behind != bool(ints(diagnosis.epochs["direction"], unknown=1)[epoch] < 0)
-    seen = rows.mirrored() if against else rows
-    found = largest_profile(seen, start, row, MARGIN)
-    part = rows.between(start, row + 1)
+    part = rows.since(window.start, row, window.since_s)
+    seen = part.mirrored() if against else part
+    found = largest_profile(seen, MARGIN)
     names = [name for name, on in zip(SCALES, diagnosis.bank.enabled, strict=True) if on or name == "raw"]
     return Profile(
         fault=pl.DataFrame({"t_s": part.t_s, "size_m": -found.fault_m if against else found.fault_m}),
         t=diagnosis.epochs["t"].gather(part.epoch[[0, -1]]),
         error_m=found.error_m,
-        bound_m=float(largest_errors(seen, start, row).most_m[-1]),
-        step_m=largest_of_shape(seen, start, row, "step"),
-        ramp_m=largest_of_shape(seen, start, row, "ramp"),
+        bound_m=float(largest_errors(seen).most_m[-1]),
+        step_m=largest_of_shape(seen, "step"),
+        ramp_m=largest_of_shape(seen, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in found.binding),
     )
 

@@ -11,18 +11,17 @@ from typing import Literal
 import numpy as np
 
 from pipeline.undetected.watched import NO_ROW, Watched
-from schemas.arrays import Floats
+from schemas.arrays import Floats, Ints
 
 Shape = Literal["step", "ramp"]
-# Starts are tried so far apart [s]: noise and thresholds change little in less.
-_STARTS_S = 1.0
-_NO_RESPONSE = 1e-12
 
 
-def largest_of_shape(rows: Watched, start: int, end: int, shape: Shape) -> float:
-    """The error ahead at row `end` by the largest step or ramp that began after row `start` unnoticed [m]."""
-    window = rows.between(start, end + 1)
-    starts = _starts(window)
+def largest_of_shape(window: Watched, shape: Shape, starts: Ints | None = None) -> float:
+    """The error ahead at the last row by the largest step or ramp that began after the first unnoticed [m].
+
+    `starts`: rows by which it has begun, by default one a second.
+    """
+    starts = _starts(window) if starts is None else starts
     response = np.zeros((starts.size, window.weight.shape[1]))
     largest = np.full(starts.size, np.inf)
     faults = np.zeros((window.rows, starts.size))
@@ -31,7 +30,7 @@ def largest_of_shape(rows: Watched, start: int, end: int, shape: Shape) -> float
         if window.fresh[row]:
             response[:] = 0.0
             jump = faults[row] - faults[row - 1]
-            largest = np.minimum(largest, _room(jump, window.unseen_m[row], -window.unseen_m[row]))
+            largest = np.minimum(largest, _room(jump, window.fastest_m[row], -window.fastest_m[row]))
         else:
             response = (1.0 - window.weight[row]) * response + window.weight[row] * rate[:, None]
             upper = window.threshold_mps[row] - window.average_mps[row]
@@ -47,14 +46,17 @@ def largest_of_shape(rows: Watched, start: int, end: int, shape: Shape) -> float
     return float(np.max(faults[-1] * largest, initial=0.0))
 
 
-def _starts(window: Watched) -> Floats:
-    """Rows at which a shape begins: the first after each second, and where the bank began anew."""
-    seconds = np.floor(window.t_s / _STARTS_S)
+def _starts(window: Watched) -> Ints:
+    """Rows at which a shape begins: the first after each second, and where the bank began anew.
+
+    Noise and thresholds change little in less than a second.
+    """
+    seconds = np.floor(window.t_s)
     first = np.flatnonzero(np.diff(seconds, prepend=seconds[0] - 1.0) > 0.0)
     return np.union1d(first[first > 0], np.union1d(np.flatnonzero(window.fresh[1:]) + 1, [1]))
 
 
-def _grown(window: Watched, row: int, starts: Floats, before: Floats, shape: Shape) -> tuple[Floats, Floats]:
+def _grown(window: Watched, row: int, starts: Ints, before: Floats, shape: Shape) -> tuple[Floats, Floats]:
     """The fault of each start at a row, of size one, and the rate at which the bank sees it change."""
     if shape == "step":
         step = np.where(starts == row, 1.0, 0.0)
@@ -65,6 +67,6 @@ def _grown(window: Watched, row: int, starts: Floats, before: Floats, shape: Sha
 
 def _room(response: Floats, upper: Floats | float, lower: Floats | float) -> Floats:
     """The largest size at which a response stays between its bounds."""
-    size = np.where(response > 0.0, upper, lower) / np.where(np.abs(response) > _NO_RESPONSE, response, 1.0)
-    room: Floats = np.where(np.abs(response) > _NO_RESPONSE, size, np.inf)
+    size = np.where(response > 0.0, upper, lower) / np.where(response == 0.0, 1.0, response)
+    room: Floats = np.where(response == 0.0, np.inf, size)
     return room

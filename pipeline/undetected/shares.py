@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 # Entries of a matrix: rows, columns, values.
 Entries = tuple[Ints, Ints, Floats]
-# Blocks are so much longer than the stretch before them.
-_BLOCK_GROWTH = 0.25
+# Blocks are so much longer than the stretch before them; so much farther on lies the next row with a split of its own.
+GROWTH = 0.3
 # Nothing is infinite in a program: a monitor that is not evaluated costs so many times the dearest that is.
 _NOT_TESTED = 1e3
 
@@ -35,7 +35,7 @@ class _Blocks(NamedTuple):
     def over(cls, rows: int) -> _Blocks:
         edges = [0]
         while edges[-1] < rows:
-            edges.append(min(edges[-1] + max(1, int(_BLOCK_GROWTH * edges[-1])), rows))
+            edges.append(min(edges[-1] + max(1, int(GROWTH * edges[-1])), rows))
         first, end = np.array(edges[:-1]), np.array(edges[1:])
         return cls(first, end - 1, np.repeat(np.arange(first.size), end - first))
 

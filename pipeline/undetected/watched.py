@@ -28,8 +28,9 @@ _MOST_HIDDEN = 0.5
 class Watched:
     """One row per epoch that the bank used while the position was not negated, in order; all of the same length m.
 
-    `epoch`: row among all epochs; `t_s`: seconds after the first epoch. `fresh`: nothing led here, so the fault may
-    have changed unseen, by `unseen_m` at most; `free`: the averages are not known here, only that they were silent.
+    `epoch`: row among all epochs; `t_s`: seconds after the first epoch. `fastest_m`: by how much a fault may have
+    changed since the row before, at its largest rate. `fresh`: nothing led here, so it may have done so unseen.
+    `free`: the averages are not known here, only that they were silent.
     `way_s`: metres of fault per m/s that the bank sees over the increment (its time over g, see `_share_seen`).
     `rate_mps`: u. `least_mps`, `most_mps`: bounds of y by the raw monitor and the largest rate of a fault.
     `weight`, `average_mps`, `threshold_mps` (m, averages): alpha(dt), what each average was, and its threshold.
@@ -42,7 +43,7 @@ class Watched:
     t_s: Floats
     fresh: Bools
     free: Bools
-    unseen_m: Floats
+    fastest_m: Floats
     way_s: Floats
     rate_mps: Floats
     least_mps: Floats
@@ -82,6 +83,18 @@ class Watched:
         part["anchor"] = np.where(part["anchor"] >= low, part["anchor"] - low, NO_ROW)
         return Watched(**part)
 
+    def since(self, start: int, end: int, fix_s: float = -np.inf) -> Watched:
+        """The rows from `start` to `end` for a fault that began after `fix_s`, an instant before the second of them."""
+        window = self.between(start, end + 1)
+        if window.rows < 2 or fix_s <= window.t_s[0]:
+            return window
+        fastest, least, most = window.fastest_m.copy(), window.least_mps.copy(), window.most_mps.copy()
+        fastest[1] *= (window.t_s[1] - fix_s) / (window.t_s[1] - window.t_s[0])
+        change_mps = fastest[1] / window.way_s[1]
+        least[1] = max(least[1], window.rate_mps[1] - change_mps)
+        most[1] = min(most[1], window.rate_mps[1] + change_mps)
+        return replace(window, fastest_m=fastest, least_mps=least, most_mps=most)
+
 
 def watched(
     epochs: pl.DataFrame, bank: AxisRecord, held: tuple[Held, ...], vehicle: Vehicle, config: Configuration
@@ -97,8 +110,8 @@ def watched(
     t_ns = times_ns(epochs)
     t_s = (t_ns[epoch] - t_ns[0]) * 1e-9
     fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
-    largest = config.undetected.max_rate_mps
-    seen = _share_seen(epochs, epoch)
+    fastest_m = config.undetected.max_rate_mps * np.diff(t_s, prepend=t_s[:1])
+    way_s = series.dt_s[kept] / _share_seen(epochs, epoch)
     rate, threshold = series.rate_mps[kept], _thresholds(bank, epoch)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
     learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
@@ -107,11 +120,11 @@ def watched(
         t_s=t_s,
         fresh=fresh,
         free=np.zeros(epoch.size, dtype=np.bool_),
-        unseen_m=np.where(fresh, largest * np.diff(t_s, prepend=t_s[:1]), 0.0),
-        way_s=series.dt_s[kept] / seen,
+        fastest_m=fastest_m,
+        way_s=way_s,
         rate_mps=rate,
-        least_mps=np.maximum(-threshold[:, 0], rate - largest * seen),
-        most_mps=np.minimum(threshold[:, 0], rate + largest * seen),
+        least_mps=np.maximum(-threshold[:, 0], rate - fastest_m / way_s),
+        most_mps=np.minimum(threshold[:, 0], rate + fastest_m / way_s),
         weight=np.ascontiguousarray(ewma_weight(alphas, series.dt_s[kept])),
         average_mps=np.where(fresh[:, None], 0.0, bank.value[epoch][:, 1:][:, bank.enabled[1:]]),
         threshold_mps=threshold[:, 1:][:, bank.enabled[1:]],

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
 from pipeline.undetected.watched import Watched
-from schemas.arrays import Ints, times_ns
+from schemas.arrays import NS_PER_S, Ints, times_ns
 from schemas.config import UndetectedConfig
 from schemas.enums import BaliseKind
 from schemas.run import RunLog
@@ -28,13 +29,29 @@ def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...
     return np.unique(np.concatenate(found))
 
 
-def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[tuple[int, int]]:
-    """First and last row of each window: the fault is zero at its first row and free up to its last one.
+class Window(NamedTuple):
+    """Rows over which a fault may grow: none at `start`, the last row at or before the fix, and free up to `end`.
 
-    `t_ns`: stamps of all epochs. The first row of a window is the last one at or before the fix.
+    `since_ns`: the fix, or the first row where the run begins without one; `since_s`: seconds after the first epoch.
     """
+
+    start: int
+    end: int
+    since_ns: int
+    since_s: float
+
+
+def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[Window]:
+    """The windows of a run, in order; `t_ns`: stamps of all epochs."""
     if not rows.rows:
         return []
-    last = np.searchsorted(t_ns[rows.epoch], fixes, side="right") - 1
-    starts = np.unique(np.append(np.maximum(last, 0), 0)).tolist()
-    return [(begin, end) for begin, end in zip(starts, [*starts[1:], rows.rows - 1], strict=True) if end > begin]
+    stamps = t_ns[rows.epoch]
+    last = np.searchsorted(stamps, fixes, side="right") - 1
+    # Of several fixes between two rows the last one counts.
+    began = {0: int(stamps[0])} | dict(zip(last[last >= 0].tolist(), fixes[last >= 0].tolist(), strict=True))
+    ends = [*sorted(began)[1:], rows.rows - 1]
+    return [
+        Window(start, end, began[start], (began[start] - int(t_ns[0])) / NS_PER_S)
+        for start, end in zip(sorted(began), ends, strict=True)
+        if end > start
+    ]

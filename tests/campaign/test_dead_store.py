@@ -22,7 +22,7 @@ _PATIENCE_S = 1.5
 # Clients that ask again by themselves wait for 60 s, five times over. A busy machine takes nothing like that.
 _SOON_S = 150.0
 # Of a store that is slow and no more: a busy machine must not make it look dead.
-_LONG_PATIENCE_S, _PAUSE_S = 5.0, 1.1
+_LONG_PATIENCE_S, _PAUSE_S = 15.0, 3.3
 _BLOCKS, _BLOCK = 6, b"x" * (1 << 16)
 _LISTING = b"<ListBucketResult><Name>b</Name><IsTruncated>false</IsTruncated></ListBucketResult>"
 

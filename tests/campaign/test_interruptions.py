@@ -52,7 +52,7 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     wait_for(lambda: len(store.run_ids(out)) >= 2)
     os.killpg(process.pid, signum) if signum == signal.SIGINT else process.send_signal(signum)
     # The run in work never ends by itself; how soon the campaign ends is measured by `make bench`.
-    stdout, stderr = process.communicate(timeout=120)
+    stdout, stderr = process.communicate(timeout=300)
     assert process.returncode == status, stderr
     assert "of 5 runs" in stdout
     assert "interrupted" in stderr
@@ -79,7 +79,7 @@ def test_progress_that_nobody_reads(small_trial: SmallTrial, tmp_path: Path) -> 
     process.stderr.readline()
     process.stderr.close()
     process.send_signal(signal.SIGHUP)
-    assert process.wait(timeout=120) == 0
+    assert process.wait(timeout=300) == 0
     assert len(store.run_ids(tmp_path)) == 2
 
 
@@ -160,7 +160,7 @@ def test_orphaned_workers_go(small_trial: SmallTrial, tmp_path: Path) -> None:
     workers = children_of(process.pid)
     assert workers
     process.kill()
-    process.communicate(timeout=120)
+    process.communicate(timeout=300)
     wait_for(lambda: not any(alive(pid) for pid in workers))
 
 
@@ -187,7 +187,7 @@ def test_two_campaigns_on_one_output(small_trial: SmallTrial, tmp_path: Path) ->
         assert "another campaign is writing here" in second.stderr
     finally:
         process.kill()
-        process.communicate(timeout=120)
+        process.communicate(timeout=300)
 
 
 @pytest.mark.usefixtures("in_process")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from hypothesis import strategies as st
 
 import cli
 from pipeline.claim import claim, load_profile, read_areas
-from pipeline.claim.claim import claim_table, demands
+from pipeline.claim.claim import claim_table
 from pipeline.claim.front import Front, front_of
-from pipeline.claim.requirements import Ride, limits_m, tallies
+from pipeline.claim.requirements import Ride, requirements, tallies
 from pipeline.claim.speed import speed_errors
 from pipeline.claim.tally import (
     Finding,
@@ -77,7 +78,7 @@ def ten() -> Front:
 
 def test_ten_epochs_by_hand() -> None:
     found = ten()
-    limit = limits_m(found, PROFILE)
+    limit = Ride("run", found, epochs([]), passages(), PROFILE).limit_m
     assert limit[:9].tolist() == [30.0] * 5 + [10.0] * 4
     # Kept 1, not known 0, broken -1. Epoch 8 is on the wrong track; of epoch 6 the evidence says nothing.
     assert found.within(limit, np.inf)[:9].tolist() == [1, 1, 1, 1, -1, 1, 0, 1, -1]
@@ -193,11 +194,48 @@ def test_what_few_runs_show() -> None:
 
 def test_exceedances_close_to_each_other_are_one_event() -> None:
     t_ns = np.array([0, 10, 310, 611]) * NS
-    assert clusters_s(t_ns, 300.0) == [310.0, 0.0]
+    assert clusters_s(t_ns, t_ns, 300.0) == [310.0, 0.0]
     code = np.array([-1, 0, 0, -1])
     counts = tally("run", t_ns, np.ones(4), code, 300.0)
     # What is not known between them may hold another event.
     assert (counts.events, counts.possible, counts.trials, counts.known_s) == (2, 3, 1, 2.0)
+
+
+def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
+    """100 runs of 100 s, each with 60 s without epochs: two in five draws are kept, and nothing is met."""
+    seconds = [float(second) for second in (*range(20), *range(80, 101))]
+    frame = epochs(seconds, netelement_id="A", measure_m=5.0, error_low_m=0.0, error_high_m=0.0)
+    found = front_of(frame, passages(), RUN, Configuration(), AREAS)
+    for one in requirements(PROFILE):
+        if one.key not in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
+            continue
+        total = sum((one.count(Ride(str(run), found, frame, passages(), PROFILE)) for run in range(100)), Tally())
+        assert total.trials == 100
+        assert 25 <= total.kept <= 55, one.key
+        assert (total.broken, total.events, total.possible) == (0, 0, 100)
+        assert of_share(total, 0.954).finding is Finding.NOT_SHOWN
+
+
+def test_a_balise_without_a_first_estimate_is_not_known() -> None:
+    """Balises at 2 s, in a gap from 5 s to 15 s, and after the log's end."""
+    seconds = [float(second) for second in (*range(6), *range(15, 20))]
+    frame = epochs(seconds, error_low_m=0.0, error_high_m=0.0)
+    balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
+    found = front_of(frame, balises, RUN, Configuration())
+    asked = next(one for one in requirements(PROFILE) if one.key == ("after_balise", "physical"))
+    total = sum((asked.count(Ride(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
+    assert (total.trials, total.broken) == (60, 0)
+    assert 10 <= total.kept <= 30
+
+
+def test_runs_of_one_day_are_one_trial_by_option(result: Path) -> None:
+    method = PROFILE.method.model_copy(update={"independent": "day"})
+    found = claim(result, PROFILE.model_copy(update={"method": method}), areas=AREAS).table
+    node = found.filter((pl.col("requirement") == "front_accuracy") & (pl.col("applies_to") == "node"))
+    assert node.select("trials", "hours").row(0) == (1, pytest.approx(2 * 5 / 3600))
+    always = found.filter((pl.col("demanded") == "always") & (pl.col("hours") > 0) & (pl.col("finding") != "not met"))
+    assert always.height > 0
+    assert always["reason"].str.contains("no number of hours|no recording|evidence says nothing").all()
 
 
 CODES = st.lists(st.tuples(st.sampled_from([1, 0, -1]), st.booleans()), min_size=1, max_size=12)
@@ -273,7 +311,7 @@ def test_the_front_end_decides_on_the_area() -> None:
         error_high_m=0.0,
     )
     found = front_of(frame, passages(), RUN, Configuration(), AREAS, ahead_m=30.0)
-    assert limits_m(found, PROFILE).tolist() == [30.0] * 5 + [10.0] * 5
+    assert Ride("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
     assert found.output.all()
     assert found.within(5.0, 5.0).tolist() == [1] * 10
 
@@ -374,6 +412,8 @@ def result(tmp_path: Path) -> Path:
     )
     for name, frame, evidence in (("judged", judged, "reference"), ("blind", blind, None)):
         runs = table(Runs, 1, solution="primary", status="ok", evidence=evidence, vehicle="file", config_digest=name)
+        t_end = datetime(2026, 3, 2, 8, len(name), tzinfo=UTC)
+        runs = runs.with_columns(t_start=pl.lit(t_end).dt.truncate("1d"), t_end=pl.lit(t_end)).cast(runs.schema)
         tables = RunTables(name, table(Hazards, 0), passages(), table(Alarms, 0), frame, runs)
         store.write_run(tables, tmp_path / "OUT", {})
     return tmp_path / "OUT"
@@ -382,7 +422,7 @@ def result(tmp_path: Path) -> Path:
 def test_a_result_with_and_without_areas(result: Path) -> None:
     found = claim(result, PROFILE, areas=AREAS)
     rows = {(row["requirement"], row["applies_to"]): row for row in found.table.iter_rows(named=True)}
-    assert set(rows) == set(demands(PROFILE))
+    assert set(rows) == {one.key for one in requirements(PROFILE)}
     # The error lies from 200 m on, in the precise area; both runs count their hours, one its evidence.
     assert rows["mapo", "precise"]["finding"] == "not met"
     assert rows["mapu", "precise"]["finding"] == "not shown"
@@ -411,9 +451,9 @@ def test_the_command(result: Path, capsys: pytest.CaptureFixture[str], monkeypat
     assert cli._guarded(["claim", str(result)], debug=False) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("safe_front_end") and "not met" in line for line in lines)
-    assert max(map(len, lines[1 : 1 + len(demands(PROFILE))])) <= 80
+    assert max(map(len, lines[1 : 1 + len(requirements(PROFILE))])) <= 80
     assert cli._guarded(["claim", str(result), "--json"], debug=False) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["profile"], told["version"], len(told["sources"])) == ("lu-2023", "1", 3)
-    assert len(told["requirements"]) == len(demands(PROFILE))
+    assert len(told["requirements"]) == len(requirements(PROFILE))
     assert cli._guarded(["claim", str(result), "--profile", "lu-2050"], debug=False) == 2

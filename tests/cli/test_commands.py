@@ -17,7 +17,10 @@ import pytest
 import typer
 
 import cli
+from pipeline.ingest import read_run
+from schemas.config import IngestConfig
 from tests.conftest import SmallTrial
+from tests.receivers.messages import sentence
 
 ROOT = Path(__file__).parents[2]
 
@@ -189,6 +192,31 @@ def test_inspect_logs(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -
     bad = balise("inspect", tmp_path / "bad.mcap")
     assert bad.status == 1
     assert "does not start with the MCAP magic bytes" in bad.out
+
+
+def test_convert_into_a_run_that_exists(balise: Balise, tmp_path: Path) -> None:
+    def log(name: str, minutes: float) -> Path:
+        times = [f"1159{second:02d}.00" for second in range(58, 60)] + [f"1200{second:02d}.00" for second in range(8)]
+        path = tmp_path / name
+        path.write_bytes(
+            b"".join(sentence(f"GPGGA,{t},50{minutes},N,00430.0,E,1,09,0.9,55.0,M,45.0,M,,") for t in times)
+        )
+        return path
+
+    first, second, run = log("a.nmea", 30.0), log("b.nmea", 30.001), tmp_path / "run.mcap"
+    day = ("--date", "2025-06-01")
+    assert balise("convert", first, "--to", run, *day).status == 0
+    assert "--solution" in balise("convert", second, "--to", run, *day).err
+    assert balise("convert", second, "--to", run, *day, "--solution", "second").status == 0
+    assert balise("convert", second, "--to", run, *day, "--stream", "reference").status == 0
+    assert "--force" in balise("convert", first, "--to", run, *day, "--stream", "reference").err
+    assert balise("convert", first, "--to", run, *day, "--stream", "reference", "--force").status == 0
+    other_day = balise("convert", first, "--to", run, "--date", "2025-06-02", "--solution", "third")
+    assert (other_day.status, "is of another time" in other_day.err) == (1, True)
+    log_of_all = read_run(run, IngestConfig())
+    assert dict(log_of_all.gnss.group_by("solution").len().iter_rows()) == {"primary": 10, "second": 10}
+    assert log_of_all.reference is not None
+    assert log_of_all.reference["latitude_deg"][0] == pytest.approx(50.5, abs=1e-9)
 
 
 def test_report(balise: Balise, small_trial: SmallTrial, tmp_path: Path) -> None:

@@ -150,3 +150,12 @@ def test_faults_stream() -> None:
 def test_faults_that_say_nothing_clear_are_refused(values: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         settings_from({"start_s": 0.0, **values}, FaultSpec, "faults.toml")
+
+
+@pytest.mark.parametrize("size", [{"size_m": 1e308, "kind": "step"}, {"rate_mps": 1e308, "kind": "slip"}])
+def test_what_no_train_can_have_is_refused(size: dict[str, object]) -> None:
+    """Positions would be no numbers, and the run would be written all the same."""
+    with pytest.raises(ValueError, match="less than or equal to 10000000"):
+        FaultSpec.model_validate({"start_s": 1.0, **size})
+    with pytest.raises(ValueError, match="less than or equal to 10000000"):
+        FaultSpec.model_validate({"kind": "outage", "start_s": 1.0, "duration_s": 1e308})

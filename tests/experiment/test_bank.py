@@ -91,7 +91,7 @@ def test_ten_hertz_keeps_a_25_m_step_in_the_budget_and_1_hz_does_not() -> None:
 
 
 def test_cross_track_faults_need_the_track() -> None:
-    specs = [BankSpec(sensors=sensors, map_m=0.1) for sensors in ("odometer", "odometer_and_track")]  # type: ignore[arg-type]
+    specs = [BankSpec(sensors=sensors, map_m=0.1) for sensors in ("odometer", "odometer_and_track")]
     comparison = compare_banks(specs, (Fault("step", "cross", 25.0),), repetitions=20, seed=2)
     assert comparison["detected"].to_list() == [0.0, 1.0]
     assert comparison["first_monitor"].to_list() == [None, "cross_raw"]
@@ -107,7 +107,7 @@ def test_results_do_not_depend_on_the_number_of_jobs() -> None:
 
 def test_time_until_a_miss_is_rare_enough() -> None:
     bank = linear_bank(GPS, 0.0, BankSpec())
-    earlier, later = epochs_until(bank, 1.0, (1e-3, 1e-9), seed=1, jobs=1)
+    earlier, later = epochs_until(bank, 1.0, (1e-3, 1e-9), seed=1, jobs=1, period_s=1.0)
     assert earlier is not None
     assert later is not None
     assert earlier < later < failure_epoch(bank, 1.0)
@@ -122,7 +122,7 @@ def test_a_configured_bank_is_judged(tmp_path: Path) -> None:
     spec = BankSpec.of(config.monitors, "odometer_and_track", 10.0)
     assert spec.weights == (1.0, 0.2, 0.05, 0.005)
     assert (spec.odometer_m, spec.false_alarm_probability, spec.rate_hz) == (0.1, 1e-6, 10.0)
-    assert all(chosen.weights == spec.weights for _, chosen, _ in banks(config))
+    assert all(chosen.spec.weights == spec.weights for _, chosen in banks(config))
     for name in ("diagnostics", "findings", "pseudorange", "thresholds"):
         with pytest.raises(UsageError, match="takes no configuration"):
             EXPERIMENTS[name](tmp_path, 1, 1, 1, config)

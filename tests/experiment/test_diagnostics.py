@@ -17,12 +17,12 @@ from datasets.experiment.geometry import (
     default_geometry,
     epochs_of_day,
     geometry_at,
-    range_variances_m2,
 )
 from datasets.experiment.passage import NEVER, NoisePaths, first_passages
 from datasets.experiment.plan import SIGNALS, Plan, bank_forms, failure_forms
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
 from datasets.experiment.workers import generator
+from pipeline.monitors.sight import range_variances_m2
 
 SMALL = {"span_s": 700, "onset_s": 100, "rates_mps": (0.05, 0.5, 5.0), "headings_deg": (0.0, 45.0)}
 
@@ -194,7 +194,7 @@ def test_bounds_on_expectations_cover() -> None:
 @pytest.fixture(scope="module")
 def published() -> pl.DataFrame:
     """The paper's grid with few repetitions."""
-    return run_diagnostics(repetitions=200, seed=11, jobs=1).detection
+    return run_diagnostics(repetitions=200, seed=11, jobs=1)["detection"]
 
 
 def holds(published: pl.DataFrame, finding: str, reading: str) -> dict[str, bool]:

@@ -11,13 +11,14 @@ from datasets.experiment.plan import BANKS
 from datasets.experiment.rare import (
     Probability,
     false_alarm_probability,
+    figures,
+    first_below,
     missed_detection_probability,
-    populations,
+    population_of,
 )
-from datasets.experiment.rare_rows import figures, first_below
 from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
 from datasets.experiment.splitting import most_probable_miss
-from datasets.experiment.workers import generator
+from datasets.experiment.workers import generator, in_blocks
 
 GPS = default_geometry("gps")
 
@@ -186,9 +187,9 @@ def test_intervals_that_meet_by_hand() -> None:
 
 
 def test_runs_are_shared_by_populations_of_some_size() -> None:
-    assert populations(20_000) == [1_000] * 20
-    assert populations(1_100) == [250] * 4 + [100]
-    assert populations(7) == [7]
+    assert in_blocks(20_000, population_of(20_000)) == [1_000] * 20
+    assert in_blocks(1_100, population_of(1_100)) == [250] * 4 + [100]
+    assert in_blocks(7, population_of(7)) == [7]
 
 
 def test_a_ramp_below_all_thresholds_is_sampled_well_too() -> None:

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from benchmarks.counting import counted_alarms, counted_misses
-from datasets.experiment import EXPERIMENTS, rare_range_tables, rare_tables
+from datasets.experiment import EXPERIMENTS, rare_tables
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
 from datasets.experiment.ranges import RangePlan
 from datasets.experiment.rare import false_alarm_probability, missed_detection_probability
@@ -79,8 +79,8 @@ def test_every_table_of_rare_events_is_written_for_a_configured_bank(
     monkeypatch.setattr(rare_tables, "_RATES_MPS", (1.0,))
     monkeypatch.setattr(rare_tables, "_HOUR_S", 60)
     monkeypatch.setattr(rare_tables, "_TRANSIENT_RATES_MPS", (1.0,))
-    monkeypatch.setattr(rare_range_tables, "_SEARCH_RUNS", 100)
-    monkeypatch.setattr(rare_range_tables, "_ASKED", ((0.1, 30.0), (0.1, 30.0), (0.1, 30.0)))
+    monkeypatch.setattr(rare_tables, "_SEARCH_RUNS", 100)
+    monkeypatch.setattr(rare_tables, "_RANGES_ASKED", ((0.1, 30.0),))
     config = Configuration(monitors=MonitorConfig(ewma_alphas=(0.3, 0.1, 0.03), false_alarm_probability=1e-5))
     EXPERIMENTS["rare"](tmp_path, 100, 1, 1, config)
     tables = {path.stem: pl.read_parquet(path) for path in tmp_path.glob("*.parquet")}

@@ -10,7 +10,7 @@ from datasets.experiment.linear_bank import BankSpec
 from datasets.experiment.range_alarms import range_alarms
 from datasets.experiment.thresholds import (
     Line,
-    SkyMonitor,
+    SkySigmas,
     calibrated_ratios,
     regressed_ratios,
     regression_lines,
@@ -24,12 +24,8 @@ def test_two_sided_tail_is_that_of_the_printed_table() -> None:
 
 
 def test_a_line_is_recovered() -> None:
-    monitors = [
-        SkyMonitor("gps", 0.0, axis, x, np.array([0.1 + 0.2 * x, 0.01 + 0.03 * x]))
-        for axis in ("along", "cross", "up")
-        for x in (0.8, 1.0, 1.7)
-    ]
-    lines = regression_lines(monitors)
+    x = np.array([0.8, 1.0, 1.7])
+    lines = regression_lines({"cross": SkySigmas(x, np.column_stack([0.1 + 0.2 * x, 0.01 + 0.03 * x]))})
     assert lines["cross", 1] == Line(pytest.approx(0.01), pytest.approx(0.03))  # type: ignore[arg-type]
 
 

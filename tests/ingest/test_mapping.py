@@ -310,7 +310,7 @@ def bestpos(kind: int, status: int = 0) -> dict:
 def test_kinds_of_novatel_solutions(tmp_path):
     # Numbers and names as the vendor's message database has them: SolType, SolStatus.
     kinds = {
-        "none": (0, 3, 8, 81), "autonomous": (1, 2, 16, 53), "differential": (17, 20, 54, 64, 69, 74, 76, 78, 79, 80),
+        "none": (0, 1, 3, 8, 81), "autonomous": (2, 16, 53), "differential": (17, 20, 54, 64, 69, 74, 76, 78, 79, 80),
         "sbas": (18, 52), "estimated": (19,), "rtk_float": (32, 33, 34, 35, 55), "rtk_fixed": (47, 48, 49, 50, 51, 56),
     }  # fmt: skip
     messages = [bestpos(code) for codes in kinds.values() for code in codes] + [bestpos(50, status=1)]

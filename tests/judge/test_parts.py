@@ -9,17 +9,21 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.evidence.evidence import Alternative, EvidenceSet
+from pipeline.evidence.evidence import KINDS, Alternative, EvidenceSet
 from pipeline.evidence.routes import Place, Route
 from pipeline.judge.across import errors_across
 from pipeline.judge.alarms import verdict_within
+from pipeline.judge.episodes import _is_back
+from pipeline.judge.hazards import drafts_of
 from pipeline.judge.judge import undetected_ns
-from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, margins_m
+from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
+from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.rows import within_budget
 from pipeline.judge.states import odometer_beyond_confidence
-from schemas.config import HazardConfig, LdsConfig
-from schemas.enums import Verdict
+from pipeline.judge.suspect import suspect_of
+from schemas.config import Configuration, HazardConfig, LdsConfig
+from schemas.enums import Evidence, Hazard, Suspect, Verdict
 
 NS = 1_000_000_000
 DEG_PER_M = np.degrees(1.0 / 6378137.0)  # east along the equator
@@ -127,3 +131,76 @@ def test_a_train_passes_a_balise_between_two_routes_that_the_evidence_tells_of()
 def test_the_margin_of_a_healthy_position() -> None:
     """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
     assert margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
+
+
+def test_what_an_episode_hit() -> None:
+    """Of ten offers: 20 m and less are no shift, nor is what was not offered, not wrong, or outside numbers 2 to 7."""
+    number = np.array([1, 2, 3, 4, 5, 6, 7, 8, 3, 4])
+    least_m = np.array([30.0, 30.0, 30.0, 10.0, 30.0, 30.0, 0.0, 30.0, 20.0, 20.1])
+    code = np.array([WRONG, WRONG, WRONG, WRONG, RIGHT, UNKNOWN, WRONG, WRONG, WRONG, WRONG])
+    astray, offered = number == 7, np.arange(10) != 2
+    judged = SimpleNamespace(least_m=least_m, code=code, wrong_track=astray)
+    offers = SimpleNamespace(number=number, judged=judged, offered=offered, t_ns=np.arange(10))
+    episode = SimpleNamespace(onset=2, end=8, jump_back=None, holds=lambda own: (own >= 2) & (own < 8))
+    found = drafts_of(cast(Any, [episode]), cast(Any, SimpleNamespace(jumps=[])), cast(Any, offers), HazardConfig())
+    assert [(draft.hazard, draft.hits) for draft in found] == [
+        (Hazard.VB_SHIFT, [1, 9]),
+        (Hazard.VB_WRONG_TRACK, [6]),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("before_m", "step_m", "after_m", "code", "back"),
+    [
+        (30.0, -30.0, 0.0, RIGHT, True),
+        (-30.0, 30.0, 0.0, RIGHT, True),
+        (30.0, 30.0, 0.0, RIGHT, False),  # farther away
+        (30.0, -30.0, 20.0, UNKNOWN, True),
+        (30.0, -30.0, 20.1, UNKNOWN, False),  # still beyond the limit
+        (30.0, -30.0, 0.0, WRONG, False),  # on another track
+    ],
+)
+def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
+    before_m: float, step_m: float, after_m: float, code: int, back: bool
+) -> None:
+    judged = SimpleNamespace(
+        middle_m=np.array([before_m, 0.0]), least_m=np.array([0.0, after_m]), code=np.array([WRONG, code])
+    )
+    found = _is_back(cast(Any, SimpleNamespace(judged=judged)), Jump(1, 1, step_m), HazardConfig())
+    assert bool(found) is back
+
+
+@pytest.mark.parametrize(
+    ("kind", "error_m", "stood", "counted_wrong", "sure", "suspect"),
+    [
+        (Evidence.REFERENCE, 9.0, False, True, True, Suspect.GNSS),
+        (Evidence.ODOMETER, 9.0, True, False, True, Suspect.ODOMETER),
+        (Evidence.ODOMETER, 9.0, False, True, True, Suspect.ODOMETER),
+        (Evidence.ODOMETER, 9.0, False, False, False, Suspect.GNSS),
+        (Evidence.REFERENCE, 5.0, False, False, False, Suspect.TRACK),  # 5 m is the margin
+        (Evidence.REFERENCE, 0.0, False, False, True, Suspect.UNKNOWN),
+    ],
+)
+def test_who_is_suspected(
+    kind: Evidence, error_m: float, stood: bool, counted_wrong: bool, sure: bool, suspect: Suspect
+) -> None:
+    """Ten epochs, of which the sixth tells; an alarm at 6 s. The odometer and the Doppler are silent."""
+    told = np.arange(10) == 5
+    error = np.where(told, error_m, 0.0)
+    nothing = pl.Series([None] * 10, dtype=pl.Float64)
+    bench = SimpleNamespace(
+        t_ns=seconds(*range(10)),
+        at_ns=seconds(*range(10)),
+        judged=Judgements(np.full(10, RIGHT), error, error, np.full(10, KINDS.index(kind)), np.zeros(10, dtype=bool)),
+        margin_m=np.full(10, 5.0),
+        stood=[(5 * NS, 6 * NS)] if stood else [],
+        odometer_wrong=told & counted_wrong,
+        path_m=np.arange(10.0),
+        positions=SimpleNamespace(unambiguous=~told | sure),
+        epochs=pl.DataFrame({"odometer_m": nothing, "velocity_along_mps": nothing}),
+        config=Configuration(),
+    )
+    assert suspect_of(cast(Any, bench), 6 * NS, 6 * NS) is suspect
+    # What was before the time looked back on does not count.
+    late = 70 * NS
+    assert suspect_of(cast(Any, bench), 6 * NS + late, 6 * NS + late) is Suspect.UNKNOWN

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from pipeline.lds import LdsResult
-from pipeline.lds.crossings import balises_of
+from pipeline.lds.crossings import balises_of, reads_of
 from pipeline.lds.journey import journey_of
-from pipeline.lds.reads import reads_of
 from pipeline.lds.relink import LOST, NO_VEHICLE, SWITCHED_OFF, Relink
 from schemas.enums import BaliseKind
 from tests.lds.scripted import (
@@ -105,6 +104,13 @@ def test_before_any_alarm_the_later_of_telegram_and_tvb_is_the_anchor() -> None:
         (False, 2),
         (False, 6),
     ]
+
+
+def test_the_bound_adds_the_variances_of_both_positions() -> None:
+    """Sigma 0.5 m at the anchor (2 s) and 1.2 m now (9 s), 140 m later."""
+    relink, _ = relink_of([0.0] * 10, [2], 3.0, position_sigma_m=[0.5] * 5 + [1.2] * 5)
+    expected = K_T * sqrt(0.25 + 1.44 + 0.05**2 * 7.0 + (1e-4 * 140.0) ** 2)
+    assert relink.compare(9).bound_m == pytest.approx(expected)
 
 
 # Returns

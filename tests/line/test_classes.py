@@ -5,7 +5,9 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
+from pipeline.line import distinct
 from pipeline.line.classes import passes_needed, piece_classes
+from pipeline.line.spans import State
 from schemas.line import LineCriteria
 from schemas.run import Site
 from tests.line.tables import (
@@ -102,11 +104,64 @@ def test_a_right_pass_never_raises_and_a_lost_one_never_lowers_a_bound(site: Sit
 
 def test_unknown_epochs_make_nothing_suitable(site: Site) -> None:
     runs = [epochs_of(number, ()).with_columns(judgement=pl.lit("unknown")) for number in range(2)]
-    many = pl.concat(passes_over(runs, site).with_columns(run_id=pl.lit(str(number))) for number in range(RUNS))
-    table = classes(many, site)
+    passed = passes_over(runs, site)
+    table = classes(pl.concat(passed.with_columns(run_id=pl.lit(str(number))) for number in range(RUNS)), site)
     assert set(table["word"]) == {"unknown"}
     assert table["passes"].sum() == 0
     assert "not_judged" in set(table["why"])
+
+
+def test_what_the_reference_lost_counts_against_a_piece(site: Site) -> None:
+    """40 right passes show 10 %; four more whose truth was lost at 1025 m may hide anything: (4, 44) reaches 21.7 %."""
+    right = passes_over([epochs_of(0, (), falling=False)], site)
+    at = pl.col("path_m").is_between(1000.0, 1050.0)
+    lost = epochs_of(0, (), falling=False).with_columns(
+        judgement=pl.when(at).then(pl.lit("unknown")).otherwise("judgement"),
+        error_low_m=pl.when(~at).then("error_low_m"),
+        error_high_m=pl.when(~at).then("error_high_m"),
+    )
+    parts = [right] * 40 + [passes_over([lost], site)] * 4
+    many = pl.concat(part.with_columns(run_id=pl.lit(str(number))) for number, part in enumerate(parts))
+    place = (pl.col("chainage") == 1025.0) & (pl.col("direction") == "growing")
+    found = classes(many, site).row(by_predicate=place, named=True)
+    assert (found["word"], found["why"], found["right"], found["unjudged"]) == ("unknown", "not_judged", 40, 4)
+    assert found["loss_high"] == pytest.approx(0.2167, abs=1e-4)
+    assert found["loss_low"] == 0.0
+    # Where the evidence is of reads they are no trials.
+    unseen = many.with_columns(pl.col("state").replace(int(State.UNKNOWN), int(State.UNSEEN)))
+    assert classes(unseen, site).row(by_predicate=place, named=True)["word"] == "suitable"
+
+
+def test_a_wrong_position_after_a_gap_is_wrong_there_and_not_along_it(site: Site) -> None:
+    """No epoch from 1500 to 1800 m, then one wrong position in use: the gap is an outage."""
+    run = epochs_of(0, (), falling=False).filter(~pl.col("path_m").is_between(1500.0, 1800.0))
+    first = pl.int_range(pl.len()) == run.filter(pl.col("path_m") < 1500.0).height
+    wrong = run.with_columns(
+        path_m=pl.when(first).then(pl.col("path_m") + 30.0).otherwise("path_m"),
+        judgement=pl.when(first).then(pl.lit("wrong")).otherwise("judgement"),
+        **{name: pl.when(first).then(pl.col(name) + 30.0).otherwise(name) for name in ("error_low_m", "error_high_m")},
+    )
+    table = classes(passes_over([wrong], site), site).filter(pl.col("direction") == "growing")
+    in_gap = table.filter(pl.col("chainage").is_between(1500.0, 1740.0))
+    assert in_gap.select(pl.col("lost_outage").sum(), pl.col("wrong_in_use").sum()).row(0) == (5, 0)
+    assert table.filter(pl.col("chainage") == 1825.0)["wrong_in_use"].to_list() == [1]
+
+
+def test_one_journey_counts_once() -> None:
+    """A log under two names, the second replayed with another verdict; and another journey."""
+    runs = pl.DataFrame(
+        {
+            "run_id": ["a", "b", "c"],
+            "solution": "primary",
+            "verdict": ["safe", "unsafe", "safe"],
+            "t_start": 0,
+            "t_end": [60, 60, 61],
+        }
+    )
+    kept, said = distinct(runs)
+    assert kept["run_id"].to_list() == ["b", "c"]
+    assert said
+    assert distinct(kept) == (kept, [])
 
 
 def test_positions_whose_place_nobody_knows_say_nothing(site: Site) -> None:
@@ -149,8 +204,9 @@ def test_the_place_is_the_trains_not_the_positions(site: Site) -> None:
 
 def test_passes_of_one_day_count_as_one_by_option(passes: pl.DataFrame, site: Site) -> None:
     table = classes(passes, site, LineCriteria(independent="day"))
-    # 84 runs an hour apart lie on four days.
+    # 84 runs an hour apart lie on four days; hours of the day are those of all passes.
     assert table["passes"].max() == 4
+    assert table["hours"].max() == 12
     assert "suitable" not in set(table["word"])
 
 

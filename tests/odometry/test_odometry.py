@@ -148,7 +148,7 @@ def test_a_spike_of_the_counter_is_passed_over():
     t = 0.5 * np.arange(7.0)
     reads = 5.0 * np.arange(7.0)
     for row in (1, 3, 5):
-        spiked = reads + 500.0 * (np.arange(7) == row)
+        spiked = 1e5 + reads + 500.0 * (np.arange(7) == row)  # of a counter that has run for 100 km
         odometry = odometry_from(odometer_of(t, distance_m=spiked))
         np.testing.assert_allclose(odometry.distance_m, reads)
         assert (odometry.segment == 0).all()

@@ -6,8 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.monitors.along import AlongEpochs, along_series, most_scatter_m
-from pipeline.monitors.axis import run_axis
+from pipeline.monitors.axis import AlongEpochs, along_series, most_scatter_m, run_axis
 from pipeline.odometry.odometry import Increments
 from pipeline.odometry.quantisation import QuantisationNoise, count_step_m
 from schemas.config import Configuration, threshold_factor

@@ -194,13 +194,34 @@ def test_rows_that_do_not_fit_the_header(tmp_path):
     found = gather([log], config)
     assert found.streams["odometer"].select("distance_m", "speed_mps").rows() == [(10.0, 1.0), (11.0, None)]
     assert found.dropped == {
-        "end of a row, which is missing (taken as empty)": 1, "row of the odometer without distance and speed": 2,
+        "end of a row, which is missing (taken as empty)": 1, "row without a value of odometer": 2,
     }  # fmt: skip
     log.write_text("Logger 7\nt,d,v\n1,10,1\n")
     with pytest.raises(
         InputError, match=r"line 2, .*more values than the header; found 3: t, d, v; expected at most 1"
     ):
         gather([log], config)
+
+
+def test_a_table_of_several_recorders_leaves_cells_empty(tmp_path):
+    log = tmp_path / "all.csv"
+    tables = {
+        "gnss": {"topic": "*", "time": "field:t", "fields": PLACE},
+        "odometer": {"topic": "*", "time": "field:t", "fields": {"distance_m": "d"}},
+        "balise_reads": {"topic": "*", "time": "field:t", "fields": {"balise_id": "b"}},
+    }
+    config = settings_from({"ingest": tables}, Configuration, "x").ingest
+    rows = [(s / 4, "50,4" if s % 4 == 0 and not 20 < s < 32 else ",", "X1" if s == 5 else "") for s in range(49)]
+    log.write_text("t,lat,lon,d,b\n" + "".join(f"{t},{place},{t * 10},{read}\n" for t, place, read in rows))
+    found = gather([log], config)
+    fixes = found.streams["gnss"]
+    # A second from 5 s to 8 s has no position: those rows may be an outage and stay.
+    outage = fixes.filter(fixes["latitude_deg"].is_null())["t"].dt.epoch("ms")
+    assert (outage.min(), outage.max(), fixes["latitude_deg"].count()) == (5250, 7750, 11)
+    assert (found.streams["odometer"].height, found.streams["balise_reads"].height) == (49, 1)
+    assert found.dropped["row without a value of gnss"] == 49 - 11 - len(outage)
+    log.write_text("t,lat,lon,d,b\n0,50,4,1,\n1,,,2,\n2,50,4,3,\n")
+    assert gather([log], config).streams["gnss"].height == 3
 
 
 def test_a_draft_can_be_saved_and_used(tmp_path):

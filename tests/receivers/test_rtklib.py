@@ -95,3 +95,11 @@ def test_a_height_over_the_geoid_is_none_over_the_ellipsoid(row_of):
 def test_what_the_header_does_not_explain_is_refused(row_of, lines, message):
     with pytest.raises(InputError, match=message):
         row_of(*lines)
+
+
+def test_a_header_that_lacks_a_column(tmp_path):
+    path = tmp_path / "a.pos"
+    row = f"2020/12/04 20:45:12.000 51.15 -114.03 120.5 {END}"
+    path.write_text(f"{HEAD}% {LLH}\n%  GPST {PLANE.replace('height(m)', 'hight(m)')}\n{row}")
+    with pytest.raises(InputError, match="has no column height; found latitude, longitude, hight"):
+        convert([path], "r")

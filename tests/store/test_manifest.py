@@ -66,7 +66,8 @@ def test_every_source_is_named_with_size_and_digest(out: Path, small_trial: Smal
     for run in ("run0", "run1", "bad"):
         tables = {name: sha256(Path(table_address(out, name, run))) for name in manifest["runs"][run]["tables"]}
         assert manifest["runs"][run]["tables"] == tables
-    assert manifest["files"]["config.toml"]["sha256"] == sha256(out / "config.toml")
+    for name in ("config.toml", "vehicle.toml"):
+        assert manifest["files"][name]["sha256"] == sha256(out / name)
     assert str(small_trial.site) not in json.dumps(manifest)
 
 

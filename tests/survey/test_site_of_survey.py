@@ -124,7 +124,7 @@ def test_doubtful_places_are_told(tmp_path: Path) -> None:
     same = way("same", (100, 0), (105, 3))
     text = told(site_of(written(tmp_path, "d.geojson", kinked, twice, beside, same)))
     assert "track: kink: 2 kinks" in text
-    assert "track: twice: lies within 1 m of kink" in text or "track: kink: lies within 1 m of twice" in text
+    assert "track: twice: lies within 1.5 m of kink" in text or "track: kink: lies within 1.5 m of twice" in text
     assert "end 0 lies 2." in text
     assert "track: same: 1 of its 1 segments stand in the survey already" in text
     assert "no point has a height" in text
@@ -167,7 +167,7 @@ def test_a_corner_between_two_lines_and_a_line_over_itself_are_told(tmp_path: Pa
     bent = written(tmp_path, "b.geojson", way("a", (0, 0), (500, 0)), way("b", (500, 0), (600, 80)))
     assert "track: a, b: 1 kinks; the sharpest turns by 39 degrees" in told(site_of(bent))
     again = written(tmp_path, "a.geojson", way("a", (0, 0), (500, 0), (500.5, 0.4), (0, 0.4)))
-    assert "track: a: lies within 1 m of itself" in told(site_of(again))
+    assert "track: a: lies within 1.5 m of itself" in told(site_of(again))
 
 
 def test_a_kilometre_that_a_jump_skips_or_repeats_places_no_balise(tmp_path: Path) -> None:
@@ -285,8 +285,24 @@ def test_a_later_pass_goes_on_from_the_end_of_the_first() -> None:
     passes = [recorded("a", first, 0.0 * first, rng), recorded("b", second, 0.0 * second, rng)]
     network = make_network(clean_traces(Survey(passes)), 0.05)
     assert [element.name for element in network.elements] == ["a", "b"]
-    track = network.track().group_by("netelement_id").agg(pl.col("measure_m").max())
+    track = network.track.group_by("netelement_id").agg(pl.col("measure_m").max())
     assert track["measure_m"].sum() == pytest.approx(1996.0, abs=0.5)
+
+
+def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None:
+    east = np.arange(0.0, 1000.0, 4.0)
+    latitude, longitude = degrees(east, np.where((east >= 400) & (east < 420), 50.0, 0.0))
+    times = pl.Series((np.arange(len(east)) * 200_000_000), dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    points = pl.DataFrame({"t": times, "latitude_deg": latitude, "longitude_deg": longitude})
+    run = tmp_path / "run"
+    run.mkdir()
+    points.with_columns(fix=pl.lit("sbas")).write_parquet(run / "gnss.parquet")
+    points.with_columns(height_m=pl.lit(None, pl.Float64), sigma_m=pl.lit(0.02)).write_parquet(
+        run / "reference.parquet"
+    )
+    site = site_of(run)
+    assert "run: 5 positions to which no train can have come are left out" in told(site)
+    assert site.track["measure_m"].max() == pytest.approx(996.0, abs=0.1)
 
 
 BAD = {

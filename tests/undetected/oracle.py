@@ -137,7 +137,7 @@ def watched(window: Rows) -> Watched:
         t_s=np.cumsum(window.dt_s),
         fresh=window.fresh,
         free=np.zeros(size, dtype=bool),
-        unseen_m=np.where(window.fresh, window.largest_mps * window.dt_s, 0.0),
+        fastest_m=window.largest_mps * window.dt_s,
         way_s=window.dt_s,
         rate_mps=window.rate_mps,
         least_mps=np.maximum(-window.raw_mps * unseen, window.rate_mps - window.largest_mps),

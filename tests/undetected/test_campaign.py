@@ -34,13 +34,22 @@ def test_of_a_run_only_what_was_in_use() -> None:
 
 
 def test_of_a_balise_the_larger_of_both_directions() -> None:
-    rows = passages(4, undetected_ahead_m=[1.0, 5.0, None, 2.0], undetected_behind_m=[4.0, 3.0, None, 1.0])
+    rows = passages(
+        4,
+        undetected_ahead_m=[1.0, 5.0, None, 2.0],
+        undetected_behind_m=[4.0, 3.0, None, 1.0],
+        physical_before_m=[None, 9000.0, 7000.0, 8000.0],
+    )
     found = rows.select(**undetected_spread()).row(0, named=True)
     assert found == {
         "undetected_count": 3,
         "undetected_median_m": 4.0,
         "undetected_p95_m": 5.0,
         "undetected_max_m": 5.0,
+        "physical_before_count": 3,
+        "physical_before_median_m": 8000.0,
+        "physical_before_p05_m": 7000.0,
+        "physical_before_min_m": 7000.0,
     }
 
 

@@ -1,0 +1,43 @@
+"""What counts as a trial: no journey twice; and how many more trials show something."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import polars as pl
+
+from schemas.enums import RunVerdict
+
+
+def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
+    """Rows of `runs` by run and solution without further recordings or replays of one journey, and a remark on them.
+
+    Runs of one solution that begin and end at the same nanoseconds are one journey: one log under two names, or in
+    two formats. The one with the worst verdict stays.
+    """
+    order = (
+        pl.col("verdict")
+        .cast(pl.String)
+        .replace_strict({RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 1}, default=2)
+    )
+    kept = runs.sort("solution", order, "run_id").filter(
+        pl.struct("solution", "t_start", "t_end").is_first_distinct() | pl.col("t_start").is_null()
+    )
+    if kept.height == runs.height:
+        return runs, []
+    left = runs.height - kept.height
+    return kept.sort("run_id", "solution"), [
+        f"{left} runs begin and end with another one: counted once, as one journey."
+    ]
+
+
+def fewest(enough: Callable[[int], bool]) -> int | None:
+    """The least number, from 0 on, that is enough; whatever is more must be enough too. None beyond 2^40."""
+    most = next((1 << power for power in range(41) if enough(1 << power)), None)
+    if most is None:
+        return None
+    low = -1
+    while most - low > 1:
+        middle = (low + most) // 2
+        low, most = (low, middle) if enough(middle) else (middle, most)
+    return most

@@ -1,0 +1,47 @@
+"""Between two anchors, worked out by hand: 100 m apart, where the odometer counts 10.2 m each second for 10 s."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from pipeline.evidence.carrying import Anchor, Trust, between_anchors, closes
+from pipeline.evidence.routes import Place
+from schemas.arrays import NS_PER_S, Ints
+from schemas.config import Configuration
+from schemas.enums import Evidence
+
+TRUST = Trust.of(Configuration())
+ANCHORS = tuple(Anchor(t_s * NS_PER_S, Place(0, 10.0 * t_s), 1.0, Evidence.BALISE) for t_s in (0, 10))
+AT_4_S = np.array([4 * NS_PER_S])
+
+
+def odometer(scale: float | None) -> Any:
+    """10.2 m and 0.01 m2 of variance in a second."""
+
+    def between(begin_ns: Ints, end_ns: Ints) -> SimpleNamespace:
+        way_s = (end_ns - begin_ns) / NS_PER_S
+        return SimpleNamespace(distance_m=10.2 * way_s, variance_m2=0.01 * np.abs(way_s))
+
+    return SimpleNamespace(scale=scale, between=between)
+
+
+def test_without_a_vehicle_file_both_anchors_may_be_right() -> None:
+    """From the first 40.8 m with variance 1.04, from the second 38.8 m with variance 1.06; three sigmas."""
+    low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, TRUST)
+    assert (low[0], high[0]) == (pytest.approx(38.8 - 3.0887), pytest.approx(40.8 + 3.0594, abs=1e-4))
+
+
+def test_where_a_known_odometer_closes_the_better_anchor_weighs_more() -> None:
+    """39.8095 m with variance 1 / (1 / 1.04 + 1 / 1.06)."""
+    low, high = between_anchors(odometer(1.0), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, TRUST)
+    assert (low[0], high[0]) == (pytest.approx(39.8095 - 2.1736, abs=1e-4), pytest.approx(39.8095 + 2.1736, abs=1e-4))
+
+
+@pytest.mark.parametrize(("apart_m", "closed"), [(97.66, True), (97.64, False), (106.34, True), (106.36, False)])
+def test_an_odometer_closes_within_three_roots_of_both_anchors_and_its_way(apart_m: float, closed: bool) -> None:
+    """102 m are counted; 3 sqrt(1 + 1 + 0.1) = 4.347 m."""
+    assert closes(odometer(1.0), cast(Any, ANCHORS), apart_m, TRUST) is closed
