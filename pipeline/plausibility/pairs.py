@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plausibility.clocks import APART_S, LEAST_SHARE, Candidates, possible_lags
+from pipeline.plausibility.clocks import APART_S, LEAST_SHARE, possible_lags
 from pipeline.plausibility.course import Course, Places
 from pipeline.plausibility.robust import LEAST, MOVES_MPS, Regression, explains, regressed, steady, usual
 from schemas.arrays import Bools, Floats
@@ -122,10 +122,10 @@ def _clock_lag(gnss: Places, counter: Course) -> tuple[float, str]:
     as_recorded = _agreement(gnss, counter, 0.0, 0.0)
     if as_recorded >= SURELY:
         return 0.0, ""
-    possible = possible_lags(gnss, counter)
-    if possible.reason:
-        return 0.0, possible.reason
-    rated = _rated(gnss, counter, possible)
+    possible_s, reason = possible_lags(gnss, counter)
+    if reason:
+        return 0.0, reason
+    rated = _rated(gnss, counter, possible_s)
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
     if len(rated) > 1 and rated[0][0] - rated[1][0] < _RIVAL:
@@ -133,10 +133,10 @@ def _clock_lag(gnss: Places, counter: Course) -> tuple[float, str]:
     return rated[0][1], ""
 
 
-def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[float, float]]:
+def _rated(gnss: Places, counter: Course, possible_s: list[float]) -> list[tuple[float, float]]:
     """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
     found: list[tuple[float, float]] = []
-    for first_s in possible.lags_s:
+    for first_s in possible_s:
         best = _agreement(gnss, counter, first_s, LEAST_SHARE), first_s
         for step_s in _CLIMB_S:
             near = [best[1] - step_s, best[1] + step_s]
