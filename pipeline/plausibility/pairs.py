@@ -97,7 +97,7 @@ class _Windows:
         # A counter that is reset seems to run so far that it would weigh more than all the rest.
         sane = np.abs(np.log(ratio / unit)) < np.log(2.0)
         design = np.column_stack([self.size, self.change])[sane, None, :] / unit
-        fit = regressed(design, self.gnss_m[sane, None], _LEAST_SPREAD_M)
+        fit = regressed(design, self.gnss_m[sane, None], _LEAST_SPREAD_M, start=(1.0, 0.0))
         halves = tuple(half / unit for half in fit.halves)
         return replace(fit, estimate=fit.estimate / unit, sigma=fit.sigma / unit, halves=halves)
 
