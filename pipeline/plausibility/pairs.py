@@ -209,7 +209,8 @@ def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s:
     size = np.abs(counted)
     moves = known & (way > _SLOW_SHARE * usual(way[known], 0.9)) & (way > MOVES_MPS * length_s)
     stands = bool(moves.any() and np.mean(size[moves] == 0.0) > 0.9)
-    moves &= size > _SLOW_SHARE * usual(size[moves])
+    # Neither a counter that stands most of the time nor one that is reset tells what is usual.
+    moves &= size > _SLOW_SHARE * usual(size[moves], 0.8)
     return _Windows(way, size, np.where(counted < 0, -change, change), counted).take(moves), stands
 
 
