@@ -80,7 +80,7 @@ class LineDirection(StrEnum):
     FALLING = "falling"
 
 
-class _Pieces(dy.Schema):
+class LinePieces(dy.Schema):
     """One row per piece of track and direction of travel over its net element."""
 
     piece = count("number of the piece in the order of the survey")
@@ -95,17 +95,20 @@ class _Pieces(dy.Schema):
     right = count("of these with every position in use and right")
     lost = count("of these on which a balise would have been lost somewhere on the piece")
     wrong_in_use = count("of these with a position judged wrong in use, or a balise accepted at a wrong place")
-
-
-class _PiecesEnd(dy.Schema):
+    lost_wrong = count("passes lost or wrong with the cause wrong")
+    lost_wrong_track = count("passes lost or wrong with the cause wrong_track")
+    lost_outage = count("passes lost or wrong with the cause outage")
+    lost_ambiguous_track = count("passes lost or wrong with the cause ambiguous_track")
+    lost_confidence = count("passes lost or wrong with the cause confidence")
+    lost_alarm = count("passes lost or wrong with the cause alarm")
     claimed_wrongly = count("passes on which a wrong position in use claimed this piece; the train was elsewhere")
     unknown = count("further passes that the evidence could not judge")
     unjudged = count("of these in runs with a reference, which should have told: each upper bound counts them as lost")
     after_alarm = count("further passes without use because of an alarm before the piece")
     loss_share = real("1", "lost or wrong passes of those judged", min=0)
-    loss_low = real("1", "exact lower bound (Clopper-Pearson)", min=0)
-    loss_high = real("1", "exact upper bound", min=0)
-    unsafe_high = real("1", "exact upper bound of the share of passes wrong in use", min=0)
+    loss_low = real("1", "exact lower bound (Clopper-Pearson); 0 where nothing was judged", min=0)
+    loss_high = real("1", "exact upper bound, what should have been judged counted as lost", min=0)
+    unsafe_high = real("1", "exact upper bound of the share of passes wrong in use, the same counted as wrong", min=0)
     passes_needed = dy.Int64(
         nullable=True,
         min=0,
@@ -118,15 +121,6 @@ class _PiecesEnd(dy.Schema):
     largest_undetected_m = real(
         "m", "largest undetected error at balises of the piece; null where not in the tables", min=0
     )
-
-
-def _pieces_schema() -> type[dy.Schema]:
-    causes = {f"lost_{cause.value}": count(f"passes lost or wrong with the cause {cause.value}") for cause in LOSSES}
-    columns = {**_Pieces.columns(), **causes, **_PiecesEnd.columns()}
-    return type("LinePieces", (dy.Schema,), {"__doc__": _Pieces.__doc__, "__module__": __name__, **columns})
-
-
-LinePieces = _pieces_schema()
 
 
 class LineProposals(dy.Schema):

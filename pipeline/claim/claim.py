@@ -59,8 +59,8 @@ def claim(
     done, twice = distinct(done)
     found: dict[str, Tallies] = defaultdict(dict)
     days: set[tuple[object, ...]] = set()
-    # Which run of a day is its trial is drawn before an error is looked at.
-    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(_name(row))):
+    # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
+    for run in sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}")):
         told = _tallies_of(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
             told = _once_a_day(told, (run["solution"], run["t_start"].date()), days)
@@ -200,6 +200,11 @@ def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahe
     late = runs["latency_sigma_s"].null_count()
     if late:
         said.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
+    said.append(
+        "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way "
+        "without balise), start of mission, cold movement and availability: they can only be found broken. "
+        "`--csv` has the reasons."
+    )
     said.append("Nothing is said of the rear end: the length of the train is not recorded.")
     return said
 

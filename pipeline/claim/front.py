@@ -108,7 +108,7 @@ def front_of(
         wrong_track=gnss & elsewhere,
         speed_mps=speed,
         direction=direction,
-        where=_areas_at(front, path, epochs, areas),
+        where=_areas_at(front, epochs, areas),
     )
 
 
@@ -152,19 +152,10 @@ def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     return base + odometer
 
 
-def _areas_at(front_m: Floats, path_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None) -> Placed:
+def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None) -> Placed:
     """The area of each front end: that of the run's epoch that is nearest on the path."""
-    there = np.flatnonzero(np.isfinite(path_m) & epochs["netelement_id"].is_not_null().to_numpy())
-    row = np.full(front_m.size, -1)
-    if there.size:
-        order = there[np.argsort(path_m[there], kind="stable")]
-        ways = path_m[order]
-        after = np.searchsorted(ways, np.nan_to_num(front_m)).clip(1, max(ways.size - 1, 1)).clip(0, ways.size - 1)
-        before = np.maximum(after - 1, 0)
-        near = np.where(np.abs(ways[before] - front_m) <= np.abs(ways[after] - front_m), before, after)
-        reached = np.abs(ways[near] - front_m) <= _REACH_M
-        row = np.where(reached, order[near], -1)
-    found = epochs.select("netelement_id", "measure_m").with_row_index("row")
-    at = pl.DataFrame({"row": row}).with_columns(pl.col("row").cast(pl.Int64))
-    places = at.join(found.with_columns(pl.col("row").cast(pl.Int64)), on="row", how="left", maintain_order="left")
+    known = epochs.select("path_m", "netelement_id", "measure_m").drop_nulls().sort("path_m")
+    fronts = pl.DataFrame({"path_m": front_m}, schema={"path_m": pl.Float64}).fill_nan(None).with_row_index("row")
+    near = fronts.drop_nulls().sort("path_m").join_asof(known, on="path_m", strategy="nearest", tolerance=_REACH_M)
+    places = fronts.select("row").join(near, on="row", how="left", maintain_order="left")
     return placed(areas, places["netelement_id"], places["measure_m"])

@@ -28,6 +28,9 @@ S_PER_H = 3600.0
 KEPT, NOT_KNOWN, BROKEN = 1, 0, -1
 
 
+_COUNTS = ("trials", "kept", "broken", "events", "possible", "held_s", "known_s")
+
+
 class Finding(StrEnum):
     """What the data say of a requirement."""
 
@@ -57,17 +60,8 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         sizes = [size for size in (self.worst, other.worst) if size is not None]
-        return Tally(
-            self.trials + other.trials,
-            self.kept + other.kept,
-            self.broken + other.broken,
-            self.events + other.events,
-            self.possible + other.possible,
-            self.held_s + other.held_s,
-            self.known_s + other.known_s,
-            max(sizes, default=None),
-            max(self.longest_s, other.longest_s),
-        )
+        counts = {name: getattr(self, name) + getattr(other, name) for name in _COUNTS}
+        return Tally(**counts, worst=max(sizes, default=None), longest_s=max(self.longest_s, other.longest_s))
 
 
 def codes(kept: Bools, broken: Bools) -> Ints:

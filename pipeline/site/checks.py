@@ -164,14 +164,17 @@ def _check_heights(track: Track, found: Remarks) -> None:
 
 
 def chord_errors_m(track: Track, part: slice) -> np.ndarray:
-    """How far the curve may lie off each segment's chord [m]: length times turn angle over 8 (sagitta)."""
+    """How far the curve may lie off each segment's chord [m]: length times turn angle over 8 (sagitta).
+
+    Of the turns at its two ends the smaller one: the other may be that of a curve which only begins there.
+    """
     surface = points_of(track.latitude_deg[part], track.longitude_deg[part]).surface
     steps = np.diff(surface, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     units = steps / lengths[:, None]
     turn = np.arccos(np.clip(np.einsum("ij,ij->i", units[:-1], units[1:]), -1.0, 1.0))
-    at_ends = np.concatenate([[0.0], turn, [0.0]])
-    return np.asarray(lengths * np.maximum(at_ends[:-1], at_ends[1:]) / 8.0)
+    at_ends = np.concatenate([turn[:1], turn, turn[-1:]]) if len(turn) else np.zeros(2)
+    return np.asarray(lengths * np.minimum(at_ends[:-1], at_ends[1:]) / 8.0)
 
 
 def _check_gaps(track: Track, found: Remarks) -> None:

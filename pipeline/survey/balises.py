@@ -147,7 +147,8 @@ class _Placer:
             for measure in measures_at(element.line_km, self.track.measure_m[self.track.vertices(number)], km)
         ]
         if not found:
-            raise self._refusal(row, f"no track has line kilometre {km:g}", expected="a survey with line kilometres")
+            expected = "a line kilometre of the survey, not one that it jumps over"
+            raise self._refusal(row, f"no track has line kilometre {km:g}", expected=expected)
         # A joint is the end of one element and the start of the next: one place.
         inner = [one for one in found if one[1] > 0] or found
         if len(inner) > 1:

@@ -160,10 +160,14 @@ def _doubled(ground: Ground) -> Iterator[Finding]:
     """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
     track = ground.track
     along = places_along(track, SAMPLE_SPACING_M)
-    found = candidates_of(points_of(along.latitude_deg, along.longitude_deg), ground, segments_of(track), SAME_TRACK_M)
-    own = along.element[found.step]
-    both = np.column_stack([own, found.element])[own < found.element]
-    pairs, count = np.unique(both, axis=0, return_counts=True)
+    segments, both = segments_of(track), []
+    # So many at once as can be held.
+    for rows in np.array_split(np.arange(len(along.element)), 1 + len(along.element) // 100_000):
+        points = points_of(along.latitude_deg[rows], along.longitude_deg[rows])
+        found = candidates_of(points, ground, segments, SAME_TRACK_M)
+        own = along.element[rows][found.step]
+        both.append(np.column_stack([own, found.element])[own < found.element])
+    pairs, count = np.unique(np.concatenate(both), axis=0, return_counts=True)
     for (one, other), samples in zip(pairs.tolist(), count.tolist(), strict=True):
         if samples * SAMPLE_SPACING_M > _DOUBLE_OVER_M:
             whom = "itself" if track.ids[one] == track.ids[other] else track.ids[other]
@@ -177,7 +181,8 @@ def _open_ends(ground: Ground) -> Iterator[Finding]:
     element, position = np.nonzero(~ground.linked_ends())
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
-    found = candidates_of(points, ground, segments_of(track), NEAR_ENDS_M)
+    # Farther aside is the next track.
+    found = candidates_of(points, ground, segments_of(track), 2 * SAME_TRACK_M)
     middle = np.minimum(found.along_m, found.left_m) > NEAR_ENDS_M
     for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
         end, other = int(found.step[near]), track.ids[int(found.element[near])]

@@ -15,7 +15,9 @@ from schemas.config import Configuration
 from schemas.enums import Evidence
 
 TRUST = Trust.of(Configuration())
-ANCHORS = tuple(Anchor(t_s * NS_PER_S, Place(0, 10.0 * t_s), 1.0, Evidence.BALISE) for t_s in (0, 10))
+ANCHORS = tuple(
+    Anchor(t_s * NS_PER_S, Place(0, 10.0 * t_s), sigma_m, Evidence.BALISE) for t_s, sigma_m in ((0, 1.0), (10, 2.0))
+)
 AT_4_S = np.array([4 * NS_PER_S])
 
 
@@ -30,18 +32,26 @@ def odometer(scale: float | None) -> Any:
 
 
 def test_without_a_vehicle_file_both_anchors_may_be_right() -> None:
-    """From the first 40.8 m with variance 1.04, from the second 38.8 m with variance 1.06; three sigmas."""
+    """From the first 40.8 m with variance 1.04, from the second 38.8 m with variance 4.06; three sigmas."""
     low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, TRUST)
-    assert (low[0], high[0]) == (pytest.approx(38.8 - 3.0887), pytest.approx(40.8 + 3.0594, abs=1e-4))
+    assert (low[0], high[0]) == (pytest.approx(38.8 - 6.0448, abs=1e-4), pytest.approx(38.8 + 6.0448, abs=1e-4))
+
+
+def test_the_hull_is_that_of_both_anchors() -> None:
+    """After 1 s the first anchor reaches less far back, after 9 s the second less far ahead."""
+    at_ns = np.array([NS_PER_S, 9 * NS_PER_S])
+    low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 130.0), at_ns, TRUST)
+    assert low == pytest.approx([10.2 - 3.0150, 91.8 - 3.1321], abs=1e-4)
+    assert high == pytest.approx([38.2 + 6.0671, 119.8 + 6.0075], abs=1e-4)
 
 
 def test_where_a_known_odometer_closes_the_better_anchor_weighs_more() -> None:
-    """39.8095 m with variance 1 / (1 / 1.04 + 1 / 1.06)."""
+    """40.3922 m with variance 1 / (1 / 1.04 + 1 / 4.06)."""
     low, high = between_anchors(odometer(1.0), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, TRUST)
-    assert (low[0], high[0]) == (pytest.approx(39.8095 - 2.1736, abs=1e-4), pytest.approx(39.8095 + 2.1736, abs=1e-4))
+    assert (low[0], high[0]) == (pytest.approx(40.3922 - 2.7297, abs=1e-4), pytest.approx(40.3922 + 2.7297, abs=1e-4))
 
 
-@pytest.mark.parametrize(("apart_m", "closed"), [(97.66, True), (97.64, False), (106.34, True), (106.36, False)])
+@pytest.mark.parametrize(("apart_m", "closed"), [(95.23, True), (95.22, False), (108.77, True), (108.78, False)])
 def test_an_odometer_closes_within_three_roots_of_both_anchors_and_its_way(apart_m: float, closed: bool) -> None:
-    """102 m are counted; 3 sqrt(1 + 1 + 0.1) = 4.347 m."""
+    """102 m are counted; 3 sqrt(1 + 4 + 0.1) = 6.775 m."""
     assert closes(odometer(1.0), cast(Any, ANCHORS), apart_m, TRUST) is closed

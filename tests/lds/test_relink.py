@@ -256,3 +256,20 @@ def test_a_telegram_after_an_outage_returns_the_position_without_a_vehicle_file(
 def test_without_the_monitor_there_is_no_test_after_an_outage() -> None:
     result = outage(90.0, 40.0, disabled=["link_distance"])
     assert negations(result) == []
+
+
+@pytest.mark.parametrize(("read_s", "moved_m"), [(26.0, 0.0), (17.0, 180.0)])
+def test_a_telegram_inside_an_outage_is_what_the_position_after_it_is_held_against(
+    read_s: float, moved_m: float
+) -> None:
+    """Ten epochs at 20 m/s, none from 5 s to 94 s; P1 at 520 m is passed at 26 s, or was stamped 9 s early."""
+    t_s = [0.0, 1.0, 2.0, 3.0, 4.0, 95.0, 96.0, 97.0, 98.0, 99.0]
+    path_m: list[float | None] = [20.0 * at_s for at_s in t_s]
+    balises = balises_at({"V1": 10.0, "P1": 520.0}, kind=KINDS)
+    result = run(epochs_of(path_m, t_s=t_s), balises, reads=reads_at([(read_s, "P1")]))
+    value, threshold, state = result.epochs.select("^link_distance_(value|threshold|state)$").row(5)
+    assert abs(value) == pytest.approx(moved_m)
+    # Sigma 1 m of position and read; the time and the way since the telegram.
+    since_s = 95.0 - read_s
+    assert threshold == pytest.approx(min(10.0, K_T * sqrt(2.0 + 0.05**2 * since_s + (1e-4 * 20.0 * since_s) ** 2)))
+    assert (state, negations(result)) == (("pass", []) if moved_m == 0.0 else ("fail", [(5, None)]))
