@@ -34,7 +34,8 @@ class PairFit:
 
     `factor`: counted units per metre, negative where the counter falls; `lag_s`: the counter's stamp of a moment minus
     the GNSS's; sigmas of both (inf: not told). `halves`: factor and lag of the first and the second half alone.
-    `constant`: share of windows that agree on the factor. `reason`: why the factor is not told.
+    `constant`: share of windows that agree on the factor, of all in which the positions move.
+    `reason`: why the factor is not told.
     `shifted`: the lag is one of the clocks, found by the whole journey's speed; `clock_reason`: why that told nothing.
     """
 
@@ -175,7 +176,8 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
     end_s = min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_S[0]:
         return PairFit(reason="nothing in common")
-    windows, stands = _windows(gnss, counter, begin_s, end_s, lag_s)
+    windows, counts = _windows(gnss, counter, begin_s, end_s, lag_s)
+    stands = counts < 0.1
     if windows.gnss_m.size < LEAST:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
@@ -189,16 +191,16 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
         lag_s=lag_s + slope / scale,
         lag_sigma_s=sigma[1] / scale,
         halves=tuple((sign / one, lag_s + change / one) for one, change in fit.halves),
-        constant=float(np.mean(np.abs(np.log(ratio / np.median(ratio))) < _AGREES)),
+        constant=counts * float(np.mean(np.abs(np.log(ratio / np.median(ratio))) < _AGREES)),
     )
 
 
-def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s: float) -> tuple[_Windows, bool]:
-    """Windows in which both move; and whether the counter stands where the positions move."""
+def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s: float) -> tuple[_Windows, float]:
+    """Windows in which both move, and their share of those in which the positions move."""
     speed = gnss.speed(np.linspace(begin_s, end_s, 400))
     fast = speed[np.nan_to_num(speed) > MOVES_MPS]
     if not fast.size:
-        return _Windows(*(np.zeros(0),) * 4), False
+        return _Windows(*(np.zeros(0),) * 4), 1.0
     length_s = float(np.clip(_WINDOW_M / np.median(fast), *_WINDOW_S))
     starts = np.arange(begin_s, end_s - length_s, length_s / 2)
     ends = starts + length_s
@@ -208,10 +210,10 @@ def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s:
     known = np.isfinite(way) & np.isfinite(counted) & np.isfinite(change)
     size = np.abs(counted)
     moves = known & (way > _SLOW_SHARE * usual(way[known], 0.9)) & (way > MOVES_MPS * length_s)
-    stands = bool(moves.any() and np.mean(size[moves] == 0.0) > 0.9)
     # Neither a counter that stands most of the time nor one that is reset tells what is usual.
-    moves &= size > _SLOW_SHARE * usual(size[moves], 0.8)
-    return _Windows(way, size, np.where(counted < 0, -change, change), counted).take(moves), stands
+    counts = moves & (size > _SLOW_SHARE * usual(size[moves], 0.8))
+    share = float(counts.sum() / moves.sum()) if moves.any() else 1.0
+    return _Windows(way, size, np.where(counted < 0, -change, change), counted).take(counts), share
 
 
 def _speed(counter: Course, t_s: Floats) -> Floats:
