@@ -6,11 +6,12 @@ import json
 from collections.abc import Iterator
 
 import dataframely as dy
+import numpy as np
 import polars as pl
 
-from pipeline.export.cdr import Fields, cdr_messages
 from pipeline.export.messages import Topic
 from pipeline.ingest.recipes import OWN_SCHEMAS
+from schemas.arrays import Floats, floats, times_ns
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
 
@@ -89,33 +90,35 @@ def _json_payloads(frame: pl.DataFrame) -> Iterator[bytes]:
 
 def twist_topic(frame: pl.DataFrame) -> Topic:
     """geometry_msgs/TwistStamped in little-endian CDR: speed as linear x."""
-    return _odometer_topic("geometry_msgs/msg/TwistStamped", frame, (*_HEAD, *_numbers("twist", 6)))
+    values = np.zeros((frame.height, 6))
+    values[:, 0] = floats(frame, "speed_mps")
+    return _odometer_topic("geometry_msgs/msg/TwistStamped", frame, (_FRAME_ID,), values)
 
 
 def odometry_topic(frame: pl.DataFrame) -> Topic:
-    """nav_msgs/Odometry in little-endian CDR: speed as linear x, variance where the stream has it."""
-    pose = (*_numbers("pose", 7), *_numbers("pose covariance", 36))
-    fields = (*_HEAD, ("child", "string"), *pose, *_numbers("twist", 6), *_numbers("twist covariance", 36))
-    return _odometer_topic("nav_msgs/msg/Odometry", frame, fields)
+    """nav_msgs/Odometry in little-endian CDR: speed as linear x, variance where the stream has it.
+
+    The numbers are a pose with its covariance, 7 and 36, and a velocity with its own, 6 and 36.
+    """
+    values = np.zeros((frame.height, 85))
+    values[:, 6] = 1.0  # the quaternion of no turn
+    values[:, 43] = floats(frame, "speed_mps")
+    values[:, 49] = np.nan_to_num(floats(frame, "sigma_speed_mps")) ** 2
+    return _odometer_topic("nav_msgs/msg/Odometry", frame, (_FRAME_ID, "base_link"), values)
 
 
-_HEAD: Fields = (("t", "time"), ("frame_id", "string"))
-
-
-def _numbers(name: str, count: int) -> Fields:
-    return tuple((f"{name} {index}", "double") for index in range(count))
-
-
-def _odometer_topic(name: str, frame: pl.DataFrame, fields: Fields) -> Topic:
-    """Speed and its variance from the rows; of the rest the quaternion is that of no turn, and all others are 0."""
-    fixed: dict[str, object] = dict.fromkeys((field for field, _ in fields), 0.0)
-    fixed |= {"pose 6": 1.0, "frame_id": _FRAME_ID, "child": "base_link"}
-    told = frame.select(
-        pl.col("t").to_physical(),
-        pl.col("speed_mps").alias("twist 0"),
-        (pl.col("sigma_speed_mps").fill_null(0.0) ** 2).alias("twist covariance 0"),
-    )
-    messages = cdr_messages(fields, (fixed | row for row in told.iter_rows(named=True)))
+def _odometer_topic(name: str, frame: pl.DataFrame, texts: tuple[str, ...], values: Floats) -> Topic:
+    """Messages that start with a header and texts and go on with numbers, laid out by CDR's alignment rules."""
+    head = b"\x00\x01\x00\x00" + bytes(8)
+    for text in texts:
+        head += bytes(-len(head) % 4) + (len(text) + 1).to_bytes(4, "little") + text.encode() + b"\0"
+    head += bytes(-(len(head) - 4) % 8)
+    rows = np.zeros(frame.height, dtype=[("head", f"V{len(head)}"), ("values", "<f8", values.shape[1])])
+    rows["head"], rows["values"] = np.void(head), values
+    stamps = np.column_stack(np.divmod(times_ns(frame), SECOND_NS)).astype("<u4")
+    content = rows.view(np.uint8).reshape(frame.height, -1)
+    content[:, 4:12] = stamps.view(np.uint8)
+    messages = (row.tobytes() for row in content)
     return Topic("/odometer", "cdr", name, "ros2msg", DEFINITIONS[name].encode(), _times_ns(frame), messages)
 
 

@@ -149,7 +149,7 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
         return frame
     unset = frame["t"].to_physical() == 0
     count = int(unset.sum())
-    if count < _STAMPS_NEVER_SET:
+    if count <= 1:  # a single 0 may be the start of a clock
         return frame
     if count == frame.height:
         raise InputError(
@@ -161,9 +161,6 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
         )
     remarks.append(f"{source.channel.topic}: {count} messages with a stamp of 0")
     return frame.filter(~unset.fill_null(False))
-
-
-_STAMPS_NEVER_SET = 2  # a single 0 may be the start of a clock
 
 
 def _columns(frame: pl.DataFrame, wanted: Mapping[str, pl.Expr]) -> pl.DataFrame:

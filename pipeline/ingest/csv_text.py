@@ -17,7 +17,6 @@ import polars as pl
 from schemas.errors import InputError
 
 _SEPARATORS = (",", ";", "\t")
-_MOST_COMMENTS = 50
 _NO_ROW = r"#|sep=.$"  # a comment; Excel's own line, which says what separates
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -143,8 +142,8 @@ def _is_empty(name: str, dtype: pl.DataType) -> pl.Expr:
 
 
 def comments_of(data: bytes) -> str:
-    """The comment lines at the top."""
-    return "\n".join(line for line in text_of(data).splitlines()[:_MOST_COMMENTS] if line.startswith("#"))
+    """The comment lines."""
+    return "\n".join(line for line in text_of(data).splitlines() if line.startswith("#"))
 
 
 def text_of(data: bytes) -> str:

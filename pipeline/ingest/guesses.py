@@ -25,7 +25,7 @@ NAMES: dict[Stream, dict[str, str]] = {
         "speed_mps": r"(odo|train|wheel|vehicle)?(speed|velocity|v|geschwindigkeit|vitesse)(mps|kmh|kph|mph|kn|knots)?",
     },
 }
-_UNITS = {
+UNITS = {
     "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600,
     "knots": 1852 / 3600, "mm/s": 1e-3, "cm/s": 1e-2, "m": 1.0, "km": 1000.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048,
     "mi": 1609.344,
@@ -74,11 +74,11 @@ def mapping_lines(
     remarks: list[str] = []
     for column in sorted(set(_UNIT_NEEDED) & set(found)):
         unit = unit_in(found[column]) or units.get(found[column])
-        if unit not in _UNITS:
+        if unit not in UNITS:
             told = "is not told" if unit is None else f"{one_line(unit)!r} is not known"
             remarks.append(f"# {column}: the unit {told}; another one than of the name needs a factor")
-        elif _UNITS[unit] != 1.0:
-            factors[column] = _UNITS[unit]
+        elif UNITS[unit] != 1.0:
+            factors[column] = UNITS[unit]
     if stream == "gnss" and "height_m" not in found:
         remarks.append("# height_m: only a height over the ellipsoid; one over the sea is another 20 to 60 m in Europe")
     pairs = ", ".join(f"{column} = {json.dumps(name, ensure_ascii=False)}" for column, name in found.items())

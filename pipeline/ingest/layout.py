@@ -17,7 +17,19 @@ from schemas.arrays import Bools
 Words = npt.NDArray[np.uint64]
 
 
-Values = npt.NDArray[Any] | pl.Series
+@dataclass(frozen=True)
+class Repeated:
+    """One value for many messages."""
+
+    value: float | str | bool | None
+    count: int
+    dtype: pl.DataType
+
+    def series(self) -> pl.Series:
+        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, self.count)
+
+
+Values = npt.NDArray[Any] | pl.Series | Repeated
 
 
 class UnfitError(Exception):
@@ -168,7 +180,7 @@ class Constant:
         return 0  # takes no bytes of the message
 
     def values(self, rows: Rows) -> Values:
-        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, rows.count)
+        return Repeated(self.value, rows.count, self.dtype)
 
 
 Field = Fixed | Flag | Varint | Text | Constant

@@ -12,8 +12,6 @@ from schemas.enums import Fix
 
 # Nobody runs trains within this of 0/0, in the Gulf of Guinea [deg].
 _ORIGIN_DEG = 0.01
-# So many epochs of exactly one place are a default, not a measurement: a fix never repeats to the last digit far away.
-_REPEATS = 2
 # A receiver that looks for its first fix does so over this share of the run at most, or this long.
 _FIRST_SHARE, _FIRST_S = 0.2, 900.0
 # No train is faster; the same limit as for odometers.
@@ -62,7 +60,8 @@ def _far(t_ns: Ints, places: Floats, far_m: float) -> Bools:
         if number == main:
             continue
         rows = np.flatnonzero(piece == number)
-        same = rows.size >= _REPEATS and np.ptp(places[rows], axis=0).max() == 0.0
+        # Several epochs of exactly one place are a default: a fix never repeats to the last digit far away.
+        same = rows.size > 1 and np.ptp(places[rows], axis=0).max() == 0.0
         first = rows[0] == 0 and number < main and _is_brief(t_ns, rows[-1] + 1)
         far = np.linalg.norm(np.median(places[rows], axis=0) - home) > far_m
         found[rows] = far and (same or first)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.ingest.generic import decode_columns
-from pipeline.ingest.layout import Rows, UnfitError, Values, joined_rows
+from pipeline.ingest.layout import Repeated, Rows, UnfitError, Values, joined_rows
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
@@ -129,6 +129,9 @@ _KINDS = {pl.Float64: np.float64, pl.Int64: np.int64, pl.Boolean: np.bool_}
 
 def _typed(values: Values, dtype: pl.DataType) -> Values:
     """In the type asked for, on its own memory."""
+    if isinstance(values, Repeated):
+        whole = values.value is not None and type(dtype) in _KINDS
+        return np.full(values.count, values.value, _KINDS[type(dtype)]) if whole else values
     if isinstance(values, pl.Series):
         return values.cast(dtype)
     if values.dtype == np.uint64 and len(values) and values.max() >= 2**63 and dtype == pl.Int64():
@@ -144,5 +147,10 @@ def _joined(name: str, parts: list[Values], dtype: pl.DataType, order: npt.NDArr
     if len(arrays) == len(parts):
         joined = np.concatenate(arrays)
         return pl.Series(name, joined if order is None else joined[order])
-    column = pl.concat([pl.Series(part).cast(dtype).alias(name) for part in parts], rechunk=True)
+    repeated = [part for part in parts if isinstance(part, Repeated)]
+    if len(repeated) == len(parts) and len({part.value for part in repeated}) == 1:
+        whole = Repeated(repeated[0].value, sum(part.count for part in repeated), dtype)
+        return whole.series().alias(name)
+    series = [part.series() if isinstance(part, Repeated) else pl.Series(part) for part in parts]
+    column = pl.concat([part.cast(dtype).alias(name) for part in series], rechunk=True)
     return column if order is None else column.gather(order)

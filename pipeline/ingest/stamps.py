@@ -10,13 +10,13 @@ from typing import Literal
 import polars as pl
 
 from pipeline.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
+from schemas.arrays import NS_PER_S
 from schemas.config import StreamMapping
 
-_SECOND_NS = 1_000_000_000
-_LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * _SECOND_NS  # leaves room in 64 bits for the GPS epoch
+_LATEST_NS = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # leaves room in 64 bits for the GPS epoch
 # Spreadsheets count days from 1899-12-30.
 _DAY_S = 86_400
-_EXCEL_TO_UNIX_NS = 25_569 * _DAY_S * _SECOND_NS
+_EXCEL_TO_UNIX_NS = 25_569 * _DAY_S * NS_PER_S
 LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
 # How fields are read that may hold a time, by what their first value is.
@@ -58,11 +58,11 @@ class TimeSource:
         first = frame[self.fields[0]]
         if len(self.fields) == 2:
             rest = frame[self.fields[1]]
-            wrong = ~rest.is_between(0, _SECOND_NS - 1).fill_null(True)
+            wrong = ~rest.is_between(0, NS_PER_S - 1).fill_null(True)
             if wrong.any():
                 row = int(wrong.arg_max() or 0)
                 raise ValueError(f"{rest[row]} nanoseconds beside whole seconds in message {row} of the topic")
-            return _within(first, _SECOND_NS) * _SECOND_NS + rest
+            return _within(first, NS_PER_S) * NS_PER_S + rest
         dtype = self.types.get(self.fields[0], pl.Int64())
         if dtype == pl.String:
             # Beyond 64 bits polars goes round without a word, so the date is read in microseconds before.
@@ -114,5 +114,5 @@ class CivilTime:
         year, month, day, hour, minute, second = (pl.when(known).then(field) for field in self.calendar)
         # A leap second (60) is the first second of the next minute; datetime() knows none.
         whole = pl.datetime(year, month, day, hour, minute, time_unit="us", time_zone="UTC").to_physical() * 1000
-        at = whole + second * _SECOND_NS + pl.when(known).then(self.nanoseconds)
+        at = whole + second * NS_PER_S + pl.when(known).then(self.nanoseconds)
         return frame.select(at.cast(pl.Datetime("ns", "UTC")).alias(name)).to_series()

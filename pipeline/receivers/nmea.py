@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.ingest.guesses import UNITS
 from pipeline.receivers.epochs import Epoch, Gathered
 from schemas.enums import Fix
 
-_KNOT_MPS = 1852.0 / 3600.0
 _FIXES = {
     0: Fix.NONE,
     1: Fix.AUTONOMOUS,
@@ -174,7 +174,7 @@ def _motion(epoch: Epoch, m: Any) -> None:
     place = {"latitude_deg": m.lat, "longitude_deg": m.lon} if m.lat != "" and m.lon != "" else {}
     epoch.gnss = {"fix": fix.value, **place} | epoch.gnss
     if valid and isinstance(m.spd, float) and isinstance(m.cog, float):
-        course, speed = np.radians(m.cog), m.spd * _KNOT_MPS
+        course, speed = np.radians(m.cog), m.spd * UNITS["knots"]
         epoch.gnss |= {"vel_e_mps": float(speed * np.sin(course)), "vel_n_mps": float(speed * np.cos(course))}
 
 

@@ -83,21 +83,27 @@ def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame
 
 
 def _layout(comments: list[str], path: Path) -> _Layout:
-    for line in reversed(comments):
-        words = re.split(r"[\s,;]+", line.lstrip("% ").strip())
-        if words[0] in _SCALES and {"Q", "ns"} <= set(words):
-            names = tuple(re.sub(r"\(.*\)$", "", word) for word in words[1:])
-            lacking = [n for group in _TOGETHER if {*group} & {*names} for n in group if n not in names]
-            if lacking:
-                found, remedy = ", ".join(names), "Let RTKLIB write the file again."
-                raise InputError(f"has no column {', '.join(lacking)}", place=str(path), found=found, remedy=remedy)
-            return _Layout(words[0], names, "(d'" in line, "\n".join(comments))
-    raise InputError(
-        "has no line that names its columns",
-        place=str(path),
-        expected="a line such as %  GPST  latitude(deg) longitude(deg) height(m) Q ns ...",
-        remedy="Let RTKLIB write its header (out-outhead = on): without it the scale of the times is not known.",
-    )
+    headers = [re.split(r"[\s,;]+", line.lstrip("% ").strip()) for line in comments]
+    headers = [words for words in headers if words[0] in _SCALES and {"Q", "ns"} <= set(words)]
+    if not headers:
+        raise InputError(
+            "has no line that names its columns",
+            place=str(path),
+            expected="a line such as %  GPST  latitude(deg) longitude(deg) height(m) Q ns ...",
+            remedy="Let RTKLIB write its header (out-outhead = on): without it the scale of the times is not known.",
+        )
+    scale, *units = headers[0]
+    names = tuple(re.sub(r"\(.*\)$", "", word) for word in units)
+    lacking = [name for group in _TOGETHER if {*group} & {*names} for name in group if name not in names]
+    if lacking:
+        found, remedy = ", ".join(names), "Let RTKLIB write the file again."
+        raise InputError(f"has no column {', '.join(lacking)}", place=str(path), found=found, remedy=remedy)
+    places = {line for line in comments if "e-baseline" in names and re.match(r"%\s*ref pos\s*:", line)}
+    if any(words != headers[0] for words in headers) or len(places) > 1:
+        found = ", ".join(sorted({" ".join(words[:3]) for words in headers} | places))
+        remedy = "Give the files that were joined one by one."
+        raise InputError("holds solutions of several forms", place=str(path), found=found, remedy=remedy)
+    return _Layout(scale, names, any("(d'" in word for word in units), "\n".join(comments))
 
 
 def _rows(lines: list[str], layout: _Layout, ended: bool, path: Path) -> tuple[list[list[str]], dict[str, int]]:

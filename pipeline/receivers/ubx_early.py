@@ -16,7 +16,6 @@ from pipeline.receivers.ubx_fields import accuracy, calendar_ns, fix_of, place, 
 
 # What each tells gives way to what a message of higher rank tells of the same epoch; NAV-PVT is above all of these.
 _STATUS, _SOL, _SINGLE, HIGHEST_RANK = 0, 1, 2, 2
-_CM = 1e-2
 # Numbers of satellites in NAV-SVINFO: first of the system, last, letter, number of the first.
 _SVIDS = (
     (1, 32, "G", 1),
@@ -49,8 +48,8 @@ def solution(_: Gathered, epoch: Epoch, m: Any) -> None:
     epoch.tell("fix", _SOL, {"fix": fix.value, "satellites": m.numSV})
     if not (m.ecefX or m.ecefY or m.ecefZ):
         return
-    where = geodetic(m.ecefX * _CM, m.ecefY * _CM, m.ecefZ * _CM)
-    speeds = (m.ecefVX * _CM, m.ecefVY * _CM, m.ecefVZ * _CM)
+    where = geodetic(m.ecefX * 1e-2, m.ecefY * 1e-2, m.ecefZ * 1e-2)
+    speeds = (m.ecefVX * 1e-2, m.ecefVY * 1e-2, m.ecefVZ * 1e-2)
     epoch.tell("place", _SOL, where)
     epoch.tell("velocity", _SOL, local_velocity(where["latitude_deg"], where["longitude_deg"], speeds))
 
@@ -68,13 +67,13 @@ def position(_: Gathered, epoch: Epoch, m: Any) -> None:
 
 def motion(_: Gathered, epoch: Epoch, m: Any) -> None:
     """NAV-VELNED: velocity [cm/s]."""
-    epoch.tell("velocity", _SINGLE, velocity(m.velE * _CM, m.velN * _CM, m.velD * _CM))
+    epoch.tell("velocity", _SINGLE, velocity(m.velE * 1e-2, m.velN * 1e-2, m.velD * 1e-2))
 
 
 def satellites(_: Gathered, epoch: Epoch, m: Any) -> None:
     """NAV-SVINFO: azimuth and elevation [deg], residual [cm]; NAV-SAT of the same epoch tells the same."""
     if not epoch.satellites:
-        epoch.satellites = satellites_of(m, m.numCh, _name, ("svid",), _CM)
+        epoch.satellites = satellites_of(m, m.numCh, _name, ("svid",), 1e-2)
 
 
 def _name(svid: int) -> str | None:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
+from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
 
-_NS_PER_S = 1_000_000_000
 _NO_FIX, _DEAD_RECKONING, _TIME_ONLY = 0, 1, 5
 _RTK_FLOAT, _RTK_FIXED = 1, 2
 
@@ -30,7 +30,7 @@ def calendar_ns(m: Any, second: int) -> int | None:
         minute = datetime(m.year, m.month, m.day, m.hour, m.min, tzinfo=UTC)
     except ValueError:
         return None
-    return (int(minute.timestamp()) + second) * _NS_PER_S + int(m.nano)
+    return (int(minute.timestamp()) + second) * NS_PER_S + int(m.nano)
 
 
 def place(m: Any) -> dict[str, float]:

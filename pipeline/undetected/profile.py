@@ -54,8 +54,10 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
     found = largest_profile(seen, MARGIN)
     names = [name for name, on in zip(SCALES, diagnosis.bank.enabled, strict=True) if on or name == "raw"]
     return Profile(
-        fault=pl.DataFrame({"t_s": part.t_s, "size_m": -found.fault_m if against else found.fault_m}),
-        t=diagnosis.epochs["t"].gather(part.epoch[[0, -1]]),
+        fault=pl.DataFrame(
+            {"t_s": [window.since_s, *part.t_s[1:]], "size_m": -found.fault_m if against else found.fault_m}
+        ),
+        t=pl.Series("t", [window.since_ns, int(t_ns[epoch])]).cast(pl.Datetime("ns", "UTC")),
         error_m=found.error_m,
         bound_m=float(largest_errors(seen).most_m[-1]),
         step_m=largest_of_shape(seen, "step"),

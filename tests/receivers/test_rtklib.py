@@ -103,3 +103,16 @@ def test_a_header_that_lacks_a_column(tmp_path):
     path.write_text(f"{HEAD}% {LLH}\n%  GPST {PLANE.replace('height(m)', 'hight(m)')}\n{row}")
     with pytest.raises(InputError, match="has no column height; found latitude, longitude, hight"):
         convert([path], "r")
+
+
+def test_solutions_of_two_forms_in_one_file(tmp_path):
+    path = tmp_path / "a.pos"
+    parts = [
+        f"{HEAD}% {LLH}\n%  {scale} {PLANE}\n2020/12/04 20:45:12.000 51.15 -114.03 120.5 {END}"
+        for scale in ("GPST", "UTC")
+    ]
+    path.write_text(parts[0] * 2)
+    assert convert([path], "r").run.gnss.height == 2
+    path.write_text("".join(parts))
+    with pytest.raises(InputError, match=r"holds solutions of several forms; found GPST latitude.*, UTC latitude"):
+        convert([path], "r")

@@ -37,9 +37,8 @@ def tables() -> RunTables:
     return replay(run, site, VEHICLE, config())
 
 
-@pytest.mark.parametrize("seed", [3, 7])
-def test_the_profile_goes_unseen_and_five_percent_more_does_not(seed: int, tmp_path: Path) -> None:
-    found = proof(seed, False, tmp_path)
+def test_the_profile_goes_unseen_and_five_percent_more_does_not(tmp_path: Path) -> None:
+    found = proof(3, False, tmp_path)
     assert found is not None
     assert found.silent
     assert found.seen_scaled
@@ -150,11 +149,14 @@ def sky() -> tuple[RunLog, Site]:
 
 
 def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[RunLog, Site]) -> None:
-    run, site = sky
+    both, site = sky
+    assert both.satellites is not None
+    alone = pl.col("solution") == "gps"
+    run = both.with_streams(gnss=both.gnss.filter(alone).head(40), satellites=both.satellites.filter(alone))
     diagnosis, _, _ = diagnosed(run, site, VEHICLE, Configuration(), "gps")
     assert diagnosis.satellites is not None
     low_m, high_m = range_bounds(diagnosis.epochs, diagnosis.satellites, Configuration())
-    clean, at = replay(run, site, VEHICLE), 60
+    clean, at = replay(run, site, VEHICLE), 35
     most_m, least_m = -np.inf, np.inf
     for name in sorted(diagnosis.satellites.filter(pl.col("used"))["sv"].unique()):
         reached = _unseen(run, site, clean, name, at)
