@@ -35,6 +35,7 @@ _SLOW = (
     "datasets/test_recordings.py",
     "datasets/test_samples.py",
     "datasets/test_sky.py",
+    "datasets/test_trial.py",
     "diff/test_compare_tables.py",
     "docs/test_commands.py",
     "docs/test_queries.py",
@@ -52,6 +53,8 @@ _SLOW = (
     "line",
     "matching/test_calibration.py",
     "matching/test_found_route.py",
+    "odometry/test_properties.py",
+    "odometry/test_quantisation.py",
     "plausibility",
     "monitors/test_pseudorange.py",
     "replay/test_channels.py",
@@ -60,7 +63,9 @@ _SLOW = (
     "replay/test_properties.py",
     "replay/test_random_trials.py",
     "report",
+    "store/test_manifest.py",
     "summary/test_summary.py",
+    "undetected/test_replay.py",
 )
 
 

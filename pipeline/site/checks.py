@@ -7,12 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from pipeline.track.geodesy import points_of
 from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
-from schemas.arrays import Floats
+from schemas.arrays import Bools, Floats
 from schemas.enums import Navigability
 from schemas.run import Finding
 
@@ -212,16 +213,25 @@ def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
             yield Finding("warning", "links", text, remedy)
 
 
+def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
+    """Pairs of places near each other: neighbours along one axis are compared. A search tree takes long to load."""
+    order = np.argsort(places[:, 0], kind="stable")
+    along = places[order, 0]
+    counts = np.searchsorted(along, along + reach_m, side="right") - np.arange(len(along)) - 1
+    first = np.repeat(np.arange(len(along)), counts)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
+    pairs: npt.NDArray[np.int64] = order[np.column_stack([first, second])]
+    near: Bools = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1) <= reach_m
+    return pairs[near]
+
+
 def _nearly_met(places: Floats, inward: Floats, free: np.ndarray) -> list[tuple[int, int, float]]:
     """Pairs of ends, and how far apart they are."""
-    # It takes long to load, and a replay needs none of it.
-    from scipy.spatial import cKDTree
-
-    near = cKDTree(places).query_pairs(NEAR_ENDS_M, output_type="ndarray")
+    near = _pairs_within(places, NEAR_ENDS_M)
     onward = np.einsum("ij,ij->i", inward[near[:, 0]], inward[near[:, 1]]) < 0.0
     near = near[onward & free[near].any(axis=1)]
     alone = np.flatnonzero(free)
-    far = alone[cKDTree(places[alone]).query_pairs(FACING_REACH_M, output_type="ndarray")] if len(alone) else near[:0]
+    far = alone[_pairs_within(places[alone], FACING_REACH_M)]
     way = places[far[:, 1]] - places[far[:, 0]]
     gap = np.linalg.norm(way, axis=1)
     ahead = [sign * np.einsum("ij,ij->i", inward[far[:, side]], way) for side, sign in ((0, -1.0), (1, 1.0))]

@@ -101,6 +101,11 @@ def remote_bytes(out: str) -> dict[str, bytes]:
     return {place.removeprefix(f"{out}/"): data for place, data in found.items()}
 
 
+def of_two(result: dict[str, bytes]) -> dict[str, bytes]:
+    """What a result holds of the first two runs: requests to the store of these tests take their time."""
+    return {name: data for name, data in result.items() if "run_id=run0" in name or "run_id=run1" in name}
+
+
 def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -> None:
     plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/out")
     assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 4
@@ -156,45 +161,45 @@ def test_store_that_refuses_now_and_then(
     s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(s3, "refuse_each", 9)
-    plan = make_plan([f"{bucket}/runs/run*"], f"{bucket}/site", f"{bucket}/moody")
-    assert run_campaign(plan).count(RunStatus.OK) == 4
+    plan = make_plan([f"{bucket}/runs/run[01]"], f"{bucket}/site", f"{bucket}/moody")
+    assert run_campaign(plan).count(RunStatus.OK) == 2
     monkeypatch.setattr(s3, "refuse_each", 0)
     assert s3.refused > 0
-    assert remote_bytes(f"{bucket}/moody") == result_bytes(undisturbed)
+    assert remote_bytes(f"{bucket}/moody") == of_two(result_bytes(undisturbed))
 
 
 @pytest.mark.usefixtures("in_process")
 def test_store_that_answers_slowly(s3: Moody, bucket: str, undisturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(s3, "answer_after_s", 0.1)
-    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/slow")
-    assert run_campaign(plan).count(RunStatus.OK) == 4
-    assert remote_bytes(f"{bucket}/slow") == result_bytes(undisturbed)
+    plan = make_plan([f"{bucket}/runs/run[01]"], f"{bucket}/site", f"{bucket}/slow")
+    assert run_campaign(plan).count(RunStatus.OK) == 2
+    assert remote_bytes(f"{bucket}/slow") == of_two(result_bytes(undisturbed))
 
 
 @pytest.mark.usefixtures("in_process")
 def test_log_that_cannot_be_had_now_is_tried_again(
     s3: Moody, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", tmp_path)
+    plan = make_plan([f"{bucket}/runs/run[12]"], f"{bucket}/site", tmp_path)
     with monkeypatch.context() as patched:
         patched.setattr(s3, "forbidden", "run2/")
         first = run_campaign(plan)
-    assert (first.count(RunStatus.OK), first.count(RunStatus.FAILED)) == (3, 1)
+    assert (first.count(RunStatus.OK), first.count(RunStatus.FAILED)) == (1, 1)
     assert "the store refused" in (by_run(first)["run2"].error or "")
     again = run_campaign(plan)
-    assert (again.count(RunStatus.OK), again.skipped) == (4, 3)
+    assert (again.count(RunStatus.OK), again.skipped) == (2, 1)
 
 
 @pytest.mark.usefixtures("in_process")
 def test_logs_are_not_fetched_again(s3: Moody, bucket: str, tmp_path: Path) -> None:
-    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", tmp_path)
+    plan = make_plan([f"{bucket}/runs/run[01]"], f"{bucket}/site", tmp_path)
     run_campaign(plan)
     assert any("/runs/run1/" in place for place in s3.fetched)
     s3.fetched.clear()
-    assert run_campaign(plan).skipped == 4
+    assert run_campaign(plan).skipped == 2
     assert [place for place in s3.fetched if "/runs/" in place] == []
     shutil.rmtree(tmp_path / ".catalogue")
-    assert run_campaign(plan).skipped == 4
+    assert run_campaign(plan).skipped == 2
     assert any("/runs/run1/" in place for place in s3.fetched)
 
 

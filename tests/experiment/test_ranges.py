@@ -90,6 +90,7 @@ def test_the_slow_ramp_is_found_before_its_failure() -> None:
     assert table["time_to_detect_s"].is_between(800.0, 1800.0).all()
 
 
+@pytest.mark.usefixtures("in_process")
 def test_results_do_not_depend_on_the_number_of_jobs() -> None:
     plans = (RangePlan(default_geometry("gps"), rates_mps=(1.0,), headings_deg=(0.0,)),)
     assert run_ranges(500, 4, 1, plans).equals(run_ranges(500, 4, 2, plans))
