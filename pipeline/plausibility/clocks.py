@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,28 +17,20 @@ _CANDIDATES, APART_S = 4, 15.0
 _LEAST_CHANGE = 0.08
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Lags that two clocks may have, to a second: the second record's stamp of a moment minus the first's.
+def possible_lags(one: Places, other: Course) -> tuple[list[float], str]:
+    """Lags at which two records of speed look alike, to a second, best correlated first; and why there are none.
 
-    Best correlated first. `reason`: why there are none.
+    A lag is the second record's stamp of a moment minus the first's.
     """
-
-    lags_s: tuple[float, ...] = ()
-    reason: str = ""
-
-
-def possible_lags(one: Places, other: Course) -> Candidates:
-    """Lags at which two records of speed look alike."""
     times = [np.arange(t_s[0], t_s[-1] + 0.5, 1.0) for t_s in (one.t_s, other.t_s)]
     speeds = _bounded(one.speed(times[0])), _bounded(np.abs(other.speed(times[1])))
     if any(np.isfinite(speed).sum() < _LEAST_S for speed in speeds):
-        return Candidates(reason=f"less than {_LEAST_S:.0f} s of movement are known")
+        return [], f"less than {_LEAST_S:.0f} s of movement are known"
     if any(np.nanstd(speed) < _LEAST_CHANGE * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
-        return Candidates(reason="the speed hardly changes")
+        return [], "the speed hardly changes"
     rho = _correlations(*speeds)
     lags_s = times[1][0] - times[0][0] + times[1].size - 1.0 - np.arange(rho.size)
-    return Candidates(tuple(_peaks(lags_s, rho)))
+    return list(_peaks(lags_s, rho)), ""
 
 
 def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:

@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.plausibility.axes import velocity_checks
 from pipeline.plausibility.check import Check, State, not_checked
 from pipeline.plausibility.course import places_of
-from pipeline.plausibility.odometer import odometer_checks
+from pipeline.plausibility.odometer import LATENCY, odometer_checks
 from pipeline.plausibility.places import reads_lag, reference_checks, survey_checks
 from pipeline.plausibility.survey import line_of
 from pipeline.plausibility.witnesses import Clocks, Lag
@@ -67,7 +67,9 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
     checks += velocity_checks(fixes, gnss, epoch_ns, config.fit_scale_limit)
     streams = [name for name in ("gnss", "satellites") if run.stream(name) is not None]
     several = solution if len(run.solutions()) > 1 else None
-    return Fit((*checks, *Clocks(streams, several, epoch_ns, config).checks(lags)))
+    believed = all(check.state is not State.MISFIT for check in checks if check.what == LATENCY)
+    latency_s = (vehicle.gnss_latency_s or 0.0) if believed else 0.0
+    return Fit((*checks, *Clocks(streams, several, epoch_ns, config, latency_s).checks(lags)))
 
 
 def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:

@@ -13,7 +13,7 @@ from pipeline.plausibility.witnesses import Lag
 from schemas.config import IngestConfig, Vehicle
 from schemas.run import RunLog
 
-_LATENCY = "GNSS latency of the vehicle file"
+LATENCY = "GNSS latency of the vehicle file"
 # So many windows agree on a factor that is a unit's; a factor that no unit explains has to be clearer, and far from 1.
 _CONSTANT, _CLEARLY, _UNEXPLAINED = 0.6, 0.8, 1.5
 # The vehicle file may differ from the run by so many of its own sigmas, and by this much at least.
@@ -67,15 +67,15 @@ def odometer_checks(
 
 
 def _lag(pair: PairFit, vehicle: Vehicle, config: IngestConfig) -> Lag:
-    """The clock of the odometer, beyond the latency that the vehicle file tells."""
+    """The clock of the odometer; it is sure of what is beyond the latency that the vehicle file tells."""
     if pair.shifted:
         return Lag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
     if pair.clock_reason or not pair.lag_told:
         return Lag("odometer", reason=pair.clock_reason or "the speed changes too little")
     from_file_s = -(vehicle.gnss_latency_s or 0.0)
-    rest_s = pair.lag_s - from_file_s
-    sure = pair.other_lag(from_file_s, config.fit_lag_told_s) and abs(rest_s) <= config.fit_lag_limit_s
-    return Lag("odometer", rest_s, pair.lag_sigma_s, sure, latency_known=vehicle.gnss_latency_s is not None)
+    sure = pair.other_lag(from_file_s, config.fit_lag_told_s)
+    sure &= abs(pair.lag_s - from_file_s) <= config.fit_lag_limit_s
+    return Lag("odometer", pair.lag_s, pair.lag_sigma_s, sure, latency_known=vehicle.gnss_latency_s is not None)
 
 
 def _base(name: str, fitted: dict[str, PairFit], config: IngestConfig) -> float:
@@ -143,16 +143,16 @@ def _latency_check(pair: PairFit, reference: Lag | None, vehicle: Vehicle, confi
     if vehicle.gnss_latency_s is None or pair.shifted:
         return None
     if not pair.lag_told:
-        return not_checked(_LATENCY, "the speed changes too little")
+        return not_checked(LATENCY, "the speed changes too little")
     least_s = max(config.fit_lag_told_s / 2.0, _FILE_SIGMAS * (vehicle.gnss_latency_sigma_s or 0.0))
     if reference is not None and not reference.reason and abs(reference.lag_s + vehicle.gnss_latency_s) < least_s:
-        return fits(_LATENCY, f"{vehicle.gnss_latency_s:.2f} s, by the reference {-reference.lag_s:.2f} s")
+        return fits(LATENCY, f"{vehicle.gnss_latency_s:.2f} s, by the reference {-reference.lag_s:.2f} s")
     found = f"{vehicle.gnss_latency_s:.2f} s, the run shows {-pair.lag_s:.2f} s (sigma {pair.lag_sigma_s:.2f} s)"
     if not pair.other_lag(-vehicle.gnss_latency_s, least_s):
-        return fits(_LATENCY, found)
+        return fits(LATENCY, found)
     sigma_s = max(2 * pair.lag_sigma_s, 0.02)
     lines = f"gnss_latency_s = {-pair.lag_s:.2f}\ngnss_latency_sigma_s = {sigma_s:.2f}\n"
-    return _wrong_file(_LATENCY, found, lines, State.MISFIT)
+    return _wrong_file(LATENCY, found, lines, State.MISFIT)
 
 
 def _wrong_file(what: str, found: str, lines: str, state: State) -> Check:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plausibility.clocks import APART_S, LEAST_SHARE, Candidates, possible_lags
+from pipeline.plausibility.clocks import APART_S, LEAST_SHARE, possible_lags
 from pipeline.plausibility.course import Course, Places
 from pipeline.plausibility.robust import LEAST, MOVES_MPS, Regression, explains, regressed, steady, usual
 from schemas.arrays import Bools, Floats
@@ -21,7 +21,8 @@ _AGREES = 0.12
 # Nobody looks for another lag where speeds agree in so much of the run; a journey that repeats itself agrees nearly as
 # well at another one.
 SURELY, _RIVAL = 0.93, 0.05
-# Steps in which a lag is improved; regressed it is as near, or faults of the counter have bent it [s].
+# Steps in which a lag is improved; regressed it is as near, or the second of them where both halves agree, or faults
+# of the counter have bent it [s].
 _CLIMB_S, _NEAR_S = (8.0, 4.0, 2.0, 1.0), 2.0
 # Windows overlap by half. Positions a step apart are known to no better than this [m].
 _OVERLAP, _LEAST_SPREAD_M = 1.5, 0.05
@@ -33,7 +34,8 @@ class PairFit:
 
     `factor`: counted units per metre, negative where the counter falls; `lag_s`: the counter's stamp of a moment minus
     the GNSS's; sigmas of both (inf: not told). `halves`: factor and lag of the first and the second half alone.
-    `constant`: share of windows that agree on the factor. `reason`: why the factor is not told.
+    `constant`: share of windows that agree on the factor, of all in which the positions move.
+    `reason`: why the factor is not told.
     `shifted`: the lag is one of the clocks, found by the whole journey's speed; `clock_reason`: why that told nothing.
     """
 
@@ -96,7 +98,7 @@ class _Windows:
         # A counter that is reset seems to run so far that it would weigh more than all the rest.
         sane = np.abs(np.log(ratio / unit)) < np.log(2.0)
         design = np.column_stack([self.size, self.change])[sane, None, :] / unit
-        fit = regressed(design, self.gnss_m[sane, None], _LEAST_SPREAD_M)
+        fit = regressed(design, self.gnss_m[sane, None], _LEAST_SPREAD_M, start=(1.0, 0.0))
         halves = tuple(half / unit for half in fit.halves)
         return replace(fit, estimate=fit.estimate / unit, sigma=fit.sigma / unit, halves=halves)
 
@@ -105,9 +107,10 @@ def fit_pair(gnss: Places, counter: Course) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     coarse_s, clock_reason = _clock_lag(gnss, counter)
     found = _fitted(gnss, counter, coarse_s)
-    if found.lag_told and abs(found.lag_s - coarse_s) < _CLIMB_S[1]:
+    if found.lag_told and abs(found.lag_s - coarse_s) <= _CLIMB_S[1]:
         found = _fitted(gnss, counter, found.lag_s)
-    if coarse_s and not (found.lag_told and abs(found.lag_s - coarse_s) < _NEAR_S):
+    agreed = found.lag_told and all(abs(half_s - found.lag_s) < _CLIMB_S[-1] for _, half_s in found.halves)
+    if coarse_s and abs(found.lag_s - coarse_s) > (_CLIMB_S[1] if agreed else _NEAR_S):
         found = replace(found, lag_s=coarse_s, lag_sigma_s=_CLIMB_S[-1])
     return replace(found, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
@@ -120,10 +123,10 @@ def _clock_lag(gnss: Places, counter: Course) -> tuple[float, str]:
     as_recorded = _agreement(gnss, counter, 0.0, 0.0)
     if as_recorded >= SURELY:
         return 0.0, ""
-    possible = possible_lags(gnss, counter)
-    if possible.reason:
-        return 0.0, possible.reason
-    rated = _rated(gnss, counter, possible)
+    possible_s, reason = possible_lags(gnss, counter)
+    if reason:
+        return 0.0, reason
+    rated = _rated(gnss, counter, possible_s)
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
     if len(rated) > 1 and rated[0][0] - rated[1][0] < _RIVAL:
@@ -131,10 +134,10 @@ def _clock_lag(gnss: Places, counter: Course) -> tuple[float, str]:
     return rated[0][1], ""
 
 
-def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[float, float]]:
+def _rated(gnss: Places, counter: Course, possible_s: list[float]) -> list[tuple[float, float]]:
     """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
     found: list[tuple[float, float]] = []
-    for first_s in possible.lags_s:
+    for first_s in possible_s:
         best = _agreement(gnss, counter, first_s, LEAST_SHARE), first_s
         for step_s in _CLIMB_S:
             near = [best[1] - step_s, best[1] + step_s]
@@ -146,7 +149,9 @@ def _rated(gnss: Places, counter: Course, possible: Candidates) -> list[tuple[fl
 
 
 def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float) -> float:
-    """Share of the moving time in which both speeds agree at this lag; 0 where they have too little in common."""
+    """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
+    common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
+    """
     begin_s = max(gnss.t_s[0], counter.t_s[0] - lag_s)
     end_s = min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
     shorter_s = min(gnss.t_s[-1] - gnss.t_s[0], counter.t_s[-1] - counter.t_s[0])
@@ -162,7 +167,8 @@ def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float
         return 0.0
     fast, factor = bounds[0] / _SLOW_SHARE, float(np.median(other[both] / one[both]))
     moves = (one > bounds[0]) | (other > bounds[1])
-    return float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * fast)[moves]))
+    share = float(np.mean(np.abs(other / factor - one)[moves] < (0.07 * one + 0.04 * fast)[moves]))
+    return share * float(end_s - begin_s) / float(shorter_s)
 
 
 def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
@@ -170,7 +176,8 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
     end_s = min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_S[0]:
         return PairFit(reason="nothing in common")
-    windows, stands = _windows(gnss, counter, begin_s, end_s, lag_s)
+    windows, counts = _windows(gnss, counter, begin_s, end_s, lag_s)
+    stands = counts < 0.1
     if windows.gnss_m.size < LEAST:
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
@@ -184,16 +191,16 @@ def _fitted(gnss: Places, counter: Course, lag_s: float) -> PairFit:
         lag_s=lag_s + slope / scale,
         lag_sigma_s=sigma[1] / scale,
         halves=tuple((sign / one, lag_s + change / one) for one, change in fit.halves),
-        constant=float(np.mean(np.abs(np.log(ratio / np.median(ratio))) < _AGREES)),
+        constant=counts * float(np.mean(np.abs(np.log(ratio / np.median(ratio))) < _AGREES)),
     )
 
 
-def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s: float) -> tuple[_Windows, bool]:
-    """Windows in which both move; and whether the counter stands where the positions move."""
+def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s: float) -> tuple[_Windows, float]:
+    """Windows in which both move, and their share of those in which the positions move."""
     speed = gnss.speed(np.linspace(begin_s, end_s, 400))
     fast = speed[np.nan_to_num(speed) > MOVES_MPS]
     if not fast.size:
-        return _Windows(*(np.zeros(0),) * 4), False
+        return _Windows(*(np.zeros(0),) * 4), 1.0
     length_s = float(np.clip(_WINDOW_M / np.median(fast), *_WINDOW_S))
     starts = np.arange(begin_s, end_s - length_s, length_s / 2)
     ends = starts + length_s
@@ -203,9 +210,10 @@ def _windows(gnss: Places, counter: Course, begin_s: float, end_s: float, lag_s:
     known = np.isfinite(way) & np.isfinite(counted) & np.isfinite(change)
     size = np.abs(counted)
     moves = known & (way > _SLOW_SHARE * usual(way[known], 0.9)) & (way > MOVES_MPS * length_s)
-    stands = bool(moves.any() and np.mean(size[moves] == 0.0) > 0.9)
-    moves &= size > _SLOW_SHARE * usual(size[moves])
-    return _Windows(way, size, np.where(counted < 0, -change, change), counted).take(moves), stands
+    # Neither a counter that stands most of the time nor one that is reset tells what is usual.
+    counts = moves & (size > _SLOW_SHARE * usual(size[moves], 0.8))
+    share = float(counts.sum() / moves.sum()) if moves.any() else 1.0
+    return _Windows(way, size, np.where(counted < 0, -change, change), counted).take(counts), share
 
 
 def _speed(counter: Course, t_s: Floats) -> Floats:

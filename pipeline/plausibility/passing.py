@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,8 +50,9 @@ def fit_places(gnss: Places, record: Places, config: IngestConfig) -> PlaceFit:
     if lag_s is None or abs(lag_s) <= _BIN_S:
         return as_recorded
     shifted = _refined(gnss, record, lag_s, config)
-    before = 0.0 if as_recorded.reason else as_recorded.agreeing
-    return shifted if not shifted.reason and explains(shifted.agreeing, before) else as_recorded
+    if shifted.reason or not explains(shifted.agreeing, 0.0 if as_recorded.reason else as_recorded.agreeing):
+        return as_recorded
+    return replace(shifted, as_recorded=0.0 if as_recorded.reason else as_recorded.as_recorded)
 
 
 def passes(track: Places, places_m: Floats, within_m: float) -> tuple[Ints, Floats]:

@@ -43,13 +43,14 @@ def reference_checks(
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
-    near = found.shift_m <= config.fit_shift_told_m or not found.shift_is_steady
-    return lag, [_beside_reference(found, near), *_reference_heights(gnss, record, found.lag_s, config)], near
+    near = found.shift_m <= config.fit_shift_told_m
+    beside = _beside_reference(found, near or not found.shift_is_steady)
+    return lag, [beside, *_reference_heights(gnss, record, found.lag_s, config)], near
 
 
-def _beside_reference(found: PlaceFit, near: bool) -> Check:
+def _beside_reference(found: PlaceFit, fit: bool) -> Check:
     words = f"{towards(found.east_m, found.north_m)} of them"
-    if near:
+    if fit:
         return fits(_REFERENCE, words)
     # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
     cause, advice = "another datum, or a fixed offset between both antennas", "Find out which of both is off."

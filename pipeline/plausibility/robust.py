@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,35 +40,42 @@ def steady(whole: Floats, *halves: Floats) -> bool:
     return all(float(half @ whole) > 0.5 * float(whole @ whole) for half in halves)
 
 
-def regressed(design: Floats, target: Floats, floor: float, told: float = 1e-12) -> Regression:
+def regressed(
+    design: Floats,
+    target: Floats,
+    floor: float,
+    told: float = 1e-12,
+    start: tuple[float, ...] | None = None,
+    halves: bool = True,
+) -> Regression:
     """Robust regression; `design` (n, m, k), `target` (n, m): the m parts of one observation share a weight.
 
     `floor`: least spread of what is left. Directions whose information is below the share `told` of the best known one
-    stay zero.
+    stay zero. `start`: an estimate to begin with, else that of least absolute deviations.
     """
     half = len(target) // 2
-    halves = [(design[:half], target[:half]), (design[half:], target[half:])]
-    parts = tuple(_solved(*part, floor, told).estimate for part in halves if len(part[1]) >= LEAST)
-    whole = _solved(design, target, floor, told)
-    return Regression(whole.estimate, whole.sigma, whole.spread, whole.whole, parts)
+    parts = [(design[:half], target[:half]), (design[half:], target[half:])] if halves else []
+    alone = tuple(_solved(*part, floor, told, start).estimate for part in parts if len(part[1]) >= LEAST)
+    return replace(_solved(design, target, floor, told, start), halves=alone)
 
 
-def _solved(design: Floats, target: Floats, floor: float, told: float) -> Regression:
+def _solved(design: Floats, target: Floats, floor: float, told: float, start: tuple[float, ...] | None) -> Regression:
     weight = np.ones(len(target))
+    left = np.zeros(len(target)) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
     for number in range(_ROUNDS):
+        spread = max(1.4826 * float(np.median(left)), floor)
+        if start is None and number < _ROUNDS // 2:
+            weight = floor / np.maximum(left, floor)
+        else:
+            weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
         weighted = design * weight[:, None, None]
         normal = np.einsum("nmk,nml->kl", weighted, design)
         inverse = np.linalg.pinv(normal, rcond=told, hermitian=True)
         estimate = inverse @ np.einsum("nmk,nm->k", weighted, target)
         left = np.linalg.norm(target - design @ estimate, axis=1)
-        spread = max(1.4826 * float(np.median(left)), floor)
-        if number < _ROUNDS // 2:
-            weight = floor / np.maximum(left, floor)
-        else:
-            weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
-    rank = int(np.linalg.matrix_rank(normal, tol=told * np.linalg.norm(normal, 2), hermitian=True))
-    sigma = spread * np.sqrt(np.diag(inverse)) if rank == len(estimate) else np.full(len(estimate), np.inf)
-    return Regression(estimate, sigma, spread, rank == len(estimate))
+    whole = int(np.linalg.matrix_rank(normal, tol=told * np.linalg.norm(normal, 2), hermitian=True)) == len(estimate)
+    sigma = spread * np.sqrt(np.diag(inverse)) if whole else np.full(len(estimate), np.inf)
+    return Regression(estimate, sigma, spread, whole)
 
 
 def explains(share: float, before: float) -> bool:

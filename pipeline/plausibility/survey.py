@@ -114,7 +114,7 @@ def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.
     shift = np.array(start_m)
     for _ in range(_ROUNDS):
         across, apart, height_m = beside(shift)
-        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, told=_ONE_HEADING)
+        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, told=_ONE_HEADING, halves=False)
         shift = fit.estimate
     left = np.abs(apart - across @ shift)
     toward, whole = (across @ shift) * apart, (across @ shift) ** 2

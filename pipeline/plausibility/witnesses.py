@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.plausibility.causes import explain_lag, leap_seconds
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
@@ -17,8 +17,8 @@ NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "bali
 class Lag:
     """Of one stream against the GNSS [s]: its stamp of a moment minus the GNSS's; `reason`: why it is not told.
 
-    `sure`: its noise is far below it, and no part of the run contradicts it. `latency_known`: of the odometer, what is
-    left beyond the latency of the vehicle file.
+    `sure`: its noise is far below it, and no part of the run contradicts it. `latency_known`: the vehicle file says
+    how late the GNSS is.
     """
 
     stream: str
@@ -31,22 +31,35 @@ class Lag:
 
 @dataclass(frozen=True)
 class Clocks:
-    """The streams of a run, the GNSS solution if there are several, an instant of it, and what is still no misfit."""
+    """The streams of a run, the GNSS solution if there are several, an instant of it, and what is still no misfit.
+
+    `latency_s`: how late the GNSS is by the vehicle file; only what is beyond is told.
+    """
 
     streams: list[str]
     solution: str | None
     t_ns: int
     config: IngestConfig
+    latency_s: float = 0.0
 
     def checks(self, lags: list[Lag]) -> list[Check]:
         """One check per stream. What two recorders say against the GNSS is the GNSS's own."""
+        lags = [replace(lag, lag_s=lag.lag_s + self.latency_s) for lag in lags]
+        sure = [lag.lag_s for lag in lags if lag.sure]
+        # Two recorders that show the same lag are surer than each.
+        lags = [lag if lag.reason else replace(lag, sure=self._as_sure(lag, sure)) for lag in lags]
         wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > self.config.fit_lag_limit_s]
-        others = [lag for lag in lags if not lag.reason and lag not in wrong]
+        others = [lag for lag in lags if not lag.reason and abs(lag.lag_s) <= self.config.fit_lag_limit_s]
         alike = all(abs(one.lag_s - wrong[0].lag_s) < _SAME_S for one in wrong)
-        gnss_is_wrong = len(wrong) >= 2 and alike and not others
-        return [self._check(lag, gnss_is_wrong, known=bool(others) or len(wrong) >= 2) for lag in lags]
+        # One clock has one lag, and one line that mends it.
+        of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
+        return [self._check(lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
 
-    def _check(self, lag: Lag, gnss_is_wrong: bool, known: bool) -> Check:
+    def _as_sure(self, lag: Lag, sure_s: list[float]) -> bool:
+        beyond = abs(lag.lag_s) > self.config.fit_lag_limit_s
+        return lag.sure or (beyond and any(abs(lag.lag_s - one_s) < _SAME_S for one_s in sure_s))
+
+    def _check(self, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
         what, size_s = f"clock of the {NAMES[lag.stream]} against the GNSS", abs(lag.lag_s)
         if lag.reason:
             return not_checked(what, lag.reason)
@@ -59,12 +72,13 @@ class Clocks:
         found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {NAMES[lag.stream]} are {later}"
         if size_s <= self.config.fit_lag_limit_s:
             return _small(what, found, lag)
-        explained = explain_lag(lag.lag_s, self.t_ns, min(3.0 * lag.sigma_s, 3.0))
-        exact_s = round(lag.lag_s if explained is None else explained.exact, 2)
+        told = of_gnss or lag
+        explained = explain_lag(told.lag_s, self.t_ns, min(3.0 * told.sigma_s, 3.0))
+        exact_s = round(told.lag_s if explained is None else explained.exact, 2)
         cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
-        at_gnss = gnss_is_wrong or (not known and _rather_gnss(lag.lag_s, cause, self.t_ns))
+        at_gnss = of_gnss is not None or (not known and _rather_gnss(lag.lag_s, cause, self.t_ns))
         pair = ("GNSS", NAMES[lag.stream]) if at_gnss else (NAMES[lag.stream], "GNSS")
-        cause += f", in the {pair[0]}" if known or gnss_is_wrong else f", rather in the {pair[0]} than in the {pair[1]}"
+        cause += f", in the {pair[0]}" if known else f", rather in the {pair[0]} than in the {pair[1]}"
         if not at_gnss:
             return Check(what, State.IMPOSSIBLE, found, cause, correction(lag.stream, shift_s=-exact_s))
         streams = [stream for stream in ("gnss", "satellites") if stream in self.streams]
