@@ -155,6 +155,7 @@ def test_what_an_episode_hit() -> None:
         (30.0, -30.0, 0.0, RIGHT, True),
         (-30.0, 30.0, 0.0, RIGHT, True),
         (30.0, 30.0, 0.0, RIGHT, False),  # farther away
+        (0.1, 8.0, 8.1, RIGHT, False),  # on from a place that was hardly wrong
         (30.0, -30.0, 20.0, UNKNOWN, True),
         (30.0, -30.0, 20.1, UNKNOWN, False),  # still beyond the limit
         (30.0, -30.0, 0.0, WRONG, False),  # on another track
