@@ -19,7 +19,7 @@ from pipeline.judge.judge import undetected_ns
 from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
 from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.rows import within_budget
+from pipeline.judge.rows import _instants, within_budget
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
 from schemas.config import Configuration, HazardConfig, LdsConfig
@@ -169,6 +169,40 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     )
     found = _is_back(cast(Any, SimpleNamespace(judged=judged)), Jump(1, 1, step_m), HazardConfig())
     assert bool(found) is back
+
+
+@pytest.mark.parametrize(("known", "detected_s"), [(True, 7.0), (False, 7.0), (True, None)])
+def test_the_times_of_a_hazard(known: bool, detected_s: float | None) -> None:
+    """From 100 s on each second: onset at 103 s, a VB hit at 104 s, failure at 105 s, alarm at 107 s, end at 109 s."""
+    begin = 100 * NS
+    detected_ns = None if detected_s is None else begin + round(detected_s * NS)
+    episode = SimpleNamespace(
+        onset_ns=begin + 3 * NS, end_ns=begin + 9 * NS, failure=5, failure_known=known, detected_ns=detected_ns,
+        monitor=None if detected_ns is None else "raw", alarm_before_onset=False,
+    )  # fmt: skip
+    t_ns = begin + seconds(*range(10))
+    series = SimpleNamespace(t_ns=t_ns, row=np.arange(10))
+    offers = SimpleNamespace(t_ns=begin + seconds(1, 4), number=np.array([1, 4]))
+    bench = SimpleNamespace(
+        t_ns=t_ns,
+        positions=SimpleNamespace(direction=np.full(10, -1), leg=np.zeros(10, dtype=np.int64)),
+        judged=SimpleNamespace(middle_m=np.full(10, 25.0)),
+        path_m=500.0 - 10.0 * np.arange(10),
+        solution=SimpleNamespace(path=SimpleNamespace(locate=lambda leg, at_m: (["e"], np.array([at_m - 400.0])))),
+        speed_at=lambda at_ns: np.array([10.0]),
+        config=Configuration(),
+    )
+    draft = SimpleNamespace(episode=episode, jump=None, hits=[1])
+    found = _instants(*(cast(Any, one) for one in (draft, series, offers, bench)))
+    assert (found["t_onset"], found["t_hazard"], found["t_failure"], found["t_end"]) == tuple(
+        begin + seconds(3, 4, 5, 9)
+    )
+    seen = detected_s is not None
+    assert (found["detected"], found["t_negated"]) == (seen, begin + 8 * NS if seen else None)  # one epoch to react
+    assert found["time_to_detect_s"] == (4.0 if seen else None)
+    assert found["time_since_failure_s"] == (2.0 if seen and known else None)
+    # At 460 m against growing path, 25 m ahead of the train.
+    assert (found["path_m"], found["measure_m"], found["speed_mps"]) == (485.0, 85.0, 10.0)
 
 
 @pytest.mark.parametrize(
