@@ -54,7 +54,7 @@ def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_episode(
 
 def test_the_distance_counts_from_the_last_accepted_balise() -> None:
     """The odometer misses 30 m between 1 s and 2 s; a balise accepted at 3 s is a new begin."""
-    t_ns, odometer_m = seconds(0, 1, 2, 3, 4), 10.0 * np.arange(5)
+    t_ns, odometer_m = seconds(0, 1, 2, 3, 4), np.linspace(0.0, 40.0, 5)
     train_m = odometer_m + np.array([0.0, 0.0, 30.0, 30.0, 30.0])
     beyond = odometer_beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
     assert beyond.tolist() == [False, False, True, False, False]
