@@ -2,7 +2,8 @@
 
 `python -m benchmarks.mutations --count 56 --seed 1` changes one place of the core in a copy of the project, runs the
 tests of the room concerned, and says `caught`, `not caught` or `timed out` for each; the defects that no test caught
-stand at the end. Some of them change nothing that a run can show; the others ask for a test.
+stand at the end. Some of them change nothing that a run can show; the others ask for a test. The quick tests (those of
+`make quick`) judge all defects first, the slow ones only what is then left, until `--minutes` are over.
 
 `--tests-of FOLDER` takes the tests of another checkout: the same defects, judged by two states of the tests.
 `--nearest` runs only the first of them for each room, of judge and evidence tables worked out by hand: what those
@@ -20,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from random import Random
@@ -35,12 +37,14 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "pipeline/lds": ("tests/lds", "tests/replay"),
     "pipeline/monitors": ("tests/monitors", "tests/replay"),
     "pipeline/alignment": ("tests/align", "tests/calibration", "tests/replay"),
+    "pipeline/epochs": ("tests/summary", "tests/judge", "tests/replay"),
     "pipeline/odometry": ("tests/odometry", "tests/align", "tests/lds", "tests/judge"),
     "pipeline/matching": ("tests/matching", "tests/replay"),
     "pipeline/figures/verdict.py": ("tests/summary", "tests/judge"),
 }
 _FAILED = re.compile(r"^(?:FAILED|ERROR) ([^ ]+::.*?|[^ ]+)(?: - .*)?$", re.MULTILINE)
-_CAUGHT, _PASSED = 1, 0
+_CAUGHT, _PASSED, _NO_TESTS = 1, 0, 5
+_QUICK, _SLOW = "not slow", "slow"
 
 
 def main() -> int:
@@ -52,14 +56,20 @@ def main() -> int:
     parser.add_argument("--tests-of", type=Path, default=ROOT, metavar="FOLDER", help="checkout whose tests are run")
     parser.add_argument("--rooms", nargs="*", default=list(ROOMS), choices=list(ROOMS), metavar="ROOM")
     parser.add_argument("--nearest", action="store_true", help="only the first folder of tests of each room")
+    parser.add_argument(
+        "--minutes", type=float, default=600.0, help="when this time is over no further defect is begun"
+    )
     given = parser.parse_args()
     tests = {room: folders[:1] if given.nearest else folders for room, folders in ROOMS.items()}
     chosen = choose(given.rooms, given.count, given.seed)
+    end = time.monotonic() + 60.0 * given.minutes
+    told: dict[int, str] = {}
     with tempfile.TemporaryDirectory(prefix="mutations-") as folder:
-        copy = copied(Path(folder) / "project", given.tests_of)
-        folders = sorted({folder for room, _ in chosen for folder in tests[room]})
-        failing = failing_anyway(copy, folders, 8 * given.limit_s)
-        told = [judged(copy, tests[room], mutant, failing, given.limit_s) for room, mutant in chosen]
+        bench = Bench(copied(Path(folder) / "project", given.tests_of), given.limit_s)
+        for speed in (_QUICK, _SLOW):
+            for number, (room, mutant) in enumerate(chosen):
+                if told.get(number, "not caught") == "not caught" and time.monotonic() < end:
+                    told[number] = bench.judged(tests[room], speed, mutant)
     show(told, chosen)
     return 0
 
@@ -89,30 +99,41 @@ def copied(folder: Path, tests_of: Path) -> Path:
     return folder
 
 
-def failing_anyway(copy: Path, folders: Sequence[str], limit_s: float) -> list[str]:
-    """Tests that fail without a defect; they can catch none and are left out."""
-    done = run_tests(copy, folders, ["-rfE", "--continue-on-collection-errors"], limit_s)
-    if done is None:
-        raise TimeoutError(f"the tests take longer than {limit_s:g} s without a defect: raise --limit-s")
-    failing = _FAILED.findall(done.stdout)
-    print(f"{len(failing)} tests fail without a defect and are left out", *failing, sep="\n  ", flush=True)
-    return failing
+@dataclass
+class Bench:
+    """A copy of the project, and which tests fail there without a defect: they can catch none and are left out."""
 
+    copy: Path
+    limit_s: float
+    failing: dict[tuple[tuple[str, ...], str], list[str]] = field(default_factory=dict)
 
-def judged(copy: Path, folders: Sequence[str], mutant: Mutant, failing: list[str], limit_s: float) -> str:
-    """`caught`, `not caught` or `timed out`, said as soon as it is known."""
-    place = copy / mutant.path.relative_to(ROOT)
-    original = place.read_text(encoding="utf-8")
-    place.write_text(mutant.source(), encoding="utf-8")
-    begin = time.monotonic()
-    try:
-        left_out = [word for name in failing for word in left_out_by(name)]
-        done = run_tests(copy, folders, ["-x", *left_out], limit_s)
-    finally:
-        place.write_text(original, encoding="utf-8")
-    outcome = "timed out" if done is None else outcome_of(done)
-    print(f"{outcome:10}  {told_place(mutant)}  [{time.monotonic() - begin:.0f} s]", flush=True)
-    return outcome
+    def failing_anyway(self, folders: tuple[str, ...], speed: str) -> list[str]:
+        """Asked once for the same tests."""
+        if (folders, speed) not in self.failing:
+            limit_s = 8 * self.limit_s
+            done = run_tests(self.copy, folders, ["-m", speed, "-rfE", "--continue-on-collection-errors"], limit_s)
+            if done is None:
+                raise TimeoutError(f"the tests take longer than {limit_s:g} s without a defect: raise --limit-s")
+            failing = self.failing[folders, speed] = _FAILED.findall(done.stdout)
+            print(
+                f"{' '.join(folders)}, {speed}: {len(failing)} fail without a defect", *failing, sep="\n  ", flush=True
+            )
+        return self.failing[folders, speed]
+
+    def judged(self, folders: tuple[str, ...], speed: str, mutant: Mutant) -> str:
+        """`caught`, `not caught` or `timed out`, said as soon as it is known."""
+        left_out = [word for name in self.failing_anyway(folders, speed) for word in left_out_by(name)]
+        place = self.copy / mutant.path.relative_to(ROOT)
+        original = place.read_text(encoding="utf-8")
+        place.write_text(mutant.source(), encoding="utf-8")
+        begin = time.monotonic()
+        try:
+            done = run_tests(self.copy, folders, ["-m", speed, "-x", *left_out], self.limit_s)
+        finally:
+            place.write_text(original, encoding="utf-8")
+        outcome = "timed out" if done is None else outcome_of(done)
+        print(f"{outcome:10}  {speed:8}  {told_place(mutant)}  [{time.monotonic() - begin:.0f} s]", flush=True)
+        return outcome
 
 
 def left_out_by(name: str) -> tuple[str, str]:
@@ -122,7 +143,7 @@ def left_out_by(name: str) -> tuple[str, str]:
 
 def outcome_of(done: subprocess.CompletedProcess[str]) -> str:
     """The exit status of pytest; a defect that stops the collection is caught too."""
-    if done.returncode == _PASSED:
+    if done.returncode in (_PASSED, _NO_TESTS):
         return "not caught"
     if done.returncode in (_CAUGHT, 2):
         return "caught"
@@ -147,13 +168,14 @@ def told_place(mutant: Mutant) -> str:
     return f"{mutant.path.relative_to(ROOT)}:{mutant.line}: {mutant.what}"
 
 
-def show(told: list[str], chosen: list[tuple[str, Mutant]]) -> None:
+def show(told: dict[int, str], chosen: Sequence[tuple[str, Mutant]]) -> None:
     """Sums, and the defects that survived."""
-    counts = {outcome: told.count(outcome) for outcome in ("caught", "not caught", "timed out")}
-    print(", ".join(f"{number} {outcome}" for outcome, number in counts.items()) + f" of {len(told)}")
-    for outcome, (_, mutant) in zip(told, chosen, strict=True):
+    outcomes = list(told.values())
+    counts = {outcome: outcomes.count(outcome) for outcome in ("caught", "not caught", "timed out")}
+    print(", ".join(f"{number} {outcome}" for outcome, number in counts.items()) + f" of {len(chosen)}")
+    for number, outcome in told.items():
         if outcome == "not caught":
-            print(f"survived: {told_place(mutant)}")
+            print(f"survived: {told_place(chosen[number][1])}")
 
 
 if __name__ == "__main__":

@@ -292,7 +292,7 @@ def _compared(
     other = context.config.monitors.channel_reference
     if other is None or other == solution or other not in matches:
         return None
-    return on_path_of(aligned, matches[other].epochs)
+    return on_path_of(aligned, matches[other].epochs, context.config.lds)
 
 
 def _ranges(context: _Context, solution: str) -> pl.DataFrame | None:

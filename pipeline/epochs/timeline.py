@@ -52,8 +52,6 @@ def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:
 
     From one usable epoch to the next; at the ends from the first and to the last epoch.
     """
-    if len(t_ns) == 0:
-        return np.empty(0)
     bounds = np.concatenate([t_ns[:1], t_ns[usable], t_ns[-1:]])
     stretches = np.diff(bounds) / NS_PER_S
     return stretches[stretches > limit_s]
@@ -62,8 +60,6 @@ def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:
 def uptime(t_ns: Ints, good: Bools, limit_s: float) -> Uptime:
     """Time during which `good` held [s], and its losses: outages that followed upon a good epoch."""
     held = t_ns[good]
-    if len(held) == 0:
-        return Uptime(0.0, 0)
     stretches = np.diff(np.concatenate([held, t_ns[-1:]])) / NS_PER_S
     lost = stretches > limit_s
     return Uptime(float(stretches[~lost].sum()), int(lost.sum()))
@@ -71,8 +67,6 @@ def uptime(t_ns: Ints, good: Bools, limit_s: float) -> Uptime:
 
 def held_s(t_ns: Ints, limit_s: float) -> Floats:
     """For how long the state of each epoch is known to hold [s]: to the next epoch, 0 before a gap."""
-    if len(t_ns) == 0:
-        return np.empty(0)
     steps = np.diff(t_ns, append=t_ns[-1:]) / NS_PER_S
     return np.where(steps <= limit_s, steps, 0.0)
 

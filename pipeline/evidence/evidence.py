@@ -140,12 +140,11 @@ class Evidence:
 
     def _interval(self, gap: Gap, way: Way, t_ns: Ints) -> Interval:
         assert self.odometer is not None
-        if gap.begin is not None and gap.end is not None and way.begin_m is not None and way.end_m is not None:
-            ends = (way.begin_m, way.end_m)
-            return between_anchors(self.odometer, (gap.begin, gap.end), ends, t_ns, self.trust)
-        (anchor,) = gap.anchors
-        at_m = way.begin_m if way.end_m is None else way.end_m
-        since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m or 0.0)
+        if gap.begin is not None and gap.end is not None:
+            begin_m, end_m = way.at_m
+            return between_anchors(self.odometer, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.trust)
+        (anchor,), (at_m,) = gap.anchors, way.at_m
+        since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
         return carried(self.odometer, since_ns, from_m, anchor.sigma_m, t_ns, self.trust)
 
 
@@ -212,8 +211,4 @@ def _contradicts(gap: Gap, odometer: Odometry | None, trust: Trust) -> bool:
     if gap.begin is None or gap.end is None or gap.ways is None or odometer is None or odometer.scale is None:
         return False
     anchors = (gap.begin, gap.end)
-    return not any(
-        closes(odometer, anchors, way.end_m - way.begin_m, trust)
-        for way in gap.ways
-        if way.begin_m is not None and way.end_m is not None
-    )
+    return not any(closes(odometer, anchors, way.at_m[1] - way.at_m[0], trust) for way in gap.ways)

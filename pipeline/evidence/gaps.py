@@ -19,11 +19,10 @@ _SAME_M = 0.01
 
 @dataclass(frozen=True)
 class Way:
-    """A chain through a gap, in the sense in which the odometer counts up, with the coordinates of its anchors."""
+    """A chain through a gap, in the sense in which the odometer counts up; `at_m`: where its anchors lie on it."""
 
     chain: Chain
-    begin_m: float | None
-    end_m: float | None
+    at_m: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def _ways_of_length(
             if found is None:
                 return None
             ends = [(0.0, _goal_m(network, chain, goal.place)) for chain in found]
-            ways += [Way(chain, *(at[::-1] if back else at)) for chain, at in zip(found, ends, strict=True)]
+            ways += [Way(chain, at[::-1] if back else at) for chain, at in zip(found, ends, strict=True)]
     return _distinct(ways)
 
 
@@ -99,7 +98,7 @@ def _distinct(ways: list[Way]) -> list[Way]:
     """Each chain once: a gap of hardly any length is found from both sides."""
     kept: dict[tuple[object, ...], Way] = {}
     for way in ways:
-        apart_m = (way.end_m or 0.0) - (way.begin_m or 0.0)
+        apart_m = way.at_m[-1] - way.at_m[0]
         kept.setdefault((way.chain.oriented, round(apart_m / _SAME_M)), way)
     return list(kept.values())
 
@@ -173,17 +172,15 @@ def _looks(gap: Gap, odometer: Odometry) -> Ints:
 def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
     """Both ways round."""
     (anchor,) = gap.anchors
-    at = (0.0, None) if anchor == gap.begin else (None, 0.0)
     both = (2 * anchor.place.element, 2 * anchor.place.element + 1)
-    return [Way(Chain((one,), (-along_m(network, one, anchor.place.measure_m),)), *at) for one in both]
+    return [Way(Chain((one,), (-along_m(network, one, anchor.place.measure_m),)), (0.0,)) for one in both]
 
 
 def _reach_m(gap: Gap, way: Way, odometer: Odometry, trust: Trust) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
     t_ns = _looks(gap, odometer)
-    places = [at_m for at_m in (way.begin_m, way.end_m) if at_m is not None]
-    least, most = min(places), max(places)
-    for anchor, at_m in zip(gap.anchors, places, strict=True):
+    least, most = min(way.at_m), max(way.at_m)
+    for anchor, at_m in zip(gap.anchors, way.at_m, strict=True):
         since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
         low, high = carried(odometer, since_ns, from_m, anchor.sigma_m, t_ns, trust)
         if np.isfinite(low).any():

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
-from schemas.arrays import NS_PER_S, times_ns
+from pipeline.epochs.timeline import crossing_gap_ns
+from schemas.arrays import times_ns
+from schemas.config import LdsConfig
 
 _PLACE = ("netelement_id", "measure_m", "path_m")
 
 
-def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
+def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
     """The rows of `other` with `path_m` as it counts on the path of `epochs`; null where nothing joins the paths.
 
     Both in order of time with `t, netelement_id, measure_m, path_m`. On a net element that both are on at one time
@@ -22,7 +23,9 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
     the beginning: as they will).
     """
     mine, theirs = _with_sense(epochs), _with_sense(other).with_row_index("row")
-    pairs = theirs.join_asof(mine, on="t_ns", strategy="nearest", tolerance=_gap_ns(epochs), suffix="_mine")
+    pairs = theirs.join_asof(
+        mine, on="t_ns", strategy="nearest", tolerance=crossing_gap_ns(times_ns(epochs), lds), suffix="_mine"
+    )
     together = (pl.col("netelement_id") == pl.col("netelement_id_mine")) & (pl.col("sense") * pl.col("sense_mine") != 0)
     turned = pl.col("sense") * pl.col("sense_mine")
     here_m = pl.col("path_m_mine") + pl.col("sense_mine") * (pl.col("measure_m") - pl.col("measure_m_mine"))
@@ -38,18 +41,18 @@ def on_path_of(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
     return other.with_columns(placed.sort("row")["path_m"])
 
 
-def paired(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
+def paired(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
     """For each epoch: `row_other`, the last of `other` since the epoch before, and `path_m`, where the train was then.
 
     Two receivers need not measure at the same times. Where they do, `path_m` is the epoch's own; else it lies between
-    the positions of this epoch and the one before, if both have one and are no more than max(1.5 periods, 1 s) apart.
+    the positions of this epoch and the one before, if both have one and are no more than `crossing_gap_s` apart.
     Null where there is nothing to compare. `epochs` with `t, path_m` (null where not usable), `other` with `t`.
     """
     stamps = other.select(t_other=_stamp()).with_row_index("row_other")
     own = epochs.select("path_m", t_ns=_stamp())
     since = pl.col("t_ns") - pl.col("t_ns").shift(1)
     early = pl.col("t_ns") - pl.col("t_other")
-    between = (early < since) & (since <= _gap_ns(epochs))
+    between = (early < since) & (since <= crossing_gap_ns(times_ns(epochs), lds))
     way = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
     return (
         own.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
@@ -60,11 +63,6 @@ def paired(epochs: pl.DataFrame, other: pl.DataFrame) -> pl.DataFrame:
 
 def _stamp() -> pl.Expr:
     return pl.col("t").to_physical()
-
-
-def _gap_ns(epochs: pl.DataFrame) -> int:
-    """Longest distance of epochs [ns] over which a position is carried."""
-    return round(linking_gap_s(nominal_period_s(times_ns(epochs))) * NS_PER_S)
 
 
 def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:

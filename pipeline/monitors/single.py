@@ -66,7 +66,7 @@ def channel_monitor(
         return no_verdicts(epochs.height, absent)
     usable = other.filter("fix_valid", "on_track")
     own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
-    pairs = paired(epochs.select("t", path_m=own_m), usable)
+    pairs = paired(epochs.select("t", path_m=own_m), usable, config.lds)
     met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
     value = floats(pairs, "path_m") - floats(met, "path_m")
     both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))

@@ -229,7 +229,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     lost = (pause & ~counted) | slip[1:]
     distance_m, segment = _sums(np.where(unknown, 0.0, way_m)), _sums(lost.astype(np.float64)).astype(np.int64)
     white_m2_per_s = max(config.monitors.odometer_sigma_mps**2, _declared_m2_per_s(stream, period_s))
-    noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, align) if counted.any() else None
+    noise = _noise(t_s, distance_m, counted & ~lost & ~pause, white_m2_per_s, config) if counted.any() else None
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     if apart.size:
         t_s, distance_m, row = filled_in(t_s, distance_m, speed, apart, align)
@@ -252,10 +252,10 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     )
 
 
-def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig) -> Noise:
+def _noise(t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: Configuration) -> Noise:
     """Noise of a recorded distance, of whose ways those to the next row are `whole` (rows - 1,)."""
-    counter_m = count_step_m(distance_m, whole, config)
-    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, config)
+    counter_m, deadband_mps = count_step_m(distance_m, whole, config.align), config.matching.deadband_mps
+    scatter = quantisation_noise(t_s, distance_m, whole, white_m2_per_s, counter_m, deadband_mps, config.align)
     return Noise(white_m2_per_s, scatter, counter_m)
 
 

@@ -21,9 +21,6 @@ _MOST_ROWS, _FEWEST_ROWS = 16, 8
 _DEGREE = 3
 # Enough for the median, however long the run is; with fewer it is chance.
 _PIECES, _FEWEST_PIECES = 400, 8
-_MOVED_M = 1.0
-# By how much the higher half of the speeds has to be above the lower one.
-_APART = 1.5
 # Less is rounding of decimal numbers.
 _ROUNDED_M = 1e-3
 
@@ -46,17 +43,23 @@ NO_QUANTISATION = QuantisationNoise()
 
 
 def quantisation_noise(
-    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, counter_m: float, config: AlignConfig
+    t_s: Floats,
+    distance_m: Floats,
+    whole: Bools,
+    white_m2_per_s: float,
+    counter_m: float,
+    deadband_mps: float,
+    config: AlignConfig,
 ) -> QuantisationNoise:
     """What rows scatter about smooth curves beyond what white noise of the increments explains.
 
-    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves, so that
-    slips do not count; of lower and higher speeds where these differ enough to tell stamps from counts. Noise that is
-    less than what the white noise makes of the same rows counts as none. A counter has the noise of its step
-    (`counter_m`) at least: at a speed at which each row gains as many steps as the last it does not show, until it
-    does.
+    `whole` (rows - 1,): ways between rows that are recorded. Medians over pieces in which the train moves (faster than
+    `deadband_mps`), so that slips do not count. Noise of stamps grows with the square of the speed: lower and higher
+    speeds are told apart where their squares differ by `quantisation_factor`, as scatter has to. Noise that is less
+    than what the white noise makes of the same rows counts as none. A counter has the noise of its step (`counter_m`)
+    at least: at a speed at which each row gains as many steps as the last it does not show, until it does.
     """
-    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, config)
+    scatter = _scatter_beyond(t_s, distance_m, whole, white_m2_per_s, deadband_mps, config)
     return replace(scatter, still_m2=max(scatter.still_m2, counter_m**2 / 12.0))
 
 
@@ -67,10 +70,10 @@ def count_step_m(distance_m: Floats, whole: Bools, config: AlignConfig) -> float
 
 
 def _scatter_beyond(
-    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, config: AlignConfig
+    t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, deadband_mps: float, config: AlignConfig
 ) -> QuantisationNoise:
     """What the rows show of their noise."""
-    rows = _moving_pieces(t_s, distance_m, whole, config.straight_s)
+    rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config.straight_s)
     if len(rows) < _FEWEST_PIECES:
         return QuantisationNoise()
     since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
@@ -78,14 +81,14 @@ def _scatter_beyond(
     speeds = np.abs(ways[:, -1]) / since_s[:, -1]
     fast = speeds > np.median(speeds)
     low_mps, high_mps = (float(np.median(speeds[part])) if part.any() else 0.0 for part in (~fast, fast))
-    if fast.sum() < _FEWEST_PIECES or high_mps < _APART * low_mps:
+    if fast.sum() < _FEWEST_PIECES or high_mps**2 < config.quantisation_factor * low_mps**2:
         return QuantisationNoise(_beyond(found, explained, config))
     low_m2, high_m2 = (_beyond(found[part], explained[part], config) for part in (~fast, fast))
     moving_s2 = max(high_m2 - low_m2, 0.0) / (high_mps**2 - low_mps**2)
     return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
 
 
-def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, farthest_s: float) -> Ints:
+def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: float, farthest_s: float) -> Ints:
     """Rows of pieces without a gap in which the train moves, spread over the run; shape (pieces, rows).
 
     Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
@@ -98,7 +101,8 @@ def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, farthest_s: fl
     length = (count - 1) * stride
     starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _PIECES))
     broken = np.concatenate([[0], np.cumsum(~whole)])
-    moves = np.abs(distance_m[starts + length] - distance_m[starts]) > _MOVED_M
+    way_m, time_s = distance_m[starts + length] - distance_m[starts], t_s[starts + length] - t_s[starts]
+    moves = np.abs(way_m) > deadband_mps * time_s
     starts = starts[moves & (broken[starts + length] == broken[starts])]
     chosen: Ints = starts[:, None] + stride * np.arange(count)
     return chosen

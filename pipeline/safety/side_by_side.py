@@ -116,12 +116,12 @@ def _evaluated(monitor: str) -> pl.Expr:
 def _composite(first: Solution, second: Solution, config: Configuration) -> Row:
     """Compared at the epochs of the solution that measures less often."""
     one, other = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
-    placed = on_path_of(one.epochs, other.epochs).with_columns(fix_valid=pl.col("path_m").is_not_null())
+    placed = on_path_of(one.epochs, other.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = one.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     compared = channel_monitor(positioned, placed, config).select(
         pl.col("value", "threshold", "state").name.prefix(f"{COMPARISON}_")
     )
-    row_other = paired(one.epochs, other.epochs)["row_other"]
+    row_other = paired(one.epochs, other.epochs, config.lds)["row_other"]
     theirs = _states(other, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
     own = _states(one, trusted(config))
     wrong = own["wrong"] | theirs["wrong"]

@@ -107,7 +107,7 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
     rows = watched(diagnosis.epochs, diagnosis.bank, diagnosis.held, vehicle, config)
     if config.undetected.solutions_at_fault == "all":
         return rows
-    return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other)
+    return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other, config.lds)
 
 
 def _both(rows: Watched, parts: list[Window]) -> _Both:

@@ -14,9 +14,12 @@ import polars as pl
 from pipeline.monitors.channels import paired
 from pipeline.undetected.watched import Watched
 from schemas.arrays import Floats, floats
+from schemas.config import LdsConfig
 
 
-def with_channel(rows: Watched, epochs: pl.DataFrame, channel: pl.DataFrame, other: pl.DataFrame | None) -> Watched:
+def with_channel(
+    rows: Watched, epochs: pl.DataFrame, channel: pl.DataFrame, other: pl.DataFrame | None, lds: LdsConfig
+) -> Watched:
     """The rows with the bounds of the channel monitor, of a fault that the other solution has not.
 
     `channel`: `value, threshold` per epoch; `other`: as the channel monitor took it. Where the other solution has its
@@ -25,7 +28,7 @@ def with_channel(rows: Watched, epochs: pl.DataFrame, channel: pl.DataFrame, oth
     if other is None:
         return rows
     value, threshold = (floats(channel, name)[rows.epoch] for name in ("value", "threshold"))
-    before = _share_before(epochs, other)[rows.epoch]
+    before = _share_before(epochs, other, lds)[rows.epoch]
     moving = before * rows.way_s
     ahead_m = moving * np.maximum(rows.most_mps - rows.rate_mps, 0.0)
     behind_m = moving * np.maximum(rows.rate_mps - rows.least_mps, 0.0)
@@ -44,11 +47,11 @@ def bounded(rows: Watched, low_m: Floats, high_m: Floats) -> Watched:
     return replace(rows, low_m=np.maximum(rows.low_m, low_m), high_m=np.minimum(rows.high_m, high_m))
 
 
-def _share_before(epochs: pl.DataFrame, other: pl.DataFrame) -> Floats:
+def _share_before(epochs: pl.DataFrame, other: pl.DataFrame, lds: LdsConfig) -> Floats:
     """How far before the epoch, as a share of the step to it, this solution was compared with the other."""
     placed = pl.when(pl.col("fix_valid") & pl.col("on_track") & pl.col("path_m").is_not_null())
     numbered = epochs.with_row_index("row").select("t", path_m=placed.then(pl.col("row").cast(pl.Float64)))
-    met = paired(numbered, other.filter("fix_valid", "on_track"))
+    met = paired(numbered, other.filter("fix_valid", "on_track"), lds)
     place = floats(met, "path_m")
     share: Floats = np.nan_to_num(np.arange(place.size) - place)
     return share

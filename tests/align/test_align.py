@@ -233,3 +233,23 @@ def test_nothing_is_learned_from_positions_off_the_track():
     assert aligned["odometer_scale"][-1] == pytest.approx(1.004, abs=4.0 * aligned["scale_sigma"][-1])
     # What comes after them still teaches.
     assert aligned["scale_sigma"][-1] < 0.9 * aligned["scale_sigma"][149]
+
+
+def ten_epochs(leap_m):
+    """Twelve seconds at 20 m/s, epochs from 2 s on; between the first two of them the position leaps."""
+    t_s = np.arange(2.0, 12.0)
+    epochs = epochs_of(t_s, 20.0 * t_s + leap_m * (t_s > 2.0))
+    odometer_s = np.arange(0.0, 13.0, 0.5)
+    aligned = align_run(epochs, odometer_of(odometer_s, distance_m=20.0 * odometer_s), Vehicle(), Configuration())
+    return aligned["scale_sigma"].to_numpy()
+
+
+def test_learning_begins_with_the_first_epoch():
+    """Epochs 1 s and 2 s after it first tell of scale; of each the odometer up to 2 s later is read."""
+    learned = ten_epochs(0.0)
+    np.testing.assert_allclose(learned[:4], 0.01, rtol=1e-6)
+    assert learned[4] < 0.009
+
+
+def test_a_leap_to_the_second_epoch_stops_the_learning():
+    np.testing.assert_array_equal(ten_epochs(50.0), 0.01)

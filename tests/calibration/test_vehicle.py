@@ -122,9 +122,10 @@ def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:
     noise = np.random.default_rng(seed).normal(0.0, size_m, track.t_s.size)
     rows = np.floor(track.distance_m / size_m) * size_m if kind == "counts" else track.distance_m + noise
     whole = np.ones(rows.size - 1, dtype=bool)
-    align, white_m2_per_s = Configuration().align, track.noise.white_m2_per_s
+    align, deadband_mps = Configuration().align, Configuration().matching.deadband_mps
+    white_m2_per_s = track.noise.white_m2_per_s
     counter_m = count_step_m(rows, whole, align)
-    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, counter_m, align)
+    found = quantisation_noise(track.t_s, rows, whole, white_m2_per_s, counter_m, deadband_mps, align)
     return replace(track, distance_m=rows, period_s=0.1, noise=Noise(white_m2_per_s, found, counter_m))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 from pipeline.evidence.carrying import Anchor, Trust, between_anchors, closes
-from pipeline.evidence.routes import Place
+from pipeline.evidence.evidence import _contradicts
+from pipeline.evidence.gaps import Gap, Way
+from pipeline.evidence.routes import Chain, Place
 from schemas.arrays import NS_PER_S, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence
@@ -55,3 +58,22 @@ def test_where_a_known_odometer_closes_the_better_anchor_weighs_more() -> None:
 def test_an_odometer_closes_within_three_roots_of_both_anchors_and_its_way(apart_m: float, closed: bool) -> None:
     """102 m are counted; 3 sqrt(1 + 4 + 0.1) = 6.775 m."""
     assert closes(odometer(1.0), cast(Any, ANCHORS), apart_m, TRUST) is closed
+
+
+@pytest.mark.parametrize(
+    ("scale", "apart_m", "contradicts"),
+    [
+        (1.0, [90.0, 100.0], False),  # one of two chains closes
+        (1.0, [90.0, 110.0], True),
+        (1.0, None, False),  # too many chains to weigh
+        (None, [90.0, 110.0], False),  # no vehicle file
+    ],
+)
+def test_a_vehicle_file_is_contradicted_where_no_chain_between_two_anchors_closes(
+    scale: float | None, apart_m: list[float] | None, contradicts: bool
+) -> None:
+    ways = None if apart_m is None else [Way(Chain((0,), (0.0,)), (0.0, length_m)) for length_m in apart_m]
+    gap = Gap(0, 10 * NS_PER_S, ANCHORS[0], ANCHORS[1], ways)
+    assert _contradicts(gap, odometer(scale), TRUST) is contradicts
+    assert _contradicts(replace(gap, end=None), odometer(scale), TRUST) is False
+    assert _contradicts(gap, None, TRUST) is False

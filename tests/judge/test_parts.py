@@ -19,7 +19,7 @@ from pipeline.judge.judge import undetected_ns
 from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
 from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.rows import within_budget
+from pipeline.judge.rows import _instants, within_budget
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
 from schemas.config import Configuration, HazardConfig, LdsConfig
@@ -54,7 +54,7 @@ def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_episode(
 
 def test_the_distance_counts_from_the_last_accepted_balise() -> None:
     """The odometer misses 30 m between 1 s and 2 s; a balise accepted at 3 s is a new begin."""
-    t_ns, odometer_m = seconds(0, 1, 2, 3, 4), 10.0 * np.arange(5)
+    t_ns, odometer_m = seconds(0, 1, 2, 3, 4), np.linspace(0.0, 40.0, 5)
     train_m = odometer_m + np.array([0.0, 0.0, 30.0, 30.0, 30.0])
     beyond = odometer_beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
     assert beyond.tolist() == [False, False, True, False, False]
@@ -155,6 +155,7 @@ def test_what_an_episode_hit() -> None:
         (30.0, -30.0, 0.0, RIGHT, True),
         (-30.0, 30.0, 0.0, RIGHT, True),
         (30.0, 30.0, 0.0, RIGHT, False),  # farther away
+        (0.1, 8.0, 8.1, RIGHT, False),  # on from a place that was hardly wrong
         (30.0, -30.0, 20.0, UNKNOWN, True),
         (30.0, -30.0, 20.1, UNKNOWN, False),  # still beyond the limit
         (30.0, -30.0, 0.0, WRONG, False),  # on another track
@@ -168,6 +169,40 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     )
     found = _is_back(cast(Any, SimpleNamespace(judged=judged)), Jump(1, 1, step_m), HazardConfig())
     assert bool(found) is back
+
+
+@pytest.mark.parametrize(("known", "detected_s"), [(True, 7.0), (False, 7.0), (True, None)])
+def test_the_times_of_a_hazard(known: bool, detected_s: float | None) -> None:
+    """From 100 s on each second: onset at 103 s, a VB hit at 104 s, failure at 105 s, alarm at 107 s, end at 109 s."""
+    begin = 100 * NS
+    detected_ns = None if detected_s is None else begin + round(detected_s * NS)
+    episode = SimpleNamespace(
+        onset_ns=begin + 3 * NS, end_ns=begin + 9 * NS, failure=5, failure_known=known, detected_ns=detected_ns,
+        monitor=None if detected_ns is None else "raw", alarm_before_onset=False,
+    )  # fmt: skip
+    t_ns = begin + seconds(*range(10))
+    series = SimpleNamespace(t_ns=t_ns, row=np.arange(10))
+    offers = SimpleNamespace(t_ns=begin + seconds(1, 4), number=np.array([1, 4]))
+    bench = SimpleNamespace(
+        t_ns=t_ns,
+        positions=SimpleNamespace(direction=np.full(10, -1), leg=np.zeros(10, dtype=np.int64)),
+        judged=SimpleNamespace(middle_m=np.full(10, 25.0)),
+        path_m=500.0 - 10.0 * np.arange(10),
+        solution=SimpleNamespace(path=SimpleNamespace(locate=lambda leg, at_m: (["e"], np.array([at_m - 400.0])))),
+        speed_at=lambda at_ns: np.array([10.0]),
+        config=Configuration(),
+    )
+    draft = SimpleNamespace(episode=episode, jump=None, hits=[1])
+    found = _instants(*(cast(Any, one) for one in (draft, series, offers, bench)))
+    assert (found["t_onset"], found["t_hazard"], found["t_failure"], found["t_end"]) == tuple(
+        begin + seconds(3, 4, 5, 9)
+    )
+    seen = detected_s is not None
+    assert (found["detected"], found["t_negated"]) == (seen, begin + 8 * NS if seen else None)  # one epoch to react
+    assert found["time_to_detect_s"] == (4.0 if seen else None)
+    assert found["time_since_failure_s"] == (2.0 if seen and known else None)
+    # At 460 m against growing path, 25 m ahead of the train.
+    assert (found["path_m"], found["measure_m"], found["speed_mps"]) == (485.0, 85.0, 10.0)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from pipeline.odometry.driven import turns_of
 from pipeline.odometry.odometry import Noise
 from pipeline.odometry.polarity import polarity
 from pipeline.odometry.quantisation import QuantisationNoise
+from pipeline.odometry.rows import ways_between
+from schemas.config import AlignConfig
 from tests.align.straight import odometer_of, odometry_from
 
 
@@ -250,3 +252,11 @@ def test_turns_show_once_the_train_came_back_so_far():
     assert turns_of(distance_m, 5.0) == [(3, 5, -1), (6, 8, 1)]
     assert turns_of(np.array([0.0, -3.0, -6.0, -20.0]), 5.0) == [(0, 2, -1)]
     assert turns_of(np.zeros(0), 5.0) == []
+
+
+@pytest.mark.parametrize(("last_m", "way_m"), [(420.0, [210.0, 210.0]), (430.0, [np.nan, np.nan])])
+def test_a_row_is_a_spike_only_where_a_train_could_have_driven_on_without_it(last_m, way_m):
+    """1000 s into a run: in two seconds at most 2 * 200 m and 20 m; half of the way, 215 m, would be no leap."""
+    t, reads = np.array([1000.0, 1001.0, 1002.0]), np.array([0.0, 900.0, last_m])
+    found = ways_between(t, reads, np.full(3, np.nan), 5.0, AlignConfig())
+    np.testing.assert_array_equal(found.way_m, way_m)

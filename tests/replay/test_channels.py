@@ -13,10 +13,11 @@ from pipeline.results.store import write_run
 from pipeline.safety.assessment import assess
 from pipeline.safety.side_by_side import side_by_side
 from pipeline.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
-from schemas.config import Configuration
+from schemas.config import Configuration, LdsConfig
 from schemas.errors import InputError
 from tests.replay.journeys import VEHICLE, journey, replay
 
+LDS = LdsConfig()
 OFFSET = {"kind": "step", "size_m": 45.0, "start_s": 150.0, "duration_s": 60.0}
 SLOW = {"kind": "ramp", "rate_mps": 0.3, "start_s": 100.0, "duration_s": 120.0}
 THERE_AND_BACK = {
@@ -212,13 +213,13 @@ def test_a_path_from_another_origin_against_the_measure_and_over_a_border():
             "path_m": [97.0, 98.0, 99.0, 92.0, 80.0],
         }
     )
-    assert on_path_of(mine, other)["path_m"].to_list() == [None] * 5  # one epoch on B does not tell its sense
+    assert on_path_of(mine, other, LDS)["path_m"].to_list() == [None] * 5  # one epoch on B does not tell its sense
     longer = pl.concat(
         [mine, mine[3:].with_columns(t=pl.lit(9, pl.Int64), measure_m=pl.lit(25.0), path_m=pl.lit(1025.0))]
     )
-    assert on_path_of(longer, other)["path_m"].to_list() == [1003.0, 1002.0, 1001.0, 1008.0, 1020.0]
+    assert on_path_of(longer, other, LDS)["path_m"].to_list() == [1003.0, 1002.0, 1001.0, 1008.0, 1020.0]
     apart = other.with_columns(netelement_id=pl.lit("C"))
-    assert on_path_of(longer, apart)["path_m"].to_list() == [None] * 5
+    assert on_path_of(longer, apart, LDS)["path_m"].to_list() == [None] * 5
 
 
 def test_pairs_of_epochs_that_were_not_measured_at_one_time():
@@ -229,9 +230,12 @@ def test_pairs_of_epochs_that_were_not_measured_at_one_time():
         {"ms": [0, 1000, 2000, 3000, 4000, 9000], "path_m": [0.0, 20.0, 40.0, None, 80.0, 180.0]}
     ).with_columns(t=start + ms)
     other = pl.DataFrame({"ms": [0, 900, 950, 2000, 2500, 3500, 8500]}).with_columns(t=start + ms)
-    found = paired(mine, other)
+    found = paired(mine, other, LDS)
     assert found["row_other"].to_list() == [0, 2, 3, None, None, None]
     assert found["path_m"].to_list() == [0.0, pytest.approx(19.0), 40.0, None, None, None]
+    over_gap = paired(mine, other, LdsConfig(crossing_gap_s=5.0))
+    assert over_gap["row_other"].to_list() == [0, 2, 3, None, None, 6]
+    assert over_gap["path_m"][5] == 170.0  # nine tenths of 5 s from 80 m to 180 m
 
 
 @pytest.mark.parametrize("behind_ms", [0, 37])
