@@ -3,6 +3,9 @@
 A copy has the solution's own errors. An independent record, however good, is off by the solution's errors, so it writes
 the same digits as seldom as these errors are smaller than one of the digits. No place is fitted for this, only the one
 difference of the stamps at which most places come back.
+
+Positions without errors (drawn by a program, to test the replay) equal a true reference. Only the survey tells: they lie
+on the track far nearer than their sigma. There a copy and the truth are the same, and nothing is told.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import polars as pl
 from pipeline.plausibility.check import Check, State
 from pipeline.plausibility.course import Places, seconds_since
 from pipeline.plausibility.robust import LEAST, MOVES_MPS
+from pipeline.plausibility.survey import Line, fit_survey
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.config import FixSigma
@@ -23,6 +27,8 @@ from schemas.enums import Fix
 _WHAT = "reference against the positions"
 # So many of the common places have to be equal, and at most so often may an independent record's be by chance.
 _MOST, _CHANCE = 0.8, 0.01
+# Positions usually as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
+_WITHOUT_ERROR = 0.2
 # Fewer moving places in common tell nothing.
 _FEWEST = 3 * LEAST
 # Stamps are equal within this: recorders round them to milliseconds [s].
@@ -44,10 +50,13 @@ class _Track:
         return _Track(self.t_s[rows], self.degrees[rows])
 
 
-def copy_check(fixes: pl.DataFrame, reference: pl.DataFrame, record: Places, epoch_ns: int) -> Check | None:
+def copy_check(
+    fixes: pl.DataFrame, gnss: Places, reference: pl.DataFrame, record: Places, epoch_ns: int, line: Line | None
+) -> Check | None:
     """`impossible` where the reference is a copy of the solution `fixes`; None where it is none, or nothing tells.
 
-    `record`: the places of the reference. An exact, a rounded or a thinned copy is told, and one with other stamps.
+    `gnss`, `record`: the places of both; `line`: the survey. An exact, a rounded or a thinned copy is told, and one with
+    other stamps.
     """
     own, other = _track(fixes, epoch_ns), _track(reference, epoch_ns)
     other = other.take(np.nan_to_num(record.speed(other.t_s)) > MOVES_MPS)
@@ -66,6 +75,8 @@ def copy_check(fixes: pl.DataFrame, reference: pl.DataFrame, record: Places, epo
     common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= _SAME_STAMP_S
     equal = np.all(np.abs(own.degrees[row] - other.degrees) <= 1.001 * digit_deg, axis=1)[common]
     if equal.size < _FEWEST or equal.mean() < _MOST:
+        return None
+    if line is not None and fit_survey(gnss, line).aside_m < _WITHOUT_ERROR * float(sigma_m.min()):
         return None
     stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > _SAME_STAMP_S else ""
     found = (

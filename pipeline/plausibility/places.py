@@ -27,13 +27,18 @@ _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
 def reference_checks(
-    fixes: pl.DataFrame, gnss: Places, reference: pl.DataFrame, epoch_ns: int, config: IngestConfig
+    fixes: pl.DataFrame,
+    gnss: Places,
+    reference: pl.DataFrame,
+    epoch_ns: int,
+    config: IngestConfig,
+    line: Line | None,
 ) -> tuple[Lag, list[Check], bool]:
     """Clock, place and heights of the reference; and whether it lies where the positions do. A copy tells nothing."""
     record = places_of(reference, epoch_ns)
     if record is None:
         return Lag("reference", reason="hardly any place"), [], False
-    if copied := copy_check(fixes, reference, record, epoch_ns):
+    if copied := copy_check(fixes, gnss, reference, record, epoch_ns, line):
         return Lag("reference", reason="a copy of the positions"), [copied], False
     found = fit_places(gnss, record, config)
     if found.reason:

@@ -11,6 +11,7 @@ import pytest
 from datasets.random_trials import random_trial
 from pipeline.plausibility.copies import copy_check
 from pipeline.plausibility.course import places_of
+from pipeline.plausibility.survey import Line, line_of
 from pipeline.stages import replay as replayed
 from schemas.arrays import times_ns
 from schemas.config import Configuration
@@ -52,11 +53,11 @@ def _moved(frame: pl.DataFrame, sigma_m: float, seed: int = 1) -> pl.DataFrame:
     return frame.with_columns(pl.col("latitude_deg") + noise[0], pl.col("longitude_deg") + noise[1])
 
 
-def _copies(gnss: pl.DataFrame, reference: pl.DataFrame) -> list[str]:
+def _copies(gnss: pl.DataFrame, reference: pl.DataFrame, line: Line | None = None) -> list[str]:
     epoch_ns = int(times_ns(gnss)[0])
-    record = places_of(reference, epoch_ns)
-    assert record is not None
-    check = copy_check(gnss, reference, record, epoch_ns)
+    places, record = places_of(gnss, epoch_ns), places_of(reference, epoch_ns)
+    assert places is not None and record is not None
+    check = copy_check(gnss, places, reference, record, epoch_ns, line)
     return [] if check is None else [check.found]
 
 
@@ -108,6 +109,25 @@ def test_an_independent_reference_is_none(run: RunLog) -> None:
     for change in (_rounded(7), _rounded(6)):
         fixed = unstated.with_columns(fix=pl.lit("rtk_fixed", unstated.schema["fix"]))
         assert _copies(change(fixed), change(_copied(truth))) == []
+
+
+def test_positions_without_errors_may_equal_the_truth() -> None:
+    """Ten minutes along a straight track, as a test of another program draws it; 0.5 m of error make a copy of it."""
+    seconds = np.arange(0, 600)
+    track = pl.DataFrame({"netelement_id": "A", "measure_m": [0.0, 20_000.0], "sigma_m": 1.0}).with_columns(
+        latitude_deg=pl.Series([50.0, 50.0 + 20_000.0 / _METRES]), longitude_deg=4.0, height_m=pl.lit(None, pl.Float64)
+    )
+    gnss = pl.DataFrame({"latitude_deg": 50.0 + seconds * 20.0 / _METRES}).with_columns(
+        t=pl.from_epoch(pl.Series(seconds), time_unit="s").cast(pl.Datetime("ns", "UTC")),
+        longitude_deg=4.0,
+        height_m=pl.lit(None, pl.Float64),
+        fix=pl.lit("sbas"),
+        cov_nn_m2=1.0,
+        cov_ee_m2=1.0,
+    )
+    line = line_of(track)
+    assert _copies(gnss, _copied(gnss), line) == []
+    assert len(_copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), line)) == 1
 
 
 def test_a_run_with_a_copy_fails_or_is_unproven() -> None:
