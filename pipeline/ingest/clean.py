@@ -199,9 +199,9 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
     """Refuse a cleaned stream with fewer than two times."""
     if stream.height < 2:
         raise InputError(
-            f"all rows have the same time{of}",
+            f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
             place=f"{place}, column t",
-            found=f"{stream.height} distinct time",
+            found=f"{stream.height} distinct time{'' if stream.height == 1 else 's'}",
             expected="at least two epochs at different times",
             remedy="Check the recorder's time stamps, or `time` in the [ingest] mapping.",
         )
