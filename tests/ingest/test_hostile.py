@@ -50,6 +50,9 @@ def bombs() -> dict[str, bytes]:
         "chunks without index": whole(definitions(), chunk(message(position(0))) * 10_000),
         "channels": numbered(60_000, schema(name="x.Y")),
         "topics of positions": numbered(2000, schema()),
+        "solutions": whole(
+            definitions(), packed(b"".join(message(position(0, solution=f"{n}"), n) for n in range(60_000)))
+        ),
     }
 
 
@@ -91,6 +94,7 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
     assert outcomes["empty chunks"] == "whole"
     assert outcomes["chunks without index"] == "whole"
     assert "more than 256 topics" in outcomes["topics of positions"]
+    assert "found 60000; expected at most 256" in outcomes["solutions"]
 
 
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
