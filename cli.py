@@ -653,12 +653,13 @@ def diff(
 ) -> None:
     """Compare two results; exit status 1 if they differ."""
     from pipeline.diff.results import diff_results
+    from schemas.errors import visible
 
     found = diff_results(out_a, out_b)
     if as_json:
         _print_json(found.as_dict())
     else:
-        print(found.text(detail))
+        print(visible(found.text(detail)))
     raise Exit(OK if found.same else RUNS_NOT_OK)
 
 

@@ -7,6 +7,7 @@ each worker first leaves a mark at the scheduler; one that finds it there alread
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import os
@@ -20,9 +21,10 @@ from pipeline.campaign.engines import Engine
 from pipeline.campaign.outcome import Result, RunOutcome
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.worker import replay_one
+from pipeline.storage.address import redacted
 from schemas.errors import UsageError
 
-_CONNECT_S = 10.0
+_CONNECT_S = 8.0
 _COUNT_EVERY_S = 2.0
 _ANSWER_S = 5.0
 _KILL_S = 15.0
@@ -44,7 +46,7 @@ class DaskEngine(Engine):
         self._threads = 0
         self._counted = -_COUNT_EVERY_S
         self._seen_s = time.monotonic()
-        self.name = self._scheduler = scheduler
+        self.name = self._scheduler = redacted(scheduler)
         self._marks: dict[Result, str] = {}
         self._workers: dict[str, str] = {}
         self._client.subscribe_topic(_BEGUN, self._note)
@@ -168,21 +170,32 @@ def lost_scheduler(scheduler: str) -> UsageError:
     """The error of a cluster that does not answer."""
     return UsageError(
         "the Dask scheduler does not answer",
-        place=scheduler,
+        place=redacted(scheduler),
         remedy="Start it again and repeat the command: complete runs are skipped.",
     )
 
 
 def _connect(scheduler: str) -> Any:
+    """A client of the cluster. Somebody must answer first: a client that finds nobody takes 20 s more to close."""
     try:
         from distributed import Client
     except ImportError:
         raise UsageError("--scheduler needs Dask", remedy="Install `balise[cluster]`.") from None
     _hush()
     try:
+        asyncio.run(_answered(scheduler))
         return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError):
         raise lost_scheduler(scheduler) from None
+
+
+async def _answered(scheduler: str) -> None:
+    from distributed import Security
+    from distributed.comm.core import connect
+
+    arguments = Security().get_connection_args("client")  # type: ignore[no-untyped-call]
+    comm = await connect(scheduler, timeout=_CONNECT_S, **arguments)  # type: ignore[no-untyped-call]
+    await comm.close()
 
 
 def _hush() -> None:

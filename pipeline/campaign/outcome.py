@@ -92,13 +92,22 @@ def never_begun(workers: int) -> str:
 def failure_of(error: BaseException, lasting: bool) -> Failure:
     """How a failure is told, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
-        again = isinstance(error, InputError) and not isinstance(error, ChangedError)
+        again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _is_of_the_machine(error)
         return Failure(redacted(str(error)), lasting and again)
     if isinstance(error, MemoryError):
         return Failure("not enough memory", lasting=False)
     text = f"defect of the program: {type(error).__name__}: {error}"
     trace = "".join(traceback.format_exception(error))
     return Failure(text, lasting=False, trace=trace)
+
+
+def _is_of_the_machine(error: BaseException | None) -> bool:
+    """A disk or a share that did not give the log may give it the next time; a file that is not there is the log's."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None and not isinstance(error, FileNotFoundError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def worst(runs: pl.DataFrame) -> RunStatus:

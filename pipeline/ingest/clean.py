@@ -22,15 +22,17 @@ _KEYS: dict[Stream, list[str]] = {
 }
 _PLACE = ("latitude_deg", "longitude_deg")
 _DAY_NS = 86_400_000_000_000
+# Streams that say something only of positions: without them a run is replayed all the same.
+_OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
 
 
 @dataclass(frozen=True)
 class StreamCounts:
     """Rows dropped because their key stands twice, and rows that came before an earlier one.
 
-    `far_off`: dropped for a time of another day. Of GNSS also `contradicting`, how many of the doubles are of another
-    place than the one that stays, and
-    `placeholders`, how many positions are none.
+    `far_off`: dropped for a time of another day than the others, or than the positions. Of GNSS also `contradicting`,
+    how many of the doubles are of another place than the one that stays, and `placeholders`, how many positions are
+    none.
     """
 
     duplicates: int = 0
@@ -51,9 +53,10 @@ class CleanCounts:
 def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
-    A few rows more than a day from the others (a receiver that did not know the date yet), and all before 1970, are
-    left out; placeholders stay as epochs without a fix. Raises `InputError` where no solution or not the odometer has
-    two different times, or both have no time in common: nothing can be replayed.
+    A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and reads,
+    reference and satellites of another day than the positions are left out; placeholders stay as epochs without a fix.
+    Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
+    nothing can be replayed.
     """
     streams: dict[str, pl.DataFrame] = {}
     counts: dict[str, StreamCounts] = {}
@@ -63,6 +66,8 @@ def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, C
         if frame is None or name == "faults":
             continue
         stray = _strays(frame, config.wrong_dates_share)
+        if name in _OF_POSITIONS:
+            stray |= _far_from_any(frame["t"], streams["gnss"]["t"])
         if name == "gnss":
             far, recorded = frame.filter(stray), frame.filter(~stray)
         kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
@@ -95,7 +100,7 @@ def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame,
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
     """Also with the rows that were left out of streams other than GNSS, whose runs say it for each solution."""
     told = [
-        f"{name}: {found.far_off} rows left out: their time is more than a day from the others"
+        f"{name}: {found.far_off} rows left out: their time is more than a day from the others or the positions"
         for name, found in counts.items()
         if found.far_off and name != "gnss"
     ]
@@ -129,6 +134,17 @@ def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
     group = np.concatenate(([0], np.cumsum(np.diff(t_ns[order]) > _DAY_NS)))
     far = np.zeros(t_ns.size, dtype=np.bool_)
     far[order] = group != np.bincount(group).argmax()
+    return far
+
+
+def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
+    """Times more than a day before or after every position, in 64 bits without overflow."""
+    known = np.sort(positions.to_physical().to_numpy())
+    if not known.size:
+        return np.zeros(t.len(), dtype=np.bool_)
+    t_ns = t.cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
+    at = np.searchsorted(np.minimum(known, np.iinfo(np.int64).max - _DAY_NS) + _DAY_NS, t_ns)
+    far: Bools = (at == known.size) | (t_ns < known[np.minimum(at, known.size - 1)] - _DAY_NS)
     return far
 
 
@@ -183,9 +199,9 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
     """Refuse a cleaned stream with fewer than two times."""
     if stream.height < 2:
         raise InputError(
-            f"all rows have the same time{of}",
+            f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
             place=f"{place}, column t",
-            found=f"{stream.height} distinct time",
+            found=f"{stream.height} distinct time{'' if stream.height == 1 else 's'}",
             expected="at least two epochs at different times",
             remedy="Check the recorder's time stamps, or `time` in the [ingest] mapping.",
         )

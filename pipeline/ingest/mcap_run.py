@@ -32,7 +32,7 @@ from schemas.run import IngestNotes, RunLog
 _MIB = 1024 * 1024
 LARGEST_MESSAGE = 4 * _MIB  # of messages that are decoded; pictures and point clouds are not
 _DECODED_TOGETHER = 16 * _MIB
-_MOST_TOPICS = 256  # that may feed a stream: no train has as many receivers
+MOST_TOPICS = 256  # that may feed a stream: no train has as many receivers
 
 
 class McapStreams:
@@ -56,9 +56,9 @@ class McapStreams:
     def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
         if not is_candidate(channel, self._config):
             return []
-        if sum(map(bool, self.readers.values())) >= _MOST_TOPICS:
+        if sum(map(bool, self.readers.values())) >= MOST_TOPICS:
             raise InputError(
-                f"holds more than {_MOST_TOPICS} topics of positions, speeds or reads",
+                f"holds more than {MOST_TOPICS} topics of positions, speeds or reads",
                 place=channel.file,
                 expected="the topics of one train",
                 remedy="Select topics with [ingest] in the configuration, or remove the others from the log.",

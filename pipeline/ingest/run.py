@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.ingest.correct import corrected
-from pipeline.ingest.mcap_run import read_mcap
+from pipeline.ingest.mcap_run import MOST_TOPICS, read_mcap
 from pipeline.ingest.parquet import read_folder
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, shown
@@ -21,7 +21,15 @@ def read_run(path: Address, config: IngestConfig, with_digest: bool = True) -> R
     included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
     damage and says so in `notes`. What the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
     """
-    return corrected(_recorded(path, config, with_digest), config.correct)
+    run = _recorded(path, config, with_digest)
+    if (count := run.gnss["solution"].n_unique()) > MOST_TOPICS:
+        raise InputError(
+            "holds more solutions of the position than any train has receivers",
+            place=f"{shown(path)}: gnss, column solution",
+            found=str(count),
+            expected=f"at most {MOST_TOPICS}",
+        )
+    return corrected(run, config.correct)
 
 
 def _recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:

@@ -26,6 +26,7 @@ from pipeline.safety.tally import added, architecture_figures
 from pipeline.storage.address import Address
 from schemas.config import Configuration
 from schemas.enums import TRUTH, RunStatus, ThrVerdict
+from schemas.errors import visible
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ def show(found: Assessment, as_json: bool) -> None:
     if as_json:
         print(to_json({"statements": found.statements, **found.tables}))
         return
-    print(found.statements[0] + "\n")
+    print(visible(found.statements[0]) + "\n")
     show_tables(for_reading(found.tables))
-    print("\n".join(found.statements[1:]))
+    print(visible("\n".join(found.statements[1:])))
 
 
 def assess(out: Address, config: Configuration | None = None, replay: Replay | None = None) -> Assessment:

@@ -11,7 +11,7 @@ Address = Path | str
 
 # User and password up to the last @ (a key may hold slashes), what follows a question mark, keys by their looks.
 _SECRETS = re.compile(
-    r"(?<=://)(?:[^/@\s]+|[^/@:\s]*:[^\s]*)@|(?<=://)(?!arn:)[^/\s:@]+:(?!\d+(?:[/\s]|$))[^\s'\"]*"
+    r"(?<=://)(?:[^/@:\s]*:[^\s]*|[^/@\s]+)@|(?<=://)(?!arn:)[^/\s:@]+:(?!\d+(?:[/\s]|$))[^\s'\"]*"
     r"|\?[^\s'\"]*|(?:AKIA|ASIA)[A-Z0-9]{12,}"
 )
 _BUCKETS = re.compile(r"s3a?://(?!arn:)[^/]*[:@]")

@@ -13,6 +13,7 @@ from distributed import Client
 
 from benchmarks.cluster import Cluster
 from pipeline.campaign import run_campaign
+from pipeline.campaign.cluster import lost_scheduler
 from pipeline.campaign.outcome import lost, overdue
 from pipeline.results import store
 from schemas.enums import RunStatus
@@ -116,6 +117,7 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
     monkeypatch.setattr("pipeline.campaign.cluster._CONNECT_S", 1.0)
     with pytest.raises(UsageError, match="Dask scheduler does not answer"):
         run_campaign(plan_of(small_trial, tmp_path), scheduler="tcp://127.0.0.1:9")
+    assert str(lost_scheduler("tls://KEY:sec/ret@host:9")).startswith("tls://host:9: the Dask scheduler")
 
 
 def test_cluster_that_lost_its_workers(

@@ -10,8 +10,10 @@ import pytest
 
 from pipeline import storage
 from pipeline.campaign import make_plan, resume, run_campaign
+from pipeline.campaign.outcome import failure_of
 from pipeline.results import store
 from schemas.config import Configuration, LdsConfig
+from schemas.errors import InputError
 from tests.campaign.compare import plan_of
 from tests.conftest import SmallTrial
 
@@ -81,3 +83,13 @@ def test_a_log_that_was_just_written_is_read_again(
     monkeypatch.setattr(resume, "_SETTLED_NS", 3600 * 10**9)
     run_campaign(plan_of(trial, out), force=True)
     assert resume.unchanged(plan_of(trial, out)) == []
+
+
+def test_what_the_disk_did_not_give_is_no_failure_of_the_log() -> None:
+    for cause, lasting in ((OSError(5, "Input/output error"), False), (ValueError("cut off"), True)):
+        try:
+            raise cause
+        except (OSError, ValueError):
+            with pytest.raises(InputError) as found:
+                raise InputError("cannot be read") from None
+        assert failure_of(found.value, lasting=True).lasting == lasting

@@ -50,6 +50,9 @@ def bombs() -> dict[str, bytes]:
         "chunks without index": whole(definitions(), chunk(message(position(0))) * 10_000),
         "channels": numbered(60_000, schema(name="x.Y")),
         "topics of positions": numbered(2000, schema()),
+        "solutions": whole(
+            definitions(), packed(b"".join(message(position(0, solution=f"{n}"), n) for n in range(60_000)))
+        ),
     }
 
 
@@ -91,6 +94,7 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
     assert outcomes["empty chunks"] == "whole"
     assert outcomes["chunks without index"] == "whole"
     assert "more than 256 topics" in outcomes["topics of positions"]
+    assert "found 60000; expected at most 256" in outcomes["solutions"]
 
 
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
@@ -210,7 +214,20 @@ def test_rows_at_the_ends_of_64_bits_are_left_out_of_every_stream(t_ns: int) -> 
     assert found.gnss.equals(without.gnss)
     assert found.odometer.equals(without.odometer)
     assert (counts.solutions["primary"].far_off, counts.streams["odometer"].far_off) == (1, 1)
-    assert found.notes.skipped_topics == ("odometer: 1 rows left out: their time is more than a day from the others",)
+    others = "their time is more than a day from the others or the positions"
+    assert found.notes.skipped_topics == (f"odometer: 1 rows left out: {others}",)
+
+
+@pytest.mark.parametrize("t_ns", [1, 2**63 - 1, samples.START_NS - 40 * 86_400 * SECOND_NS])
+def test_reads_of_another_day_than_the_positions_are_left_out(t_ns: int) -> None:
+    """One of two reads in 1970 asked for 13 GB: the train was looked for in every second since."""
+    run = samples.run()
+    reads = pl.DataFrame({"t": [samples.START_NS + 5, t_ns], "balise_id": ["P1", "P1"]})
+    reads = reads.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
+    found, counts = clean(run.with_streams(balise_reads=reads))
+    assert found.balise_reads is not None
+    assert found.balise_reads.equals(reads.head(1))
+    assert counts.streams["balise_reads"].far_off == 1
 
 
 def test_parquet_without_checksums_is_said_and_with_them_is_proved(tmp_path: Path) -> None:

@@ -235,6 +235,7 @@ def test_config_is_written_resolved(tmp_path: Path) -> None:
         ("/data/run.mcap: damaged", "/data/run.mcap: damaged"),
         ("s3://KEY:sec/ret@bucket/run.mcap: damaged", "s3://bucket/run.mcap: damaged"),
         ("s3://KEY:sec/ret", "s3://"),
+        ("http://user:p@ss/word@store/run", "http://store/run"),
         ("s3://bucket/run@2.mcap", "s3://bucket/run@2.mcap"),
         ("tcp://10.0.0.1:8786 does not answer", "tcp://10.0.0.1:8786 does not answer"),
     ],
