@@ -93,7 +93,7 @@ def _tallies_of(
 ) -> Tallies:
     of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
     epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
-    front = front_of(epochs, passages, run, config, areas, ahead_m)
+    front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
     ride = Ride(_name(run), front, epochs, passages, profile)
     return tallies(ride) | {("no_area", ALL): ride.outside()}
 

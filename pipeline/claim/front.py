@@ -15,14 +15,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.claim.areas import Placed, placed
+from pipeline.claim.profile import Method
 from pipeline.claim.tally import codes
 from pipeline.epochs.clock import Clock
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
 from schemas.enums import Judgement, PassageStatus, VehicleFigures
-
-# A front end farther than this from every epoch's place has no known place on the net elements.
-_REACH_M = 50.0
 
 
 @dataclass(frozen=True)
@@ -79,6 +77,7 @@ def front_of(
     passages: pl.DataFrame,
     run: dict[str, Any],
     config: Configuration,
+    method: Method,
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
 ) -> Front:
@@ -108,7 +107,7 @@ def front_of(
         wrong_track=gnss & elsewhere,
         speed_mps=speed,
         direction=direction,
-        where=_areas_at(front, epochs, areas),
+        where=_areas_at(front, epochs, areas, method.area_reach_m),
     )
 
 
@@ -152,10 +151,10 @@ def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     return base + odometer
 
 
-def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None) -> Placed:
-    """The area of each front end: that of the run's epoch that is nearest on the path."""
+def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None, reach_m: float) -> Placed:
+    """The area of each front end: that of the run's epoch that is nearest on the path, none beyond the reach."""
     known = epochs.select("path_m", "netelement_id", "measure_m").drop_nulls().sort("path_m")
     fronts = pl.DataFrame({"path_m": front_m}, schema={"path_m": pl.Float64}).fill_nan(None).with_row_index("row")
-    near = fronts.drop_nulls().sort("path_m").join_asof(known, on="path_m", strategy="nearest", tolerance=_REACH_M)
+    near = fronts.drop_nulls().sort("path_m").join_asof(known, on="path_m", strategy="nearest", tolerance=reach_m)
     places = fronts.select("row").join(near, on="row", how="left", maintain_order="left")
     return placed(areas, places["netelement_id"], places["measure_m"])

@@ -23,6 +23,7 @@ class Method(Settings):
 
     event_gap_s: Positive
     speed_window_s: Positive
+    area_reach_m: Positive
     independent: Literal["run", "day"] = "run"
 
 

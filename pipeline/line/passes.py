@@ -79,7 +79,7 @@ def passes_of(
     if epochs.height < 2:
         return pl.DataFrame(schema=_PASSES)
     legs, states = stretches_of(epochs), states_of(epochs, alarms["t_start"], config)
-    spans = spans_of(epochs, states, 2.0 * config.hazards.failure_limit_m)
+    spans = spans_of(epochs, states, config)
     hits = laid_on(spans, legs, ground.pieces)
     parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, legs, ground.pieces)]
     parts += _misleading(epochs, states, legs, ground, criteria)

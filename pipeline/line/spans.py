@@ -7,8 +7,9 @@ from enum import IntEnum
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from pipeline.epochs.clock import confident, met, unambiguous, usable
+from pipeline.epochs.timeline import crossing_gap_ns
+from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration
 
 
@@ -43,9 +44,9 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
         (wrong & in_use, State.WRONG_IN_USE),
         (wrong & ~np.isfinite(floats(epochs, "error_low_m")), State.WRONG_TRACK),
         (wrong, State.WRONG),
-        (~(flags(epochs, "on_track") & np.isfinite(floats(epochs, "confidence_m"))), State.OUTAGE),
-        (floats(epochs, "gate_probability") < config.matching.ambiguity_probability, State.AMBIGUOUS),
-        (floats(epochs, "confidence_m") > config.lds.ci_limit_m, State.CONFIDENCE),
+        (~met(epochs, usable() & pl.col("confidence_m").is_not_null()), State.OUTAGE),
+        (~met(epochs, unambiguous(config)), State.AMBIGUOUS),
+        (~met(epochs, confident(config)), State.CONFIDENCE),
         (starts, State.ALARM),
         (~in_use, State.AFTER_ALARM),
         (_is(epochs, "right"), State.RIGHT),
@@ -71,13 +72,13 @@ def true_path_m(epochs: pl.DataFrame, direction: Floats) -> tuple[Floats, Floats
     return np.minimum(one, other), np.maximum(one, other)
 
 
-def spans_of(epochs: pl.DataFrame, states: Ints, max_width_m: float) -> pl.DataFrame:
+def spans_of(epochs: pl.DataFrame, states: Ints, config: Configuration) -> pl.DataFrame:
     """One row per pair of epochs: `low_m, high_m` where the train may have been, `from_m, to_m` where it was most
     likely, `direction, state, t, one, other` (net elements of the two positions).
 
     Between two places that are known nothing but a pure outage is told of what lies between: the rest is unknown, for
-    nobody knows on which piece it was. So is a place known less closely than `max_width_m`. What was wrong at an end
-    of such a way, or of an outage, was wrong there and not along it: a row of its own.
+    nobody knows on which piece it was. So is a place known less closely than the failure limit on both sides. What
+    was wrong at an end of such a way, or of an outage, was wrong there and not along it: a row of its own.
     """
     direction = directions_of(epochs)
     low, high = true_path_m(epochs, direction)
@@ -85,7 +86,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, max_width_m: float) -> pl.DataF
     t_ns, names = times_ns(epochs), epochs["netelement_id"]
     here, there = placed[:-1], placed[1:]
     state = np.maximum(states[here], states[there])
-    silent = (t_ns[there] - t_ns[here] > linking_gap_s(nominal_period_s(t_ns) or 0.0) * NS_PER_S) & (there == here + 1)
+    silent = (t_ns[there] - t_ns[here] > crossing_gap_ns(t_ns, config.lds)) & (there == here + 1)
     between = np.flatnonzero(there > here + 1)
     state[silent] = State.OUTAGE
     state[between] = [_between(states[here[row] + 1 : there[row]]) for row in between]
@@ -93,7 +94,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, max_width_m: float) -> pl.DataF
     ends = np.unique(np.concatenate([here[apart], there[apart]]))
     ends = ends[states[ends] >= State.WRONG]
     here, there, state = (np.concatenate(pair) for pair in ((here, ends), (there, ends), (state, states[ends])))
-    wide = np.maximum((high - low)[here], (high - low)[there]) > max_width_m
+    wide = np.maximum((high - low)[here], (high - low)[there]) > 2.0 * config.hazards.failure_limit_m
     state = np.where(wide & (state < State.WRONG), int(State.UNKNOWN), state)
     middle = 0.5 * (low + high)
     return pl.DataFrame(

@@ -60,7 +60,7 @@ SITE = Site(
 def front(t_s: list[float], areas: pl.DataFrame | None = AREAS, run: dict[str, Any] = RUN, **columns: Any) -> Front:
     """The train of the tables: 20 m each second along net element A."""
     frame = epochs(t_s, **({"netelement_id": "A", "measure_m": [20.0 * t for t in t_s]} | columns))
-    return front_of(frame, passages(), run, Configuration(), areas)
+    return front_of(frame, passages(), run, Configuration(), PROFILE.method, areas)
 
 
 def ten() -> Front:
@@ -205,7 +205,7 @@ def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
     """100 runs of 100 s, each with 60 s without epochs: two in five draws are kept, and nothing is met."""
     seconds = [float(second) for second in (*range(20), *range(80, 101))]
     frame = epochs(seconds, netelement_id="A", measure_m=5.0, error_low_m=0.0, error_high_m=0.0)
-    found = front_of(frame, passages(), RUN, Configuration(), AREAS)
+    found = front_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS)
     for one in requirements(PROFILE):
         if one.key not in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
             continue
@@ -221,7 +221,7 @@ def test_a_balise_without_a_first_estimate_is_not_known() -> None:
     seconds = [float(second) for second in (*range(6), *range(15, 20))]
     frame = epochs(seconds, error_low_m=0.0, error_high_m=0.0)
     balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
-    found = front_of(frame, balises, RUN, Configuration())
+    found = front_of(frame, balises, RUN, Configuration(), PROFILE.method)
     asked = next(one for one in requirements(PROFILE) if one.key == ("after_balise", "physical"))
     total = sum((asked.count(Ride(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
     assert (total.trials, total.broken) == (60, 0)
@@ -292,7 +292,7 @@ def test_the_odometer_goes_on_where_no_position_is_in_use() -> None:
         doubt_under_m=[None] * 5 + [17.0, 18.0, 19.0, 20.0, 21.0],
     )
     crossed = passages(1, balise_id="b", status="accepted", path_m=100.0, kind="virtual")
-    found = front_of(frame, crossed, RUN, Configuration())
+    found = front_of(frame, crossed, RUN, Configuration(), PROFILE.method)
     assert found.path_m == pytest.approx([*true[:9], 140.0])
     assert found.over_m[6:].tolist() == [18.0, 19.0, 20.0, 21.0]
     assert found.low_m[[6, 9]] == pytest.approx([-0.5, -40.5])
@@ -310,7 +310,7 @@ def test_the_front_end_decides_on_the_area() -> None:
         error_low_m=0.0,
         error_high_m=0.0,
     )
-    found = front_of(frame, passages(), RUN, Configuration(), AREAS, ahead_m=30.0)
+    found = front_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS, ahead_m=30.0)
     assert Ride("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
     assert found.output.all()
     assert found.within(5.0, 5.0).tolist() == [1] * 10
@@ -344,7 +344,7 @@ def test_after_a_balise_start_and_availability() -> None:
     lost = [50 <= second < 140 for second in seconds]
     frame = epochs(seconds, in_use=[not gone for gone in lost], error_low_m=0.29, error_high_m=0.31, tvb=False)
     balise = passages(1, status="accepted", kind="physical", t_offered=[2 * NS])
-    found = tallies(Ride("run", front_of(frame, balise, RUN, Configuration()), frame, balise, PROFILE))
+    found = tallies(Ride("run", front_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE))
     assert found["after_balise", "physical"].broken == 1
     assert found["after_balise", "virtual"].trials == 0
     assert (found["availability", "all"].worst, found["availability", "all"].broken) == (90.0, 1)
@@ -355,7 +355,9 @@ def test_after_a_balise_start_and_availability() -> None:
 
 def test_a_run_without_epochs_says_nothing() -> None:
     nothing = epochs([], t=[], path_m=[], odometer_m=[])
-    found = tallies(Ride("run", front_of(nothing, passages(), RUN, Configuration()), nothing, passages(), PROFILE))
+    found = tallies(
+        Ride("run", front_of(nothing, passages(), RUN, Configuration(), PROFILE.method), nothing, passages(), PROFILE)
+    )
     table = claim_table({"primary": found}, PROFILE)
     assert set(table["finding"]) == {"not shown"}
     assert table["events"].sum() == 0
