@@ -226,7 +226,8 @@ def main() -> None:
     given = parser.parse_args()
     skies: tuple[Constellation, ...] = ("gps", "gps_galileo")
     show_table(pl.DataFrame([bank_figures(sky, name, given.repetitions, MINUTES) for sky in skies for name in BANKS]))
-    doppler = [bank_figures(sky, "0.1 0.01 0.001", given.repetitions, MINUTES[:3], velocity=True) for sky in skies]
+    # Over the same times, so that it is the same noise.
+    doppler = [bank_figures(sky, "0.1 0.01 0.001", given.repetitions, MINUTES, velocity=True) for sky in skies]
     show_table(pl.DataFrame(doppler), "Where the velocity carries the fault")
     show_table(pl.DataFrame([row for sky in skies for row in shape_figures(sky, given.repetitions, MINUTES[:4])]))
     ranges = [{"sky": sky, **{f"{h:.0f} deg": range_figure(sky, h) for h in HEADINGS_DEG}} for sky in skies]

@@ -122,7 +122,9 @@ class Passages(dy.Schema):
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
     crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
-    undetected_ahead_m = real("m", "largest fault ahead of the train that no monitor would have noticed", min=0)
+    undetected_ahead_m = real(
+        "m", "largest fault ahead of the train that no monitor would have noticed; not proved on curves", min=0
+    )
     undetected_behind_m = real("m", "the same behind it; null as all of these where not computed", min=0)
     undetected_range_ahead_m = real("m", "largest of these by one range at fault, the pseudorange monitor heard", min=0)
     undetected_range_behind_m = real("m", "the same behind it", min=0)
@@ -198,7 +200,9 @@ class _EpochsAfterMonitors(dy.Schema):
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
     in_use = flag("fix valid, unambiguous, confident, not blocked (DOMAIN section 5.2)")
-    undetected_ahead_m = real("m", "largest fault ahead of the train that no monitor would have noticed", min=0)
+    undetected_ahead_m = real(
+        "m", "largest fault ahead of the train that no monitor would have noticed; not proved on curves", min=0
+    )
     undetected_behind_m = real("m", "the same behind it; both null where not computed", min=0)
 
 

@@ -14,6 +14,7 @@ from schemas.enums import LdsMode
 _LOW = 0.9
 _SHOWN = 3
 _LEAST_SHARE = 0.02
+_REST = "of the moving time, the rest lost to: "
 
 
 def availability_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> tuple[str, ...]:
@@ -35,7 +36,12 @@ def availability_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration
         lost &= ~applies
     shown = sorted(((share, reason) for reason, share in parts.items() if share > _LEAST_SHARE), reverse=True)[:_SHOWN]
     told = ", ".join(f"{share:.0%} {reason}" for share, reason in shown) or "many short losses"
-    return (f"available for {1.0 - lost_s / whole_s:.0%} of the moving time, the rest lost to: {told}",)
+    return (f"available for {1.0 - lost_s / whole_s:.0%} {_REST}{told}",)
+
+
+def lost_to() -> pl.Expr:
+    """The same reasons out of `notes` of a result; null where little was lost."""
+    return pl.col("notes").str.extract(f"{_REST}([^;]*)").alias("lost_to")
 
 
 def _reasons(epochs: pl.DataFrame, config: Configuration) -> dict[str, Bools]:

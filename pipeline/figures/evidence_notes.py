@@ -118,4 +118,4 @@ def undiagnosed_notes(epochs: pl.DataFrame, passages: pl.DataFrame) -> tuple[str
 def motion_notes(epochs: pl.DataFrame, clock: Clock) -> tuple[str, ...]:
     """For how long nobody knows whether the train moved."""
     untold_s = float(clock.held_s[met(epochs, pl.col("moving").is_null())].sum())
-    return (_UNTOLD.format(s=untold_s),) if untold_s > 0.0 else ()
+    return (_UNTOLD.format(s=untold_s),) if round(untold_s) > 0 else ()

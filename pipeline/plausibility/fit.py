@@ -56,7 +56,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
     if run.reference is not None and run.reference.height:
         checks += reference_elsewhere(gnss, run.reference, epoch_ns)
         if not checks:
-            of_reference, checks, beside_reference = reference_checks(gnss, run.reference, epoch_ns, config)
+            of_reference, checks, beside_reference = reference_checks(fixes, gnss, run.reference, epoch_ns, config)
             lags.append(of_reference)
     of_odometer, odometer_lags = odometer_checks(run, gnss, epoch_ns, vehicle, config, of_reference)
     checks, lags = [*of_odometer, *checks], [*odometer_lags, *lags]

@@ -7,6 +7,7 @@ import polars as pl
 
 from pipeline.plausibility.causes import explain_factor
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
+from pipeline.plausibility.copies import copy_check
 from pipeline.plausibility.course import Places, places_of, seconds_since
 from pipeline.plausibility.frames import Datum, datums_at
 from pipeline.plausibility.passing import READ_M, PlaceFit, common_lag, fit_places, passes
@@ -26,12 +27,14 @@ _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
 def reference_checks(
-    gnss: Places, reference: pl.DataFrame, epoch_ns: int, config: IngestConfig
+    fixes: pl.DataFrame, gnss: Places, reference: pl.DataFrame, epoch_ns: int, config: IngestConfig
 ) -> tuple[Lag, list[Check], bool]:
-    """Clock, place and heights of the reference; and whether it lies where the positions do."""
+    """Clock, place and heights of the reference; and whether it lies where the positions do. A copy tells nothing."""
     record = places_of(reference, epoch_ns)
     if record is None:
         return Lag("reference", reason="hardly any place"), [], False
+    if copied := copy_check(fixes, reference, record, epoch_ns):
+        return Lag("reference", reason="a copy of the positions"), [copied], False
     found = fit_places(gnss, record, config)
     if found.reason:
         return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False

@@ -9,6 +9,7 @@ import pytest
 
 from datasets.comma2k19 import comma2k19_run
 from datasets.demo import demo_scenario
+from datasets.scenario import OdometerSpec
 from datasets.trial import build_run, build_site
 from pipeline.calibration.calibrate import Calibration, calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
@@ -110,6 +111,7 @@ def test_a_noisy_odometer_shows_in_the_sigma_of_the_velocity(fault_free: tuple[l
     """0.2 m per root second, of which the bank expects 0.05, beside ten velocities of 0.03 m/s a second."""
     scenario, (_, site) = demo_scenario(), fault_free
     clean = scenario.runs[0]
+    assert isinstance(clean.odometer, OdometerSpec)
     noisy = clean.model_copy(update={"odometer": clean.odometer.model_copy(update={"noise_m_per_root_s": 0.2})})
     log = build_run(scenario, noisy)
     result = calibrate([log], site)

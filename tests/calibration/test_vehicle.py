@@ -108,13 +108,13 @@ def test_too_little_data_gives_nothing() -> None:
 def test_pooling_by_hand() -> None:
     """Equal sigmas, runs that agree: the mean with sigma / sqrt(n). Runs that differ: their scatter stays."""
     agree = pooled(np.array([1.0, 1.0, 1.0, 1.0]), np.full(4, 0.2))
-    assert (agree.value, agree.sigma) == (pytest.approx(1.0), pytest.approx(0.1))
+    assert [agree.value, agree.sigma] == pytest.approx([1.0, 0.1])
     # Two runs at -1 and 1 with sigma 0.1: between = (Q - 1) / (sum w - sum w^2 / sum w) = (200 - 1) / 100.
     differ = pooled(np.array([-1.0, 1.0]), np.full(2, 0.1))
     assert differ.value == pytest.approx(0.0)
     assert differ.sigma == pytest.approx(np.sqrt((0.01 + 1.99) / 2.0 + 1.99))
     alone = pooled(np.array([3.0]), np.array([0.4]))
-    assert (alone.value, alone.sigma) == (pytest.approx(3.0), pytest.approx(0.4))
+    assert [alone.value, alone.sigma] == pytest.approx([3.0, 0.4])
 
 
 def with_rows(track: Odometry, kind: str, size_m: float, seed: int) -> Odometry:

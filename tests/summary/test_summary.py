@@ -177,6 +177,8 @@ class TestAvailability:
         found = row(epochs(seconds(41), moving=[None if 10 <= k < 20 else True for k in range(41)]))
         assert found["availability"] == pytest.approx(30 / 40)
         assert found["notes"].startswith("for 10 s it is not known whether the train moved")
+        short = [0.0, 0.1, *(0.2 + k for k in range(41))]
+        assert "not known whether" not in (row(epochs(short, moving=[True, None, *[True] * 41]))["notes"] or "")
 
     def test_gap_while_moving_is_without_a_tvb(self) -> None:
         assert row(epochs([*seconds(11), *(30.0 + k for k in range(11))]))["availability"] == pytest.approx(20 / 40)

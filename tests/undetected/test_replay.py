@@ -152,11 +152,11 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     both, site = sky
     assert both.satellites is not None
     alone = pl.col("solution") == "gps"
-    run = both.with_streams(gnss=both.gnss.filter(alone).head(40), satellites=both.satellites.filter(alone))
+    run = both.with_streams(gnss=both.gnss.filter(alone).head(12), satellites=both.satellites.filter(alone))
     diagnosis, _, _ = diagnosed(run, site, VEHICLE, Configuration(), "gps")
     assert diagnosis.satellites is not None
     low_m, high_m = range_bounds(diagnosis.epochs, diagnosis.satellites, Configuration())
-    clean, at = replay(run, site, VEHICLE), 35
+    clean, at = replay(run, site, VEHICLE), 9
     most_m, least_m = -np.inf, np.inf
     for name in sorted(diagnosis.satellites.filter(pl.col("used"))["sv"].unique()):
         reached = _unseen(run, site, clean, name, at)
