@@ -89,6 +89,15 @@ def test_stamps_that_scatter_weigh_with_the_speed(seed):
     assert found.still_m2 < 0.1**2
 
 
+def test_noise_of_the_reading_and_of_the_stamps_are_told_apart():
+    """0.3 m whatever the speed, and 20 ms: 0.2 m at 10 m/s, 0.6 m at 30 m/s."""
+    t = np.arange(0.0, 500.0, 0.05)
+    rng = np.random.default_rng(3)
+    found = noise_of(t, way(t + rng.normal(0.0, 0.02, t.size)) + rng.normal(0.0, 0.3, t.size))
+    assert np.sqrt(found.still_m2) == pytest.approx(0.3, rel=0.2)
+    assert np.sqrt(found.moving_s2) == pytest.approx(0.02, rel=0.2)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_what_the_white_noise_explains_is_left_out(seed):
     t = np.arange(0.0, 500.0, 0.05)
