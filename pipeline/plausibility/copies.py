@@ -4,8 +4,8 @@ A copy has the solution's own errors. An independent record, however good, is of
 the same digits as seldom as these errors are smaller than one of the digits. No place is fitted for this, only the one
 difference of the stamps at which most places come back.
 
-Positions without errors (drawn by a program, to test the replay) equal a true reference. Only the survey tells: they lie
-on the track far nearer than their sigma. There a copy and the truth are the same, and nothing is told.
+Positions without errors (drawn by a program, to test the replay) equal a true reference. Only the survey tells: they
+lie on the track far nearer than their sigma. There a copy and the truth are the same, and nothing is told.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def copy_check(
 ) -> Check | None:
     """`impossible` where the reference is a copy of the solution `fixes`; None where it is none, or nothing tells.
 
-    `gnss`, `record`: the places of both; `line`: the survey. An exact, a rounded or a thinned copy is told, and one with
-    other stamps.
+    `gnss`, `record`: the places of both; `line`: the survey. An exact, a rounded or a thinned copy is told, and one
+    with other stamps.
     """
     own, other = _track(fixes, epoch_ns), _track(reference, epoch_ns)
     other = other.take(np.nan_to_num(record.speed(other.t_s)) > MOVES_MPS)

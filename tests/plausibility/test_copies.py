@@ -56,7 +56,8 @@ def _moved(frame: pl.DataFrame, sigma_m: float, seed: int = 1) -> pl.DataFrame:
 def _copies(gnss: pl.DataFrame, reference: pl.DataFrame, line: Line | None = None) -> list[str]:
     epoch_ns = int(times_ns(gnss)[0])
     places, record = places_of(gnss, epoch_ns), places_of(reference, epoch_ns)
-    assert places is not None and record is not None
+    assert places is not None
+    assert record is not None
     check = copy_check(gnss, places, reference, record, epoch_ns, line)
     return [] if check is None else [check.found]
 
