@@ -15,7 +15,7 @@ from pipeline.figures.fit_notes import fit_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
-from pipeline.ingest.clean import CleanCounts, clean, require_one_journey, require_two_times
+from pipeline.ingest.clean import CleanCounts, clean, of_the_journey, require_one_journey, require_two_times
 from pipeline.judge.bench import Bench, Solution
 from pipeline.judge.judge import Judged, judge
 from pipeline.lds.run import LdsResult, run_lds
@@ -91,6 +91,7 @@ def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -
     """The run in order, whether it fits, its odometer, and what is known of where the train was."""
     cleaned, counts = clean(run, config.ingest)
     fits = {name: fit_run(cleaned, name, vehicle, config.ingest, site) for name in cleaned.solutions()}
+    cleaned = of_the_journey(cleaned)
     odometry = odometry_of(cleaned.odometer, vehicle, config)
     network = site_network(site)
     reference = _reference_places(cleaned, site, odometry, network, vehicle, config)

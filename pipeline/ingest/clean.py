@@ -53,8 +53,9 @@ class CleanCounts:
 def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
-    A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and reads,
-    reference and satellites of another day than the positions are left out; placeholders stay as epochs without a fix.
+    A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and single
+    reads, reference and satellites of another day than the positions are left out; placeholders stay as epochs without
+    a fix.
     Raises `InputError` where no solution or not the odometer has two different times, or both have no time in common:
     nothing can be replayed.
     """
@@ -67,7 +68,9 @@ def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, C
             continue
         stray = _strays(frame, config.wrong_dates_share)
         if name in _OF_POSITIONS:
-            stray |= _far_from_any(frame["t"], streams["gnss"]["t"])
+            elsewhere = _far_from_any(frame["t"], streams["gnss"]["t"])
+            # Where no row is near, the clock of the whole recorder is wrong, which the fit of the run tells.
+            stray |= elsewhere & (not elsewhere.all())
         if name == "gnss":
             far, recorded = frame.filter(stray), frame.filter(~stray)
         kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
@@ -83,6 +86,24 @@ def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, C
         _require_common_time(run.with_streams(**streams))
     cleaned = replace(run, notes=_noted(run.notes, counts))
     return cleaned.with_streams(**streams), CleanCounts(solutions, counts)
+
+
+def of_the_journey(run: RunLog) -> RunLog:
+    """The cleaned run without the streams of which no row lies within a day of a position; `notes` say so.
+
+    Their clocks are wrong, which the fit of the run tells: what is judged must not carry anything over years.
+    """
+    away = [
+        name
+        for name in _OF_POSITIONS
+        if (frame := run.stream(name)) is not None and frame.height and _far_from_any(frame["t"], run.gnss["t"]).all()
+    ]
+    if not away:
+        return run
+    told = [f"{name}: left out, its times are all more than a day from the positions" for name in away]
+    notes = replace(run.notes, skipped_topics=(*run.notes.skipped_topics, *told))
+    satellites, reference, reads = (None if name in away else run.stream(name) for name in _OF_POSITIONS)
+    return replace(run, notes=notes, satellites=satellites, reference=reference, balise_reads=reads)
 
 
 def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame, dict[str, int]]:

@@ -14,7 +14,7 @@ import pytest
 import zstandard
 
 from pipeline.ingest import mcap_chunk, read_run
-from pipeline.ingest.clean import clean
+from pipeline.ingest.clean import clean, of_the_journey
 from pipeline.ingest.describe import describe_log
 from pipeline.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
 from pipeline.storage.parquet import parquet_bytes
@@ -228,6 +228,20 @@ def test_reads_of_another_day_than_the_positions_are_left_out(t_ns: int) -> None
     assert found.balise_reads is not None
     assert found.balise_reads.equals(reads.head(1))
     assert counts.streams["balise_reads"].far_off == 1
+
+
+def test_a_stream_all_of_another_day_is_seen_by_the_fit_only() -> None:
+    """The fit tells its clock; the evidence of the same run asked for 54 GB."""
+    run = samples.run()
+    reads = pl.DataFrame({"t": [2**62, 2**62 + 10**9], "balise_id": ["P1", "P2"]})
+    reads = reads.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
+    found, _ = clean(run.with_streams(balise_reads=reads))
+    assert found.balise_reads is not None
+    assert found.balise_reads.height == 2
+    judged = of_the_journey(found)
+    assert judged.balise_reads is None
+    assert "more than a day from the positions" in judged.notes.skipped_topics[-1]
+    assert of_the_journey(run) is run
 
 
 def test_parquet_without_checksums_is_said_and_with_them_is_proved(tmp_path: Path) -> None:
