@@ -187,32 +187,47 @@ class _Ride:
 
 
 def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
-    run, config, found = context.run, context.config, matches[solution]
-    balises = found.path.balises(context.site.balises)
-    fixes = run.gnss.filter(pl.col("solution") == solution)
+    """What the train makes of one solution: aligned with the odometer, monitored, detected at balises."""
+    config, found = context.config, matches[solution]
     odometry = None if context.odometry is None else context.odometry.oriented(found.odometer_sign)
     aligned = align(found.epochs, odometry, context.vehicle, config)
     compared = _compared(context, solution, aligned, matches)
     singles = _single_monitors(context, solution, aligned, compared)
     bank = MonitorBank(aligned, singles, config)
-    reads = _reads_on_odometer(run.balise_reads, aligned, odometry)
+    balises = found.path.balises(context.site.balises)
+    reads = _reads_on_odometer(context.run.balise_reads, aligned, odometry)
     scale_sigma = None if odometry is None else odometry.scale_sigma
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
     seen = pl.concat([aligned, lds.epochs.drop("t")], how="horizontal")
-    diagnosis = Diagnosis(
-        epochs=seen,
-        bank=bank.along(),
-        held=lds.held,
-        channel=singles["channel"],
-        other=compared,
-        satellites=_ranges(context, solution),
-        fixes_ns=fixes_ns(run, lds.crossings, config.lds.starts_of_mission, config.undetected),
-    )
+    diagnosis = _diagnosis(context, solution, seen, bank, lds, singles["channel"], compared)
     unnoticed = undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
     monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
     passages = lds.passages.with_columns(unnoticed.passages)
+    fixes = context.run.gnss.filter(pl.col("solution") == solution)
     taken = Solution(solution, fixes, monitored, lds.crossings, passages, balises, found.path)
     return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
+
+
+def _diagnosis(
+    context: _Context,
+    solution: str,
+    seen: pl.DataFrame,
+    bank: MonitorBank,
+    lds: LdsResult,
+    channel: pl.DataFrame,
+    compared: pl.DataFrame | None,
+) -> Diagnosis:
+    """All that watched the solution, for the question what it would not have noticed."""
+    config = context.config
+    return Diagnosis(
+        epochs=seen,
+        bank=bank.along(),
+        held=lds.held,
+        channel=channel,
+        other=compared,
+        satellites=_ranges(context, solution),
+        fixes_ns=fixes_ns(context.run, lds.crossings, config.lds.starts_of_mission, config.undetected),
+    )
 
 
 def _reads_on_odometer(
