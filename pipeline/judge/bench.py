@@ -176,8 +176,7 @@ class Bench:
         if self.odometry is None:
             return found
         since_ns, path_m = self.instants(times_ns(self.accepted)), floats(self.accepted, "path_m")
-        trust, limit_m = self.evidence.trust, hazards.failure_limit_m
-        carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, trust, limit_m)
+        carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, self.config)
         return with_own_anchors(found, positions, carried, hazards)
 
     @cached_property
