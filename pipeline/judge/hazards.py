@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.judge.episodes import Episode, Series
+from pipeline.judge.bench import Bench, Offers, Series
+from pipeline.judge.episodes import Episode
 from pipeline.judge.judgement import WRONG
 from pipeline.judge.jumps import Jump
-from pipeline.judge.offers import Offers
 from schemas.config import HazardConfig
 from schemas.enums import Hazard
 
@@ -30,12 +30,13 @@ class Draft:
     caused_by: Draft | None = None
 
 
-def drafts_of(episodes: Iterable[Episode], series: Series, offers: Offers, config: HazardConfig) -> list[Draft]:
+def drafts_of(episodes: Iterable[Episode], bench: Bench) -> list[Draft]:
     """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
-    drafts: list[Draft] = []
-    for episode in episodes:
-        drafts += _of_episode(episode, series, offers, config)
-    return drafts
+    return [
+        draft
+        for episode in episodes
+        for draft in _of_episode(episode, bench.series, bench.offers, bench.config.hazards)
+    ]
 
 
 def _of_episode(episode: Episode, series: Series, offers: Offers, config: HazardConfig) -> list[Draft]:
@@ -107,7 +108,7 @@ def _class_of(crossed: list[int], offers: Offers) -> Hazard:
     return Hazard.VB_JUMP_1A if len(distinct) > 1 else Hazard.VB_JUMP_1B
 
 
-def size_m(draft: Draft, series: Series, offers: Offers, known_to_m: float) -> float | None:
+def size_m(draft: Draft, bench: Bench) -> float | None:
     """The largest known |e| of the episode with its sign; of a jump back its step, as of a jump without known errors.
 
     Where no error is known closely, the largest that is sure.
@@ -115,8 +116,9 @@ def size_m(draft: Draft, series: Series, offers: Offers, known_to_m: float) -> f
     episode, jump = draft.episode, draft.jump
     if jump is not None and jump is episode.jump_back:
         return jump.step_m
-    lasting = series.judged.take(np.arange(episode.onset, episode.end))
-    hit = offers.judged.take(np.array(draft.hits, dtype=np.int64))
+    known_to_m = bench.config.hazards.known_error_m
+    lasting = bench.series.judged.take(np.arange(episode.onset, episode.end))
+    hit = bench.offers.judged.take(np.array(draft.hits, dtype=np.int64))
     known = np.concatenate([lasting.known_m(known_to_m), hit.known_m(known_to_m)])
     if not np.isfinite(known).any():
         if jump is not None:
@@ -126,13 +128,14 @@ def size_m(draft: Draft, series: Series, offers: Offers, known_to_m: float) -> f
     return float(known[np.argmax(np.abs(known))]) if known.size else None
 
 
-def rate_mps(draft: Draft, series: Series, known_to_m: float) -> float | None:
+def rate_mps(draft: Draft, bench: Bench) -> float | None:
     """Slope of the error from onset to failure [m/s]; None for a step, or where it is not known."""
     episode = draft.episode
     if episode.step is not None or draft.jump is not None:
         return None
     until = episode.mark if episode.failure is None else episode.failure
     part = slice(episode.onset, until + 1)
+    series, known_to_m = bench.series, bench.config.hazards.known_error_m
     error, t_s = series.judged.known_m(known_to_m)[part], (series.t_ns[part] - episode.onset_ns) / 1e9
     known = np.isfinite(error)
     if known.sum() < 2 or np.ptp(t_s[known]) == 0.0:

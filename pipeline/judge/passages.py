@@ -9,9 +9,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.evidence.evidence import NOTHING, within_spans
-from pipeline.judge.bench import Bench
+from pipeline.judge.bench import Bench, Offers
 from pipeline.judge.judgement import judgement_words
-from pipeline.judge.offers import Offers
 from pipeline.judge.passings import Passing
 from schemas.arrays import Bools, Floats, Ints, floats, ints
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
@@ -28,7 +27,6 @@ class Found(NamedTuple):
 
 def passages_table(
     bench: Bench,
-    offers: Offers,
     found: Found,
     passings: dict[str, list[Passing]],
     forward: dict[str, int],
@@ -45,7 +43,7 @@ def passages_table(
     positioned = _within_gap(stamps, ints(t_true), bench.gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
         t_true.cast(pl.Datetime("ns", "UTC")).alias("t_true"),
-        *_of_crossings(passages, offers, found),
+        *_of_crossings(passages, bench.offers, found),
         pl.Series("_positioned", positioned),
         pl.Series("_suspect", _inside(passages, spans)),
         _speeds(passages, t_true, bench),

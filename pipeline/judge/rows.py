@@ -9,11 +9,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.evidence.evidence import KINDS
-from pipeline.judge.bench import Bench
-from pipeline.judge.episodes import Episode, Series
+from pipeline.judge.bench import Bench, Offers
+from pipeline.judge.episodes import Episode
 from pipeline.judge.hazards import Draft, rate_mps, size_m
 from pipeline.judge.judgement import UNKNOWN, WRONG
-from pipeline.judge.offers import Offers
 from pipeline.judge.states import reaction_s
 from pipeline.judge.suspect import suspect_of
 from schemas.arrays import NS_PER_S
@@ -32,12 +31,10 @@ def within_budget(episode: Episode, offers: Offers, budget_s: float) -> bool | N
     return True if proved else None
 
 
-def failures_table(
-    episodes: Sequence[Episode], drafts: Sequence[Draft], series: Series, offers: Offers, bench: Bench
-) -> pl.DataFrame:
+def failures_table(episodes: Sequence[Episode], drafts: Sequence[Draft], bench: Bench) -> pl.DataFrame:
     """One row per episode with time judged wrong in use."""
     first_row = {id(draft.episode): number for number, draft in reversed(list(enumerate(drafts)))}
-    budget_s = bench.config.budget_s
+    series, budget_s = bench.series, bench.config.budget_s
     rows = [
         {
             "t_onset": episode.onset_ns,
@@ -45,7 +42,7 @@ def failures_table(
             "t_end": episode.end_ns,
             "hazardous_s": episode.hazardous_s,
             "hazardous_may_s": episode.hazardous_may_s,
-            "within_budget": within_budget(episode, offers, budget_s),
+            "within_budget": within_budget(episode, bench.offers, budget_s),
             "wrong_track": bool(series.judged.wrong_track[episode.onset : episode.end].any()),
             "hazard_id": first_row.get(id(episode)),
         }
@@ -55,12 +52,7 @@ def failures_table(
     return pl.DataFrame(rows, schema=dtypes(Failures))
 
 
-def hazards_table(
-    drafts: Sequence[Draft],
-    series: Series,
-    offers: Offers,
-    bench: Bench,
-) -> pl.DataFrame:
+def hazards_table(drafts: Sequence[Draft], bench: Bench) -> pl.DataFrame:
     """Rows in order of time; `hazard_id` is the place in `drafts`."""
     ids = {id(draft): number for number, draft in enumerate(drafts)}
     rows = [
@@ -69,12 +61,12 @@ def hazards_table(
             "hazard_id": number,
             "caused_by": None if draft.caused_by is None else ids[id(draft.caused_by)],
             "suspect": suspect_of(bench, draft.episode.onset_ns, draft.episode.end_ns).value,
-            "size_m": size_m(draft, series, offers, bench.config.hazards.known_error_m),
-            "rate_mps": rate_mps(draft, series, bench.config.hazards.known_error_m),
-            "evidence": _evidence(draft, series, offers).value,
-            **_kind(draft, offers),
-            **_instants(draft, series, offers, bench),
-            **_budget(draft, offers, bench),
+            "size_m": size_m(draft, bench),
+            "rate_mps": rate_mps(draft, bench),
+            "evidence": _evidence(draft, bench).value,
+            **_kind(draft, bench.offers),
+            **_instants(draft, bench),
+            **_budget(draft, bench),
         }
         for number, draft in enumerate(drafts)
     ]
@@ -107,14 +99,15 @@ def _failure_mode(draft: Draft, offers: Offers) -> FailureMode:
     return FailureMode.DELETION if offers.beyond_window[draft.hits].any() else FailureMode.NONE
 
 
-def _evidence(draft: Draft, series: Series, offers: Offers) -> Evidence:
+def _evidence(draft: Draft, bench: Bench) -> Evidence:
     """What the judgement of the first VB hit rests on, else that of the mark; the odometer where nothing else is."""
-    kinds = [offers.judged.kind[draft.hits[0]], series.judged.kind[draft.episode.mark]]
+    kinds = [bench.offers.judged.kind[draft.hits[0]], bench.series.judged.kind[draft.episode.mark]]
     known = [KINDS[kind] for kind in kinds if kind >= 0]
     return known[0] if known else Evidence.ODOMETER
 
 
-def _instants(draft: Draft, series: Series, offers: Offers, bench: Bench) -> dict[str, Any]:
+def _instants(draft: Draft, bench: Bench) -> dict[str, Any]:
+    series, offers = bench.series, bench.offers
     episode, jump = draft.episode, draft.jump
     hazard_ns = int(offers.t_ns[draft.hits[0]] if jump is None else series.t_ns[jump.first])
     number = int(offers.number[draft.hits[0]] if jump is None else jump.first)
@@ -154,13 +147,13 @@ def _known(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _budget(draft: Draft, offers: Offers, bench: Bench) -> dict[str, Any]:
+def _budget(draft: Draft, bench: Bench) -> dict[str, Any]:
     episode, budget_s = draft.episode, bench.config.budget_s
     return {
         "hazardous_s": episode.hazardous_s,
         "hazardous_may_s": episode.hazardous_may_s,
         "budget_s": budget_s,
-        "within_budget": within_budget(episode, offers, budget_s),
+        "within_budget": within_budget(episode, bench.offers, budget_s),
     }
 
 
