@@ -11,7 +11,6 @@ from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
-from pipeline.figures.fit_notes import fit_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
@@ -225,7 +224,8 @@ def _reads_on_odometer(
 
 
 def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFrame) -> SolutionResults:
-    name, counts = ride.solution.name, context.counts.solutions[ride.solution.name]
+    name = ride.solution.name
+    counts, fit = context.counts.solutions[name], context.fits[name]
     notes = run_notes(
         context.run,
         context.site,
@@ -236,10 +236,9 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.vehicle,
         context.odometry,
         context.config.align.straight_s,
+        fit,
     )
-    fit = context.fits[name]
-    notes = (*fit_notes(fit), *notes, *reading_notes(ride.aligned, context.config))
-    notes = (*notes, *reference_notes(context.evidence.disputed))
+    notes = (*notes, *reading_notes(ride.aligned, context.config), *reference_notes(context.evidence.disputed))
     return SolutionResults(
         solution=name,
         epochs=epochs,

@@ -15,8 +15,6 @@ from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
 from schemas.config import Configuration
 
-_SAME_M = 0.01
-
 
 @dataclass(frozen=True)
 class Way:
@@ -107,7 +105,7 @@ def _distinct(ways: list[Way]) -> list[Way]:
     kept: dict[tuple[object, ...], Way] = {}
     for way in ways:
         apart_m = way.at_m[-1] - way.at_m[0]
-        kept.setdefault((way.chain.oriented, round(apart_m / _SAME_M)), way)
+        kept.setdefault((way.chain.oriented, round(apart_m, 2)), way)
     return list(kept.values())
 
 

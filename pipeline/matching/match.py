@@ -29,15 +29,13 @@ from schemas.run import Site
 class Match:
     """Epochs on the path, the path, and when it was in doubt.
 
-    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
-    possible at the steps of the search. `odometer_sign`: of the recorded
-    odometer against growing path, set here and nowhere else.
+    `posterior`: elements that are possible at the steps of the search. `odometer_sign`: of the recorded odometer
+    against growing path, set here and nowhere else.
     """
 
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
-    antenna_ahead_m: float
     posterior: Posterior
     odometer_sign: int
 
@@ -73,7 +71,7 @@ def match(
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, sign)
+    return Match(epochs, path, ambiguous, posterior, sign)
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:

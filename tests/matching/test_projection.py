@@ -334,4 +334,4 @@ def test_the_lever_arm_stays_where_it_is_on_a_train_that_begins_by_reversing() -
     forward = matched(fixes, place, distance=odometer(x - 300.0), vehicle=vehicle)
     assert np.allclose(backward.epochs["path_m"], x + 30.0, atol=2e-3)
     assert np.allclose(forward.epochs["path_m"], x - 30.0, atol=2e-3)
-    assert (backward.antenna_ahead_m, forward.antenna_ahead_m) == (-30.0, 30.0)
+    assert (backward.odometer_sign, forward.odometer_sign) == (-1, 1)
