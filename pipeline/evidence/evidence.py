@@ -17,7 +17,7 @@ from pipeline.evidence.anchors import (
     lost_spans,
     read_anchors,
 )
-from pipeline.evidence.carrying import Anchor, Interval, between_anchors, carried, closes
+from pipeline.evidence.carrying import Interval, between_anchors, carried, closes
 from pipeline.evidence.gaps import Gap, Way, gaps_of
 from pipeline.evidence.routes import Route
 from pipeline.odometry import Odometry
@@ -190,7 +190,9 @@ def evidence_of(
             covered.remove(one)
             unknown.append((int(reference.t_ns[one.first]), int(reference.t_ns[one.last]) + 1))
     apart = [one for one in read if not any(c.begin.t_ns <= one.t_ns <= c.end.t_ns for c in covered)]
-    borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
+    borders = sorted(
+        [(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=lambda border: border[0].t_ns
+    )
     gaps: list[Gap] = []
     if odometer is not None and borders:
         least_m = config.matching.orientation_distance_m
@@ -200,10 +202,6 @@ def evidence_of(
     return Evidence(
         reference, tuple(covered), tuple(gaps), odometer, network, config, contradicted, tuple(unknown), disputed
     )
-
-
-def _begin_ns(border: tuple[Anchor, Anchor]) -> int:
-    return border[0].t_ns
 
 
 def _contradicts(gap: Gap, odometer: Odometry | None, config: Configuration) -> bool:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.evidence.carrying import Anchor, beside_m, carried, driven_m
-from pipeline.evidence.routes import Chain, Place, along_m, chains_between, extended
+from pipeline.evidence.routes import Chain, along_m, chains_between, extended
 from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
@@ -91,13 +91,10 @@ def _ways_of_length(
             found = chains_between(network, start, begin.place, goal.place, lengths, back, most)
             if found is None:
                 return None
-            ends = [(0.0, _goal_m(network, chain, goal.place)) for chain in found]
-            ways += [Way(chain, at[::-1] if back else at) for chain, at in zip(found, ends, strict=True)]
+            for chain in found:
+                end_m = chain.entry_m[-1] + along_m(network, chain.oriented[-1], goal.place.measure_m)
+                ways.append(Way(chain, (end_m, 0.0) if back else (0.0, end_m)))
     return _distinct(ways)
-
-
-def _goal_m(network: Network, chain: Chain, goal: Place) -> float:
-    return chain.entry_m[-1] + along_m(network, chain.oriented[-1], goal.measure_m)
 
 
 def _distinct(ways: list[Way]) -> list[Way]:

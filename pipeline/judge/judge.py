@@ -11,17 +11,16 @@ import polars as pl
 from pipeline.epochs.failure_log import failure_log
 from pipeline.evidence.evidence import KINDS, NOTHING, within_spans
 from pipeline.evidence.routes import Place
-from pipeline.judge.across import errors_across, healthy_across
 from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import find_episodes
-from pipeline.judge.hazards import Draft, drafts_of
-from pipeline.judge.judgement import WRONG, judgement_words
-from pipeline.judge.passages import Found, passages_table
+from pipeline.judge.hazards import drafts_of, failures_table, hazards_table
+from pipeline.judge.judgement import judgement_words
+from pipeline.judge.passages import passages_table
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.rows import failures_table, hazards_table
 from pipeline.judge.states import lds_states
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from pipeline.track.geodesy import points_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Evidence
 
 
@@ -46,36 +45,19 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
     log = failure_log(bench.epochs, bench.config.lds.recovery_s)
     episodes = find_episodes(bench, log, faults)
     drafts = drafts_of(episodes, bench)
-    across = _across(bench, reference)
+    heading_deg, hazards = floats(bench.epochs, "heading_deg"), bench.config.hazards
+    limits = hazards.reference_gap_s, hazards.failure_limit_m
+    across = errors_across(bench.solution.fixes, heading_deg, bench.at_ns, reference, *limits)
     spans = [one.undetected_ns(bench.series) for one in episodes]
     return Judged(
         hazards=hazards_table(drafts, bench),
-        alarms=alarms_table(bench, log, _healthy(bench, across), drafts),
-        passages=passages_table(bench, _found(bench, drafts), *_train_passings(bench), spans),
+        alarms=alarms_table(bench, log, healthy_across(bench, across), drafts),
+        passages=passages_table(bench, drafts, *_train_passings(bench), spans),
         failures=failures_table(episodes, drafts, bench),
         epochs_columns=_epochs(bench, spans, across),
         distance_m=_distance_m(bench),
         evidence=_evidence(bench),
     )
-
-
-def _across(bench: Bench, reference: pl.DataFrame | None) -> tuple[Floats, Floats]:
-    """Errors across the track and of height [m]."""
-    heading, hazards = floats(bench.epochs, "heading_deg"), bench.config.hazards
-    limits = hazards.reference_gap_s, hazards.failure_limit_m
-    return errors_across(bench.solution.fixes, heading, bench.at_ns, reference, *limits)
-
-
-def _found(bench: Bench, drafts: Sequence[Draft]) -> Found:
-    """What the hazards say of each offer; inserted: by a jump, on another track, or early and wrong."""
-    judged = bench.offers.judged
-    hazard = np.full(judged.code.size, NOTHING)
-    jumped = np.zeros(judged.code.size, dtype=np.bool_)
-    for number, draft in reversed(list(enumerate(drafts))):
-        hazard[draft.hits] = number
-        jumped[draft.crossed] = True
-    early = (judged.code == WRONG) & ((judged.low_m > 0.0) | judged.wrong_track)
-    return Found(judged.known_m(bench.config.hazards.known_error_m), hazard, jumped | early)
 
 
 def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
@@ -103,12 +85,6 @@ def _look_at(bench: Bench) -> Ints:
         for begin, end in zip(at_ns[long].tolist(), at_ns[long + 1].tolist(), strict=True)
     ]
     return np.unique(np.concatenate([at_ns, *between]))
-
-
-def _healthy(bench: Bench, across: tuple[Floats, Floats]) -> dict[str, Bools]:
-    factor = bench.config.hazards.evidence_factor
-    sigmas = floats(bench.epochs, "sigma_cross_m"), floats(bench.epochs, "sigma_up_m")
-    return healthy_across(across, sigmas, bench.judged.half_m / factor, factor)
 
 
 def _epochs(bench: Bench, spans: Sequence[tuple[int, int]], across: tuple[Floats, Floats]) -> pl.DataFrame:
@@ -145,3 +121,51 @@ def _evidence(bench: Bench) -> Evidence | None:
     """What most epochs rest on."""
     kinds = bench.judged.kind[bench.judged.kind != NOTHING]
     return KINDS[int(np.bincount(kinds).argmax())] if kinds.size else None
+
+
+def errors_across(
+    fixes: pl.DataFrame,
+    heading_deg: Floats,
+    at_ns: Ints,
+    reference: pl.DataFrame | None,
+    gap_s: float,
+    along_limit_m: float,
+) -> tuple[Floats, Floats]:
+    """Position minus reference, left of growing path and upwards [m]; NaN where the reference is silent.
+
+    `fixes`: those of the solution; `at_ns`: the instants that they are judged at. NaN too where the position is more
+    than `along_limit_m` ahead or behind: a curve goes aside by metres over such a way, and a slope up.
+    """
+    nothing = np.full(at_ns.size, np.nan)
+    if reference is None or reference.height < 2:
+        return nothing, nothing
+    stamps = times_ns(reference)
+    x, at = (stamps - stamps[0]) / NS_PER_S, (at_ns - stamps[0]) / NS_PER_S
+    after = np.searchsorted(x, at).clip(1, x.size - 1)
+    silent = (at < x[0]) | (at > x[-1]) | (x[after] - x[after - 1] > gap_s)
+    latitude, longitude, height = (
+        np.where(silent, np.nan, np.interp(at, x, floats(reference, name)))
+        for name in ("latitude_deg", "longitude_deg", "height_m")
+    )
+    known = np.flatnonzero(~silent & np.isfinite(floats(fixes, "latitude_deg")))
+    own = points_of(floats(fixes, "latitude_deg")[known], floats(fixes, "longitude_deg")[known])
+    there = points_of(latitude[known], longitude[known])
+    away = own.surface - there.surface
+    east, north = np.einsum("ij,ij->i", away, own.east), np.einsum("ij,ij->i", away, own.north)
+    heading = np.radians(heading_deg[known])
+    comparable = np.abs(east * np.sin(heading) + north * np.cos(heading)) <= along_limit_m
+    across, up = nothing.copy(), nothing.copy()
+    across[known] = np.where(comparable, north * np.sin(heading) - east * np.cos(heading), np.nan)
+    up[known] = np.where(comparable, (floats(fixes, "height_m") - height)[known], np.nan)
+    return across, up
+
+
+def healthy_across(bench: Bench, errors_m: tuple[Floats, Floats]) -> dict[str, Bools]:
+    """Per axis of the monitors, epochs whose error by the reference is within the noise of both."""
+    factor, healthy = bench.config.hazards.evidence_factor, {}
+    reference_m = np.nan_to_num(bench.judged.half_m / factor)
+    for axis, error_m in zip(("cross", "up"), errors_m, strict=True):
+        noise_m = np.hypot(np.nan_to_num(floats(bench.epochs, f"sigma_{axis}_m")), reference_m)
+        with np.errstate(invalid="ignore"):
+            healthy[f"{axis}_"] = np.abs(error_m) <= factor * noise_m
+    return healthy

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from pipeline.lds.bank_protocol import Bank
-from pipeline.lds.columns import epoch_columns
 from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time, reads_of
-from pipeline.lds.journey import journey_of
+from pipeline.lds.journey import Journey, journey_of
+from pipeline.lds.linking import LrvbChange
 from pipeline.lds.machine import LocationSystem
 from pipeline.lds.passage import passage_rows
 from pipeline.lds.relink import Held
-from schemas.config import Configuration
-from schemas.enums import BaliseKind
+from schemas.arrays import Floats
+from schemas.config import Configuration, LdsConfig
+from schemas.enums import BaliseKind, LdsMode
+from schemas.tables import Epochs
 
 
 @dataclass(frozen=True)
@@ -67,3 +70,80 @@ def run_lds(
         unknown_reads=unknown,
         held=tuple(system.held),
     )
+
+
+def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config: LdsConfig) -> pl.DataFrame:
+    """`t` and the LDS columns, row for row with the journey."""
+    names = [change.lrvb and change.lrvb.balise.balise_id for change in system.lrvb_changes]
+    starts = np.array([change.epoch for change in system.lrvb_changes])
+    index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
+    distance_m, doubt_m = _reported_m(system.lrvb_changes, index, journey, config)
+    columns = [
+        t,
+        _modes(system, index, journey),
+        pl.Series("tvb", system.tvb, dtype=pl.Boolean),
+        pl.Series("lrvb_id", names, dtype=pl.String).gather(index),
+        pl.Series("distance_from_lrvb_m", distance_m).fill_nan(None),
+        pl.Series("doubt_over_m", doubt_m).fill_nan(None),
+        pl.Series("doubt_under_m", doubt_m).fill_nan(None),
+        pl.Series("exposure_s", _exposure_s(system, journey)).fill_nan(None),
+        pl.Series("negated", system.negated, dtype=pl.Boolean),
+        pl.Series("diagnosis_faulty", ~np.array(system.evaluated, dtype=bool)),
+        pl.Series("alarm", system.alarm, dtype=pl.Boolean),
+    ]
+    return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
+
+
+def _modes(system: LocationSystem, index: np.ndarray, journey: Journey) -> pl.Series:
+    linked = np.array(
+        [
+            (change.lrvb is not None and change.lrvb.odometer_m is not None)
+            or (change.chain_begun and journey.has_odometer)
+            for change in system.lrvb_changes
+        ]
+    )[index]
+    modes = [mode.value for mode in LdsMode]
+    in_use = np.where(journey.usable, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
+    mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
+    mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
+    return pl.Series("lds_mode", modes, dtype=Epochs.columns()["lds_mode"].dtype).gather(mode)
+
+
+def _reported_m(
+    changes: list[LrvbChange], index: np.ndarray, journey: Journey, config: LdsConfig
+) -> tuple[Floats, Floats]:
+    """Odometer distance since the LRVB, and the over- and under-reading amount of that report.
+
+    SUBSET-026 3.6.4: location accuracy of the reference plus the odometer's confidence on the way run.
+    """
+    values = [
+        (np.nan, np.nan, np.nan)
+        if (lrvb := change.lrvb) is None
+        else (
+            np.nan if lrvb.odometer_m is None else lrvb.odometer_m,
+            lrvb.travelled_m,
+            lrvb.balise.accuracy_m,
+        )
+        for change in changes
+    ]
+    odometer_m, travelled_m, accuracy_m = np.array(values)[index].T
+    distance_m = np.abs(journey.odometer_m - odometer_m)
+    way_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
+    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * way_m
+
+
+def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
+    """Time since the last linked TVB or accepted VB before this epoch's own validation.
+
+    That is the interval of TVB eq. 7; measured after validation it would hide an outage without epochs.
+    """
+    never = np.iinfo(np.int64).min
+    validated_ns = np.where(system.tvb, journey.t_ns, never)
+    before_ns = np.concatenate(([never], validated_ns[:-1]))[: journey.t_ns.size]
+    for epoch, t_ns in system.accepted_at_ns.items():
+        before_ns[epoch] = max(before_ns[epoch], t_ns)
+    last_ns = np.maximum.accumulate(before_ns)
+    known = last_ns != never
+    exposure_s = np.full(last_ns.size, np.nan)
+    exposure_s[known] = (journey.t_ns[known] - last_ns[known]) * 1e-9
+    return exposure_s

@@ -7,18 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
+from pipeline.matching.doubt import Posterior, rivals_of
 from pipeline.matching.epochs import Assignment, epoch_frame
 from pipeline.matching.find import find_path
-from pipeline.matching.fixes import Fixes, fixes_of
-from pipeline.matching.resolution import digit_noise
-from pipeline.matching.rivals import Posterior, Rivals, rivals_of
+from pipeline.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import polarity
-from pipeline.track.network import network_of
+from pipeline.track.network import network_along, network_of, visits_of
 from pipeline.track.path import TravelledPath
-from pipeline.track.pieces import in_pieces
-from pipeline.track.route import network_along, visits_of
-from pipeline.track.survey import Track, track_of
+from pipeline.track.survey import Track, in_pieces, track_of
 from schemas.arrays import Ints, floats, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
@@ -39,9 +36,9 @@ class Match:
     posterior: Posterior
     odometer_sign: int
 
-    def rivals(self, limit: float) -> Rivals:
-        """Per epoch the net elements whose posterior reaches `limit` there, the path's own among them."""
-        return rivals_of(self.posterior, self.epochs, self.path, limit)
+    def rivals(self, limit: float, index: dict[str, int]) -> tuple[Ints, Ints]:
+        """Epochs and net elements (numbers by `index`) whose posterior reaches `limit` there, the path's own too."""
+        return rivals_of(self.posterior, self.epochs, self.path, index, limit)
 
 
 def match(

@@ -11,14 +11,13 @@ import pytest
 
 from pipeline.evidence.evidence import KINDS, Alternative, EvidenceSet
 from pipeline.evidence.routes import Place, Route
-from pipeline.judge.across import errors_across
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.episodes import Episode, _is_back
-from pipeline.judge.hazards import drafts_of
+from pipeline.judge.hazards import _instants, drafts_of, within_budget
+from pipeline.judge.judge import errors_across
 from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
 from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.rows import _instants, within_budget
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
 from schemas.config import Configuration, HazardConfig, LdsConfig
