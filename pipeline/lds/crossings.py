@@ -13,8 +13,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.lds.journey import Journey
+from pipeline.lds.windows import Window
 from schemas.conform import dtypes
-from schemas.enums import BaliseKind, PassageStatus, Reaction
+from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import Crossings
 
 
@@ -55,6 +56,35 @@ class Crossing:
     absence: PassageStatus | None = None
     offered: bool = False
     status: PassageStatus | None = None
+
+
+_SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
+
+
+@dataclass(slots=True)
+class Passage:
+    """What the train makes of a balise that it passes: a row of `passages` in the making.
+
+    `crossing`: the one that offered it; `t_ns`: of the offer, else when it was settled; `direction`: of travel as
+    known then; `announced_odometer_m`: where the train passes it by linking.
+    """
+
+    balise: Balise
+    t_ns: int
+    direction: int
+    status: PassageStatus = PassageStatus.MISSED
+    crossing: Crossing | None = None
+    window: Window | None = None
+    odometer_distance_m: float | None = None
+    linking_error: LinkingError = LinkingError.NONE
+    reaction: Reaction = Reaction.NONE
+    announced_odometer_m: float | None = None
+
+    def record(self, error: LinkingError, reaction: Reaction) -> None:
+        """The first linking error of a passage stays, the most severe reaction counts."""
+        if self.linking_error is LinkingError.NONE:
+            self.linking_error = error
+        self.reaction = max(self.reaction, reaction, key=_SEVERITY.index)
 
 
 def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:

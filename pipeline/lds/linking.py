@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.lds.crossings import Balise, Crossing
+from pipeline.lds.crossings import Balise, Crossing, Passage
 from pipeline.lds.journey import Journey
-from pipeline.lds.passage import Passage
 from pipeline.lds.windows import Window, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
-from pipeline.lds.bank_protocol import Bank
-from pipeline.lds.crossings import balises_of, crossing_rows, find_crossings, in_order_of_time, reads_of
+from pipeline.lds.crossings import (
+    Crossing,
+    Passage,
+    balises_of,
+    crossing_rows,
+    find_crossings,
+    in_order_of_time,
+    reads_of,
+)
 from pipeline.lds.journey import Journey, journey_of
 from pipeline.lds.linking import LrvbChange
 from pipeline.lds.machine import LocationSystem
-from pipeline.lds.passage import passage_rows
 from pipeline.lds.relink import Held
+from pipeline.monitors.bank import MonitorBank
 from schemas.arrays import Floats
 from schemas.config import Configuration, LdsConfig
-from schemas.enums import BaliseKind, LdsMode
-from schemas.tables import Epochs
+from schemas.conform import dtypes
+from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
+from schemas.tables import Epochs, Passages
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,7 @@ class LdsResult:
 
 def run_lds(
     epochs: pl.DataFrame,
-    bank: Bank,
+    bank: MonitorBank,
     balises: pl.DataFrame,
     balise_reads: pl.DataFrame | None,
     scale_sigma: float | None,
@@ -147,3 +156,58 @@ def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
     exposure_s = np.full(last_ns.size, np.nan)
     exposure_s[known] = (journey.t_ns[known] - last_ns[known]) * 1e-9
     return exposure_s
+
+
+def passage_rows(
+    passages: Sequence[Passage], crossings: Sequence[Crossing], journey: Journey, solution: str
+) -> pl.DataFrame:
+    """Passages in order of time, as in the contract, and `t_reckoned`; `crossings` in order of time."""
+    ids = {id(crossing): number for number, crossing in enumerate(crossings)}
+    rows = [_row(passage, ids, journey, solution) for passage in passages]
+    when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
+    order = sorted(range(len(rows)), key=lambda i: (when[i], passages[i].balise.balise_id))
+    schema = dtypes(Passages) | {"t_reckoned": pl.Datetime("ns", "UTC")}
+    return pl.DataFrame([rows[i] for i in order], schema=schema)
+
+
+def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
+    balise, window, crossing = passage.balise, passage.window, passage.crossing
+    direction = journey.direction_at(passage.t_ns, passage.direction)
+    return {
+        "solution": solution,
+        "balise_id": balise.balise_id,
+        "kind": balise.kind.value,
+        "netelement_id": balise.netelement_id,
+        "measure_m": balise.measure_m,
+        "path_m": balise.path_m,
+        "direction": (Direction.GROWING if direction > 0 else Direction.FALLING).value,
+        "status": passage.status.value,
+        "t_offered": crossing and crossing.t_ns,
+        "window_open_m": window and window.open_m,
+        "window_close_m": window and window.close_m,
+        "odometer_distance_m": passage.odometer_distance_m,
+        "confidence_m": crossing and crossing.confidence_m,
+        "linking_error": passage.linking_error.value,
+        "reaction": passage.reaction.value,
+        "failure_mode": FailureMode.NONE.value,
+        "cause": Cause.NONE.value,
+        "suspect_after_the_fact": False,
+        "location_accuracy_m": balise.accuracy_m,
+        "crossing_id": crossing and ids[id(crossing)],
+        "t_reckoned": _reckoned_ns(passage, journey),
+    }
+
+
+def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
+    """When the odometer last passed the announced place before the passage was settled."""
+    if passage.crossing is not None or passage.announced_odometer_m is None:
+        return None
+    known = np.flatnonzero(np.isfinite(journey.odometer_m) & (journey.t_ns <= passage.t_ns))
+    beyond = (journey.odometer_m[known] - passage.announced_odometer_m) >= 0
+    steps = np.flatnonzero(beyond[1:] != beyond[:-1])
+    if not steps.size:
+        return None
+    i, j = known[steps[-1]], known[steps[-1] + 1]
+    part_m = passage.announced_odometer_m - journey.odometer_m[i]
+    share = float(part_m / (journey.odometer_m[j] - journey.odometer_m[i]))
+    return int(journey.t_ns[i]) + round(share * int(journey.t_ns[j] - journey.t_ns[i]))
