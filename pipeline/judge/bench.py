@@ -123,18 +123,16 @@ class Bench:
     @cached_property
     def odometer_moves(self) -> Bools:
         """Per epoch whether the odometer says that the train moved to the next one."""
-        if self.odometry is None:
-            return np.zeros(self.t_ns.size, dtype=np.bool_)
-        moves = self.odometry.moved(self.at_ns)
-        return np.append(moves, moves[-1:])[: self.t_ns.size]
+        nothing = np.zeros(self.t_ns.size - 1, dtype=np.bool_)
+        return held_on(nothing if self.odometry is None else self.odometry.moved(self.at_ns), self.t_ns.size)
 
     @cached_property
     def odometer_told(self) -> Bools:
         """Per epoch whether the odometer counted from it to the next one."""
-        if self.odometry is None:
-            return np.zeros(self.t_ns.size, dtype=np.bool_)
-        told = np.isfinite(self.odometry.between(self.at_ns[:-1], self.at_ns[1:]).distance_m)
-        return np.append(told, told[-1:])[: self.t_ns.size]
+        nothing = np.full(self.t_ns.size - 1, np.nan)
+        steps = self.at_ns[:-1], self.at_ns[1:]
+        counted_m = nothing if self.odometry is None else self.odometry.between(*steps).distance_m
+        return held_on(np.isfinite(counted_m), self.t_ns.size)
 
     @cached_property
     def stood(self) -> list[tuple[int, int]]:
