@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
 from pipeline.figures.evidence_notes import reading_notes, reference_notes
-from pipeline.figures.fit_notes import fit_notes
 from pipeline.figures.run_notes import run_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
@@ -22,15 +20,13 @@ from pipeline.lds.run import LdsResult, run_lds
 from pipeline.matching import Match, match
 from pipeline.matching.reference import match_reference
 from pipeline.monitors.bank import MonitorBank
-from pipeline.monitors.channels import on_path_of
 from pipeline.monitors.pseudorange import pseudorange_monitor
-from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor
+from pipeline.monitors.single import NO_OTHER_SOLUTION, channel_monitor, doppler_monitor, on_path_of
 from pipeline.odometry import Odometry, odometry_of
 from pipeline.odometry.polarity import polarity
 from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
 from pipeline.results.provenance import Provenance, provenance
-from pipeline.track.network import Network
-from pipeline.track.route import site_network
+from pipeline.track.network import Network, site_network
 from pipeline.undetected.columns import Diagnosis, undetected_of
 from pipeline.undetected.windows import fixes_ns
 from schemas.arrays import floats, times_ns
@@ -109,18 +105,13 @@ def _reference_places(
     found = match_reference(run.reference, site, config.matching, config.hazards, run.balise_reads)
     if found is None:
         return None
-    rivals = found.rivals(config.hazards.rival_probability)
-    index = network.track.index
-    sample = np.repeat(np.arange(len(rivals)), np.diff(rivals.first))
-    element = np.array([index[name] for name in rivals.ids], dtype=np.int64)[rivals.element]
+    rivals = found.rivals(config.hazards.rival_probability, network.track.index)
     sigma_m = floats(run.reference.with_columns(pl.col("sigma_m").fill_null(default_m)), "sigma_m")
     # The leading end faces along growing path where the odometer grows over the first movement.
     path_m, distance_m = floats(found.epochs, "path_m"), config.matching.orientation_distance_m
     facing = 1 if odometry is None else polarity(odometry, times_ns(found.epochs), path_m, distance_m)
     ahead_m = facing * vehicle.gnss_antenna_ahead_m
-    return ReferencePlaces.of(
-        found.epochs, found.path, (sample, element), sigma_m, ahead_m, network.track, config.align
-    )
+    return ReferencePlaces.of(found.epochs, found.path, rivals, sigma_m, ahead_m, network.track, config.align)
 
 
 def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]]:
@@ -240,7 +231,8 @@ def _reads_on_odometer(
 
 
 def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFrame) -> SolutionResults:
-    name, counts = ride.solution.name, context.counts.solutions[ride.solution.name]
+    name = ride.solution.name
+    counts, fit = context.counts.solutions[name], context.fits[name]
     notes = run_notes(
         context.run,
         context.site,
@@ -251,10 +243,9 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.vehicle,
         context.odometry,
         context.config.align.straight_s,
+        fit,
     )
-    fit = context.fits[name]
-    notes = (*fit_notes(fit), *notes, *reading_notes(ride.aligned, context.config))
-    notes = (*notes, *reference_notes(context.evidence.disputed))
+    notes = (*notes, *reading_notes(ride.aligned, context.config), *reference_notes(context.evidence.disputed))
     return SolutionResults(
         solution=name,
         epochs=epochs,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.estimates import Estimates, stamp_jitter_s
 from pipeline.alignment.learning import learn
+from pipeline.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.epochs.verdicts import NO_ODOMETER, first_reason
 from pipeline.monitors.axis import most_scatter_m
 from pipeline.odometry.driven import hysteresis_m, with_hysteresis

@@ -8,8 +8,7 @@ from itertools import pairwise
 import numpy as np
 import polars as pl
 
-from pipeline.alignment.estimates import Estimates
-from pipeline.alignment.odometer_filter import FilterState, ScaleLatencyFilter, estimates_of, prior_of
+from pipeline.alignment.odometer_filter import Estimates, FilterState, ScaleLatencyFilter, estimates_of, prior_of
 from pipeline.epochs.timeline import gap_limit_s
 from pipeline.monitors.axis import (
     BLOCK,

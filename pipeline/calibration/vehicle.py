@@ -27,9 +27,6 @@ _LEAST_POINTS = 20
 # Keeps the covariance well conditioned where epochs repeat.
 _WHITE_SHARE = 0.001
 _ITERATIONS = 4
-# Time before and after an epoch over which its speed is taken. Changes of speed tell the latency; over less time the
-# odometer's noise would pass for such changes, and at constant speed any latency be found, and be sure.
-_SPEED_SPAN_S = 2.0
 # Of what a run seems to tell of the latency, at least so much counts: a sigma stays finite.
 _LEAST_SHARE = 1e-4
 
@@ -166,7 +163,7 @@ def _chance_information(block: Observations, covariance: Floats, odometry: Odome
     The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second,
     beside that of the rows at both ends.
     """
-    span_s = 2.0 * _SPEED_SPAN_S
+    span_s = 2.0 * odometry.config.latency_span_s
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     noise = odometry.noise.white_m2_per_s * np.maximum(span_s - lag, 0.0) / span_s**2
     if odometry.noise.quantisation:
@@ -198,7 +195,8 @@ def _linearised(block: Observations, odometry: Odometry, estimate: Floats) -> tu
 
 def _span(t_s: Floats, odometry: Odometry) -> tuple[Floats, Floats]:
     """Begin and end of the time over which the speed is taken, within what the odometer recorded."""
-    return np.maximum(t_s - _SPEED_SPAN_S, odometry.t_s[0]), np.minimum(t_s + _SPEED_SPAN_S, odometry.t_s[-1])
+    span_s = odometry.config.latency_span_s
+    return np.maximum(t_s - span_s, odometry.t_s[0]), np.minimum(t_s + span_s, odometry.t_s[-1])
 
 
 @dataclass(frozen=True)

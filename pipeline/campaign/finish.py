@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import polars as pl
 
 from pipeline import storage
-from pipeline.figures.derived_tables import derived_tables
+from pipeline.figures.campaign_figures import derived_tables
 from pipeline.results import catalogue, store
 from pipeline.results.manifest import write_manifest
 from pipeline.storage.address import Address, join

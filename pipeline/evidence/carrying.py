@@ -15,33 +15,6 @@ from schemas.enums import Evidence
 
 
 @dataclass(frozen=True)
-class Trust:
-    """How far evidence goes: k sigma, and 5 m + 5 % of the way on one side of an anchor (SUBSET-041 5.3.1.1).
-
-    `slip_m`, `slip_share`: how far a way between two anchors may differ from the odometer's; `routes`: how many chains
-    between them are weighed.
-    """
-
-    factor: float
-    fixed_m: float
-    share: float
-    slip_m: float
-    slip_share: float
-    routes: int
-
-    @classmethod
-    def of(cls, config: Configuration) -> Trust:
-        hazards, lds = config.hazards, config.lds
-        beside = hazards.evidence_factor, lds.odometer_fixed_m, lds.odometer_share
-        return cls(*beside, hazards.slip_m, hazards.slip_share, hazards.routes_limit)
-
-    def beside_m(self, driven_m: Floats, sigma_m: float) -> Floats:
-        """Half the interval on one side of an anchor of this sigma."""
-        half: Floats = max(self.fixed_m, self.factor * sigma_m) + self.share * driven_m
-        return half
-
-
-@dataclass(frozen=True)
 class Anchor:
     """A place known by evidence at an instant."""
 
@@ -54,24 +27,33 @@ class Anchor:
 Interval = tuple[Floats, Floats]
 
 
+def beside_m(driven_m: Floats, sigma_m: float, config: Configuration) -> Floats:
+    """Half the interval on one side of an anchor of this sigma: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
+    lds, noise_m = config.lds, config.hazards.evidence_factor * sigma_m
+    half: Floats = max(lds.odometer_fixed_m, noise_m) + lds.odometer_share * driven_m
+    return half
+
+
 def driven_m(odometer: Odometry, since_ns: Ints, t_ns: Ints) -> Floats:
     """Way driven from instants to others, turns included [m]."""
     driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(since_ns))
     return driven
 
 
-def carried(odometer: Odometry, since_ns: Ints, at_m: Floats, sigma_m: float, t_ns: Ints, trust: Trust) -> Interval:
+def carried(
+    odometer: Odometry, since_ns: Ints, at_m: Floats, sigma_m: float, t_ns: Ints, config: Configuration
+) -> Interval:
     """Least and largest coordinate on one side of anchors of this sigma; NaN where the odometer does not reach.
 
     Of each instant `t_ns` the anchor: when it was, and its coordinate.
     """
     centre = at_m + odometer.between(since_ns, t_ns).distance_m
-    half = trust.beside_m(driven_m(odometer, since_ns, t_ns), sigma_m)
+    half = beside_m(driven_m(odometer, since_ns, t_ns), sigma_m, config)
     return centre - half, centre + half
 
 
 def between_anchors(
-    odometer: Odometry, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, trust: Trust
+    odometer: Odometry, anchors: tuple[Anchor, Anchor], at_m: tuple[float, float], t_ns: Ints, config: Configuration
 ) -> Interval:
     """Least and largest coordinate between two anchors that lie at these coordinates of their route.
 
@@ -81,22 +63,22 @@ def between_anchors(
     ways = [_from(odometer, anchor, t_ns) for anchor in anchors]
     places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
     variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]
-    if odometer.scale is not None and closes(odometer, anchors, at_m[1] - at_m[0], trust):
+    if odometer.scale is not None and closes(odometer, anchors, at_m[1] - at_m[0], config):
         weights = [1.0 / variance for variance in variances]
         centre = (weights[0] * places[0] + weights[1] * places[1]) / (weights[0] + weights[1])
-        half = trust.factor / np.sqrt(weights[0] + weights[1])
+        half = config.hazards.evidence_factor / np.sqrt(weights[0] + weights[1])
         return centre - half, centre + half
-    halves = [trust.factor * np.sqrt(variance) for variance in variances]
+    halves = [config.hazards.evidence_factor * np.sqrt(variance) for variance in variances]
     low = np.minimum(places[0] - halves[0], places[1] - halves[1])
     return low, np.maximum(places[0] + halves[0], places[1] + halves[1])
 
 
-def closes(odometer: Odometry, anchors: tuple[Anchor, Anchor], apart_m: float, trust: Trust) -> bool:
+def closes(odometer: Odometry, anchors: tuple[Anchor, Anchor], apart_m: float, config: Configuration) -> bool:
     """The odometer's way from anchor to anchor is their distance, within k times both roots combined."""
     begin, end = anchors
     way = _from(odometer, begin, np.array([end.t_ns]))
     root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + way.variance_m2)
-    return bool((np.abs(apart_m - way.distance_m) <= trust.factor * root)[0])
+    return bool((np.abs(apart_m - way.distance_m) <= config.hazards.evidence_factor * root)[0])
 
 
 def _from(odometer: Odometry, anchor: Anchor, t_ns: Ints) -> Way:
@@ -109,8 +91,7 @@ def carried_forward(
     t_ns: Ints,
     odometer: Odometry,
     stood: Sequence[tuple[int, int]],
-    trust: Trust,
-    limit_m: float,
+    config: Configuration,
 ) -> Interval:
     """Least and largest path position of the train [m], NaN where no accepted balise reaches.
 
@@ -118,26 +99,27 @@ def carried_forward(
     path), never bridged. It can show that something was wrong, never that it was right. A balise that was accepted
     beyond the limit by the one before is no anchor. `odometer` grows with the path.
     """
-    used = _consistent(accepted_ns, path_m, odometer, trust, limit_m)
+    used = _consistent(accepted_ns, path_m, odometer, config)
     low, high = np.full((2, t_ns.size), np.nan)
     if used.size:
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
         own = used[last[rows]]
-        found = carried(odometer, accepted_ns[own], path_m[own], 0.0, t_ns[rows], trust)
+        found = carried(odometer, accepted_ns[own], path_m[own], 0.0, t_ns[rows], config)
         void = _stood_since(accepted_ns[own], t_ns[rows], stood)
         low[rows], high[rows] = (np.where(void, np.nan, values) for values in found)
     return low, high
 
 
-def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometry, trust: Trust, limit_m: float) -> Ints:
+def _consistent(accepted_ns: Ints, path_m: Floats, odometer: Odometry, config: Configuration) -> Ints:
     """Accepted balises, but for those that the odometer since the one before puts beyond the limit."""
     used: list[int] = []
+    limit_m = config.hazards.failure_limit_m
     for number in range(path_m.size):
         here = slice(number, number + 1)
         if used:
             before = np.array(used[-1:])
-            low, high = carried(odometer, accepted_ns[before], path_m[before], 0.0, accepted_ns[here], trust)
+            low, high = carried(odometer, accepted_ns[before], path_m[before], 0.0, accepted_ns[here], config)
             if path_m[number] < low[0] - limit_m or path_m[number] > high[0] + limit_m:
                 continue
         if odometer.known_at(accepted_ns[here])[0]:

@@ -17,7 +17,7 @@ from pipeline.evidence.anchors import (
     lost_spans,
     read_anchors,
 )
-from pipeline.evidence.carrying import Anchor, Interval, Trust, between_anchors, carried, closes
+from pipeline.evidence.carrying import Interval, between_anchors, carried, closes
 from pipeline.evidence.gaps import Gap, Way, gaps_of
 from pipeline.evidence.routes import Route
 from pipeline.odometry import Odometry
@@ -67,7 +67,7 @@ class Evidence:
     gaps: tuple[Gap, ...]
     odometer: Odometry | None
     network: Network
-    trust: Trust
+    config: Configuration
     contradicted: int
     unknown: tuple[Span, ...]
     disputed: int
@@ -101,7 +101,7 @@ class Evidence:
         rows, before, after = rows[whole], before[whole], after[whole]
         at_m = np.interp((t_ns[rows] - times[0]).astype(np.float64), times - times[0], self.reference.path_m[part])
         sigma = self.reference.sigma_m[part]
-        half = self.trust.factor * np.maximum(sigma[before], sigma[after])
+        half = self.config.hazards.evidence_factor * np.maximum(sigma[before], sigma[after])
         kind[rows] = KINDS.index(Kind.REFERENCE)
         rivals.append(self._rivals(coverage.first + before, coverage.first + after, rows))
         legs = leg[before]
@@ -142,10 +142,10 @@ class Evidence:
         assert self.odometer is not None
         if gap.begin is not None and gap.end is not None:
             begin_m, end_m = way.at_m
-            return between_anchors(self.odometer, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.trust)
+            return between_anchors(self.odometer, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
         (anchor,), (at_m,) = gap.anchors, way.at_m
         since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
-        return carried(self.odometer, since_ns, from_m, anchor.sigma_m, t_ns, self.trust)
+        return carried(self.odometer, since_ns, from_m, anchor.sigma_m, t_ns, self.config)
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
@@ -180,7 +180,7 @@ def evidence_of(
     `reference`: placed on the network by itself; `reads`, `balises`: as in the run and the site; `odometer`: as
     recorded. Anchors are the reads outside the reference's time, and the reference's samples beside its pauses.
     """
-    trust, hazards = Trust.of(config), config.hazards
+    hazards = config.hazards
     read = read_anchors(reads, balises, network.track, hazards)
     covered, disputed, unknown = coverages(reference, odometer, hazards), 0, lost_spans(reference, hazards)
     if reference is not None:
@@ -190,25 +190,23 @@ def evidence_of(
             covered.remove(one)
             unknown.append((int(reference.t_ns[one.first]), int(reference.t_ns[one.last]) + 1))
     apart = [one for one in read if not any(c.begin.t_ns <= one.t_ns <= c.end.t_ns for c in covered)]
-    borders = sorted([(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=_begin_ns)
+    borders = sorted(
+        [(c.begin, c.end) for c in covered] + [(one, one) for one in apart], key=lambda border: border[0].t_ns
+    )
     gaps: list[Gap] = []
     if odometer is not None and borders:
         least_m = config.matching.orientation_distance_m
         facing = set() if reference is None else facing_of(reference, covered, odometer, least_m)
-        gaps = gaps_of(borders, facing, odometer, network, trust)
-    contradicted = sum(_contradicts(gap, odometer, trust) for gap in gaps)
+        gaps = gaps_of(borders, facing, odometer, network, config)
+    contradicted = sum(_contradicts(gap, odometer, config) for gap in gaps)
     return Evidence(
-        reference, tuple(covered), tuple(gaps), odometer, network, trust, contradicted, tuple(unknown), disputed
+        reference, tuple(covered), tuple(gaps), odometer, network, config, contradicted, tuple(unknown), disputed
     )
 
 
-def _begin_ns(border: tuple[Anchor, Anchor]) -> int:
-    return border[0].t_ns
-
-
-def _contradicts(gap: Gap, odometer: Odometry | None, trust: Trust) -> bool:
+def _contradicts(gap: Gap, odometer: Odometry | None, config: Configuration) -> bool:
     """An odometer with the scale of a vehicle file that closes on none of the chains between two anchors."""
     if gap.begin is None or gap.end is None or gap.ways is None or odometer is None or odometer.scale is None:
         return False
     anchors = (gap.begin, gap.end)
-    return not any(closes(odometer, anchors, way.at_m[1] - way.at_m[0], trust) for way in gap.ways)
+    return not any(closes(odometer, anchors, way.at_m[1] - way.at_m[0], config) for way in gap.ways)

@@ -8,13 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.evidence.carrying import Anchor, Trust, carried, driven_m
-from pipeline.evidence.routes import Chain, Place, along_m, chains_between, extended
+from pipeline.evidence.carrying import Anchor, beside_m, carried, driven_m
+from pipeline.evidence.routes import Chain, along_m, chains_between, extended
 from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
-
-_SAME_M = 0.01
+from schemas.config import Configuration
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,11 @@ class Gap:
 
 
 def gaps_of(
-    borders: Sequence[tuple[Anchor, Anchor]], facing: set[int], odometer: Odometry, network: Network, trust: Trust
+    borders: Sequence[tuple[Anchor, Anchor]],
+    facing: set[int],
+    odometer: Odometry,
+    network: Network,
+    config: Configuration,
 ) -> list[Gap]:
     """Gaps before, between and after what is known from one anchor to another, with all chains through each.
 
@@ -53,13 +56,13 @@ def gaps_of(
     first, last = borders[0][0], borders[-1][1]
     found = [Gap(min(odometer.begin_ns, first.t_ns), first.t_ns, None, first, [])]
     for (_, a), (b, _) in pairwise(borders):
-        found += _between(a, b, odometer, network, trust)
+        found += _between(a, b, odometer, network, config)
     found.append(Gap(last.t_ns, max(odometer.end_ns, last.t_ns), last, None, []))
     sheets = _sheets(found, facing, network)
-    return [_reaching(gap, sheets, odometer, network, trust) for gap in found]
+    return [_reaching(gap, sheets, odometer, network, config) for gap in found]
 
 
-def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, trust: Trust) -> list[Gap]:
+def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, config: Configuration) -> list[Gap]:
     """Where the odometer lost distance in a gap, it is two halves that know nothing of each other."""
     if b.t_ns <= a.t_ns:
         return []
@@ -67,10 +70,13 @@ def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, trust: 
     if np.isnan(length_m):
         return [Gap(a.t_ns, b.t_ns, a, None, []), Gap(a.t_ns, b.t_ns, None, b, [])]
     way_m = float(driven_m(odometer, np.array([a.t_ns]), np.array([b.t_ns]))[0])
-    slack_m = float(trust.beside_m(np.array(way_m), 0.0)) + trust.factor * (a.sigma_m + b.sigma_m)
-    ways = _ways_of_length(a, b, length_m, slack_m, network, trust.routes)
+    hazards = config.hazards
+    slack_m = float(beside_m(np.array(way_m), 0.0, config)) + hazards.evidence_factor * (a.sigma_m + b.sigma_m)
+    ways = _ways_of_length(a, b, length_m, slack_m, network, hazards.routes_limit)
     if ways == []:
-        ways = _ways_of_length(a, b, length_m, trust.slip_m + trust.slip_share * way_m, network, trust.routes)
+        ways = _ways_of_length(
+            a, b, length_m, hazards.slip_m + hazards.slip_share * way_m, network, hazards.routes_limit
+        )
     return [Gap(a.t_ns, b.t_ns, a, b, ways)]
 
 
@@ -85,13 +91,10 @@ def _ways_of_length(
             found = chains_between(network, start, begin.place, goal.place, lengths, back, most)
             if found is None:
                 return None
-            ends = [(0.0, _goal_m(network, chain, goal.place)) for chain in found]
-            ways += [Way(chain, at[::-1] if back else at) for chain, at in zip(found, ends, strict=True)]
+            for chain in found:
+                end_m = chain.entry_m[-1] + along_m(network, chain.oriented[-1], goal.place.measure_m)
+                ways.append(Way(chain, (end_m, 0.0) if back else (0.0, end_m)))
     return _distinct(ways)
-
-
-def _goal_m(network: Network, chain: Chain, goal: Place) -> float:
-    return chain.entry_m[-1] + along_m(network, chain.oriented[-1], goal.measure_m)
 
 
 def _distinct(ways: list[Way]) -> list[Way]:
@@ -99,7 +102,7 @@ def _distinct(ways: list[Way]) -> list[Way]:
     kept: dict[tuple[object, ...], Way] = {}
     for way in ways:
         apart_m = way.at_m[-1] - way.at_m[0]
-        kept.setdefault((way.chain.oriented, round(apart_m / _SAME_M)), way)
+        kept.setdefault((way.chain.oriented, round(apart_m, 2)), way)
     return list(kept.values())
 
 
@@ -129,24 +132,24 @@ def _connected(elements: set[int], network: Network) -> bool:
     return elements <= seen
 
 
-def _reaching(gap: Gap, sheets: set[bool], odometer: Odometry, network: Network, trust: Trust) -> Gap:
+def _reaching(gap: Gap, sheets: set[bool], odometer: Odometry, network: Network, config: Configuration) -> Gap:
     """The gap with the chains of the kept orientation, over every branch as far as the odometer says."""
     if gap.ways is None:
         return gap
-    turned = _turned(gap, odometer, trust)
+    turned = _turned(gap, odometer, config)
     ways = gap.ways if len(gap.anchors) == 2 else _from_one_anchor(gap, network)
     reached: list[Way] = []
     for way in ways:
         if network.usable[way.chain.oriented[0]] not in sheets:
             continue
-        chains = extended(network, way.chain, *_reach_m(gap, way, odometer, trust), trust.routes)
+        chains = extended(network, way.chain, *_reach_m(gap, way, odometer, config), config.hazards.routes_limit)
         if chains is None or (turned and any(_branches(chain, network) for chain in chains)):
             return replace(gap, ways=None)
         reached += [replace(way, chain=chain) for chain in chains]
     return replace(gap, ways=reached)
 
 
-def _turned(gap: Gap, odometer: Odometry, trust: Trust) -> bool:
+def _turned(gap: Gap, odometer: Odometry, config: Configuration) -> bool:
     """The train went to and fro in the gap by more than the odometer's own error."""
     t_ns = _looks(gap, odometer)
     for anchor in gap.anchors[:1]:
@@ -154,7 +157,7 @@ def _turned(gap: Gap, odometer: Odometry, trust: Trust) -> bool:
         known = way[np.isfinite(way)]
         if known.size:
             back = min(float((np.maximum.accumulate(sign * known) - sign * known).max()) for sign in (1.0, -1.0))
-            return back > trust.fixed_m
+            return back > config.lds.odometer_fixed_m
     return False
 
 
@@ -176,13 +179,13 @@ def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
     return [Way(Chain((one,), (-along_m(network, one, anchor.place.measure_m),)), (0.0,)) for one in both]
 
 
-def _reach_m(gap: Gap, way: Way, odometer: Odometry, trust: Trust) -> tuple[float, float]:
+def _reach_m(gap: Gap, way: Way, odometer: Odometry, config: Configuration) -> tuple[float, float]:
     """Least and largest coordinate that the train may have come to in the gap [m]."""
     t_ns = _looks(gap, odometer)
     least, most = min(way.at_m), max(way.at_m)
     for anchor, at_m in zip(gap.anchors, way.at_m, strict=True):
         since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
-        low, high = carried(odometer, since_ns, from_m, anchor.sigma_m, t_ns, trust)
+        low, high = carried(odometer, since_ns, from_m, anchor.sigma_m, t_ns, config)
         if np.isfinite(low).any():
             least, most = min(least, float(np.nanmin(low))), max(most, float(np.nanmax(high)))
     return least, most

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import Clock, met
+from pipeline.epochs.clock import Clock, confident, may_move, met, unambiguous
 from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import LdsMode
@@ -22,7 +22,7 @@ def availability_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration
 
     `epochs`: monitored and judged, in order of time. Each epoch counts for the first reason that applies.
     """
-    moving = met(epochs, pl.col("moving").fill_null(value=True))
+    moving = met(epochs, may_move())
     whole_s = float(clock.held_s[moving].sum())
     if whole_s <= 0.0 or not met(epochs, pl.col("moving")).any():
         return ()
@@ -48,12 +48,11 @@ def _reasons(epochs: pl.DataFrame, config: Configuration) -> dict[str, Bools]:
     """Conditions by their words, in the order in which they apply."""
     aside_m = epochs.filter(~pl.col("on_track"))["cross_track_m"].abs().median()
     by = f", usually {aside_m:.0f} m beside it" if isinstance(aside_m, float) else ""
-    limit_m, ambiguous = config.lds.ci_limit_m, config.matching.ambiguity_probability
     return {
         "no fix": ~met(epochs, pl.col("fix_valid")),
         f"positions off the track{by}": ~met(epochs, pl.col("on_track")),
-        f"a confidence interval over {limit_m:g} m": met(epochs, pl.col("confidence_m") > limit_m),
-        "positions that fit more than one track": met(epochs, pl.col("gate_probability") < ambiguous),
+        f"a confidence interval over {config.lds.ci_limit_m:g} m": met(epochs, ~confident(config)),
+        "positions that fit more than one track": met(epochs, ~unambiguous(config)),
         f"an alarm, or the wait for re-linking after it{_loudest(epochs)}": met(
             epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value
         ),

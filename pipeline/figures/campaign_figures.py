@@ -13,13 +13,22 @@ from pipeline.figures.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.figures.campaign_tables import RATES, counted_runs
+from pipeline.figures.campaign_tables import (
+    RATES,
+    campaign_accuracy,
+    campaign_balises,
+    campaign_levels,
+    campaign_runs,
+    counted_runs,
+    with_truth,
+)
 from pipeline.figures.estimates import Estimator, columns_of, continuity_15s, mtbf, with_estimates
 from pipeline.figures.independent import independent_episodes
-from pipeline.figures.levels import level_counts
+from pipeline.figures.map_errors import map_places
 from pipeline.figures.undetected import spacing_of_runs
+from pipeline.figures.verdict import level_counts
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
-from schemas.config import SafetyConfig
+from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform, dtypes
 from schemas.enums import TRUTH, RunStatus, RunVerdict
 
@@ -191,4 +200,20 @@ def _quantiles(values: pl.Series, name: str) -> Row:
         f"{name}_median_s": known.median(),
         f"{name}_p95_s": known.quantile(0.95, interpolation="linear"),
         f"{name}_max_s": known.max(),
+    }
+
+
+def derived_tables(
+    runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
+) -> dict[str, pl.DataFrame]:
+    """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order."""
+    told = with_truth(passages, runs)
+    return {
+        "runs": campaign_runs(runs, hazards, config),
+        "balises": campaign_balises(told),
+        "accuracy": campaign_accuracy(told, config),
+        "figures": measured_figures(runs, hazards, config.safety),
+        "detection": detection_by_level(runs, hazards, config.safety),
+        "levels": campaign_levels(runs, config),
+        "map": map_places(alarms, config.hazards.map_reach_m),
     }

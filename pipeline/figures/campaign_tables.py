@@ -10,9 +10,9 @@ import polars as pl
 from pipeline.figures.bounds import clopper_pearson, poisson_rate
 from pipeline.figures.estimates import Estimator, with_estimates
 from pipeline.figures.independent import independent_episodes
-from pipeline.figures.levels import level_rows
 from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
 from pipeline.figures.undetected import undetected_spread
+from pipeline.figures.verdict import level_rows
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes

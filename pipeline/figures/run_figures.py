@@ -12,7 +12,7 @@ from pipeline.epochs.timeline import availability, outages_s, share_of_time, upt
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
 from pipeline.figures.independent import missed_detection
-from pipeline.figures.levels import LEVEL_LISTS, level_rows
+from pipeline.figures.verdict import LEVEL_LISTS, level_rows
 from schemas.config import Configuration
 from schemas.enums import (
     TRUTH,

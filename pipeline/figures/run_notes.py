@@ -13,6 +13,7 @@ from pipeline.lds.run import LdsResult
 from pipeline.matching import Match
 from pipeline.matching.fixes import contradictory_covariances
 from pipeline.odometry import Odometry
+from pipeline.plausibility.fit import Fit
 from pipeline.site.checks import BALISE_PLACE
 from schemas.arrays import NS_PER_S
 from schemas.config import Vehicle
@@ -31,12 +32,14 @@ def run_notes(
     vehicle: Vehicle,
     odometry: Odometry | None,
     straight_s: float,
+    fit: Fit,
 ) -> tuple[str, ...]:
     """Notes on what went in and what matching and the LDS made of it.
 
     `counts`, `fixes`: the GNSS of this solution. `straight_s`: rows of an odometer may be so far apart [s].
     """
     return (
+        *_misfits(fit),
         *_injected(run),
         *_off_the_track(site),
         *_stamps(counts),
@@ -46,6 +49,13 @@ def run_notes(
         *_ambiguous(found),
         *_linking(lds),
     )
+
+
+def _misfits(fit: Fit) -> Iterator[str]:
+    """What of the run does not fit, the impossible first."""
+    for check in fit.misfits:
+        where = "; `balise inspect RUN --site SITE` prints the lines that correct it" if check.lines else ""
+        yield f"does not fit: {check.sentence}{where}"
 
 
 def _injected(run: RunLog) -> Iterator[str]:
@@ -115,7 +125,7 @@ def _extent_ns(stream: pl.DataFrame) -> tuple[int, int]:
 
 
 def _positions(fixes: pl.DataFrame, found: Match, vehicle: Vehicle) -> Iterator[str]:
-    if found.antenna_ahead_m * vehicle.gnss_antenna_ahead_m < 0:
+    if found.odometer_sign < 0 and vehicle.gnss_antenna_ahead_m:
         yield "the odometer counts down at first, so the train reverses: the sign of gnss_antenna_ahead_m is changed"
     contradictory = contradictory_covariances(fixes)
     if contradictory:

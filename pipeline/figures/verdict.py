@@ -1,14 +1,15 @@
-"""The verdict of a run, and what heads several solutions or runs (DOMAIN section 5.4)."""
+"""The verdict of a run (DOMAIN section 5.4), by service level too (TVB eq. 7), and what heads several runs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
 
-from schemas.enums import RunStatus, RunVerdict
+from schemas.config import Configuration
+from schemas.enums import TRUTH, Evidence, RunStatus, RunVerdict, ThrVerdict
 
 Row = Mapping[str, Any]
 
@@ -99,3 +100,51 @@ def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
     """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
     listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
     return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
+
+
+LEVEL_LISTS = {
+    "service_level": "service_levels",
+    "allowed_s": "level_allowed_s",
+    "within": "level_within",
+    "exceeded": "level_exceeded",
+    "verdict": "level_verdict",
+}
+"""What `level_rows` tells of each service level, and the list of the `runs` table that holds it."""
+
+
+def level_rows(
+    hazardous_s: Sequence[float],
+    hazardous_may_s: Sequence[float],
+    evidence: Evidence | str | None,
+    share_unknown: float | None,
+    config: Configuration,
+) -> list[dict[str, object]]:
+    """The failures of one run against the allowed T_D of each service level, with the verdict on it."""
+    proven = _is_proven(evidence, share_unknown, config.hazards.unknown_share_limit)
+    rows: list[dict[str, object]] = []
+    for level in config.safety.service_levels:
+        allowed_s = config.safety.allowed_time_to_detect_s(level)
+        within, exceeded = level_counts(hazardous_s, hazardous_may_s, allowed_s)
+        verdict = _verdict(len(hazardous_s), within, exceeded, proven=proven).value
+        rows.append(dict(zip(LEVEL_LISTS, (level, allowed_s, within, exceeded, verdict), strict=True)))
+    return rows
+
+
+def level_counts(hazardous_s: Sequence[float], hazardous_may_s: Sequence[float], allowed_s: float) -> tuple[int, int]:
+    """How many failures are within the allowed time whatever is unknown, and how many beyond it for certain."""
+    within = sum(may_s <= allowed_s for may_s in hazardous_may_s)
+    return within, sum(spent_s > allowed_s for spent_s in hazardous_s)
+
+
+def _verdict(failures: int, within: int, exceeded: int, *, proven: bool) -> ThrVerdict:
+    """`proven`: next to nothing of the run is unknown (`_is_proven`), so that no failure can be hidden."""
+    if exceeded:
+        return ThrVerdict.EXCEEDED
+    if within < failures or not proven:
+        return ThrVerdict.UNKNOWN
+    return ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
+
+
+def _is_proven(evidence: Evidence | str | None, share_unknown: float | None, unknown_share_limit: float) -> bool:
+    """A reference or balise reads judge the position in use but for the share that a verdict may leave unknown."""
+    return evidence in TRUTH and share_unknown is not None and share_unknown <= unknown_share_limit

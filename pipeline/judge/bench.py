@@ -12,10 +12,11 @@ from pipeline.epochs.clock import met, unambiguous
 from pipeline.epochs.timeline import crossing_gap_ns
 from pipeline.evidence import Evidence as AllEvidence
 from pipeline.evidence.carrying import carried_forward
-from pipeline.evidence.evidence import KINDS
+from pipeline.evidence.evidence import KINDS, within_spans
 from pipeline.evidence.routes import Route, routes_of_path
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, margins_m, with_own_anchors
-from pipeline.judge.states import odometer_beyond_confidence, stood_spans
+from pipeline.judge.jumps import Jump, find_jumps, steps_of
+from pipeline.judge.states import held_on, in_use_s, odometer_beyond_confidence, stood_spans
 from pipeline.odometry import Odometry
 from pipeline.track.path import TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
@@ -38,6 +39,50 @@ class Solution:
     passages: pl.DataFrame
     balises: pl.DataFrame
     path: TravelledPath
+
+
+@dataclass(frozen=True)
+class Series:
+    """Valid positions of one solution in order of time, judged; `row`: their epochs.
+
+    `path_m`, `train_m`: path positions of position and train (NaN where not known), `direction` of travel along it;
+    `used_s`: for how long each was in use; `sigma_m`: of the position; `jumps` in order of time.
+    """
+
+    row: Ints
+    t_ns: Ints
+    path_m: Floats
+    train_m: Floats
+    direction: Ints
+    judged: Judgements
+    used_s: Floats
+    sigma_m: Floats
+    jumps: list[Jump]
+
+    @property
+    def size(self) -> int:
+        return self.t_ns.size
+
+
+@dataclass(frozen=True)
+class Offers:
+    """Crossings and telegrams, judged; arrays in order of time.
+
+    `number`: the valid position that completes the crossing (`Series`); `beyond_window`: offered after its window
+    closed; `accepted`: a virtual one by the LDS; not `offered`: crossed again before it was re-armed, which only a jump
+    does.
+    """
+
+    crossing_id: Ints
+    balise_id: list[str]
+    t_ns: Ints
+    number: Ints
+    path_m: Floats
+    judged: Judgements
+    virtual: Bools
+    offered: Bools
+    accepted: Bools
+    beyond_window: Bools
 
 
 @dataclass(frozen=True)
@@ -78,18 +123,16 @@ class Bench:
     @cached_property
     def odometer_moves(self) -> Bools:
         """Per epoch whether the odometer says that the train moved to the next one."""
-        if self.odometry is None:
-            return np.zeros(self.t_ns.size, dtype=np.bool_)
-        moves = self.odometry.moved(self.at_ns)
-        return np.append(moves, moves[-1:])[: self.t_ns.size]
+        nothing = np.zeros(self.t_ns.size - 1, dtype=np.bool_)
+        return held_on(nothing if self.odometry is None else self.odometry.moved(self.at_ns), self.t_ns.size)
 
     @cached_property
     def odometer_told(self) -> Bools:
         """Per epoch whether the odometer counted from it to the next one."""
-        if self.odometry is None:
-            return np.zeros(self.t_ns.size, dtype=np.bool_)
-        told = np.isfinite(self.odometry.between(self.at_ns[:-1], self.at_ns[1:]).distance_m)
-        return np.append(told, told[-1:])[: self.t_ns.size]
+        nothing = np.full(self.t_ns.size - 1, np.nan)
+        steps = self.at_ns[:-1], self.at_ns[1:]
+        counted_m = nothing if self.odometry is None else self.odometry.between(*steps).distance_m
+        return held_on(np.isfinite(counted_m), self.t_ns.size)
 
     @cached_property
     def stood(self) -> list[tuple[int, int]]:
@@ -137,7 +180,36 @@ class Bench:
         return self._judge(self.positions, self.at_ns)
 
     @cached_property
-    def offers(self) -> pl.DataFrame:
+    def used_s(self) -> Floats:
+        """For how long each epoch stands for a position in use [s]."""
+        return in_use_s(self.epochs, self.config)
+
+    @cached_property
+    def series(self) -> Series:
+        """The valid positions with their jumps."""
+        row = np.flatnonzero(self.positions.known)
+        at_ns, t_ns, path_m = self.at_ns[row], self.t_ns[row], self.path_m[row]
+        counted_m = np.full(max(row.size - 1, 0), np.nan)
+        if self.odometry is not None:
+            counted_m = self.odometry.between(at_ns[:-1], at_ns[1:]).distance_m
+        steps, direction = (
+            steps_of(t_ns, path_m, self.by_reference_m[row], counted_m, self.gap_ns),
+            self.positions.direction[row],
+        )
+        return Series(
+            row=row,
+            t_ns=t_ns,
+            path_m=path_m,
+            train_m=self.train_m[row],
+            direction=direction,
+            judged=self.judged.take(row),
+            used_s=self.used_s[row],
+            sigma_m=floats(self.epochs, "sigma_along_m")[row],
+            jumps=find_jumps(steps, direction, self.config.hazards),
+        )
+
+    @cached_property
+    def _offered(self) -> pl.DataFrame:
         """Crossings of virtual balises and telegrams, those of a balise not re-armed yet (not `offered`) among them.
 
         `virtual`, and `accepted` (of a virtual one by the LDS), stand beside the columns of the LDS.
@@ -151,24 +223,36 @@ class Bench:
     @cached_property
     def accepted(self) -> pl.DataFrame:
         """The virtual balises that the LDS accepted, in order of time."""
-        return self.offers.filter("accepted").sort("t")
+        return self._offered.filter("accepted").sort("t")
 
     @cached_property
-    def offers_judged(self) -> Judgements:
-        """What the evidence says of every offer: the balise against where the train was."""
-        offers = self.offers
-        index = self.evidence.network.track.index
-        sure = self.positions.unambiguous
+    def offers(self) -> Offers:
+        """What was offered, the balise judged against where the train was."""
+        offered, passages, valid = self._offered, self.solution.passages, self.series.row
+        late = passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
+        index, sure = self.evidence.network.track.index, self.positions.unambiguous
+        t_ns, virtual = times_ns(offered), flags(offered, "virtual")
+        before, epoch = ints(offered["before"]), ints(offered["epoch"])
         positions = Positions(
-            element=offers["netelement_id"].replace_strict(index, default=-1, return_dtype=pl.Int64).to_numpy(),
-            measure_m=floats(offers, "measure_m"),
-            leg=ints(offers["leg"]),
-            path_m=floats(offers, "path_m"),
-            direction=self.positions.direction[ints(offers["before"])],
-            unambiguous=sure[ints(offers["before"])] & sure[ints(offers["epoch"])],
+            element=offered["netelement_id"].replace_strict(index, default=-1, return_dtype=pl.Int64).to_numpy(),
+            measure_m=floats(offered, "measure_m"),
+            leg=ints(offered["leg"]),
+            path_m=floats(offered, "path_m"),
+            direction=self.positions.direction[before],
+            unambiguous=sure[before] & sure[epoch],
         )
-        t_ns = times_ns(offers)
-        return self._judge(positions, np.where(flags(offers, "virtual"), self.instants(t_ns), t_ns))
+        return Offers(
+            crossing_id=ints(offered["crossing_id"]),
+            balise_id=offered["balise_id"].to_list(),
+            t_ns=t_ns,
+            number=np.searchsorted(valid, epoch).clip(0, max(valid.size - 1, 0)),
+            path_m=positions.path_m,
+            judged=self._judge(positions, np.where(virtual, self.instants(t_ns), t_ns)),
+            virtual=virtual,
+            offered=virtual & flags(offered, "offered"),
+            accepted=flags(offered, "accepted"),
+            beyond_window=offered["crossing_id"].is_in(late.drop_nulls().implode()).to_numpy(),
+        )
 
     def _judge(self, positions: Positions, at_ns: Ints) -> Judgements:
         hazards = self.config.hazards
@@ -176,8 +260,7 @@ class Bench:
         if self.odometry is None:
             return found
         since_ns, path_m = self.instants(times_ns(self.accepted)), floats(self.accepted, "path_m")
-        trust, limit_m = self.evidence.trust, hazards.failure_limit_m
-        carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, trust, limit_m)
+        carried = carried_forward(since_ns, path_m, at_ns, self.odometry, self.stood, self.config)
         return with_own_anchors(found, positions, carried, hazards)
 
     @cached_property
@@ -217,3 +300,22 @@ class Bench:
     def gap_ns(self) -> int:
         """Longest time between epochs over which a movement is interpolated."""
         return crossing_gap_ns(self.t_ns, self.config.lds)
+
+    @cached_property
+    def moving(self) -> tuple[Bools, Bools]:
+        """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
+
+        By the reference it moved where it came farther over a second than the dead band and the noise of both places
+        allow. It also tells where the odometer stands or is silent.
+        """
+        t_ns, train_m, noise_m = self.at_ns, self.by_reference_m, self.judged.half_m
+        window_ns = round(self.config.align.speed_window_s * NS_PER_S)
+        ahead = np.searchsorted(t_ns, t_ns + window_ns).clip(0, t_ns.size - 1)
+        still_m = self.config.matching.deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S
+        with np.errstate(invalid="ignore"):
+            came_m = np.abs(train_m[ahead] - train_m)
+            by_reference = came_m > still_m + noise_m + noise_m[ahead]
+        told = np.isfinite(came_m)
+        moves, sure = by_reference | (self.odometer_moves & self.odometer_told), told | self.odometer_told
+        sure &= told | ~within_spans(t_ns, self.stood)
+        return held_on(moves[:-1], t_ns.size), held_on(sure[:-1], t_ns.size)

@@ -8,35 +8,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import FailureLog
-from pipeline.judge.judgement import UNKNOWN, WRONG, Judgements
+from pipeline.judge.bench import Bench, Series
+from pipeline.judge.judgement import UNKNOWN, WRONG
 from pipeline.judge.jumps import Jump
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
+from schemas.arrays import NS_PER_S, Bools, Ints, spans_of
 from schemas.config import HazardConfig
 
 _ODOMETER = "odometer"
-
-
-@dataclass(frozen=True)
-class Series:
-    """Valid positions of one solution in order of time, judged; `row`: their epochs.
-
-    `path_m`, `train_m`: path positions of position and train (NaN where not known), `direction` of travel along it;
-    `used_s`: for how long each was in use; `sigma_m`: of the position; `jumps` in order of time.
-    """
-
-    row: Ints
-    t_ns: Ints
-    path_m: Floats
-    train_m: Floats
-    direction: Ints
-    judged: Judgements
-    used_s: Floats
-    sigma_m: Floats
-    jumps: list[Jump]
-
-    @property
-    def size(self) -> int:
-        return self.t_ns.size
 
 
 @dataclass(frozen=True)
@@ -61,17 +39,23 @@ class Episode:
     hazardous_s: float
     hazardous_may_s: float
 
+    def undetected_ns(self, series: Series) -> tuple[int, int]:
+        """From onset to detection, or to the end; what a step offers on its way lies before its first position."""
+        begin_ns = self.onset_ns
+        if self.step is not None:
+            begin_ns = min(begin_ns, int(series.t_ns[self.step.first - 1]) + 1)
+        return begin_ns, self.end_ns if self.detected_ns is None else self.detected_ns
+
     def holds(self, number: Ints) -> Bools:
         """Valid positions that belong to the episode."""
         inside: Bools = (number >= self.onset) & (number < self.end)
         return inside
 
 
-def find_episodes(
-    series: Series, marked: Bools, log: FailureLog, faults: pl.DataFrame | None, config: HazardConfig
-) -> list[Episode]:
-    """One episode for each time that positions left the evidence; `marked`: also where a VB was offered wrong."""
-    marks = np.flatnonzero((series.judged.code == WRONG) | marked)
+def find_episodes(bench: Bench, log: FailureLog, faults: pl.DataFrame | None) -> list[Episode]:
+    """One episode for each time that positions left the evidence, or offered a VB wrong."""
+    series, config = bench.series, bench.config.hazards
+    marks = np.flatnonzero((series.judged.code == WRONG) | _marked(bench))
     calm_from = _calm_from(series, config)
     quiet = _quiet(series, config)
     episodes: list[Episode] = []
@@ -83,6 +67,15 @@ def find_episodes(
         episodes.append(episode)
         until = max(episode.end, mark + 1, 0 if episode.jump_back is None else episode.jump_back.last + 1)
     return episodes
+
+
+def _marked(bench: Bench) -> Bools:
+    """Valid positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
+    offers, marked = bench.offers, np.zeros(bench.series.size, dtype=np.bool_)
+    marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
+    for jump in bench.series.jumps:
+        marked[jump.first : jump.last + 1] = False
+    return marked
 
 
 def _episode(

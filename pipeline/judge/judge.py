@@ -11,19 +11,16 @@ import polars as pl
 from pipeline.epochs.failure_log import failure_log
 from pipeline.evidence.evidence import KINDS, NOTHING, within_spans
 from pipeline.evidence.routes import Place
-from pipeline.judge.across import errors_across, healthy_across
 from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
-from pipeline.judge.episodes import Episode, Series, find_episodes
-from pipeline.judge.hazards import Draft, drafts_of
-from pipeline.judge.judgement import WRONG, judgement_words
-from pipeline.judge.jumps import find_jumps, steps_of
-from pipeline.judge.offers import Offers
-from pipeline.judge.passages import Found, passages_table
+from pipeline.judge.episodes import find_episodes
+from pipeline.judge.hazards import drafts_of, failures_table, hazards_table
+from pipeline.judge.judgement import judgement_words
+from pipeline.judge.passages import passages_table
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.rows import failures_table, hazards_table
-from pipeline.judge.states import in_use_s, lds_states, moving_by_evidence
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats
+from pipeline.judge.states import lds_states
+from pipeline.track.geodesy import points_of
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Evidence
 
 
@@ -45,74 +42,22 @@ class Judged:
 
 def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | None) -> Judged:
     """Judge one solution; `reference`: as recorded, for errors across the track; `faults`: what was injected."""
-    used_s = in_use_s(bench.epochs, bench.config)
     log = failure_log(bench.epochs, bench.config.lds.recovery_s)
-    series = _series(bench, used_s)
-    offers = Offers.of(bench, series.row)
-    episodes = find_episodes(series, _marked(series, offers), log, faults, bench.config.hazards)
-    drafts = drafts_of(episodes, series, offers, bench.config.hazards)
-    across = _across(bench, reference)
-    spans = [undetected_ns(one, series) for one in episodes]
+    episodes = find_episodes(bench, log, faults)
+    drafts = drafts_of(episodes, bench)
+    heading_deg, hazards = floats(bench.epochs, "heading_deg"), bench.config.hazards
+    limits = hazards.reference_gap_s, hazards.failure_limit_m
+    across = errors_across(bench.solution.fixes, heading_deg, bench.at_ns, reference, *limits)
+    spans = [one.undetected_ns(bench.series) for one in episodes]
     return Judged(
-        hazards=hazards_table(drafts, series, offers, bench),
-        alarms=alarms_table(bench, log, _healthy(bench, across), drafts),
-        passages=passages_table(bench, offers, _found(bench, drafts, offers), *_train_passings(bench), spans),
-        failures=failures_table(episodes, drafts, series, offers, bench),
-        epochs_columns=_epochs(bench, used_s, spans, across),
+        hazards=hazards_table(drafts, bench),
+        alarms=alarms_table(bench, log, healthy_across(bench, across), drafts),
+        passages=passages_table(bench, drafts, *_train_passings(bench), spans),
+        failures=failures_table(episodes, drafts, bench),
+        epochs_columns=_epochs(bench, spans, across),
         distance_m=_distance_m(bench),
         evidence=_evidence(bench),
     )
-
-
-def undetected_ns(episode: Episode, series: Series) -> tuple[int, int]:
-    """From onset to detection, or to the end; what a step offers on its way lies before its first position."""
-    begin_ns = episode.onset_ns
-    if episode.step is not None:
-        begin_ns = min(begin_ns, int(series.t_ns[episode.step.first - 1]) + 1)
-    return begin_ns, episode.end_ns if episode.detected_ns is None else episode.detected_ns
-
-
-def _series(bench: Bench, used_s: Floats) -> Series:
-    """Valid positions with their jumps."""
-    row = np.flatnonzero(bench.positions.known)
-    at_ns, odometry = bench.at_ns[row], bench.odometry
-    counted_m = np.full(max(row.size - 1, 0), np.nan)
-    if odometry is not None:
-        counted_m = odometry.between(at_ns[:-1], at_ns[1:]).distance_m
-    t_ns, path_m = bench.t_ns[row], bench.path_m[row]
-    steps = steps_of(t_ns, path_m, bench.by_reference_m[row], counted_m, bench.gap_ns)
-    jumps = find_jumps(steps, bench.positions.direction[row], bench.config.hazards)
-    sigma_m = floats(bench.epochs, "sigma_along_m")[row]
-    direction = bench.positions.direction[row]
-    return Series(row, t_ns, path_m, bench.train_m[row], direction, bench.judged.take(row), used_s[row], sigma_m, jumps)
-
-
-def _marked(series: Series, offers: Offers) -> Bools:
-    """Valid positions that complete an offer judged wrong; what a jump offers on its way is the jump's."""
-    marked = np.zeros(series.size, dtype=np.bool_)
-    marked[offers.number[offers.offered & (offers.judged.code == WRONG)]] = True
-    for jump in series.jumps:
-        marked[jump.first : jump.last + 1] = False
-    return marked
-
-
-def _across(bench: Bench, reference: pl.DataFrame | None) -> tuple[Floats, Floats]:
-    """Errors across the track and of height [m]."""
-    heading, hazards = floats(bench.epochs, "heading_deg"), bench.config.hazards
-    limits = hazards.reference_gap_s, hazards.failure_limit_m
-    return errors_across(bench.solution.fixes, heading, bench.at_ns, reference, *limits)
-
-
-def _found(bench: Bench, drafts: Sequence[Draft], offers: Offers) -> Found:
-    """What the hazards say of each offer; inserted: by a jump, on another track, or early and wrong."""
-    hazard = np.full(offers.t_ns.size, NOTHING)
-    jumped = np.zeros(offers.t_ns.size, dtype=np.bool_)
-    for number, draft in reversed(list(enumerate(drafts))):
-        hazard[draft.hits] = number
-        jumped[draft.crossed] = True
-    judged = offers.judged
-    early = (judged.code == WRONG) & ((judged.low_m > 0.0) | judged.wrong_track)
-    return Found(judged.known_m(bench.config.hazards.known_error_m), hazard, jumped | early)
 
 
 def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
@@ -142,29 +87,8 @@ def _look_at(bench: Bench) -> Ints:
     return np.unique(np.concatenate([at_ns, *between]))
 
 
-def _healthy(bench: Bench, across: tuple[Floats, Floats]) -> dict[str, Bools]:
-    factor = bench.config.hazards.evidence_factor
-    sigmas = floats(bench.epochs, "sigma_cross_m"), floats(bench.epochs, "sigma_up_m")
-    return healthy_across(across, sigmas, bench.judged.half_m / factor, factor)
-
-
-def _epochs(
-    bench: Bench,
-    used_s: Floats,
-    spans: Sequence[tuple[int, int]],
-    across: tuple[Floats, Floats],
-) -> pl.DataFrame:
-    config, judged = bench.config, bench.judged
-    moving, sure = moving_by_evidence(
-        bench.at_ns,
-        bench.by_reference_m,
-        judged.half_m,
-        bench.odometer_moves,
-        bench.odometer_told,
-        bench.stood,
-        config.matching.deadband_mps,
-        config.align.speed_window_s,
-    )
+def _epochs(bench: Bench, spans: Sequence[tuple[int, int]], across: tuple[Floats, Floats]) -> pl.DataFrame:
+    config, judged, (moving, sure) = bench.config, bench.judged, bench.moving
     suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
     known = np.isfinite(bench.path_m)
     return pl.DataFrame(
@@ -175,7 +99,7 @@ def _epochs(
             pl.Series("error_cross_m", across[0], nan_to_null=True),
             pl.Series("error_up_m", across[1], nan_to_null=True),
             judgement_words(judged.code),
-            pl.Series("in_use", used_s > 0.0),
+            pl.Series("in_use", bench.used_s > 0.0),
             lds_states(bench.epochs, judged, bench.odometer_wrong),
             pl.Series("suspect_after_the_fact", suspect),
             pl.select(pl.when(pl.Series(sure)).then(pl.Series(moving)).alias("moving")).to_series(),
@@ -197,3 +121,51 @@ def _evidence(bench: Bench) -> Evidence | None:
     """What most epochs rest on."""
     kinds = bench.judged.kind[bench.judged.kind != NOTHING]
     return KINDS[int(np.bincount(kinds).argmax())] if kinds.size else None
+
+
+def errors_across(
+    fixes: pl.DataFrame,
+    heading_deg: Floats,
+    at_ns: Ints,
+    reference: pl.DataFrame | None,
+    gap_s: float,
+    along_limit_m: float,
+) -> tuple[Floats, Floats]:
+    """Position minus reference, left of growing path and upwards [m]; NaN where the reference is silent.
+
+    `fixes`: those of the solution; `at_ns`: the instants that they are judged at. NaN too where the position is more
+    than `along_limit_m` ahead or behind: a curve goes aside by metres over such a way, and a slope up.
+    """
+    nothing = np.full(at_ns.size, np.nan)
+    if reference is None or reference.height < 2:
+        return nothing, nothing
+    stamps = times_ns(reference)
+    x, at = (stamps - stamps[0]) / NS_PER_S, (at_ns - stamps[0]) / NS_PER_S
+    after = np.searchsorted(x, at).clip(1, x.size - 1)
+    silent = (at < x[0]) | (at > x[-1]) | (x[after] - x[after - 1] > gap_s)
+    latitude, longitude, height = (
+        np.where(silent, np.nan, np.interp(at, x, floats(reference, name)))
+        for name in ("latitude_deg", "longitude_deg", "height_m")
+    )
+    known = np.flatnonzero(~silent & np.isfinite(floats(fixes, "latitude_deg")))
+    own = points_of(floats(fixes, "latitude_deg")[known], floats(fixes, "longitude_deg")[known])
+    there = points_of(latitude[known], longitude[known])
+    away = own.surface - there.surface
+    east, north = np.einsum("ij,ij->i", away, own.east), np.einsum("ij,ij->i", away, own.north)
+    heading = np.radians(heading_deg[known])
+    comparable = np.abs(east * np.sin(heading) + north * np.cos(heading)) <= along_limit_m
+    across, up = nothing.copy(), nothing.copy()
+    across[known] = np.where(comparable, north * np.sin(heading) - east * np.cos(heading), np.nan)
+    up[known] = np.where(comparable, (floats(fixes, "height_m") - height)[known], np.nan)
+    return across, up
+
+
+def healthy_across(bench: Bench, errors_m: tuple[Floats, Floats]) -> dict[str, Bools]:
+    """Per axis of the monitors, epochs whose error by the reference is within the noise of both."""
+    factor, healthy = bench.config.hazards.evidence_factor, {}
+    reference_m = np.nan_to_num(bench.judged.half_m / factor)
+    for axis, error_m in zip(("cross", "up"), errors_m, strict=True):
+        noise_m = np.hypot(np.nan_to_num(floats(bench.epochs, f"sigma_{axis}_m")), reference_m)
+        with np.errstate(invalid="ignore"):
+            healthy[f"{axis}_"] = np.abs(error_m) <= factor * noise_m
+    return healthy

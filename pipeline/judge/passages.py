@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
 from pipeline.evidence.evidence import NOTHING, within_spans
 from pipeline.judge.bench import Bench
-from pipeline.judge.judgement import judgement_words
-from pipeline.judge.offers import Offers
+from pipeline.judge.hazards import Draft
+from pipeline.judge.judgement import WRONG, judgement_words
 from pipeline.judge.passings import Passing
-from schemas.arrays import Bools, Floats, Ints, floats, ints
+from schemas.arrays import Bools, Ints, floats, ints
 from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LinkingError, PassageStatus, Reaction
 from schemas.tables import Passages
 
 
-class Found(NamedTuple):
-    """Per offer: its error where known closely [m], its hazard (-1 none), and whether it is an insertion."""
-
-    known_m: Floats
-    hazard: Ints
-    inserted: Bools
-
-
 def passages_table(
     bench: Bench,
-    offers: Offers,
-    found: Found,
+    drafts: Sequence[Draft],
     passings: dict[str, list[Passing]],
     forward: dict[str, int],
     spans: Sequence[tuple[int, int]],
@@ -45,7 +35,7 @@ def passages_table(
     positioned = _within_gap(stamps, ints(t_true), bench.gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
         t_true.cast(pl.Datetime("ns", "UTC")).alias("t_true"),
-        *_of_crossings(passages, offers, found),
+        *_of_crossings(passages, bench, drafts),
         pl.Series("_positioned", positioned),
         pl.Series("_suspect", _inside(passages, spans)),
         _speeds(passages, t_true, bench),
@@ -53,19 +43,29 @@ def passages_table(
     return _with_failures(frame).select(Passages.column_names())
 
 
-def _of_crossings(passages: pl.DataFrame, offers: Offers, found: Found) -> pl.DataFrame:
-    """Judgement, error, hazard and insertion of the crossing that each passage rests on."""
-    judged = pl.DataFrame(
+def _of_crossings(passages: pl.DataFrame, bench: Bench, drafts: Sequence[Draft]) -> pl.DataFrame:
+    """Judgement, error, hazard and insertion of the crossing that each passage rests on.
+
+    Inserted is one by a jump, on another track, or early and wrong.
+    """
+    offers, judged = bench.offers, bench.offers.judged
+    hazard, jumped = np.full(judged.code.size, NOTHING), np.zeros(judged.code.size, dtype=np.bool_)
+    for number, draft in reversed(list(enumerate(drafts))):
+        hazard[draft.hits] = number
+        jumped[draft.crossed] = True
+    early = (judged.code == WRONG) & ((judged.low_m > 0.0) | judged.wrong_track)
+    known_m = judged.known_m(bench.config.hazards.known_error_m)
+    judged_crossings = pl.DataFrame(
         [
             pl.Series("crossing_id", offers.crossing_id, dtype=pl.Int64),
-            judgement_words(offers.judged.code),
-            pl.Series("location_error_m", found.known_m, nan_to_null=True),
-            pl.Series("hazard_id", found.hazard).replace(NOTHING, None),
-            pl.Series("_inserted", found.inserted),
+            judgement_words(judged.code),
+            pl.Series("location_error_m", known_m, nan_to_null=True),
+            pl.Series("hazard_id", hazard).replace(NOTHING, None),
+            pl.Series("_inserted", jumped | early),
             pl.Series("_virtual", offers.virtual),
         ]
     )
-    told = passages.select("crossing_id").join(judged, on="crossing_id", how="left", maintain_order="left")
+    told = passages.select("crossing_id").join(judged_crossings, on="crossing_id", how="left", maintain_order="left")
     return told.select(
         pl.when("_virtual").then("judgement"),
         "location_error_m",

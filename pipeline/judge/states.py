@@ -99,33 +99,7 @@ def stood_spans(
     return found
 
 
-def moving_by_evidence(
-    t_ns: Ints,
-    train_m: Floats,
-    noise_m: Floats,
-    odometer_moves: Bools,
-    known: Bools,
-    stood: list[tuple[int, int]],
-    deadband_mps: float,
-    window_s: float,
-) -> tuple[Bools, Bools]:
-    """Per epoch whether the train moved to the next one, and whether that is known: by reference or odometer.
-
-    `train_m`: its place by the reference, NaN elsewhere, known to `noise_m`: over `window_s` it moved where it came
-    farther than the dead band and that noise allow. It also tells where the odometer stands or is silent.
-    """
-    ahead = np.searchsorted(t_ns, t_ns + round(window_s * NS_PER_S)).clip(0, t_ns.size - 1)
-    with np.errstate(invalid="ignore"):
-        came_m = np.abs(train_m[ahead] - train_m)
-        by_reference = came_m > deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S + noise_m + noise_m[ahead]
-    told = np.isfinite(came_m)
-    moves, sure = by_reference | (odometer_moves & known), told | known
-    for begin_ns, end_ns in stood:
-        sure &= told | (t_ns < begin_ns) | (t_ns >= end_ns)
-    return _held(moves[:-1], t_ns.size), _held(sure[:-1], t_ns.size)
-
-
-def _held(steps: Bools, size: int) -> Bools:
-    """Nothing follows upon the last epoch, which stays as it was before."""
+def held_on(steps: Bools, size: int) -> Bools:
+    """What holds from each epoch to the next; nothing follows upon the last one, which stays as it was before."""
     last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
     return np.concatenate([steps, last])[:size]

@@ -2,7 +2,7 @@
 
 In: aligned epochs of one solution, a monitor bank, balises of the path, telegrams with the odometer at each.
 Out: LDS columns of the epochs, the table of crossings, passages.
-Touches no file, knows of no truth, and asks the monitors only through `bank_protocol`.
+Touches no file, knows of no truth, and asks the monitors only through `MonitorBank`.
 
 Where the sources leave a choice, this package reads them so:
 
@@ -37,7 +37,6 @@ Where the sources leave a choice, this package reads them so:
 - Exposure at an epoch is the time since the TVB or accepted VB before it, so a gap without epochs shows.
 """
 
-from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.run import LdsResult, run_lds
 
-__all__ = ["Bank", "LdsResult", "run_lds"]
+__all__ = ["LdsResult", "run_lds"]

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from math import isnan
 
 import numpy as np
 import polars as pl
 
 from pipeline.lds.journey import Journey
+from pipeline.lds.windows import Window
 from schemas.conform import dtypes
-from schemas.enums import BaliseKind, PassageStatus, Reaction
+from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import Crossings
 
 
@@ -34,21 +34,14 @@ class Balise:
     reaction: Reaction
 
 
-class Seen(Enum):
-    """How a balise was passed: between near epochs (or read), in a gap, or in a gap with positions off all track."""
-
-    CROSSED = "crossed"
-    IN_GAP = "in gap"
-    UNPLACED = "unplaced"
-
-
 @dataclass(slots=True, eq=False)
 class Crossing:
     """The position passes a virtual balise, or the reader reads a physical one.
 
     `before`, `epoch`: rows of the epochs around it. `sense`: +1 where the position passes the balise along growing
     path; `direction`: direction of travel as known at `epoch`. Time, odometer and way run are interpolated; after a
-    gap they are those of `epoch`. `offered`, `status`: what became of it, as in `Crossings`.
+    gap they are those of `epoch`. `absence`: what to say of it in a gap, None between near epochs and of telegrams.
+    `offered`, `status`: what became of it, as in `Crossings`.
     """
 
     balise: Balise
@@ -60,9 +53,38 @@ class Crossing:
     odometer_m: float | None
     travelled_m: float
     confidence_m: float | None
-    seen: Seen = Seen.CROSSED
+    absence: PassageStatus | None = None
     offered: bool = False
     status: PassageStatus | None = None
+
+
+_SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)
+
+
+@dataclass(slots=True)
+class Passage:
+    """What the train makes of a balise that it passes: a row of `passages` in the making.
+
+    `crossing`: the one that offered it; `t_ns`: of the offer, else when it was settled; `direction`: of travel as
+    known then; `announced_odometer_m`: where the train passes it by linking.
+    """
+
+    balise: Balise
+    t_ns: int
+    direction: int
+    status: PassageStatus = PassageStatus.MISSED
+    crossing: Crossing | None = None
+    window: Window | None = None
+    odometer_distance_m: float | None = None
+    linking_error: LinkingError = LinkingError.NONE
+    reaction: Reaction = Reaction.NONE
+    announced_odometer_m: float | None = None
+
+    def record(self, error: LinkingError, reaction: Reaction) -> None:
+        """The first linking error of a passage stays, the most severe reaction counts."""
+        if self.linking_error is LinkingError.NONE:
+            self.linking_error = error
+        self.reaction = max(self.reaction, reaction, key=_SEVERITY.index)
 
 
 def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
@@ -114,9 +136,9 @@ def _in_order(balises: Sequence[Balise], before: int, after: int) -> Iterator[tu
 
 
 def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int) -> Crossing:
-    seen, share = _seen(journey, before, k), 1.0
+    near, share = bool(journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns), 1.0
     t_ns, path_m, odometer_m = journey.t_ns, journey.path_m, journey.odometer_m
-    if seen is Seen.CROSSED:
+    if near:
         share = float((balise.path_m - path_m[before]) / (path_m[k] - path_m[before]))
     back_m = 0.0 if share == 1.0 else (1.0 - share) * float(odometer_m[k] - odometer_m[before])
     direction = int(journey.direction[k]) if journey.has_odometer else sense
@@ -130,14 +152,8 @@ def _crossing(journey: Journey, balise: Balise, before: int, k: int, sense: int)
         odometer_m=_known(float(odometer_m[k]) - back_m),
         travelled_m=float(journey.travelled_m[k]) - back_m * direction,
         confidence_m=_known(float(journey.confidence_m[k])),
-        seen=seen,
+        absence=None if near else journey.absence(slice(before + 1, k)),
     )
-
-
-def _seen(journey: Journey, before: int, k: int) -> Seen:
-    if journey.t_ns[k] - journey.t_ns[before] <= journey.gap_ns:
-        return Seen.CROSSED
-    return Seen.UNPLACED if journey.placed_nowhere[before + 1 : k].any() else Seen.IN_GAP
 
 
 def _known(value: float) -> float | None:

@@ -7,7 +7,7 @@ from math import isnan
 
 import numpy as np
 
-from pipeline.lds.crossings import Balise, Crossing, Seen
+from pipeline.lds.crossings import Balise, Crossing
 from pipeline.lds.journey import Journey, turning_epochs
 from pipeline.lds.link_monitors import LinkOrder, disorder
 from pipeline.lds.linking import LinkingChain
@@ -53,16 +53,8 @@ class BaliseDetection:
 
     def turn(self, k: int) -> None:
         """Both chains learn that the train goes another way from this epoch on."""
-        if k not in self._turns:
-            return
-        journey = self._journey
-        for chain in (self.virtual, self.physical):
-            chain.turn(
-                float(journey.odometer_m[k]),
-                float(journey.travelled_m[k]),
-                int(journey.direction[k]),
-                int(journey.leg[k]),
-            )
+        for chain in (self.virtual, self.physical) if k in self._turns else ():
+            chain.turn(self._journey, k)
 
     def read(self, k: int) -> list[Crossing]:
         """Telegrams accepted by the rules of linking; only windows can reject them, no monitor."""
@@ -78,12 +70,10 @@ class BaliseDetection:
         for crossing in self._at[BaliseKind.VIRTUAL].get(k, ()):
             if self._disarmed.holds(crossing.balise):
                 self.virtual.cross_again(crossing)
-            elif crossing.seen is Seen.CROSSED:
+            elif crossing.absence is None:
                 offered.append(crossing)
             else:
-                unplaced = crossing.seen is Seen.UNPLACED
-                status = PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
-                self.virtual.pass_unoffered(crossing, status)
+                self.virtual.pass_unoffered(crossing, crossing.absence)
                 self._disarmed.add(crossing)
         if not offered:
             return [], False
@@ -133,10 +123,7 @@ class BaliseDetection:
 
     def _absence(self, k: int) -> PassageStatus:
         """What to say of a balise that the train has passed and the position has not."""
-        if not self._journey.blind[k]:
-            return PassageStatus.MISSED
-        unplaced = bool(self._journey.placed_nowhere[k])
-        return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
+        return self._journey.absence(slice(k, k + 1)) if self._journey.blind[k] else PassageStatus.MISSED
 
     def _order_fails(self, k: int, offered: list[Crossing], overdue: int) -> bool:
         if not self.order.is_evaluated(k):

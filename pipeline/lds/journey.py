@@ -65,6 +65,11 @@ class Journey:
     def has_odometer(self) -> bool:
         return bool(np.isfinite(self.odometer_m).any())
 
+    def absence(self, epochs: slice) -> PassageStatus:
+        """What to say of a balise passed while no position was on the path: off all track, or none."""
+        unplaced = self.placed_nowhere[epochs].any()
+        return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
+
     def direction_at(self, t_ns: int, otherwise: int) -> int:
         """Direction of travel at a time, turns as they were; `otherwise` where there is no odometer."""
         if not self.has_odometer:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.lds.crossings import Balise, Crossing
-from pipeline.lds.passage import Passage
+from pipeline.lds.crossings import Balise, Crossing, Passage
+from pipeline.lds.journey import Journey
 from pipeline.lds.windows import Window, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction
@@ -88,12 +88,13 @@ class LinkingChain:
         if self.linking:
             self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
-    def turn(self, odometer_m: float, travelled_m: float, direction: int, leg: int) -> None:
-        """The train goes the other way, or on another leg: expect what lies on its new way."""
+    def turn(self, journey: Journey, k: int) -> None:
+        """The train goes the other way from this epoch on, or on another leg: expect what lies on its new way."""
         if self.reference is None or not self.linking:
             return
-        self._direction, self._leg = direction, leg
-        self._turn = _Turn(self._distance_m(odometer_m), travelled_m - self.reference.travelled_m)
+        self._direction, self._leg = int(journey.direction[k]), int(journey.leg[k])
+        travelled_m = float(journey.travelled_m[k]) - self.reference.travelled_m
+        self._turn = _Turn(self._distance_m(float(journey.odometer_m[k])), travelled_m)
         for kept in (self._own, self._set_aside, self._unoffered):
             kept.clear()
         windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel()]

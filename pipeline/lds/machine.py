@@ -9,13 +9,13 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 
-from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.crossings import Balise, Crossing
 from pipeline.lds.detection import BaliseDetection
 from pipeline.lds.journey import Journey, mission_epochs, segment_epochs
 from pipeline.lds.link_monitors import LinkDistance
 from pipeline.lds.linking import LrvbChange
 from pipeline.lds.relink import Anchor, Held, Recovery, Relink, breaks
+from pipeline.monitors.bank import MonitorBank
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.enums import BaliseKind
@@ -30,7 +30,7 @@ class LocationSystem:
     def __init__(
         self,
         journey: Journey,
-        bank: Bank,
+        bank: MonitorBank,
         balises: dict[BaliseKind, list[Balise]],
         crossings: Sequence[Crossing],
         config: Configuration,

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.lds.bank_protocol import Bank
 from pipeline.lds.crossings import Crossing
 from pipeline.lds.journey import Journey
+from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from schemas.arrays import NS_PER_S
 from schemas.config import AlignConfig, Configuration, LdsConfig
@@ -154,7 +154,7 @@ class Relink:
 class Recovery:
     """One negation: since when nothing has failed fast."""
 
-    def __init__(self, k: int, journey: Journey, bank: Bank, config: LdsConfig) -> None:
+    def __init__(self, k: int, journey: Journey, bank: MonitorBank, config: LdsConfig) -> None:
         self._journey, self._bank = journey, bank
         self._recovery_ns = config.recovery_s * NS_PER_S
         self._failed_at_ns = self._seen_at_ns = int(journey.t_ns[k])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -70,11 +70,7 @@ class Candidates:
         return replace(self, step=step, first=np.searchsorted(step, np.arange(int(kept.sum()) + 1)))
 
 
-_COLUMNS = (
-    *("step", "element", "along_m", "left_m", "beyond_m", "offset_m"),
-    *("distance_m", "height_m", "heading_rad", "survey_sigma_m", "past"),
-    *("linked_start", "linked_end"),
-)
+_COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != "first")
 
 
 def segments_of(track: Track) -> Segments:

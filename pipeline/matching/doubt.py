@@ -1,4 +1,4 @@
-"""How sure the path is: at each step, and as stretches of doubt."""
+"""How sure the path is: at each step, as stretches of doubt, and which other net elements are possible."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pipeline.matching.fixes import Fixes
 from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
 from pipeline.track.network import Network
+from pipeline.track.path import TravelledPath
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
 
@@ -121,3 +122,58 @@ def _elements_about(decoded: Decoded, leg: int, number: int) -> Ints:
 
 def _share(values: Floats, first: Ints) -> Floats:
     return np.clip(np.add.reduceat(values, first[:-1]), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Per step of the search its net elements in order, and how probable each is by the whole run.
+
+    `epoch[k]` is the row of step k; `first[k] : first[k + 1]` are its elements, as numbers of the path's track.
+    """
+
+    epoch: Ints
+    first: Ints
+    element: Ints
+    probability: Floats
+
+
+def posterior_of(trellis: Trellis, found: Found) -> Posterior:
+    """Probability of each element at each step: of all its states together."""
+    step = np.repeat(np.arange(len(trellis)), np.diff(trellis.first))
+    count = trellis.network.count
+    keys, inverse = np.unique(step * count + trellis.oriented // 2, return_inverse=True)
+    probability = np.asarray(np.bincount(inverse, found.posterior, len(keys)), dtype=np.float64)
+    first = np.searchsorted(keys // count, np.arange(len(trellis) + 1))
+    return Posterior(trellis.steps.epoch, first, (keys % count).astype(np.int64), probability)
+
+
+def rivals_of(
+    posterior: Posterior, epochs: pl.DataFrame, path: TravelledPath, index: dict[str, int], limit: float
+) -> tuple[Ints, Ints]:
+    """Pairs of epoch and net element (numbers by `index`): of at least `limit` at the steps about it, and its own."""
+    names = epochs["netelement_id"].replace_strict(index, default=None, return_dtype=pl.Int64)
+    rows = np.flatnonzero(names.is_not_null().to_numpy())
+    pairs = [np.column_stack([rows, names.drop_nulls().to_numpy()])]
+    number = np.array([index[name] for name in path.track.ids], dtype=np.int64)
+    pairs += [_at_steps(posterior, number, side, limit) for side in _sides(posterior, epochs.height)]
+    keys = np.unique(np.concatenate(pairs) @ np.array([len(index), 1]))
+    return keys // len(index), keys % len(index)
+
+
+def _sides(posterior: Posterior, epochs: int) -> tuple[Ints, Ints]:
+    """Per epoch the step at or before it, and the step at or after it."""
+    row, last = np.arange(epochs), len(posterior.epoch) - 1
+    before = np.searchsorted(posterior.epoch, row, side="right") - 1
+    after = np.searchsorted(posterior.epoch, row, side="left")
+    return np.maximum(before, 0), np.minimum(after, last)
+
+
+def _at_steps(posterior: Posterior, number: Ints, step: Ints, limit: float) -> Ints:
+    """Pairs of epoch and element number, of those that reach the limit at each epoch's step."""
+    kept = posterior.probability >= limit
+    first = np.concatenate([[0], np.cumsum(kept)])[posterior.first]
+    element = number[posterior.element[kept]]
+    count = np.diff(first)[step]
+    row = np.repeat(np.arange(len(step)), count)
+    inside = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+    return np.column_stack([row, element[first[step][row] + inside]])

@@ -60,14 +60,14 @@ def epoch_frame(
     track too (`on_track` false), and goes on straight beyond the ends of the path.
     """
     feet = path.feet(fixes.points, found.leg, fixes.valid, found.near_path_m)
-    places = path.places(found.leg, feet, fixes.height_m)
-    path_m = places.path_m - vehicle.gnss_antenna_ahead_m
+    antenna_m, vertical_m = path.places(found.leg, feet, fixes.height_m)
+    path_m = antenna_m - vehicle.gnss_antenna_ahead_m
     element, measure_m = path.locate_index(found.leg, path_m)
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
-    shape = shape_at(path, found.leg, places.path_m)
+    shape = shape_at(path, found.leg, antenna_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
     allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
-    distance_m = np.nan_to_num(places.distance_m, nan=np.inf)
+    distance_m = np.nan_to_num(feet.distance_m, nan=np.inf)
     on_track = fixes.valid & (distance_m <= np.nan_to_num(allowed_m))
     source = np.where(fixes.valid, np.where(fixes.from_receiver, 0, 1), -1)
     columns: dict[str, npt.NDArray[Any] | pl.Series] = {
@@ -75,8 +75,8 @@ def epoch_frame(
         "netelement_id": _words(path.track.ids, element, pl.String()),
         "measure_m": measure_m,
         "path_m": path_m,
-        "cross_track_m": places.cross_m,
-        "vertical_m": places.vertical_m,
+        "cross_track_m": feet.offset_m,
+        "vertical_m": vertical_m,
         "on_track": on_track,
         "near_track": fixes.valid & (distance_m <= config.reach_m),
         "path_probability": np.where(on_track, found.path_probability, np.nan),

@@ -8,23 +8,22 @@ from scipy.spatial import cKDTree
 
 from pipeline.matching.candidates import Candidates, Segments, candidates_of, merged, segments_of
 from pipeline.matching.decode import Decoded, aligned, decode, legs_of, positions_m
-from pipeline.matching.diagnosis import off_the_network
-from pipeline.matching.doubt import Doubt, doubt_of, stretches
+from pipeline.matching.doubt import Doubt, Posterior, doubt_of, posterior_of, stretches
 from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
-from pipeline.matching.jumps import with_tracks_aside
 from pipeline.matching.likelihood import likelihood_of
-from pipeline.matching.rivals import Posterior, posterior_of
 from pipeline.matching.search import search
 from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import grows_with
+from pipeline.track.geodesy import points_of
 from pipeline.track.network import Network
 from pipeline.track.path import TravelledPath
-from pipeline.track.survey import end_places
+from pipeline.track.survey import Track, end_places
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
+from schemas.errors import InputError
 
 # An element past whose end a position lies by more is no candidate, unless the track ends there.
 _BEYOND_M = 15.0
@@ -152,3 +151,77 @@ def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: D
     share = np.divide(elapsed, end_s - begin_s, out=np.zeros(len(fixes)), where=end_s > begin_s)
     moved_m = np.where(decoded.leg[last] == decoded.leg[following], at_m[following] - at_m[last], 0.0)
     return Assignment(leg, at_m[last] + share * moved_m, doubt.posterior[last], doubt.gate[last])
+
+
+def with_tracks_aside(
+    found: Candidates,
+    fixes: Fixes,
+    believed: Ints,
+    steps: Steps,
+    network: Network,
+    segments: Segments,
+    config: MatchingConfig,
+) -> Candidates:
+    """About jumps, also candidates as far off as the jump was long, on elements that are candidates elsewhere.
+
+    A receiver that was lost for a minute shows positions on other tracks, some of them within reach. The track that the
+    train is on all the while must stay possible, however far off, or the search could only explain the jump by another
+    track for the whole run.
+    """
+    aside_m = _aside_m(fixes, believed, steps, config)
+    wider = np.flatnonzero(aside_m > 0)
+    if len(wider) == 0:
+        return found
+    far = candidates_of(fixes.points.take(steps.epoch[wider]), network, segments, float(aside_m.max()) + config.reach_m)
+    known = found.step * network.count + found.element
+    step = wider[far.step]
+    kept = (far.distance_m <= aside_m[step] + config.reach_m) & np.isin(far.element, np.unique(found.element))
+    kept &= ~np.isin(step * network.count + far.element, known)
+    kept &= (far.past == 0) | ~np.where(far.past < 0, far.linked_start, far.linked_end)
+    return merged(found, far.take(np.flatnonzero(kept), len(wider)), wider)
+
+
+def _aside_m(fixes: Fixes, believed: Ints, steps: Steps, config: MatchingConfig) -> Floats:
+    """Per step the length of the longest jump about it [m], 0 where there is none."""
+    usable = np.cumsum(fixes.valid)
+    after = np.flatnonzero(np.diff(usable[believed]) > 1) + 1
+    size = np.linalg.norm(fixes.points.surface[believed[after]] - fixes.points.surface[believed[after - 1]], axis=1)
+    t_s, begin_s, end_s = fixes.t_s[steps.epoch], fixes.t_s[believed[after - 1]], fixes.t_s[believed[after]]
+    first = np.searchsorted(t_s, begin_s - config.jump_aside_s)
+    last = np.searchsorted(t_s, end_s + config.jump_aside_s, side="right")
+    aside_m = np.zeros(len(steps))
+    for one, (low, high) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        aside_m[low:high] = np.maximum(aside_m[low:high], min(float(size[one]), config.jump_aside_m))
+    return aside_m
+
+
+def off_the_network(fixes: Fixes, track: Track, config: MatchingConfig) -> InputError:
+    """The error for a run of which no epoch is within reach of any track."""
+    tree = cKDTree(points_of(track.latitude_deg, track.longitude_deg).surface)
+    rows = np.flatnonzero(fixes.valid)
+    nearest_m, vertex = tree.query(fixes.points.surface[rows])
+    row = int(np.argmin(nearest_m))
+    swapped = points_of(fixes.longitude_deg[rows], fixes.latitude_deg[rows]).surface
+    swapped_m, _ = tree.query(swapped)
+    latitude, longitude = fixes.latitude_deg[rows[row]], fixes.longitude_deg[rows[row]]
+    at = int(vertex[row])
+    if float(np.min(swapped_m)) < min(10 * config.reach_m + 1000.0, float(nearest_m[row])):
+        remedy = "Latitude and longitude are swapped, in the log or in the site: exchange them."
+    elif nearest_m[row] > 10_000.0:
+        remedy = "Check that this is the right site, and that track file and log name the correct coordinate system."
+    elif nearest_m[row] < 500.0:
+        remedy = "A national grid or datum read as WGS 84 gives such a shift: check the EPSG codes of both."
+    else:
+        remedy = "Check that the site covers this run; matching.reach_m is the largest accepted distance from a track."
+    return InputError(
+        "all positions of the run are off the track",
+        place="gnss: columns latitude_deg, longitude_deg",
+        found=f"positions {_length(float(nearest_m[row]))} or more from any track, nearest at "
+        f"{latitude:.5f}, {longitude:.5f} (track at {track.latitude_deg[at]:.5f}, {track.longitude_deg[at]:.5f})",
+        expected=f"positions within {config.reach_m:g} m of a net element",
+        remedy=remedy,
+    )
+
+
+def _length(metres: float) -> str:
+    return f"{metres / 1000:.0f} km" if metres >= 10_000 else f"{metres:.0f} m"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
+from pipeline.matching.doubt import Posterior
 from pipeline.matching.match import Match
-from pipeline.matching.rivals import Posterior
 from pipeline.track.leg import Leg, segments_at
 from pipeline.track.survey import Track
 from schemas.arrays import Bools, Ints, floats
@@ -89,9 +89,5 @@ def _highest(posterior: Posterior, first: int, last: int) -> dict[int, float]:
     """The highest probability of each element at the steps from one epoch to another."""
     begin, end = np.searchsorted(posterior.epoch, [first, last + 1])
     part = slice(int(posterior.first[max(int(begin) - 1, 0)]), int(posterior.first[int(end)]))
-    highest: dict[int, float] = {}
-    for element, probability in zip(
-        posterior.element[part].tolist(), posterior.probability[part].tolist(), strict=True
-    ):
-        highest[element] = max(highest.get(element, 0.0), probability)
-    return highest
+    told = pl.DataFrame({"element": posterior.element[part], "probability": posterior.probability[part]})
+    return dict(told.group_by("element").agg(pl.col("probability").max()).iter_rows())

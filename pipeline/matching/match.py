@@ -7,18 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
+from pipeline.matching.doubt import Posterior, rivals_of
 from pipeline.matching.epochs import Assignment, epoch_frame
 from pipeline.matching.find import find_path
-from pipeline.matching.fixes import Fixes, fixes_of
-from pipeline.matching.resolution import digit_noise
-from pipeline.matching.rivals import Posterior, Rivals, rivals_of
+from pipeline.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import polarity
-from pipeline.track.network import network_of
+from pipeline.track.network import network_along, network_of, visits_of
 from pipeline.track.path import TravelledPath
-from pipeline.track.pieces import in_pieces
-from pipeline.track.route import network_along, visits_of
-from pipeline.track.survey import Track, track_of
+from pipeline.track.survey import Track, in_pieces, track_of
 from schemas.arrays import Ints, floats, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
@@ -29,21 +26,19 @@ from schemas.run import Site
 class Match:
     """Epochs on the path, the path, and when it was in doubt.
 
-    `antenna_ahead_m`: GNSS antenna ahead of the balise antenna, along growing path. `posterior`: elements that are
-    possible at the steps of the search. `odometer_sign`: of the recorded
-    odometer against growing path, set here and nowhere else.
+    `posterior`: elements that are possible at the steps of the search. `odometer_sign`: of the recorded odometer
+    against growing path, set here and nowhere else.
     """
 
     epochs: pl.DataFrame
     path: TravelledPath
     ambiguous: pl.DataFrame
-    antenna_ahead_m: float
     posterior: Posterior
     odometer_sign: int
 
-    def rivals(self, limit: float) -> Rivals:
-        """Per epoch the net elements whose posterior reaches `limit` there, the path's own among them."""
-        return rivals_of(self.posterior, self.epochs, self.path, limit)
+    def rivals(self, limit: float, index: dict[str, int]) -> tuple[Ints, Ints]:
+        """Epochs and net elements (numbers by `index`) whose posterior reaches `limit` there, the path's own too."""
+        return rivals_of(self.posterior, self.epochs, self.path, index, limit)
 
 
 def match(
@@ -73,7 +68,7 @@ def match(
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
-    return Match(epochs, path, ambiguous, vehicle.gnss_antenna_ahead_m, posterior, sign)
+    return Match(epochs, path, ambiguous, posterior, sign)
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: MatchingConfig) -> int:

@@ -99,10 +99,11 @@ class _AxisBank:
 
 
 class MonitorBank:
-    """The bank as the location determination system sees it (`pipeline.lds.bank_protocol.Bank`).
+    """The bank as the location determination system sees it: monitors of one solution, from the last restart on.
 
-    `single` are monitors without memory beyond an epoch, evaluated beforehand: frames `value, threshold, state,
-    reason` by monitor name. A fail of any monitor at an epoch is an alarm.
+    Epochs are rows of the solution's epochs. The answers for an epoch may change with `restart` at that epoch or before
+    it, never through later ones. `single` are monitors without memory beyond an epoch, evaluated beforehand: frames
+    `value, threshold, state, reason` by monitor name. A fail of any monitor at an epoch is an alarm.
     """
 
     def __init__(self, epochs: pl.DataFrame, single: dict[str, pl.DataFrame], config: Configuration):
@@ -137,24 +138,33 @@ class MonitorBank:
         self._along[part] = (self._axes[0].state[part] != NOT_EVALUATED).any(axis=1)
 
     def failed(self, epoch: int) -> bool:
+        """Any monitor of the bank fails at this epoch."""
         self._look(epoch)
         return bool(self._any[epoch])
 
     def fast_failed(self, epoch: int) -> bool:
+        """A monitor fails that does not ring: raw, fastest EWMA, or without memory. Only these hold back recovery.
+
+        A monitor without memory (Doppler, ranges, channels) belongs here: it does not outlive its fault, and a return
+        while it fails would restart the bank every `recovery_s` and so blind its slow averages.
+        """
         self._look(epoch)
         return bool(self._fast[epoch])
 
     def along_evaluated(self, epoch: int) -> bool:
+        """The along-track monitors have a verdict (pass or fail) at this epoch."""
         self._look(epoch)
         return bool(self._along[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on at which a monitor fails, or that is not looked at yet; at most `end`."""
         self._look(epoch)
         ahead = self._any[epoch : min(self._known_to + 1, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> npt.NDArray[np.bool_]:
+        """`along_evaluated` of the epochs [epoch, end), none of them beyond what `quiet_until` answered."""
         return self._along[epoch:end]
 
     def restart(self, epoch: int) -> None:

@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.figures.campaign_tables import campaign_balises, with_truth
 from pipeline.figures.known_counts import known_counts
-from pipeline.figures.levels import LEVEL_LISTS
+from pipeline.figures.verdict import LEVEL_LISTS
 from pipeline.report.architectures import architectures_section
 from pipeline.report.balises import balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table

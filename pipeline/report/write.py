@@ -14,7 +14,7 @@ import polars as pl
 from pipeline import storage
 from pipeline.campaign.plan import software_digest
 from pipeline.campaign.workers import each
-from pipeline.figures.derived_tables import derived_tables
+from pipeline.figures.campaign_figures import derived_tables
 from pipeline.report.availability import availability_pieces, together
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.run_page import Made, Neighbours, run_page

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.figures.derived_tables import derived_tables
+from pipeline.figures.campaign_figures import derived_tables
 from pipeline.figures.map_errors import map_suspects
 from pipeline.results import catalogue, store
 from pipeline.results.terminal import show_tables, tall, to_json

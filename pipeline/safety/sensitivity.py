@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable
 
 import polars as pl
 
-from pipeline.figures.levels import level_counts
-from pipeline.figures.verdict import head_of, run_verdicts, verdict_of
+from pipeline.figures.verdict import head_of, level_counts, run_verdicts, verdict_of
 from pipeline.results import store
 from schemas.config import Configuration
 from schemas.enums import RunStatus

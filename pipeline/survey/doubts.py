@@ -17,9 +17,8 @@ from pipeline.survey.pieces import COLUMNS, SAME_TRACK_M, SHAPE_M, Piece
 from pipeline.track.geodesy import earth_centred_m, points_of, way_m
 from pipeline.track.network import Network as Ground
 from pipeline.track.network import network_of
-from pipeline.track.pieces import in_pieces
 from pipeline.track.segments import SAMPLE_SPACING_M
-from pipeline.track.survey import places_along, track_of
+from pipeline.track.survey import in_pieces, places_along, track_of
 from schemas.arrays import Floats
 from schemas.enums import Navigability
 from schemas.run import Finding

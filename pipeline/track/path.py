@@ -30,22 +30,6 @@ BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
 
 
 @dataclass(frozen=True)
-class Places:
-    """Positions on the path, one per point asked for, NaN where the point is not known.
-
-    `cross_m` is positive left of growing path; `vertical_m` is height over the track (NaN without heights);
-    `distance_m` is the horizontal distance to the path itself, which matters beyond its ends, where
-    `path_m` goes on straight.
-    """
-
-    leg: Ints
-    path_m: Floats
-    cross_m: Floats
-    vertical_m: Floats
-    distance_m: Floats
-
-
-@dataclass(frozen=True)
 class TravelledPath:
     """The legs of a run in order of time; `path_m` is 0 at the start of the first net element."""
 
@@ -67,7 +51,7 @@ class TravelledPath:
 
         None and NaN where the position is not known.
         """
-        position = _column(path_m)
+        position = np.atleast_1d(np.asarray(path_m, dtype=np.float64))
         number = np.broadcast_to(np.asarray(leg, dtype=np.int64), position.shape)
         element, measure = self.locate_index(number, position)
         return np.array([*self.track.ids, None], dtype=object)[element], measure
@@ -96,8 +80,8 @@ class TravelledPath:
             feet.put(rows, nearest_on_leg(points.take(rows), one, near))
         return feet
 
-    def places(self, leg: Ints, feet: Feet, height_m: Floats) -> Places:
-        """Feet on the legs as path positions."""
+    def places(self, leg: Ints, feet: Feet, height_m: Floats) -> tuple[Floats, Floats]:
+        """Feet on the legs as path positions, and heights over the track [m]; NaN where not known."""
         path_m, vertical_m = np.full((2, len(leg)), np.nan)
         for index, one in enumerate(self.legs):
             rows = np.flatnonzero((leg == index) & np.isfinite(feet.fraction))
@@ -105,7 +89,7 @@ class TravelledPath:
             rise = one.height_end_m[part.segment] - one.height_start_m[part.segment]
             path_m[rows] = path_at(one, part)
             vertical_m[rows] = height_m[rows] - one.height_start_m[part.segment] - part.fraction * rise
-        return Places(leg, path_m, feet.offset_m, vertical_m, feet.distance_m)
+        return path_m, vertical_m
 
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with their path position, in order of leg and path position.
@@ -143,7 +127,3 @@ def _balises_on(
             values = (row["balise_id"], row["kind"], name, row["measure_m"], path_m)
             rows.append((number, *values, row["location_accuracy_m"], row["linked"], row["link_reaction"]))
     return rows
-
-
-def _column(values: npt.ArrayLike) -> Floats:
-    return np.atleast_1d(np.asarray(values, dtype=np.float64))

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 # Search points along long segments: close enough that the nearest one leads to the nearest segment.
 SAMPLE_SPACING_M = 20.0
-# Most points lie nearer than this [m], and a bounded search for them is quicker.
-_NEAR_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -79,9 +77,7 @@ def nearest(points: Points, line: Polyline) -> Feet:
     if len(points) == 0:
         return no_feet(0)
     tree, segment = line.samples
-    _, sample = tree.query(points.surface, distance_upper_bound=_NEAR_M)
-    far = np.flatnonzero(sample == tree.n)
-    sample[far] = tree.query(points.surface[far])[1]
+    _, sample = tree.query(points.surface)
     return held_to_line(downhill(points, line, segment[sample]), len(line))
 
 

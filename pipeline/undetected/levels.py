@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.monitors.channels import paired
+from pipeline.monitors.single import paired
 from pipeline.undetected.watched import Watched
 from schemas.arrays import Floats, floats
 from schemas.config import LdsConfig

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.evidence.carrying import Anchor, Trust, between_anchors, closes
+from pipeline.evidence.carrying import Anchor, between_anchors, closes
 from pipeline.evidence.evidence import _contradicts
 from pipeline.evidence.gaps import Gap, Way
 from pipeline.evidence.routes import Chain, Place
@@ -17,7 +17,7 @@ from schemas.arrays import NS_PER_S, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence
 
-TRUST = Trust.of(Configuration())
+CONFIG = Configuration()
 ANCHORS = tuple(
     Anchor(t_s * NS_PER_S, Place(0, 10.0 * t_s), sigma_m, Evidence.BALISE) for t_s, sigma_m in ((0, 1.0), (10, 2.0))
 )
@@ -36,28 +36,28 @@ def odometer(scale: float | None) -> Any:
 
 def test_without_a_vehicle_file_both_anchors_may_be_right() -> None:
     """From the first 40.8 m with variance 1.04, from the second 38.8 m with variance 4.06; three sigmas."""
-    low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, TRUST)
+    low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, CONFIG)
     assert (low[0], high[0]) == (pytest.approx(38.8 - 6.0448, abs=1e-4), pytest.approx(38.8 + 6.0448, abs=1e-4))
 
 
 def test_the_hull_is_that_of_both_anchors() -> None:
     """After 1 s the first anchor reaches less far back, after 9 s the second less far ahead."""
     at_ns = np.array([NS_PER_S, 9 * NS_PER_S])
-    low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 130.0), at_ns, TRUST)
+    low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 130.0), at_ns, CONFIG)
     assert low == pytest.approx([10.2 - 3.0150, 91.8 - 3.1321], abs=1e-4)
     assert high == pytest.approx([38.2 + 6.0671, 119.8 + 6.0075], abs=1e-4)
 
 
 def test_where_a_known_odometer_closes_the_better_anchor_weighs_more() -> None:
     """40.3922 m with variance 1 / (1 / 1.04 + 1 / 4.06)."""
-    low, high = between_anchors(odometer(1.0), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, TRUST)
+    low, high = between_anchors(odometer(1.0), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, CONFIG)
     assert (low[0], high[0]) == (pytest.approx(40.3922 - 2.7297, abs=1e-4), pytest.approx(40.3922 + 2.7297, abs=1e-4))
 
 
 @pytest.mark.parametrize(("apart_m", "closed"), [(95.23, True), (95.22, False), (108.77, True), (108.78, False)])
 def test_an_odometer_closes_within_three_roots_of_both_anchors_and_its_way(apart_m: float, closed: bool) -> None:
     """102 m are counted; 3 sqrt(1 + 4 + 0.1) = 6.775 m."""
-    assert closes(odometer(1.0), cast(Any, ANCHORS), apart_m, TRUST) is closed
+    assert closes(odometer(1.0), cast(Any, ANCHORS), apart_m, CONFIG) is closed
 
 
 @pytest.mark.parametrize(
@@ -74,6 +74,6 @@ def test_a_vehicle_file_is_contradicted_where_no_chain_between_two_anchors_close
 ) -> None:
     ways = None if apart_m is None else [Way(Chain((0,), (0.0,)), (0.0, length_m)) for length_m in apart_m]
     gap = Gap(0, 10 * NS_PER_S, ANCHORS[0], ANCHORS[1], ways)
-    assert _contradicts(gap, odometer(scale), TRUST) is contradicts
-    assert _contradicts(replace(gap, end=None), odometer(scale), TRUST) is False
-    assert _contradicts(gap, None, TRUST) is False
+    assert _contradicts(gap, odometer(scale), CONFIG) is contradicts
+    assert _contradicts(replace(gap, end=None), odometer(scale), CONFIG) is False
+    assert _contradicts(gap, None, CONFIG) is False

@@ -11,15 +11,13 @@ import pytest
 
 from pipeline.evidence.evidence import KINDS, Alternative, EvidenceSet
 from pipeline.evidence.routes import Place, Route
-from pipeline.judge.across import errors_across
 from pipeline.judge.alarms import verdict_within
-from pipeline.judge.episodes import _is_back
-from pipeline.judge.hazards import drafts_of
-from pipeline.judge.judge import undetected_ns
+from pipeline.judge.episodes import Episode, _is_back
+from pipeline.judge.hazards import _instants, drafts_of, within_budget
+from pipeline.judge.judge import errors_across
 from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
 from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.rows import _instants, within_budget
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
 from schemas.config import Configuration, HazardConfig, LdsConfig
@@ -65,7 +63,7 @@ def test_what_a_step_offers_on_its_way_lies_before_its_first_position(first: int
     step = None if first is None else SimpleNamespace(first=first)
     episode = SimpleNamespace(onset_ns=10, end_ns=30, detected_ns=None, step=step)
     series = SimpleNamespace(t_ns=np.array([0, 10, 20]))
-    assert undetected_ns(cast(Any, episode), cast(Any, series)) == (begin_ns, 30)
+    assert Episode.undetected_ns(cast(Any, episode), cast(Any, series)) == (begin_ns, 30)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +140,8 @@ def test_what_an_episode_hit() -> None:
     judged = SimpleNamespace(least_m=least_m, code=code, wrong_track=astray)
     offers = SimpleNamespace(number=number, judged=judged, offered=offered, t_ns=np.arange(10))
     episode = SimpleNamespace(onset=2, end=8, jump_back=None, holds=lambda own: (own >= 2) & (own < 8))
-    found = drafts_of(cast(Any, [episode]), cast(Any, SimpleNamespace(jumps=[])), cast(Any, offers), HazardConfig())
+    bench = SimpleNamespace(series=SimpleNamespace(jumps=[]), offers=offers, config=Configuration())
+    found = drafts_of(cast(Any, [episode]), cast(Any, bench))
     assert [(draft.hazard, draft.hits) for draft in found] == [
         (Hazard.VB_SHIFT, [1, 9]),
         (Hazard.VB_WRONG_TRACK, [6]),
@@ -184,6 +183,8 @@ def test_the_times_of_a_hazard(known: bool, detected_s: float | None) -> None:
     series = SimpleNamespace(t_ns=t_ns, row=np.arange(10))
     offers = SimpleNamespace(t_ns=begin + seconds(1, 4), number=np.array([1, 4]))
     bench = SimpleNamespace(
+        series=series,
+        offers=offers,
         t_ns=t_ns,
         positions=SimpleNamespace(direction=np.full(10, -1), leg=np.zeros(10, dtype=np.int64)),
         judged=SimpleNamespace(middle_m=np.full(10, 25.0)),
@@ -193,7 +194,7 @@ def test_the_times_of_a_hazard(known: bool, detected_s: float | None) -> None:
         config=Configuration(),
     )
     draft = SimpleNamespace(episode=episode, jump=None, hits=[1])
-    found = _instants(*(cast(Any, one) for one in (draft, series, offers, bench)))
+    found = _instants(cast(Any, draft), cast(Any, bench))
     assert (found["t_onset"], found["t_hazard"], found["t_failure"], found["t_end"]) == tuple(
         begin + seconds(3, 4, 5, 9)
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.matching.hypotheses import hypotheses_of
+from pipeline.matching.likelihood import hypotheses_of
 from schemas.config import MatchingConfig
 
 CONFIG = MatchingConfig(cross_bias_sigma_m=3.0, slow_share=0.5)

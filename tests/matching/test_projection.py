@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.matching.fixes import contradictory_covariances
 from pipeline.track.geodesy import points_of
 from pipeline.track.leg import Visit, leg_of
-from pipeline.track.path import Places, TravelledPath
+from pipeline.track.path import TravelledPath
 from pipeline.track.survey import track_of
 from schemas.config import Vehicle
 from schemas.errors import InputError
@@ -236,11 +236,14 @@ def curved() -> TravelledPath:
     return TravelledPath(track, (leg_of(track, [Visit(0, True), Visit(1, False)], 100.0),))
 
 
-def on_first_leg(path: TravelledPath, latitude_deg: np.ndarray, longitude_deg: np.ndarray) -> Places:
+def on_first_leg(
+    path: TravelledPath, latitude_deg: np.ndarray, longitude_deg: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Path positions, and how far left of the path [m]."""
     latitude_deg, longitude_deg = np.atleast_1d(latitude_deg), np.atleast_1d(longitude_deg)
     leg, height_m = np.zeros(len(latitude_deg), dtype=np.int64), np.full(len(latitude_deg), np.nan)
     feet = path.feet(points_of(latitude_deg, longitude_deg), leg, np.isfinite(latitude_deg))
-    return path.places(leg, feet, height_m)
+    return path.places(leg, feet, height_m)[0], feet.offset_m
 
 
 @settings(max_examples=60, deadline=None)
@@ -257,29 +260,29 @@ def test_locating_and_projecting_are_inverse(path_m: float, away_m: float) -> No
     longitude = np.interp(measures[0], path.track.measure_m[rows], path.track.longitude_deg[rows])
     heading = np.radians(leg.heading_deg[segment])
     north, east = away_m * np.sin(heading), -away_m * np.cos(heading)
-    found = on_first_leg(
+    found_m, cross_m = on_first_leg(
         path,
         latitude + np.degrees(north / 6_372_955.9),
         longitude + np.degrees(east / (6_390_702.0 * np.cos(np.radians(latitude)))),
     )
     assert 0.0 <= share <= 1.0
     # Between two chords of a curve a place square to one may be nearer to the next.
-    assert found.path_m[0] == pytest.approx(path_m, abs=0.02 + 0.02 * abs(away_m))
-    assert found.cross_m[0] == pytest.approx(away_m, abs=0.02)
+    assert found_m[0] == pytest.approx(path_m, abs=0.02 + 0.02 * abs(away_m))
+    assert cross_m[0] == pytest.approx(away_m, abs=0.02)
 
 
 def test_a_path_survives_the_way_between_processes() -> None:
     path = curved()
     other = pickle.loads(pickle.dumps(path))
     place = (np.array([50.0005]), np.array([14.01]))
-    assert on_first_leg(other, *place).path_m[0] == on_first_leg(path, *place).path_m[0]
+    assert on_first_leg(other, *place)[0][0] == on_first_leg(path, *place)[0][0]
     assert other.elements() == ["a", "b"]
 
 
 def test_unknown_places_are_nan_and_none() -> None:
     path = curved()
-    found = on_first_leg(path, np.array([50.0, np.nan]), np.array([14.01, 14.01]))
-    assert np.isnan(found.path_m[1])
+    found_m, _ = on_first_leg(path, np.array([50.0, np.nan]), np.array([14.01, 14.01]))
+    assert np.isnan(found_m[1])
     assert path.locate(0, [np.nan, 200.0])[0][0] is None
 
 
@@ -334,4 +337,4 @@ def test_the_lever_arm_stays_where_it_is_on_a_train_that_begins_by_reversing() -
     forward = matched(fixes, place, distance=odometer(x - 300.0), vehicle=vehicle)
     assert np.allclose(backward.epochs["path_m"], x + 30.0, atol=2e-3)
     assert np.allclose(forward.epochs["path_m"], x - 30.0, atol=2e-3)
-    assert (backward.antenna_ahead_m, forward.antenna_ahead_m) == (-30.0, 30.0)
+    assert (backward.odometer_sign, forward.odometer_sign) == (-1, 1)

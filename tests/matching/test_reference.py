@@ -26,41 +26,46 @@ def placed(y_m: Floats, sigma_m: float | None, place: Site = TRACKS) -> Match | 
     return match_reference(stream, place, MatchingConfig(), HazardConfig())
 
 
+def possible(found: Match, epoch: int, limit: float = 0.001) -> list[str]:
+    """Names of the net elements possible at an epoch."""
+    names = list(dict.fromkeys(found.path.track.ids))
+    rows, elements = found.rivals(limit, {name: number for number, name in enumerate(names)})
+    return [names[element] for element in elements[rows == epoch]]
+
+
 def test_an_exact_reference_leaves_one_track() -> None:
     found = placed(0.0 * X_M, 0.05)
     assert found is not None
     assert np.allclose(found.epochs["path_m"], X_M, atol=1e-3)
-    rivals = found.rivals(0.001)
-    assert len(rivals) == len(X_M)
-    assert rivals.at(5) == ["a"]
-    assert rivals.at(len(X_M) - 5) == ["b"]
+    assert all(possible(found, epoch) for epoch in range(len(X_M)))
+    assert possible(found, 5) == ["a"]
+    assert possible(found, len(X_M) - 5) == ["b"]
 
 
 def test_an_exact_reference_whose_antenna_is_aside_is_on_its_track() -> None:
     found = placed(np.full(len(X_M), 0.4), 0.02)
     assert found is not None
     assert found.epochs["on_track"].all()
-    assert "a" in found.rivals(0.001).at(5)
+    assert "a" in possible(found, 5)
 
 
 @pytest.mark.parametrize("sigma_m", [2.0, None])
 def test_a_coarse_reference_leaves_both(sigma_m: float | None) -> None:
     found = placed(np.full(len(X_M), 1.8), sigma_m)
     assert found is not None
-    assert found.rivals(0.001).at(5) == ["a", "c"]
+    assert possible(found, 5) == ["a", "c"]
 
 
 def test_the_path_s_own_element_is_there_whatever_the_limit() -> None:
     found = placed(np.full(len(X_M), 2.0), 2.0)
     assert found is not None
-    rivals = found.rivals(0.999)
-    assert [rivals.at(k)[0] for k in range(len(X_M))] == found.epochs["netelement_id"].to_list()
+    assert [possible(found, k, 0.999)[0] for k in range(len(X_M))] == found.epochs["netelement_id"].to_list()
 
 
 def test_on_one_chain_there_is_its_own_element_only() -> None:
     found = placed(0.0 * X_M, 5.0, site({"a": line((0, 0), (2000, 0))}))
     assert found is not None
-    assert found.rivals(0.001).at(3) == ["a"]
+    assert possible(found, 3) == ["a"]
 
 
 def test_a_reference_beside_every_track_is_no_witness() -> None:

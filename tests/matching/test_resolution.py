@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.matching.resolution import digit_noise, step_m
+from pipeline.matching.fixes import digit_noise, step_m
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 
 _PER_DEG_M = np.radians(1.0) * 6_371_000.0

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from pipeline.monitors.channels import on_path_of, paired
+from pipeline.monitors.single import on_path_of, paired
 from pipeline.report import write_report
 from pipeline.results.store import write_run
 from pipeline.safety.assessment import assess
