@@ -14,10 +14,9 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from pipeline.campaign.engines import Engine
 from pipeline.campaign.outcome import Result
 from pipeline.campaign.plan import RunJob
+from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import replay_one
 from pipeline.campaign.workers import single_threaded_children
-
-_RUNS_PER_PROCESS = 200
 
 
 class LocalEngine(Engine):
@@ -65,7 +64,7 @@ class _Slot:
 
     def submit(self, job: RunJob) -> Result:
         self._runs += 1
-        if self._runs > _RUNS_PER_PROCESS:
+        if self._runs > WAITS.runs_per_process:
             self.kill()
         try:
             return self._started().submit(replay_one, job)

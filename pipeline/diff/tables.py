@@ -118,12 +118,8 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
 
 
 def _float_mask(a: pl.Series, b: pl.Series, tolerance: float) -> pl.Series:
-    frame = pl.DataFrame({"a": a.alias("a"), "b": b.alias("b")})
-    x, y = pl.col("a"), pl.col("b")
-    apart = (x != y) & ~((x - y).abs() <= tolerance)
-    broken = x.is_nan().fill_null(value=False) | y.is_nan().fill_null(value=False)
-    unknown = x.is_null() != y.is_null()
-    return frame.select((apart.fill_null(value=False) | broken | unknown).alias("differs")).to_series()
+    alike = a.eq_missing(b) | ((a - b).abs() <= tolerance).fill_null(value=False)
+    return ~alike | a.is_nan().fill_null(value=False) | b.is_nan().fill_null(value=False)
 
 
 def _count(rows: int, of: int) -> str:

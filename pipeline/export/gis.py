@@ -11,8 +11,7 @@ from xml.sax.saxutils import escape, quoteattr
 import polars as pl
 
 from pipeline.export.events import hazard_text
-from pipeline.export.places import Ground, ground_of
-from pipeline.export.positions import positions_of
+from pipeline.export.places import Ground, ground_of, positions_of
 from schemas.arrays import Floats
 from schemas.run import RunTables, Site
 

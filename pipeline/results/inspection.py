@@ -16,6 +16,7 @@ from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.receivers.csv_draft import draft_mapping
 from pipeline.results import store
 from pipeline.results.fit_report import FitReport, fit_report
+from pipeline.results.terminal import show_tables
 from pipeline.site.read import is_geojson, read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
@@ -69,6 +70,13 @@ def inspect_path(
 def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
     """A mapping to begin with; the columns stand in it."""
     return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
+
+
+def show(tables: Mapping[str, pl.DataFrame]) -> None:
+    """Print the tables; what is to be saved as configuration last, without a frame."""
+    show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
+    if STARTING_CONFIG in tables:
+        print("\n".join(tables[STARTING_CONFIG]["toml"]))
 
 
 def inspect_log(

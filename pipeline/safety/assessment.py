@@ -11,7 +11,7 @@ from pipeline.figures.derived_tables import derived_tables
 from pipeline.figures.map_errors import map_suspects
 from pipeline.results import catalogue, store
 from pipeline.results.terminal import show_tables, tall, to_json
-from pipeline.safety.reading import figures_for_reading
+from pipeline.safety.reading import figures_for_reading, some_of, source_files
 from pipeline.safety.sensitivity import Replay, sensitivity
 from pipeline.safety.sentences import (
     level_statements,
@@ -21,7 +21,6 @@ from pipeline.safety.sentences import (
     verdict_statement,
 )
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, side_by_side
-from pipeline.safety.sources import some_of, source_files
 from pipeline.safety.tally import added, architecture_figures
 from pipeline.storage.address import Address
 from schemas.config import Configuration

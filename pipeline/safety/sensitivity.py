@@ -8,22 +8,33 @@ need the logs again.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import polars as pl
 
+from pipeline.campaign import make_plan, run_campaign
 from pipeline.figures.levels import level_counts
 from pipeline.figures.verdict import head_of, run_verdicts, verdict_of
 from pipeline.results import store
-from schemas.config import Configuration
+from schemas.config import Configuration, Vehicle
 from schemas.enums import RunStatus
+from schemas.errors import UsageError
 
 # Shares of the configured value: a half and half as much again; two to five sigma round the usual three.
 _VARIED = {"failure_limit_m": (0.5, 1.5), "evidence_factor": (2.0 / 3.0, 4.0 / 3.0, 5.0 / 3.0)}
 _TABLES, _REPLAYED, _NEEDED = "from tables", "replayed", "needs --logs"
 
 Row = dict[str, object]
-Replay = Callable[[Configuration, str], None]
+Replay = Callable[[Configuration, str], object]
+
+
+def replayed(logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int) -> Replay | None:
+    """How to replay these logs with another configuration; none without logs. Raises `UsageError` without a site."""
+    if not logs:
+        return None
+    if site is None:
+        raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
+    return lambda settings, to: run_campaign(make_plan(logs, site, to, settings, vehicle), jobs=jobs)
 
 
 def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:
