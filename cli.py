@@ -55,14 +55,9 @@ def _here(value: Any) -> Any:
     return value
 
 
-def _cores(jobs: int) -> int:
-    return jobs or os.cpu_count() or 1
-
-
 _place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
-_LOGS = """UBX, SBF, NMEA, NovAtel, RTKLIB .pos, ROS bags, MCAP, CSV with a mapping in --config, or a public recording;
-.gz and .zip of these."""
+_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; .gz, .zip of these."
 
 Result = Annotated[str, Argument(help="A result of `balise replay`.")]
 ResultFolder = Annotated[Path, _place(help="A result of `balise replay`.")]
@@ -75,7 +70,9 @@ VehicleFile = Annotated[Path | None, _file("--vehicle", help="Vehicle file (TOML
 ConfigFile = Annotated[Path | None, _file("--config", help="Configuration file (TOML).")]
 RouteFiles = Annotated[Path | None, _file("--route", help="Known route: a file, or a folder with RUN.csv or .parquet.")]
 Solution = Annotated[str, Option(help="Solution of the runs.")]
-Jobs = Annotated[int, Option(min=0, callback=_cores, help="Number of runs at the same time; 0: one per core.")]
+Jobs = Annotated[
+    int, Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="So many at once; 0: one per core.")
+]
 CsvFile = Annotated[Path | None, _file("--csv", metavar="FILE", help="Write CSV; `-` is standard output.")]
 Force = Annotated[bool, Option("--force", help="Replace what is there.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no tables; errors only.")]
@@ -111,7 +108,7 @@ def replay(
     time_limit: Annotated[float, Option(min=0.1, help="Seconds that one run may take; a slower run fails.")] = 3600.0,
     undetected: Annotated[bool, Option("--undetected", help="Also the largest error no monitor would notice.")] = False,
     quiet: Quiet = False,
-    as_json: Annotated[bool, Option("--json", help="JSON: progress on standard error, the result at the end.")] = False,
+    as_json: Annotated[bool, Option("--json", help="JSON: progress on standard error, then the result.")] = False,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
@@ -183,11 +180,7 @@ def demo(
 
 
 @_command("balise synth scenario.toml --out trial")
-def synth(
-    scenario: Annotated[Path, _place(help="Scenario (TOML).")],
-    out: OutFolder,
-    quiet: Quiet = False,
-) -> None:
+def synth(scenario: Annotated[Path, _place(help="Scenario (TOML).")], out: OutFolder, quiet: Quiet = False) -> None:
     """Write a synthetic trial: site, runs and the faults injected into them."""
     from datasets.scenario import load_scenario
     from datasets.trial import write_trial
@@ -216,8 +209,8 @@ def safety(
         from pipeline.safety.assessment import assess, show
         from pipeline.safety.sensitivity import replayed
 
-        settings = None if config is None else _configuration(config)
-        show(assess(out, settings, replayed(logs or [], site, _vehicle(vehicle), jobs)), as_json)
+        again = replayed(logs or [], site, _vehicle(vehicle), jobs)
+        show(assess(out, None if config is None else _configuration(config), again), as_json)
         return
     from pipeline.results.terminal import show_tables
     from pipeline.safety import safety_tables
@@ -319,7 +312,7 @@ def convert(
     config: ConfigFile = None,
     solution: Annotated[str | None, Option(help="Name of the receiver in the run, where it has several.")] = None,
     stream: Annotated[Literal["gnss", "reference"], Option(help="What the positions are for.")] = "gnss",
-    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day of an NMEA log without one.")] = None,
+    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of an NMEA log without one.")] = None,
     force: Force = False,
 ) -> None:
     """Convert receiver logs to a run, or add streams to a run."""
@@ -359,9 +352,9 @@ def make_a_site(
     elements, findings = elements_table(site), findings_table(site.findings)
     made = {"elements": elements, "findings": findings, "balises": site.balises}
     count = 0 if site.balises is None else site.balises.height
-    size = f"{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}."
+    size = f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}."
     look = f"Look at {out / 'site.html'} before you replay on it."
-    _tell(as_json, made, {"Elements": elements.head(25), "Findings": findings}, "", size, look)
+    _tell(as_json, made, {"Elements": elements.head(25), "Findings": findings}, size, look)
 
 
 @_command("balise calibrate good/*.mcap --site line9 --out train7.toml")
@@ -387,9 +380,9 @@ def calibrate(
     measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
     tables = {"Scale and latency": found.runs, "Sigma of the monitors": found.sigmas}
     none = "\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few."
-    latency = [none] if found.vehicle.gnss_latency_s is None else []
-    settings_text = f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}"
-    _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *latency, settings_text)
+    words = [none] if found.vehicle.gnss_latency_s is None else []
+    words.append(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
+    _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
 
 
 @_command("balise experiment list", "balise experiment diagnostics --repetitions 50")
@@ -398,7 +391,7 @@ def experiment(
     out: OutFolder = Path("experiment-out"),
     repetitions: Annotated[int | None, Option(min=1, help="Number of repetitions; default: as published.")] = None,
     seed: Annotated[int, Option(help="Seed of all random numbers.")] = 1,
-    jobs: Annotated[int, Option(min=0, callback=_cores, help="Number of processes; 0: one per core.")] = 0,
+    jobs: Jobs = 0,
     config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue` only).")] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -426,7 +419,10 @@ def experiment(
 def sql(
     out: Result,
     query: Annotated[str, Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
-    beside: Annotated[list[str] | None, Option("--with", metavar="NAME=OUT", help="Another: tables NAME_runs.")] = None,
+    beside: Annotated[
+        list[str] | None,
+        Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
+    ] = None,
     csv: CsvFile = None,
     parquet: Annotated[Path | None, _file(metavar="FILE", help="Write Parquet.")] = None,
     xlsx: Annotated[Path | None, _file(metavar="FILE", help="Write an Excel workbook (extra `excel`).")] = None,
@@ -531,11 +527,11 @@ def verify(
     if logs:
         settings = _configuration(config) if config else None
         found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
+    if as_json:
+        _print_json([{"compared": one.compared, "problems": one.table} for one in found])
     for one in found if not as_json else []:
         if one.problems or not quiet:
             _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
-    if as_json:
-        _print_json([{"compared": one.compared, "problems": one.table} for one in found])
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
 
 

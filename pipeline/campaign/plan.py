@@ -5,14 +5,14 @@ from __future__ import annotations
 import glob
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
 from pipeline import storage
 from pipeline.results import store
-from pipeline.results.manifest import NO_FILES, SettingsFiles, listing
+from pipeline.results.manifest import SettingsFiles, listing, settings_files
 from pipeline.site.read import read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
@@ -60,7 +60,7 @@ class Plan:
     out: str
     config: Configuration
     vehicle: Vehicle
-    given: SettingsFiles = NO_FILES
+    given: SettingsFiles = field(default_factory=settings_files)
 
 
 def make_plan(
@@ -101,7 +101,7 @@ def make_plan(
     if routes is not None and not any(job.route for job in jobs):
         expected = "a route file, or a folder with RUN.csv or RUN.parquet of these runs"
         raise UsageError("has no route for any of the runs", place=redacted(str(routes)), expected=expected)
-    return Plan(tuple(jobs), base.out, config, vehicle, given or NO_FILES)
+    return Plan(tuple(jobs), base.out, config, vehicle, given or settings_files())
 
 
 def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | None) -> RunJob:

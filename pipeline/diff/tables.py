@@ -109,7 +109,7 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
     if rows == 0:
         return None
     first = differs.arg_true()[0]
-    message = f"{_count(rows, a.len())} differ, first row {first}: {_text(a[first])} became {_text(b[first])}"
+    message = f"{rows} of {a.len()} rows differ, first row {first}: {_text(a[first])} became {_text(b[first])}"
     if a.dtype.is_float():
         largest = (a - b).abs().filter(differs).drop_nans().max()
         if isinstance(largest, float):
@@ -120,10 +120,6 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
 def _float_mask(a: pl.Series, b: pl.Series, tolerance: float) -> pl.Series:
     alike = a.eq_missing(b) | ((a - b).abs() <= tolerance).fill_null(value=False)
     return ~alike | a.is_nan().fill_null(value=False) | b.is_nan().fill_null(value=False)
-
-
-def _count(rows: int, of: int) -> str:
-    return f"{rows} of {of} rows"
 
 
 def _text(value: object) -> str:

@@ -5,17 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cache
 from typing import Any, Literal
 
 import polars as pl
 
 from schemas.arrays import NS_PER_S
-
-# descriptor.proto: FieldDescriptorProto.Type and Label
-_DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM = 1, 3, 7, 8, 9, 11, 14
-_OPTIONAL, _REPEATED = 1, 3
-_TYPES: Mapping[str, int] = {"double": _DOUBLE, "int64": _INT64, "fixed32": _FIXED32, "bool": _BOOL, "string": _STRING}
 
 Encoding = Literal["protobuf", "cdr"]
 
@@ -28,7 +24,15 @@ LOG: Fields = (
 GEOJSON: Fields = (("geojson", "string"),)
 """foxglove.GeoJSON."""
 
-INFO, WARNING, ERROR = 2, 3, 4
+
+class Level(IntEnum):
+    """foxglove.Log levels that events have."""
+
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+
+
 # Kinds that are enumerations: name and words in the order of their numbers.
 _ENUMS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "level": ("Level", ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")),
@@ -125,26 +129,29 @@ def message_class(name: str, fields: Fields) -> Any:
 
 
 def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> None:
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto
+
+    def add(kind: str, **more: Any) -> None:
+        label, of_type = more.pop("label", "OPTIONAL"), FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
+        of_label = FieldDescriptorProto.Label.Value(f"LABEL_{label}")
+        message.field.add(name=field, number=number, type=of_type, label=of_label, **more)
+
     if kind == "time":
-        stamp = ".google.protobuf.Timestamp"
-        message.field.add(name=field, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=stamp)
+        add("message", type_name=".google.protobuf.Timestamp")
     elif kind in _ENUMS:
         enum, words = _ENUMS[kind]
         values = message.enum_type.add(name=enum)
         for value, word in enumerate(words):
             values.value.add(name=word, number=value)
-        message.field.add(name=field, number=number, type=_ENUM, label=_OPTIONAL, type_name=f".{name}.{enum}")
+        add("enum", type_name=f".{name}.{enum}")
     elif kind == "doubles":
-        message.field.add(name=field, number=number, type=_DOUBLE, label=_REPEATED)
+        add("double", label="REPEATED")
     elif name.startswith("foxglove."):
-        message.field.add(name=field, number=number, type=_TYPES[kind], label=_OPTIONAL)
+        add(kind)
     else:
         # With presence: absent means not known, which a plain proto3 field would show as zero.
         message.oneof_decl.add(name=f"_{field}")
-        index = len(message.oneof_decl) - 1
-        message.field.add(
-            name=field, number=number, type=_TYPES[kind], label=_OPTIONAL, proto3_optional=True, oneof_index=index
-        )
+        add(kind, proto3_optional=True, oneof_index=len(message.oneof_decl) - 1)
 
 
 def _kind(dtype: pl.DataType) -> str:

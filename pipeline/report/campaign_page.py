@@ -12,9 +12,9 @@ import polars as pl
 from pipeline.figures.campaign_figures import failures_of
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts, word_of
-from pipeline.report.availability import availability_map
 from pipeline.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
+from pipeline.report.ground import availability_map
 from pipeline.report.headline import campaign_headline, run_headline, wrong_acceptances
 from pipeline.report.markup import (
     Cell,

@@ -15,7 +15,8 @@ from pipeline.figures.known_counts import known_counts
 from pipeline.figures.levels import LEVEL_LISTS
 from pipeline.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
-from pipeline.report.headline import run_headline
+from pipeline.report.ground import plan_data
+from pipeline.report.headline import FILES, JUDGES, facts, file_table, run_headline, tile_figures
 from pipeline.report.markup import (
     Cell,
     Json,
@@ -28,9 +29,7 @@ from pipeline.report.markup import (
     tiles,
     verdict_head,
 )
-from pipeline.report.plan_view import plan_data
 from pipeline.report.route_found import route_section
-from pipeline.report.run_facts import FILES, JUDGES, facts, file_table, tile_figures
 from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
 from pipeline.report.words import WORDS
 from schemas.campaign import CampaignLevels

@@ -57,7 +57,7 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
     if config is not None:
         settings = settings.model_copy(update={"safety": config.safety})
     names = ("runs", "hazards", "passages", "alarms")
-    runs, hazards, passages, alarms = (_table(out, name) for name in names)
+    runs, hazards, passages, alarms = (catalogue.scan(out, name).collect() for name in names)
     derived = derived_tables(runs, hazards, passages, alarms, settings)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
@@ -81,12 +81,6 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
         *level_statements(derived["detection"]),
     ]
     return Assessment(said, tables)
-
-
-def _table(out: Address, name: str) -> pl.DataFrame:
-    """From the catalogue where it is fresh; nothing is written."""
-    kept = catalogue.fresh(out, name)
-    return (store.read_table(out, name) if kept is None else kept).collect()
 
 
 def compare_architectures(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -51,7 +52,7 @@ def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
 
 def _figures(row: Mapping[str, Any]) -> pl.DataFrame:
     bounds = bounds_of(row)
-    beside = {"solution", *(name for pair in bounds.values() for name in pair)}
+    beside = {"solution", *(name for name in row if re.search("_(low|high)(_|$)", name))}
     rows = [
         (name, value, *(row.get(bound) for bound in bounds.get(name, ("", ""))), *_told(name))
         for name, value in row.items()
@@ -68,7 +69,6 @@ def _told(name: str) -> tuple[str, str]:
     return unit, next((source for start, source in _SOURCES.items() if name.startswith(start)), "")
 
 
-_SHOWN = 8
 _SCHEMA = {"kind": pl.String, "of": pl.String, "name": pl.String, "bytes": pl.Int64, "sha256": pl.String}
 
 
@@ -92,11 +92,11 @@ def source_files(out: Address) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=_SCHEMA, orient="row").unique(maintain_order=True)
 
 
-def some_of(sources: pl.DataFrame) -> pl.DataFrame:
+def some_of(sources: pl.DataFrame, most: int = 8) -> pl.DataFrame:
     """The sources as they fit a screen: digests shortened, and not all logs of many."""
     logs = sources.filter(pl.col("kind") == "log")
-    shown = pl.concat([sources.filter(pl.col("kind") != "log"), logs.head(_SHOWN)])
-    if (more := logs.height - _SHOWN) > 0:
+    shown = pl.concat([sources.filter(pl.col("kind") != "log"), logs.head(most)])
+    if (more := logs.height - most) > 0:
         rest = pl.DataFrame([("log", f"and {more} more", NAME, None, "")], schema=_SCHEMA, orient="row")
         shown = pl.concat([shown, rest])
     return shown.with_columns(pl.col("sha256").str.head(16))

@@ -8,7 +8,8 @@ need the logs again.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import polars as pl
 
@@ -24,7 +25,7 @@ from schemas.errors import UsageError
 _VARIED = {"failure_limit_m": (0.5, 1.5), "evidence_factor": (2.0 / 3.0, 4.0 / 3.0, 5.0 / 3.0)}
 _TABLES, _REPLAYED, _NEEDED = "from tables", "replayed", "needs --logs"
 
-Row = dict[str, object]
+Row = dict[str, Any]
 Replay = Callable[[Configuration, str], object]
 
 
@@ -66,14 +67,10 @@ def at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.
 def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
     if row["status"] == RunStatus.FAILED:
         return row
-    spent, may = (list(_floats(row[name])) for name in ("failure_hazardous_s", "failure_hazardous_may_s"))
+    spent, may = (row[name] or [] for name in ("failure_hazardous_s", "failure_hazardous_may_s"))
     within, beyond = level_counts(spent, may, allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
     return {**counted, "verdict": verdict_of(counted, config.hazards.unknown_share_limit).value}
-
-
-def _floats(values: object) -> Iterable[float]:
-    return values if isinstance(values, list) else []
 
 
 def _varied(runs: pl.DataFrame, config: Configuration, key: str, value: float, replay: Replay | None) -> Row:
