@@ -21,6 +21,8 @@ from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
+# What the program is made of: pages also follow from their styles, scripts and words.
+_SOURCES = {".css", ".csv", ".html", ".js", ".py", ".toml"}
 _NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
 _DECIDING_LIBRARIES = ("dataframely", "numpy", "polars", "pyarrow", "pyproj", "scipy")
 
@@ -237,7 +239,7 @@ def software_digest() -> str:
     root = Path(__file__).parents[2]
     digest = hashlib.sha256()
     for package in ("pipeline", "schemas"):
-        for source in sorted((root / package).rglob("*.py")):
+        for source in sorted(path for path in (root / package).rglob("*.*") if path.suffix in _SOURCES):
             digest.update(f"{source.relative_to(root).as_posix()} ".encode())
             digest.update(hashlib.sha256(source.read_bytes()).digest())
     for library in _DECIDING_LIBRARIES:

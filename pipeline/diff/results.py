@@ -120,12 +120,13 @@ def diff_results(out_a: Address, out_b: Address) -> ResultDiff:
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
     found = [_diff_run(out_a, out_b, run) for run in common]
+    others = Counter(column for run in found for column in run.made_otherwise)
     return ResultDiff(
         compared=len(common),
         only_in_a=tuple(run for run in runs_a if run not in set(runs_b)),
         only_in_b=tuple(run for run in runs_b if run not in set(runs_a)),
         runs=tuple(run for run in found if not run.same),
-        notes=_notes(found),
+        notes=tuple(f"{column} differs in {others[column]} runs" for column in _PROVENANCE if others[column]),
     )
 
 
@@ -137,11 +138,6 @@ def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]
     width = max(len(run_id) for run_id, _ in shown)
     more = [f"  and {len(rows) - len(shown)} more"] if len(rows) > len(shown) else []
     return ["", title, *(f"  {run_id:<{width}}  {text}" for run_id, text in shown), *more]
-
-
-def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
-    counts = Counter(column for run in runs for column in run.made_otherwise)
-    return tuple(f"{column} differs in {counts[column]} runs" for column in _PROVENANCE if counts[column])
 
 
 def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:

@@ -104,7 +104,10 @@ def _joined(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti"
 
 def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, int] | None:
     """What differs, and in how many rows."""
-    differs = _float_mask(a, b, tolerance) if a.dtype.is_float() else a.ne_missing(b)
+    differs = a.ne_missing(b)
+    if a.dtype.is_float():
+        near = ((a - b).abs() <= tolerance).fill_null(value=False)
+        differs = (differs & ~near) | a.is_nan().fill_null(value=False) | b.is_nan().fill_null(value=False)
     rows = int(differs.sum())
     if rows == 0:
         return None
@@ -115,11 +118,6 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
         if isinstance(largest, float):
             message += f"; by up to {largest:.3g}, tolerance {tolerance:.3g}"
     return message, rows
-
-
-def _float_mask(a: pl.Series, b: pl.Series, tolerance: float) -> pl.Series:
-    alike = a.eq_missing(b) | ((a - b).abs() <= tolerance).fill_null(value=False)
-    return ~alike | a.is_nan().fill_null(value=False) | b.is_nan().fill_null(value=False)
 
 
 def _text(value: object) -> str:

@@ -57,17 +57,12 @@ def passage_entries(passages: pl.DataFrame) -> list[Entry]:
         t_ns = row["t_offered"] if row["t_offered"] is not None else row["t_true"]
         if t_ns is None:
             continue
+        accepted, wrong = row["status"] == PassageStatus.ACCEPTED, row["judgement"] == Judgement.WRONG
+        level = Level.WARNING if not accepted else Level.ERROR if wrong else Level.INFO
         error = "" if row["location_error_m"] is None else f", location error {row['location_error_m']:.2f} m"
         judged = "" if row["judgement"] is None else f", position {row['judgement']}"
-        entries.append((t_ns, _passage_level(row), row["balise_id"], f"{row['status']}{judged}{error}"))
+        entries.append((t_ns, level, row["balise_id"], f"{row['status']}{judged}{error}"))
     return entries
-
-
-def _passage_level(row: Row) -> int:
-    """An error where a wrong position was accepted."""
-    if row["status"] != PassageStatus.ACCEPTED:
-        return Level.WARNING
-    return Level.ERROR if row["judgement"] == Judgement.WRONG else Level.INFO
 
 
 def _plain(frame: pl.DataFrame) -> list[dict[str, Any]]:

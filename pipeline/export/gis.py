@@ -102,7 +102,8 @@ def _placed(frame: pl.DataFrame, site: Site) -> Iterator[tuple[dict[str, Any], t
 
 
 def _point(kind: str, row: Mapping[str, Any], ground: tuple[float, float, float]) -> Feature:
-    named = {"kind_of_balise" if name == "kind" else name: _plain(value) for name, value in row.items()}
+    plain = {name: _utc(value) if isinstance(value, datetime) else value for name, value in row.items()}
+    named = {"kind_of_balise" if name == "kind" else name: value for name, value in plain.items()}
     return _feature("Point", _place(*ground), {"kind": kind, **named})
 
 
@@ -134,7 +135,3 @@ def _lat_lon(latitude: float, longitude: float) -> str:
 
 def _utc(t: datetime) -> str:
     return t.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def _plain(value: Any) -> Any:
-    return _utc(value) if isinstance(value, datetime) else value

@@ -31,7 +31,7 @@ from pipeline.report.markup import (
     verdict_head,
 )
 from pipeline.report.run_page import ALLOWED, Made, configuration, hazard_cell
-from pipeline.report.words import plural
+from pipeline.report.words import plots_of, plural
 from pipeline.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict
@@ -64,14 +64,6 @@ _HAZARD_COLUMNS = (
     *("hazardous_s", "hazardous_may_s", "size_m", "balise_ids", "failure_mode", "t_onset", "suspect"),
 )
 _LEVEL_COLUMNS = ("service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged", "within_share")
-_PLOTS = (
-    ("classes", "Hazards by class", "In time, too late, could not be checked."),
-    ("detection", "Time to detect", "Share of all hazards detected by then, and of all wrong positions in use no "
-     "longer; upright lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never "
-     "detected."),
-    ("location", "Location error at virtual balises", "Positive: offered early. Offers by what became of them."),
-    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; crosses are hazards."),
-)  # fmt: skip
 _TONES = {"unsafe": "bad", "failed": "bad", "unproven": "doubt", "safe": "good"}
 # What comes first in the list of runs; failed ones, which have no verdict, after the unsafe.
 _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
@@ -192,7 +184,7 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
         f"Solution {name}" if several else "Balises, hazards, figures",
         balise_table(f"table-balises-{key}", "Balises over all runs, the worst first", lost_shares(balises)),
         _hazards_table(key, _only(campaign.hazards, name), campaign),
-        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
+        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in plots_of("campaign")),
         said,
         frame_table(f"table-levels-{key}", ALLOWED, levels, _LEVEL_COLUMNS, CampaignDetection),
         note,

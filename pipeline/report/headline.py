@@ -45,9 +45,8 @@ def run_headline(rows: Iterable[Row], passages: pl.DataFrame, hazards: pl.DataFr
     worst = _worst(heading, passages, hazards, limit) if verdict is not None else heading["error"] or "the run failed"
     named = len(listed) > 1
     if named:
-        return Headline(
-            word_of(verdict), f"{heading['solution']}: {worst}", " ".join(_told(row, limit) for row in listed)
-        )
+        told = " ".join(_told(row, limit) for row in listed)
+        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told)
     told = f"{verdict_reasons(heading, limit)}." if verdict == RunVerdict.UNSAFE else ""
     return Headline(word_of(verdict), worst, told)
 

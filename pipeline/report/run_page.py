@@ -31,7 +31,7 @@ from pipeline.report.markup import (
 )
 from pipeline.report.route_found import route_section
 from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
-from pipeline.report.words import WORDS
+from pipeline.report.words import WORDS, plots_of
 from schemas.campaign import CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
@@ -51,28 +51,6 @@ _PASSAGES = (
 _ALARMS = (
     *("t_start", "t_end", "verdict", "monitors", "peak_ratio", "suspect", "hazard_id", "netelement_id", "measure_m"),
 )
-_PLOTS = (
-    ("balises", "Balises along the path", "Location error of each offer where it is known, early is positive; dashed: "
-     "the limit beyond which a position is wrong. Below: offers of unknown error, and balises that were lost."),
-    ("plan", "Plan", "GNSS positions by what the evidence says of them, balises by the worst that became of them."),
-    ("bands", "State of the system over time", "Where nothing is drawn there was no epoch. Hazards are shaded; of the "
-     "chosen one the dotted line is the begin of the fault, the dashed one the failure, the solid one the detection."),
-    ("speed", "Speed", ""),
-    ("along", "Error along the track", "Positive: ahead of the train. Drawn where it is known to 5 m, else GNSS minus "
-     "odometer. Dashed: the confidence interval, and the limit beyond which a position is wrong. Dotted, where it was "
-     "computed: the largest fault that no monitor would have noticed."),
-    ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
-    ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
-     "in odometer distance; marks are the offers."),
-    ("exposure", "Exposure", "Time since the last linked TVB or accepted balise."),
-    ("monitors-along", "Monitors along the track", "Value over threshold: beyond 1 or -1 the monitor fails."),
-    ("monitors-cross", "Monitors across the track", "Value over threshold."),
-    ("monitors-up", "Monitors of height", "Value over threshold."),
-    ("monitors-other", "Other monitors", "Value over threshold."),
-    ("states", "State of every monitor", "Not evaluated is not the same as passed."),
-    ("stanford", "Stanford diagram", "Epochs of known error: error along the track against the confidence claimed. "
-     "Below the diagonal the claim was wrong."),
-)  # fmt: skip
 ALLOWED = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
 _KEYS = "Keys: n p next and previous hazard, + - 0 zoom, ← → time, [ ] previous and next run"
 
@@ -233,7 +211,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
         part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
         part("hazards", "Hazards", _hazards(key, row, hazards)),
         part("balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
-        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in _PLOTS)),
+        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in plots_of("run"))),
         part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
         part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
         part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
