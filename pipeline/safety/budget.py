@@ -6,6 +6,7 @@ Rates [1/h], times [s]; every figure may be a number or a column.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
 from typing import TypeVar
 
@@ -19,6 +20,7 @@ Figure = TypeVar("Figure", float, pl.Expr)
 S_PER_H = 3600.0
 
 
+@cache
 def published(name: str, *figures: str) -> pl.DataFrame:
     """A table that the papers print, from its file beside this one; text but for figures."""
     table = pl.read_csv((files("pipeline.safety") / f"{name}.csv").read_bytes(), infer_schema=False)

@@ -12,37 +12,9 @@ import polars as pl
 from pipeline import storage
 from pipeline.figures.estimates import bounds_of
 from pipeline.results.manifest import NAME, read_manifest
+from pipeline.safety.budget import published
 from pipeline.storage.address import Address, join
 from schemas.campaign import CampaignFigures
-
-# By the beginning of the figure's name, the first that fits; docs/domain.md is DOMAIN.
-_SOURCES = {
-    "runs_unsafe": "DOMAIN 5.4",
-    "runs_unproven": "DOMAIN 5.4",
-    "runs_safe": "DOMAIN 5.4",
-    "runs": "count",
-    "hours_needed": "Poisson, 95 %, against THR_VB (TVB section 3)",
-    "hours_still_needed": "Poisson, 95 %, against THR_VB (TVB section 3)",
-    "hours": "DOMAIN 5.1",
-    "hazard": "DIAG, section Hazards; DOMAIN 5.3",
-    "missed": "DIAG, section Hazards; DOMAIN 5.3",
-    "beyond_budget": "TVB eq. 7; DOMAIN 5.3",
-    "failures": "TVB eq. 7; DOMAIN 5.3",
-    "false_alarm": "DOMAIN 3 and 5.3",
-    "accepted": "DOMAIN 4",
-    "unsafe": "DOMAIN 5.2",
-    "unproven": "DOMAIN 5.2",
-    "outage": "count of gaps (dictionary, `runs`)",
-    "trusted": "LOC eq. 8",
-    "mtbf": "LOC eq. 8",
-    "continuity": "LOC eq. 8",
-    "share_p": "TVB, Markov model; DOMAIN 4",
-    "share_unknown": "DOMAIN 5.2",
-    "stanford": "Stanford diagram, along track",
-    "thr_vb": "TVB section 3",
-    "undetected": "docs/domain.md section 5.6",
-    "physical_spacing": "docs/domain.md section 5.6",
-}
 
 
 def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
@@ -66,7 +38,9 @@ def _told(name: str) -> tuple[str, str]:
     """Unit, and paper or clause."""
     column = CampaignFigures.columns()[name]
     unit = str((column.metadata or {}).get("unit", "")) or "1"
-    return unit, next((source for start, source in _SOURCES.items() if name.startswith(start)), "")
+    # By the beginning of the figure's name, the first that fits; docs/domain.md is DOMAIN.
+    sources = published("figure_sources").iter_rows()
+    return unit, next((source for start, source in sources if name.startswith(start)), "")
 
 
 _SCHEMA = {"kind": pl.String, "of": pl.String, "name": pl.String, "bytes": pl.Int64, "sha256": pl.String}
