@@ -181,10 +181,7 @@ def _expand(name: str) -> list[Address]:
         raise UsageError(
             "no such run", place=redacted(name), expected="RUN.mcap, a run folder, a folder of runs or a glob"
         )
-    runs: list[Address] = []
-    for match in matches:
-        runs += [match] if _is_run(match) else _runs_in(match)
-    return runs
+    return [run for match in matches for run in ([match] if _is_run(match) else _runs_in(match))]
 
 
 def _matches(name: str) -> list[Address]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import quote
@@ -33,7 +33,7 @@ from pipeline.safety.side_by_side import side_by_side
 from pipeline.safety.tally import added
 from pipeline.storage import files
 from schemas.config import Configuration, to_toml
-from schemas.run import RunTables, Site
+from schemas.run import Site
 from schemas.tables import TABLES
 
 # The end of a page: what it was made from.
@@ -82,18 +82,14 @@ def write_report(
             progress(done, len(pages))
     if states == catalogue.states(out, *TABLES):
         remember(out, states, _settings_digest(made), shares)
-    _remove_others(out / "report" / "runs", {page.path.name for page in pages})
+    folder, own = out / "report" / "runs", {page.path.name for page in pages}
+    for name in files.list_dir(folder):
+        if name.endswith(".html") and name not in own:
+            storage.remove(folder / name)
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
     index = out / "report" / "index.html"
     storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, shares), made).encode())
     return [index, *(page.path for page in pages)]
-
-
-def _remove_others(folder: Path, names: Collection[str]) -> None:
-    """Remove pages of runs that are no longer in the result."""
-    for name in files.list_dir(folder):
-        if name.endswith(".html") and name not in names:
-            storage.remove(folder / name)
 
 
 def page_name(run_id: str) -> str:
@@ -123,18 +119,14 @@ def _written(page: _Page) -> Share:
     metadata = metadata_of(contents["runs"] or b"")
     check_site(page.made.site, metadata.get("site_digest"), page.run)
     tables = read_run(page.out, page.run)
-    share = _share(page, tables, _digest(contents))
+    several, config = tables.runs.height > 1, page.made.config
+    judged = (tables.epochs, tables.hazards, tables.alarms, tables.runs)
+    tallies = side_by_side(*judged, config) if several else None
+    share = Share(page.run, _digest(contents), availability_pieces(tables.epochs.lazy()), tallies)
     if not _is_there(replace(page, content=share.content)):
         html = run_page(tables, metadata, page.made, share.tallies, page.neighbours)
         storage.write_bytes(page.path, html.encode() + _mark(page, share.content))
     return share
-
-
-def _share(page: _Page, tables: RunTables, content: str) -> Share:
-    tallies = None
-    if tables.runs.height > 1:
-        tallies = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, page.made.config)
-    return Share(page.run, content, availability_pieces(tables.epochs.lazy()), tallies)
 
 
 def _digest(contents: Mapping[str, bytes | None]) -> str:

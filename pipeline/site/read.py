@@ -48,7 +48,9 @@ def read_site(path: Path | str) -> Site:
     links = _read_links(files, network, breaches)
     raw = _load(files, "balises", breaches)
     balises = None if raw is None else typed_table(raw, "balises", breaches)
-    route = _read_route(files, breaches)
+    name = next((name for name in files if name.startswith("route.")), None)
+    route = None if name is None else route_table(name, files[name], breaches)
+    route = None if route is None else route.drop("leg")  # that of every run over this site, in one piece
     if breaches or track is None or links is None:
         raise _refusal(path, breaches)
     lengths = network.declared_length_m if network else {}
@@ -141,13 +143,6 @@ def _read_links(files: dict[str, bytes], network: Network | None, breaches: list
     if raw is None:
         return Links.create_empty()
     return typed_table(raw, "links", breaches)
-
-
-def _read_route(files: dict[str, bytes], breaches: list[str]) -> pl.DataFrame | None:
-    """The route of every run over this site."""
-    name = next((name for name in files if name.startswith("route.")), None)
-    route = None if name is None else route_table(name, files[name], breaches)
-    return None if route is None else route.drop("leg")
 
 
 def _in_degrees(raw: RawTable) -> RawTable:
