@@ -101,9 +101,14 @@ def stretches_of(epochs: pl.DataFrame) -> Stretches:
 def ground_at(track: pl.DataFrame, stretches: Stretches, path_m: Floats, margin_m: float = 50.0) -> Ground:
     """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
     best, chosen = np.full(len(path_m), np.inf), np.full(len(path_m), -1, dtype=np.int64)
-    lengths = _element_ends(track)
+    survey = track_of(track)
     for number, element in enumerate(stretches.elements):
-        low, high = _path_range(stretches, number, lengths.get(element))
+        # Path positions of the whole element, not just of the epochs on it.
+        ends = [stretches.first_m[number], stretches.last_m[number]]
+        if element in survey.index:
+            measures = survey.measure_m[survey.vertices(survey.index[element])][[0, -1]]
+            ends += list(stretches.offset_m[number] + stretches.sign[number] * measures)
+        low, high = min(ends), max(ends)
         away = np.maximum(np.maximum(low - path_m, path_m - high), 0.0)
         nearer = (away < best) & (away <= margin_m)
         best[nearer], chosen[nearer] = away[nearer], number
@@ -173,23 +178,6 @@ def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, F
     heading = np.degrees(np.arctan2(east, np.diff(latitude))) % 360.0
     along = (column[segment] + share * np.diff(column)[segment] for column in (latitude, longitude, height))
     return (*along, heading[segment])  # type: ignore[return-value]
-
-
-def _element_ends(track: pl.DataFrame) -> dict[str, tuple[float, float]]:
-    survey = track_of(track)
-    return {
-        name: (float(survey.measure_m[rows][0]), float(survey.measure_m[rows][-1]))
-        for _, name, rows in survey.elements()
-    }
-
-
-def _path_range(stretches: Stretches, number: int, ends: tuple[float, float] | None) -> tuple[float, float]:
-    """Path positions of a whole element, not just of the epochs on it."""
-    low, high = float(stretches.first_m[number]), float(stretches.last_m[number])
-    if ends is None:
-        return low, high
-    places = [stretches.offset_m[number] + stretches.sign[number] * end for end in ends]
-    return float(min(low, *places)), float(max(high, *places))
 
 
 _COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
