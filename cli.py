@@ -8,7 +8,7 @@ import re
 import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,6 @@ from typer import Argument, Exit, Option, Typer
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.campaign import Summary
     from schemas.config import Configuration, Vehicle
     from schemas.run import RunLog
     from schemas.run import Site as Ground
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., None])
 
 OK, RUNS_NOT_OK, USAGE, DEFECT = 0, 1, 2, 3
-_SHOWN_ELEMENTS = 25
 
 app = Typer(
     name="balise",
@@ -45,13 +43,10 @@ def _command(*examples: str, name: str | None = None) -> Callable[[Command], Com
     return app.command(name, epilog="\n\n".join(["Examples:", *examples]))
 
 
-_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
-
-
 def _here(value: Any) -> Any:
     """Refuse addresses where a path is meant: `s3://bucket/run` would become a folder called `s3:`."""
     for path in value if isinstance(value, list | tuple) else [value]:
-        if path is not None and _ADDRESS.match(str(path)):
+        if path is not None and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(path)):
             from pipeline.storage.address import redacted
             from schemas.errors import UsageError
 
@@ -60,26 +55,26 @@ def _here(value: Any) -> Any:
     return value
 
 
-def _cores(jobs: int) -> int:
-    return jobs or os.cpu_count() or 1
-
-
 _place, _file = partial(Argument, callback=_here), partial(Option, callback=_here)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
+_LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; .gz, .zip of these."
 
 Result = Annotated[str, Argument(help="A result of `balise replay`.")]
 ResultFolder = Annotated[Path, _place(help="A result of `balise replay`.")]
 Run = Annotated[str, Argument(help="A recorded run.")]
 Site = Annotated[str, Option(help="Site: a folder with track, links, balises and route, or a GeoJSON file.")]
+LogsAgain = Annotated[list[str] | None, Option("--logs", help="Logs to replay again: paths, folders, patterns.")]
 LogsSite = Annotated[str | None, Option("--site", help="Site of these logs.")]
 OutFolder = Annotated[Path, _file("--out", help="Folder to write.")]
 VehicleFile = Annotated[Path | None, _file("--vehicle", help="Vehicle file (TOML).")]
 ConfigFile = Annotated[Path | None, _file("--config", help="Configuration file (TOML).")]
-RouteFiles = Annotated[
-    Path | None, _file("--route", help="Known route: a file for all runs, or a folder with RUN.csv or RUN.parquet.")
-]
+RouteFiles = Annotated[Path | None, _file("--route", help="Known route: a file, or a folder with RUN.csv or .parquet.")]
 Solution = Annotated[str, Option(help="Solution of the runs.")]
-Jobs = Annotated[int, Option(min=0, callback=_cores, help="Number of runs at the same time; 0: one per core.")]
+Jobs = Annotated[
+    int, Option(min=0, callback=lambda jobs: jobs or os.cpu_count() or 1, help="So many at once; 0: one per core.")
+]
+CsvFile = Annotated[Path | None, _file("--csv", metavar="FILE", help="Write CSV; `-` is standard output.")]
+Force = Annotated[bool, Option("--force", help="Replace what is there.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="No progress, no tables; errors only.")]
 Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 
@@ -106,35 +101,29 @@ def replay(
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
     route: RouteFiles = None,
-    write_route: Annotated[
-        Path | None, _file(help="Folder for the route found of each run; doubtful net elements are marked.")
-    ] = None,
+    write_route: Annotated[Path | None, _file(help="Folder for the routes found, doubtful parts marked.")] = None,
     jobs: Jobs = 0,
     scheduler: Annotated[str | None, Option(help="Run on this Dask cluster (tcp://host:port).")] = None,
     force: Annotated[bool, Option("--force", help="Also replay runs that are already complete.")] = False,
     time_limit: Annotated[float, Option(min=0.1, help="Seconds that one run may take; a slower run fails.")] = 3600.0,
-    undetected: Annotated[
-        bool, Option("--undetected", help="Also compute the largest error that no monitor would have noticed.")
-    ] = False,
+    undetected: Annotated[bool, Option("--undetected", help="Also the largest error no monitor would notice.")] = False,
     quiet: Quiet = False,
-    as_json: Annotated[
-        bool, Option("--json", help="JSON: progress as lines on standard error, the result on standard output.")
-    ] = False,
+    as_json: Annotated[bool, Option("--json", help="JSON: progress on standard error, then the result.")] = False,
 ) -> None:
     """Replay recorded runs on a site and write the tables hazards, passages, alarms, epochs and runs."""
     from pipeline.campaign import Interrupted, make_plan, run_campaign
-    from pipeline.campaign.ending import show_summary
-    from pipeline.campaign.progress import watches
+    from pipeline.campaign.progress import show_summary, watches
     from pipeline.results.manifest import settings_files
 
-    settings, train = _configuration(config), _vehicle(vehicle)
+    settings, given = _configuration(config), settings_files(config, vehicle)
     if undetected:
-        asked = settings.undetected.model_copy(update={"compute": True})
-        settings = settings.model_copy(update={"undetected": asked})
-    plan = make_plan(runs, site, out, settings, train, route, write_route, settings_files(config, vehicle))
-    work = partial(run_campaign, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit)
+        settings = settings.model_copy(update={"undetected": settings.undetected.model_copy(update={"compute": True})})
+    plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
+    shown = watches(quiet, as_json)
     try:
-        summary = work(plan, watches=watches(quiet, as_json))
+        summary = run_campaign(
+            plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
+        )
     except Interrupted as interrupted:
         # A terminal that was closed takes no more words.
         with contextlib.suppress(OSError):
@@ -143,7 +132,7 @@ def replay(
             print("balise: interrupted; repeat the command to continue", file=sys.stderr)
         raise Exit(128 + interrupted.signum) from None
     show_summary(summary, out, quiet, as_json)
-    raise Exit(_status_of(summary))
+    raise Exit(DEFECT if summary.defects else OK if summary.all_ok else RUNS_NOT_OK)
 
 
 @_command("balise dictionary --table hazards", "balise dictionary --markdown > dictionary.md")
@@ -182,9 +171,8 @@ def demo(
     result = run_demo(out, seed=seed, progress=None if quiet else _say)
     page = write_demo(result, out / "tables")
     if not quiet:
-        differing = result.checks.filter(~result.checks["agrees"])
-        if differing.height:
-            _show(differing.drop("title", "agrees"), "What was found differs from what was expected")
+        if not result.agrees:
+            _show(result.differing, "What was found differs from what was expected")
         print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {page}\n")
         _show(result.lines)
         print(result.sentence)
@@ -192,11 +180,7 @@ def demo(
 
 
 @_command("balise synth scenario.toml --out trial")
-def synth(
-    scenario: Annotated[Path, _place(help="Scenario (TOML).")],
-    out: OutFolder,
-    quiet: Quiet = False,
-) -> None:
+def synth(scenario: Annotated[Path, _place(help="Scenario (TOML).")], out: OutFolder, quiet: Quiet = False) -> None:
     """Write a synthetic trial: site, runs and the faults injected into them."""
     from datasets.scenario import load_scenario
     from datasets.trial import write_trial
@@ -208,13 +192,9 @@ def synth(
 
 @_command("balise safety", "balise safety week12", "balise safety week12 --config other_level.toml --json")
 def safety(
-    out: Annotated[
-        str | None, Argument(help="Result of `balise replay` to assess; without it: the budget only.")
-    ] = None,
+    out: Annotated[str | None, Argument(help="Result of `balise replay`; without it: the budget only.")] = None,
     config: ConfigFile = None,
-    logs: Annotated[
-        list[str] | None, Option(help="Logs to replay with other limits, for the sensitivity of the verdict.")
-    ] = None,
+    logs: LogsAgain = None,
     site: LogsSite = None,
     vehicle: VehicleFile = None,
     jobs: Jobs = 0,
@@ -226,11 +206,11 @@ def safety(
     once per value of `failure_limit_m` and `evidence_factor`, to show how the verdict depends on these.
     """
     if out is not None:
-        from pipeline.campaign.replayed_again import again
         from pipeline.safety.assessment import assess, show
+        from pipeline.safety.sensitivity import replayed
 
-        settings = None if config is None else _configuration(config)
-        show(assess(out, settings, again(logs or [], site, _vehicle(vehicle), jobs)), as_json)
+        again = replayed(logs or [], site, _vehicle(vehicle), jobs)
+        show(assess(out, None if config is None else _configuration(config), again), as_json)
         return
     from pipeline.results.terminal import show_tables
     from pipeline.safety import safety_tables
@@ -244,10 +224,8 @@ def claim(
     out: Result,
     profile: Annotated[str, Option(help="Requirements: a profile by name, or a TOML file.")] = "lu-2023",
     site: Annotated[str | None, Option(help="Site with areas.csv or areas.parquet.")] = None,
-    front_ahead: Annotated[
-        float, Option(metavar="METRES", help="Distance of the front end ahead of the balise antenna.")
-    ] = 0.0,
-    csv: Annotated[Path | None, _file(metavar="FILE", help="Write all columns as CSV; `-` is standard output.")] = None,
+    front_ahead: Annotated[float, Option(metavar="METRES", help="Front end ahead of the balise antenna.")] = 0.0,
+    csv: CsvFile = None,
     as_json: Json = False,
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
@@ -257,16 +235,14 @@ def claim(
 
     wanted = load_profile(profile)
     ground = _ground(site) if site else None
-    areas = read_areas(site, ground) if site and ground else None
-    found = hold(out, wanted, ground, areas, front_ahead)
+    found = hold(out, wanted, ground, read_areas(site, ground) if site and ground else None, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
-    if as_json:
+    if as_json or str(csv) != "-":
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
-        _print_json({**head, "notes": found.notes, "requirements": found.table})
-    elif str(csv) != "-":
-        _show(for_reading(found.table), f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}")
-        print("\n".join(["", *found.notes]))
+        title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
+        told = {**head, "notes": found.notes, "requirements": found.table}
+        _tell(as_json, told, {title: for_reading(found.table)}, "", *found.notes)
 
 
 @_command("balise inspect monday.mcap", "balise inspect line9", "balise inspect line9 --result week12")
@@ -279,17 +255,11 @@ def inspect(
     as_json: Json = False,
 ) -> None:
     """Describe a log, a site or a result, and list what needs attention."""
-    from pipeline.results.inspection import STARTING_CONFIG, inspect_path
-    from pipeline.results.terminal import show_tables
+    from pipeline.results.inspection import inspect_path, show
 
     settings = _configuration(config)
     tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
-    if as_json:
-        _print_json(tables)
-    else:
-        show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
-        if STARTING_CONFIG in tables:  # to be saved, so without a frame
-            print("\n".join(tables[STARTING_CONFIG]["toml"]))
+    _print_json(tables) if as_json else show(tables)
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
@@ -302,15 +272,10 @@ def inject(
     config: ConfigFile = None,
 ) -> None:
     """Add a known fault to a recorded run, to measure detection on real noise."""
-    from datasets.inject import inject_all, load_faults
-    from datasets.trial import write_run_as
-    from schemas.errors import UsageError
+    from datasets.inject import inject_into, load_faults
 
     faults = load_faults(fault)
-    if out.resolve() == Path(run).resolve():
-        raise UsageError("is the recording itself", place=str(out), remedy="Name another place with --out.")
-    log = _log(run, _configuration(config))
-    write_run_as(inject_all(log, faults, _ground(site) if site else None), out)
+    inject_into(run, _configuration(config), faults, _ground(site) if site else None, out)
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
@@ -327,20 +292,12 @@ def undetected(
     behind: Annotated[bool, Option("--behind", help="An error behind the train instead of ahead.")] = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
-    from datasets.undetected import largest_fault, write_fault
+    from datasets.undetected import largest_fault, told, write_fault
 
     settings, train = _configuration(config), _vehicle(vehicle)
-    log = _log(run, settings)
-    found = largest_fault(log, _ground(site), train, settings, solution, balise, at_s, behind)
-    one = settings.undetected.solutions_at_fault == "one"
-    file = write_fault(found, solution if one else None, out)
-    began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
-    print(
-        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most.\n"
-        f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.\n"
-        f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}.\n"
-        f"To check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2."
-    )
+    found = largest_fault(_log(run, settings), _ground(site), train, settings, solution, balise, at_s, behind)
+    file = write_fault(found, solution if settings.undetected.solutions_at_fault == "one" else None, out)
+    print(f"{told(found)}\nTo check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
 
 @_command(
@@ -350,48 +307,20 @@ def undetected(
     "balise convert positions.csv --config columns.toml --to monday.mcap",
 )
 def convert(
-    logs: Annotated[
-        list[Path],
-        _place(
-            help="UBX, SBF, NMEA, NovAtel, RTKLIB .pos, ROS bags, MCAP, CSV with a mapping in --config, or a public "
-            "recording; .gz and .zip of these."
-        ),
-    ],
+    logs: Annotated[list[Path], _place(help=_LOGS)],
     to: Annotated[Path, _file(help=_NEW_RUN + " To one that exists, streams are added.")],
     config: ConfigFile = None,
     solution: Annotated[str | None, Option(help="Name of the receiver in the run, where it has several.")] = None,
     stream: Annotated[Literal["gnss", "reference"], Option(help="What the positions are for.")] = "gnss",
-    date: Annotated[
-        datetime | None, Option(formats=["%Y-%m-%d"], help="Day of an NMEA log that holds none (UTC).")
-    ] = None,
-    force: Annotated[bool, Option("--force", help="Replace a stream or solution that the run has.")] = False,
+    date: Annotated[datetime | None, Option(formats=["%Y-%m-%d"], help="Day (UTC) of an NMEA log without one.")] = None,
+    force: Force = False,
 ) -> None:
     """Convert receiver logs to a run, or add streams to a run."""
-    from datasets.recordings import known_recording
-    from datasets.trial import write_run_as
-    from pipeline.ingest import read_run
-    from pipeline.receivers import Purpose, as_run, extended, gather
-    from pipeline.results.fit_report import fit_report
-    from schemas.config import IngestConfig
-    from schemas.errors import visible
+    from datasets.recordings import convert_logs
+    from pipeline.receivers import Purpose
 
-    settings, purpose = _configuration(config), Purpose(solution, stream)
-    recording = known_recording(logs[0]) if len(logs) == 1 and config is None else None
-    if recording is None:
-        found = gather(logs, settings.ingest, None if date is None else date.date())
-    else:
-        found = recording.gathered()
-    if to.is_file() or (to / "gnss.parquet").is_file():
-        run = read_run(to, IngestConfig(), with_digest=False)
-        converted = extended(run, to, found, purpose, settings.fix_sigma, force)
-    else:
-        converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
-    write_run_as(converted.run, to)
-    print(f"{converted.run.gnss.height} epochs in {to}")
-    for reason, count in converted.dropped.items():
-        print(f"not used: {count} x {visible(reason)}")
-    for line in fit_report(converted.run, settings.ingest).lines():
-        print(line)
+    given, day = None if config is None else _configuration(config), None if date is None else date.date()
+    print("\n".join(convert_logs(logs, to, given, Purpose(solution, stream), day, force)))
 
 
 @_command(
@@ -400,19 +329,15 @@ def convert(
     name="site",
 )
 def make_a_site(
-    surveys: Annotated[
-        list[Path], _place(help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK positions.")
-    ],
+    surveys: Annotated[list[Path], _place(help="GPX, KML, KMZ, GeoJSON, CSV, or runs with a reference or RTK.")],
     out: OutFolder,
-    balises: Annotated[
-        str | None, Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
-    ] = None,
+    balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
     epsg: Annotated[int | None, Option(help="Of x and y in tables that do not say.")] = None,
     join: Annotated[float, Option(help="Ends of lines within so many metres meet.")] = 0.05,
     flat: Annotated[bool, Option("--flat", help="Leave heights out.")] = False,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
-    force: Annotated[bool, Option("--force", help="Replace a site that is there.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Make a site of a survey of the line: net elements, links, balises, and a page to look at."""
@@ -425,14 +350,11 @@ def make_a_site(
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
     write_made(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)
-    if as_json:
-        _print_json({"elements": elements, "findings": findings, "balises": site.balises})
-        return
-    _show(elements.head(_SHOWN_ELEMENTS), "Elements")
-    _show(findings, "Findings")
+    made = {"elements": elements, "findings": findings, "balises": site.balises}
     count = 0 if site.balises is None else site.balises.height
-    print(f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}.")
-    print(f"Look at {out / 'site.html'} before you replay on it.")
+    size = f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}."
+    look = f"Look at {out / 'site.html'} before you replay on it."
+    _tell(as_json, made, {"Elements": elements.head(25), "Findings": findings}, size, look)
 
 
 @_command("balise calibrate good/*.mcap --site line9 --out train7.toml")
@@ -455,15 +377,12 @@ def calibrate(
     logs = [_log(address, settings) for address in find_runs(runs).values()]
     found = measure(logs, _ground(site), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
-    if as_json:
-        measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
-        _print_json({**measured, "runs": found.runs, "sigmas": found.sigmas})
-        return
-    _show(found.runs, "Scale and latency")
-    _show(found.sigmas, "Sigma of the monitors")
-    if found.vehicle.gnss_latency_s is None:
-        print("\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few.")
-    print(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
+    measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
+    tables = {"Scale and latency": found.runs, "Sigma of the monitors": found.sigmas}
+    none = "\nNo latency in the vehicle file: only changes of speed show it, and these runs have too few."
+    words = [none] if found.vehicle.gnss_latency_s is None else []
+    words.append(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
+    _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
 
 
 @_command("balise experiment list", "balise experiment diagnostics --repetitions 50")
@@ -472,28 +391,23 @@ def experiment(
     out: OutFolder = Path("experiment-out"),
     repetitions: Annotated[int | None, Option(min=1, help="Number of repetitions; default: as published.")] = None,
     seed: Annotated[int, Option(help="Seed of all random numbers.")] = 1,
-    jobs: Annotated[int, Option(min=0, callback=_cores, help="Number of processes; 0: one per core.")] = 0,
+    jobs: Jobs = 0,
     config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue` only).")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Repeat a published experiment, by default with its own number of runs."""
-    from datasets.experiment import EXPERIMENTS
+    from datasets.experiment import EXPERIMENTS, experiment_of
 
     if name == "list":
         print("\n".join(EXPERIMENTS))
         return
-    if name not in EXPERIMENTS:
-        from schemas.errors import UsageError
-        from schemas.near import did_you_mean
-
-        known = ", ".join(EXPERIMENTS)
-        raise UsageError(f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=known)
+    wanted = experiment_of(name)
     from pipeline.campaign.workers import watched
     from pipeline.results.terminal import how_far
 
     bank = None if config is None else _configuration(config)
     with watched(None if quiet else how_far("pieces of work")):
-        print(*EXPERIMENTS[name](out, repetitions, seed, jobs, bank), sep="\n")
+        print(*wanted(out, repetitions, seed, jobs, bank), sep="\n")
 
 
 @_command(
@@ -509,27 +423,21 @@ def sql(
         list[str] | None,
         Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
-    csv: Annotated[Path | None, _file(metavar="FILE", help="Write CSV; `-` is standard output.")] = None,
+    csv: CsvFile = None,
     parquet: Annotated[Path | None, _file(metavar="FILE", help="Write Parquet.")] = None,
     xlsx: Annotated[Path | None, _file(metavar="FILE", help="Write an Excel workbook (extra `excel`).")] = None,
     as_json: Json = False,
     allow_files: Annotated[bool, Option("--allow-files", help="Let the query read other files (`read_csv`).")] = False,
 ) -> None:
     """Ask the tables of a result in SQL: hazards, passages, alarms, epochs, runs and those of the campaign."""
-    from pipeline.results.answer_files import write_csv, write_parquet, write_xlsx
+    from pipeline.results.answer_files import write_answer
     from pipeline.results.query import named_results, run_sql
 
     answer = run_sql(out, query, allow_files, named_results(beside or []))
-    written = [(csv, write_csv), (parquet, write_parquet), (xlsx, write_xlsx)]
-    for file, write in written:
-        if file is not None:
-            write(answer, file)
-            if str(file) != "-":
-                _say(f"{answer.height} rows in {file}")
-    if as_json:
-        _print_json(answer)
-    elif all(file is None for file, _ in written):
-        _show(answer)
+    for file in (written := write_answer(answer, csv, parquet, xlsx)):
+        _say(f"{answer.height} rows in {file}")
+    if as_json or not (written or csv):
+        _tell(as_json, answer, {"": answer})
 
 
 @_command("balise report week12 --site line9")
@@ -572,13 +480,10 @@ def line(
 
     given = None if points is None else read_points(points)
     found = write_line(out, _ground(site), load_settings(criteria, LineCriteria), solution, given, to)
-    if as_json:
-        _print_json({"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)})
-        return
-    _show(found.summary, "Pieces of track")
-    _show(found.proposals, "Proposals")
-    print("\n".join(found.remarks))
-    print(f"{len(found.files)} files; begin with {found.files[0]}")
+    told = {"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)}
+    tables = {"Pieces of track": found.summary, "Proposals": found.proposals}
+    files = f"{len(found.files)} files; begin with {found.files[0]}"
+    _tell(as_json, told, tables, "\n".join(found.remarks), files)
 
 
 @_command(
@@ -595,22 +500,16 @@ def export(
 ) -> None:
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
     from pipeline.export import export_run
-    from pipeline.ingest.run import read_run
 
-    recorded = read_run(log, _configuration(config).ingest) if log else None
-    ground = _ground(site) if site else None
+    recorded, ground = _log(log, _configuration(config), True) if log else None, _ground(site) if site else None
     files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
-    print("Wrote " + " and ".join(str(path) for path in files))
-    for text in missing:
-        print(f"Without {text}")
+    print("\n".join(["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]))
 
 
 @_command("balise verify week12", "balise verify week12 --logs logs --site line9 --vehicle train7.toml")
 def verify(
     out: Result,
-    logs: Annotated[
-        list[str] | None, Option(help="Logs to replay again and compare: paths, folders, glob patterns.")
-    ] = None,
+    logs: LogsAgain = None,
     site: LogsSite = None,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,
@@ -620,27 +519,19 @@ def verify(
     as_json: Json = False,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
-    from pipeline.campaign.plan import make_plan
     from pipeline.campaign.verify import recompute
     from pipeline.campaign.verify import verify as compare
-    from pipeline.results.store import read_config
     from pipeline.results.terminal import how_far
-    from schemas.errors import UsageError
 
     found = [compare(out, None if quiet else how_far("runs"))]
     if logs:
-        if site is None:
-            raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
-        settings = _configuration(config) if config else read_config(out)
-        train = _vehicle(vehicle)
-        found.append(recompute(out, lambda to: make_plan(logs, site, to, settings, train, route), jobs))
+        settings = _configuration(config) if config else None
+        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs))
     if as_json:
         _print_json([{"compared": one.compared, "problems": one.table} for one in found])
     for one in found if not as_json else []:
-        if one.problems:
-            _show(one.table)
         if one.problems or not quiet:
-            print(one.sentence)
+            _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
 
 
@@ -713,10 +604,10 @@ def _vehicle(file: Path | None) -> Vehicle:
     return load_settings(file, Vehicle)
 
 
-def _log(address: str, settings: Configuration) -> RunLog:
+def _log(address: str, settings: Configuration, with_digest: bool = False) -> RunLog:
     from pipeline.ingest import read_run
 
-    return read_run(address, settings.ingest, with_digest=False)
+    return read_run(address, settings.ingest, with_digest)
 
 
 def _ground(site: str) -> Ground:
@@ -731,6 +622,17 @@ def _show(table: pl.DataFrame, title: str = "") -> None:
     show_table(table, title)
 
 
+def _tell(as_json: bool, value: Any, tables: Mapping[str, pl.DataFrame], *words: str) -> None:
+    """The value as JSON, or for people: tables under their titles, then what they mean."""
+    if as_json:
+        _print_json(value)
+        return
+    for title, table in tables.items():
+        _show(table, title)
+    if words:
+        print("\n".join(words))
+
+
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -739,14 +641,6 @@ def _print_json(value: Any) -> None:
     from pipeline.results.terminal import to_json
 
     print(to_json(value))
-
-
-def _status_of(summary: Summary) -> int:
-    from schemas.enums import RunStatus
-
-    if summary.defects:
-        return DEFECT
-    return OK if summary.count(RunStatus.OK) == summary.planned else RUNS_NOT_OK
 
 
 if __name__ == "__main__":

@@ -52,6 +52,11 @@ class DemoResult:
         return bool(self.checks["agrees"].all())
 
     @property
+    def differing(self) -> pl.DataFrame:
+        """Checks that found something else than expected."""
+        return self.checks.filter(~self.checks["agrees"]).drop("title", "agrees")
+
+    @property
     def lines(self) -> pl.DataFrame:
         """One line per run, `run_id, injected, verdict, hazards, checks`, as short as a terminal is wide."""
         of_runs = self.checks.group_by("run_id", maintain_order=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +23,11 @@ from datasets.faults import (
 from datasets.inject_ranges import inject_ranges
 from datasets.line import Places, shifted
 from datasets.run_path import displacement_m
+from datasets.trial import write_run_as
+from pipeline.ingest import read_run
 from schemas.arrays import Floats
-from schemas.config import Settings, read_toml, settings_from
-from schemas.errors import ConfigError, InputError
+from schemas.config import Configuration, Settings, read_toml, settings_from
+from schemas.errors import ConfigError, InputError, UsageError
 from schemas.run import RunLog, Site
 
 _PLACE = ("latitude_deg", "longitude_deg", "height_m")
@@ -52,6 +54,14 @@ def load_faults(path: Path) -> tuple[FaultSpec, ...]:
 def _with_profile_beside(fault: FaultSpec, folder: Path) -> FaultSpec:
     """A profile is named as seen from its fault file."""
     return fault if fault.profile is None else fault.model_copy(update={"profile": str(folder / fault.profile)})
+
+
+def inject_into(address: str, config: Configuration, faults: Sequence[FaultSpec], site: Site | None, out: Path) -> None:
+    """Write a recorded run with faults to another place. Raises `UsageError` where that is the recording itself."""
+    if out.resolve() == Path(address).resolve():
+        raise UsageError("is the recording itself", place=str(out), remedy="Name another place with --out.")
+    run = read_run(address, config.ingest, with_digest=False)
+    write_run_as(inject_all(run, faults, site), out)
 
 
 def inject_all(run: RunLog, faults: Iterable[FaultSpec], site: Site | None = None) -> RunLog:

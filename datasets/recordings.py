@@ -1,12 +1,39 @@
-"""Which public recording a path holds, if any."""
+"""Logs of receivers and public recordings to runs: what `balise convert` does."""
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
 
 from datasets import infrabel
 from datasets.comma2k19 import comma2k19_run
-from pipeline.receivers import Converted
+from datasets.trial import write_run_as
+from pipeline.ingest import read_run
+from pipeline.receivers import Converted, Purpose, as_run, extended, gather
+from pipeline.results.fit_report import fit_report
+from schemas.config import Configuration, IngestConfig
+from schemas.errors import visible
+
+
+def convert_logs(
+    logs: list[Path], to: Path, given: Configuration | None, purpose: Purpose, day: date | None, force: bool
+) -> list[str]:
+    """Write logs as a run, or add their streams to one; returns what was done and what does not fit, in lines.
+
+    With a configuration no log is taken for a public recording.
+    """
+    settings = given or Configuration()
+    recording = known_recording(logs[0]) if len(logs) == 1 and given is None else None
+    found = gather(logs, settings.ingest, day) if recording is None else recording.gathered()
+    if to.is_file() or (to / "gnss.parquet").is_file():
+        run = read_run(to, IngestConfig(), with_digest=False)
+        converted = extended(run, to, found, purpose, settings.fix_sigma, force)
+    else:
+        converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
+    write_run_as(converted.run, to)
+    unused = [f"not used: {count} x {visible(reason)}" for reason, count in converted.dropped.items()]
+    fit = fit_report(converted.run, settings.ingest).lines()
+    return [f"{converted.run.gnss.height} epochs in {to}", *unused, *fit]
 
 
 def known_recording(path: Path) -> Converted | None:

@@ -31,6 +31,16 @@ def largest_fault(
     return profile_at(diagnosis, epoch, behind, vehicle, config)
 
 
+def told(found: Profile) -> str:
+    """The fault in words: how large, since when, and what a ramp and a step would have reached."""
+    began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
+    return (
+        f"{found.error_m:.3f} m at {reached}, of a fault since {began}; the tables say {found.bound_m:.3f} m at most.\n"
+        f"Of a ramp {found.ramp_m:.3f} m would have gone unnoticed there, of a step {found.step_m:.3f} m.\n"
+        f"It reaches the thresholds of {', '.join(found.monitors) or 'no monitor'}."
+    )
+
+
 def write_fault(profile: Profile, solution: str | None, out: Path) -> Path:
     """`fault.toml` and its `profile.csv` in a folder; `solution`: the only one that is hit, None for all."""
     fault = {"kind": "profile", "target": "along", "profile": PROFILE}

@@ -82,7 +82,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Campaigns and pages are made here: for tests that are not about workers, which take seconds to start."""
     from pipeline.campaign import run, workers
-    from pipeline.campaign.serial import SerialEngine
+    from pipeline.campaign.engines import SerialEngine
 
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     monkeypatch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))

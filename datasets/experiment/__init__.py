@@ -64,3 +64,14 @@ EXPERIMENTS: dict[str, Experiment] = {
         Experiment("catalogue", "catalogue", configured=True),
     )
 }
+
+
+def experiment_of(name: str) -> Experiment:
+    """The experiment of this name. Raises `UsageError` with the nearest where there is none."""
+    if name not in EXPERIMENTS:
+        from schemas.errors import UsageError
+        from schemas.near import did_you_mean
+
+        known = ", ".join(EXPERIMENTS)
+        raise UsageError(f"is not an experiment{did_you_mean(name, EXPERIMENTS)}", place=name, expected=known)
+    return EXPERIMENTS[name]

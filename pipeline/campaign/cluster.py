@@ -20,15 +20,11 @@ from typing import Any
 from pipeline.campaign.engines import Engine
 from pipeline.campaign.outcome import Result, RunOutcome
 from pipeline.campaign.plan import RunJob
+from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import replay_one
 from pipeline.storage.address import redacted
 from schemas.errors import UsageError
 
-_CONNECT_S = 8.0
-_COUNT_EVERY_S = 2.0
-_ANSWER_S = 5.0
-_KILL_S = 15.0
-_GRACE_S = 15.0
 _BEGUN = "balise-run-begun"
 
 
@@ -44,7 +40,7 @@ class DaskEngine(Engine):
         self._executor = self._client.get_executor(pure=False)
         self._limit_s = limit_s
         self._threads = 0
-        self._counted = -_COUNT_EVERY_S
+        self._counted = -WAITS.count_every_s
         self._seen_s = time.monotonic()
         self.name = self._scheduler = redacted(scheduler)
         self._marks: dict[Result, str] = {}
@@ -53,7 +49,7 @@ class DaskEngine(Engine):
 
     def capacity(self) -> int:
         """Twice the cluster's threads, so that no worker waits for the next run."""
-        if time.monotonic() - self._counted > _COUNT_EVERY_S:
+        if time.monotonic() - self._counted > WAITS.count_every_s:
             self._threads = sum(self._count().values())
             self._counted = time.monotonic()
             if self._threads:
@@ -66,7 +62,7 @@ class DaskEngine(Engine):
     def submit(self, job: RunJob) -> Result:
         mark = f"balise-{secrets.token_hex(8)}"
         self._workers[mark] = ""
-        result: Result = self._executor.submit(replay_there, job, mark, self._limit_s + _GRACE_S)
+        result: Result = self._executor.submit(replay_there, job, mark, self._limit_s + WAITS.grace_s)
         self._marks[result] = mark
         return result
 
@@ -113,7 +109,7 @@ class DaskEngine(Engine):
             self._client.sync(
                 self._client.scheduler.restart_workers,
                 workers=[worker],
-                timeout=_KILL_S,
+                timeout=WAITS.kill_s,
                 wait_for_workers=False,
                 on_error="return",
                 stimulus_id=_BEGUN,
@@ -121,7 +117,7 @@ class DaskEngine(Engine):
         result.cancel()
 
     def _ask(self, question: Any, **arguments: str) -> Any:
-        return self._client.sync(question, callback_timeout=_ANSWER_S, **arguments)
+        return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
     def _count(self) -> dict[str, int]:
         try:
@@ -184,7 +180,7 @@ def _connect(scheduler: str) -> Any:
     _hush()
     try:
         asyncio.run(_answered(scheduler))
-        return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+        return Client(scheduler, timeout=WAITS.scheduler_s, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError):
         raise lost_scheduler(scheduler) from None
 
@@ -194,7 +190,7 @@ async def _answered(scheduler: str) -> None:
     from distributed.comm.core import connect
 
     arguments = Security().get_connection_args("client")  # type: ignore[no-untyped-call]
-    comm = await connect(scheduler, timeout=_CONNECT_S, **arguments)  # type: ignore[no-untyped-call]
+    comm = await connect(scheduler, timeout=WAITS.scheduler_s, **arguments)  # type: ignore[no-untyped-call]
     await comm.close()
 
 

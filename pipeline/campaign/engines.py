@@ -1,12 +1,26 @@
-"""Where runs are replayed: in this process (`serial`), in processes of this machine, or on a Dask cluster.
+"""Where runs are replayed: in this process, in processes of this machine, or on a Dask cluster (`cluster`).
 
 All of them give `concurrent.futures` futures, so that the campaign loop is the same.
 """
 
 from __future__ import annotations
 
-from pipeline.campaign.outcome import Result
+import contextlib
+import multiprocessing
+import multiprocessing.process
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from types import FrameType
+
+from pipeline.campaign.interruption import StopRun
+from pipeline.campaign.outcome import Failure, Result, overdue
 from pipeline.campaign.plan import RunJob
+from pipeline.campaign.waits import WAITS
+from pipeline.campaign.worker import fail_run, replay_one
+from pipeline.campaign.workers import single_threaded_children
 
 
 class Engine:
@@ -42,3 +56,152 @@ class Engine:
 
     def close(self) -> None:
         """End whatever is still under way, at once."""
+
+
+class SerialEngine(Engine):
+    """This very process: for a single run, without the seconds that a worker takes to start."""
+
+    in_process = True
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+
+    def submit(self, job: RunJob) -> Result:
+        result: Result = Future()
+        try:
+            with _alarm(self._limit_s):
+                result.set_result(replay_one(job))
+        except _Overdue:
+            result.set_result(fail_run(job, Failure(overdue(self._limit_s), lasting=False)))
+        except Exception as error:
+            result.set_exception(error)
+        return result
+
+
+class _Overdue(StopRun):
+    """The run has had its time."""
+
+
+@contextlib.contextmanager
+def _alarm(limit_s: float) -> Iterator[None]:
+    """Raise `_Overdue` after a time; only the main thread can be told."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(signum: int, frame: FrameType | None) -> None:
+        raise _Overdue
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+class LocalEngine(Engine):
+    """Processes of this machine, each in an executor of its own, so that the loss of one touches no other."""
+
+    def __init__(self, jobs: int) -> None:
+        self._slots = [_Slot() for _ in range(jobs)]
+        self._busy: dict[Result, _Slot] = {}
+
+    def capacity(self) -> int:
+        return len(self._slots)
+
+    def submit(self, job: RunJob) -> Result:
+        taken = set(map(id, self._busy.values()))
+        slot = next(slot for slot in self._slots if id(slot) not in taken)
+        result = slot.submit(job)
+        self._busy[result] = slot
+        return result
+
+    def has_begun(self, result: Result) -> bool:
+        return self._busy[result].is_ready
+
+    def kill(self, result: Result) -> None:
+        self._busy[result].kill()
+
+    def is_lost_worker(self, error: BaseException) -> bool:
+        return isinstance(error, BrokenExecutor)
+
+    def collected(self, result: Result) -> None:
+        del self._busy[result]
+
+    def close(self) -> None:
+        for slot in self._slots:
+            slot.kill()
+
+
+class _Slot:
+    """One worker process, started when first needed and again after it was lost."""
+
+    def __init__(self) -> None:
+        self._executor: ProcessPoolExecutor | None = None
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._answer: Future[int] | None = None
+        self._runs = 0
+
+    def submit(self, job: RunJob) -> Result:
+        self._runs += 1
+        if self._runs > WAITS.runs_per_process:
+            self.kill()
+        try:
+            return self._started().submit(replay_one, job)
+        except BrokenExecutor:
+            # It died while it was idle: that costs no run.
+            self.kill()
+            return self._started().submit(replay_one, job)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the process has started and answered."""
+        return self._answer is not None and self._answer.done()
+
+    def kill(self) -> None:
+        """End the process, also one that is still starting."""
+        if self._executor is None or self._process is None:
+            return
+        self._process.kill()
+        self._executor.shutdown(wait=True, cancel_futures=True)
+        self._executor, self._process, self._answer, self._runs = None, None, None, 0
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._process is not None and not self._process.is_alive():
+            self.kill()
+        if self._executor is None:
+            context = multiprocessing.get_context("spawn")
+            self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker)
+            before = set(multiprocessing.active_children())
+            with single_threaded_children(), _deaf():
+                self._answer = self._executor.submit(os.getpid)
+            (self._process,) = set(multiprocessing.active_children()) - before
+        return self._executor
+
+
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """What a worker inherits from its start on: deafness to Ctrl-C, which is the parent's to answer."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def _begin_worker() -> None:
+    """Runs first in a worker: leave Ctrl-C to the parent, and go when the parent goes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_go_with_parent, daemon=True).start()
+
+
+def _go_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import polars as pl
 
 from pipeline import storage
@@ -22,10 +20,7 @@ def write_campaign(out: Address, config: Configuration) -> dict[str, pl.DataFram
     tables = derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], config)
     metadata = {"software": SOFTWARE, "contract": CONTRACT_VERSION, "config_digest": digest_of(config)}
     for name, table in tables.items():
-        storage.write_bytes(join(join(out, "campaign"), f"{name}.parquet"), _bytes(table, name, metadata))
+        content = store.parquet_bytes(table, {"table": f"campaign/{name}", **metadata})
+        storage.write_bytes(join(join(out, "campaign"), f"{name}.parquet"), content)
     write_manifest(out)
     return tables
-
-
-def _bytes(table: pl.DataFrame, name: str, metadata: Mapping[str, str]) -> bytes:
-    return store.parquet_bytes(table, {"table": f"campaign/{name}", **metadata})

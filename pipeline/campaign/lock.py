@@ -16,12 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline import storage
+from pipeline.campaign.waits import WAITS
 from pipeline.storage.address import Address, is_url, join, redacted
 from schemas.errors import OutputError
 
 _NAME = ".lock"
-_BEAT_S = 2.0
-_SILENCE_S = 8.0
 
 
 @contextlib.contextmanager
@@ -72,7 +71,7 @@ def _locked_remote(out: str, own: str) -> Iterator[None]:
     place = str(join(out, _NAME))
     _wait_for_silence(place, out)
     storage.write_bytes(place, f"{own} 0".encode())
-    time.sleep(_BEAT_S / 4)
+    time.sleep(WAITS.lock_beat_s / 4)
     if not _content(place).startswith(own):
         raise _busy(out)
     ended = threading.Event()
@@ -89,9 +88,9 @@ def _locked_remote(out: str, own: str) -> Iterator[None]:
 
 def _wait_for_silence(place: str, out: str) -> None:
     seen = _content(place)
-    until = time.monotonic() + _SILENCE_S
+    until = time.monotonic() + WAITS.lock_silence_s
     while seen and time.monotonic() < until:
-        time.sleep(_BEAT_S / 4)
+        time.sleep(WAITS.lock_beat_s / 4)
         now = _content(place)
         if now and now != seen:
             raise _busy(out)
@@ -105,7 +104,7 @@ def _content(place: Address) -> str:
 def _beat(place: str, own: str, ended: threading.Event) -> None:
     """Rewrite the lock until the end, or until a campaign that took this one for dead has taken it over."""
     count = 0
-    while not ended.wait(_BEAT_S):
+    while not ended.wait(WAITS.lock_beat_s):
         count += 1
         with contextlib.suppress(OutputError):
             if not _content(place).startswith(own):

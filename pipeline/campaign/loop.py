@@ -12,17 +12,10 @@ from pipeline.campaign.engines import Engine
 from pipeline.campaign.interruption import ENDING, Interrupted
 from pipeline.campaign.outcome import Failure, Result, RunOutcome, failure_of, lost, never_begun, overdue
 from pipeline.campaign.plan import RunJob
+from pipeline.campaign.waits import WAITS
 from pipeline.campaign.watch import Watch
 from pipeline.campaign.worker import fail_run
 from schemas.errors import BaliseError, UsageError
-
-_LOOK_S = 0.2
-_ATTEMPTS = 2
-_STARTS = 10
-# A cluster without a worker: after how long that is said, and after how long the campaign gives up, since in the
-# night nobody would notice [s].
-_SAY_S = 4.0
-_PATIENCE_S = 300.0
 
 
 @dataclass(frozen=True)
@@ -80,7 +73,7 @@ class CampaignLoop:
             self._note(outcome)
         while self._waiting or self._under_way:
             self._hand_out()
-            done, _ = wait(self._under_way, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
+            done, _ = wait(self._under_way, timeout=WAITS.look_s, return_when=FIRST_COMPLETED)
             if self._stop is not None:
                 raise Interrupted(self._stop)
             for result in done:
@@ -129,10 +122,10 @@ class CampaignLoop:
 
     def _after_loss(self, attempt: _Attempt, begun: bool) -> RunOutcome | None:
         """A run that was under way when its worker died has one more attempt; one that waited has lost nothing."""
-        if not begun and attempt.starts < _STARTS:
+        if not begun and attempt.starts < WAITS.starts:
             self._waiting.appendleft(replace(attempt, starts=attempt.starts + 1))
             return None
-        if begun and attempt.number < _ATTEMPTS:
+        if begun and attempt.number < WAITS.attempts:
             self._disturbed.add(attempt.job.run_id)
             for watch in self._watches:
                 watch.lost(attempt.job.run_id, attempt.number)
@@ -154,18 +147,18 @@ class CampaignLoop:
         """Say soon that no worker is left, with what is done and what to do; raises `UsageError` in the end."""
         lonely_s = self._engine.lonely_s()
         done = f"{len(self.outcomes)} of {self._planned} runs are done"
-        if lonely_s > _PATIENCE_S:
+        if lonely_s > WAITS.lonely_s:
             raise UsageError(
-                f"{self._engine.name} has had no worker for {_PATIENCE_S:g} s; {done}",
+                f"{self._engine.name} has had no worker for {WAITS.lonely_s:g} s; {done}",
                 remedy="Start workers and repeat the command: complete runs are skipped.",
             )
-        if lonely_s > _SAY_S and not self._said:
+        if lonely_s > WAITS.lonely_said_s and not self._said:
             for watch in self._watches:
                 watch.noted(
                     f"{self._engine.name} has no worker left; {done}. Start workers, and the campaign goes on by "
-                    f"itself; it ends after {_PATIENCE_S:g} s without, and the same command then does the rest"
+                    f"itself; it ends after {WAITS.lonely_s:g} s without, and the same command then does the rest"
                 )
-        self._said = lonely_s > _SAY_S
+        self._said = lonely_s > WAITS.lonely_said_s
 
 
 def _failed(attempt: _Attempt, failure: Failure) -> RunOutcome:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import glob
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
 from pipeline import storage
 from pipeline.results import store
-from pipeline.results.manifest import NO_FILES, SettingsFiles, listing
+from pipeline.results.manifest import SettingsFiles, listing, settings_files
 from pipeline.site.read import read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, check_public, is_url, join, name_of, redacted, stem_of
@@ -21,6 +21,8 @@ from schemas.errors import InputError, UsageError
 from schemas.run import STREAMS
 from schemas.version import SOFTWARE
 
+# What the program is made of: pages also follow from their styles, scripts and words.
+_SOURCES = {".css", ".csv", ".html", ".js", ".py", ".toml"}
 _NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
 _DECIDING_LIBRARIES = ("dataframely", "numpy", "polars", "pyarrow", "pyproj", "scipy")
 
@@ -60,7 +62,7 @@ class Plan:
     out: str
     config: Configuration
     vehicle: Vehicle
-    given: SettingsFiles = NO_FILES
+    given: SettingsFiles = field(default_factory=settings_files)
 
 
 def make_plan(
@@ -101,7 +103,7 @@ def make_plan(
     if routes is not None and not any(job.route for job in jobs):
         expected = "a route file, or a folder with RUN.csv or RUN.parquet of these runs"
         raise UsageError("has no route for any of the runs", place=redacted(str(routes)), expected=expected)
-    return Plan(tuple(jobs), base.out, config, vehicle, given or NO_FILES)
+    return Plan(tuple(jobs), base.out, config, vehicle, given or settings_files())
 
 
 def _with_routes(job: RunJob, routes: Address | None, write_routes: Address | None) -> RunJob:
@@ -179,10 +181,7 @@ def _expand(name: str) -> list[Address]:
         raise UsageError(
             "no such run", place=redacted(name), expected="RUN.mcap, a run folder, a folder of runs or a glob"
         )
-    runs: list[Address] = []
-    for match in matches:
-        runs += [match] if _is_run(match) else _runs_in(match)
-    return runs
+    return [run for match in matches for run in ([match] if _is_run(match) else _runs_in(match))]
 
 
 def _matches(name: str) -> list[Address]:
@@ -237,7 +236,7 @@ def software_digest() -> str:
     root = Path(__file__).parents[2]
     digest = hashlib.sha256()
     for package in ("pipeline", "schemas"):
-        for source in sorted((root / package).rglob("*.py")):
+        for source in sorted(path for path in (root / package).rglob("*.*") if path.suffix in _SOURCES):
             digest.update(f"{source.relative_to(root).as_posix()} ".encode())
             digest.update(hashlib.sha256(source.read_bytes()).digest())
     for library in _DECIDING_LIBRARIES:

@@ -1,4 +1,4 @@
-"""Campaigns as people follow them: a bar on a terminal, lines in a pipe, a log file beside the results."""
+"""Campaigns as people follow them: a bar on a terminal, lines in a pipe, a log beside the results; and their end."""
 
 from __future__ import annotations
 
@@ -6,181 +6,124 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline import storage
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
-from pipeline.campaign.tally import Tally, loss_line, outcome_line, summary_line
-from pipeline.campaign.watch import Summary, Watch
+from pipeline.campaign.waits import WAITS
+from pipeline.campaign.watch import Summary, Watch, ending_rows, outcome_line, outcome_rows, summary_line
 from pipeline.figures.verdict import word_of
+from pipeline.results.terminal import show_table, to_json
 from pipeline.storage.address import is_url, join, redacted
 from schemas.enums import RunStatus
 from schemas.version import SOFTWARE
 
-_LINE_EVERY_S = 5.0
 
-
-class _Spoken:
-    """Says on a stream, every few seconds, how far the campaign is."""
+class LineWatch(Watch):
+    """Plain lines: each run that is not ok, and every few seconds how far the campaign is."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stderr
         self._said_s = time.monotonic()
-        self._tally = Tally(0)
-
-    def begin(self, plan: Plan) -> None:
-        self._tally = Tally(len(plan.jobs))
 
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
-        if time.monotonic() - self._said_s >= _LINE_EVERY_S:
+        if time.monotonic() - self._said_s >= WAITS.say_s:
             self._said_s = time.monotonic()
-            self._say_progress(under_way)
+            self.progress(under_way)
 
-    def end(self, summary: Summary) -> None:
-        self._say_progress(())
+    def progress(self, under_way: Sequence[tuple[str, float]]) -> None:
+        self.noted(self.tally.line(under_way))
 
-    def _say_progress(self, under_way: Sequence[tuple[str, float]]) -> None:
-        raise NotImplementedError
-
-    def _print(self, text: str) -> None:
+    def noted(self, text: str) -> None:
         """One line; a reader or a terminal that has gone is no reason to stop a campaign."""
         with contextlib.suppress(OSError):
             print(text, file=self._stream, flush=True)
 
-
-class LineWatch(_Spoken):
-    """Plain lines: each run that is not ok, and how far the campaign is."""
-
-    def finished(self, outcome: RunOutcome) -> None:
-        self._tally.add(outcome)
-        if outcome.status is not RunStatus.OK:
-            self._print(outcome_line(outcome))
-
-    def lost(self, run_id: str, attempt: int) -> None:
-        self._print(loss_line(run_id, attempt))
-
-    def noted(self, text: str) -> None:
-        self._print(text)
-
-    def _say_progress(self, under_way: Sequence[tuple[str, float]]) -> None:
-        self._print(self._tally.line(under_way))
+    def end(self, summary: Summary) -> None:
+        self.progress(())
 
 
-class JsonWatch(_Spoken):
+class JsonWatch(LineWatch):
     """JSON lines for programs: `run` as each run ends, `lost` with each worker that dies, `progress` in between."""
 
     def begin(self, plan: Plan) -> None:
         super().begin(plan)
-        self._say_progress(())
+        self.progress(())
+
+    def progress(self, under_way: Sequence[tuple[str, float]]) -> None:
+        self._say("progress", **self.tally.figures(under_way))
 
     def finished(self, outcome: RunOutcome) -> None:
-        self._tally.add(outcome)
+        self.tally.add(outcome)
         names = ("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections")
-        told = {name: getattr(outcome, name) for name in names}
-        self._say(
-            "run",
-            {
-                "verdict": word_of(outcome.verdict),
-                **told,
-                "seconds": round(outcome.seconds, 3),
-                **self._tally.figures(),
-            },
-        )
+        told = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
+        self._say("run", **told | {"seconds": round(outcome.seconds, 3)} | self.tally.figures())
 
     def lost(self, run_id: str, attempt: int) -> None:
-        self._say("lost", {"run_id": run_id, "attempt": attempt})
+        self._say("lost", run_id=run_id, attempt=attempt)
 
     def noted(self, text: str) -> None:
-        self._say("note", {"text": text})
+        self._say("note", text=text)
 
-    def _say_progress(self, under_way: Sequence[tuple[str, float]]) -> None:
-        self._say("progress", self._tally.figures(under_way))
-
-    def _say(self, event: str, told: Mapping[str, object]) -> None:
-        self._print(json.dumps({"event": event, **told}))
+    def _say(self, event: str, **told: object) -> None:
+        super().noted(json.dumps({"event": event, **told}))
 
 
-class BarWatch:
+class BarWatch(Watch):
     """A progress bar on a terminal."""
 
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-        self._progress = Progress(*columns, console=self._console)
-        self._tally = Tally(0)
-        self._task = TaskID(0)
-
     def begin(self, plan: Plan) -> None:
-        self._tally = Tally(len(plan.jobs))
-        self._task = self._progress.add_task("", total=len(plan.jobs))
-        self._progress.start()
+        super().begin(plan)
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._task = self._bar.add_task("", total=len(plan.jobs))
+        self._bar.start()
 
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
-        text = self._tally.line(under_way).partition(", ")[2]
-        self._progress.update(self._task, completed=self._tally.done, description=text)
-
-    def finished(self, outcome: RunOutcome) -> None:
-        self._tally.add(outcome)
-        if outcome.status is not RunStatus.OK:
-            self._progress.console.print(outcome_line(outcome), markup=False, highlight=False)
-
-    def lost(self, run_id: str, attempt: int) -> None:
-        self.noted(loss_line(run_id, attempt))
+        text = self.tally.line(under_way).partition(", ")[2]
+        self._bar.update(self._task, completed=self.tally.done, description=text)
 
     def noted(self, text: str) -> None:
-        self._progress.console.print(text, markup=False, highlight=False)
+        self._bar.console.print(text, markup=False, highlight=False)
 
     def end(self, summary: Summary) -> None:
         # The terminal may be closed.
         with contextlib.suppress(OSError):
             self.look(())
-            self._progress.stop()
+            self._bar.stop()
 
 
-class LogWatch:
+class LogWatch(Watch):
     """`OUT/replay.log`: every run with its time; an object store gets it when the campaign ends."""
 
-    def __init__(self) -> None:
-        self._lines: list[str] = []
-        self._place: str = ""
-
     def begin(self, plan: Plan) -> None:
-        self._place = str(join(plan.out, "replay.log"))
-        self._write(f"{SOFTWARE}: {len(plan.jobs)} runs")
-
-    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
-        return None
+        self._place, self._lines = str(join(plan.out, "replay.log")), list[str]()
+        self.noted(f"{SOFTWARE}: {len(plan.jobs)} runs")
 
     def finished(self, outcome: RunOutcome) -> None:
-        self._write(outcome_line(outcome))
+        self.noted(outcome_line(outcome))
         if outcome.trace:
-            self._write(redacted(outcome.trace))
-
-    def lost(self, run_id: str, attempt: int) -> None:
-        self.noted(loss_line(run_id, attempt))
+            self.noted(redacted(outcome.trace))
 
     def noted(self, text: str) -> None:
-        self._write(text)
-
-    def end(self, summary: Summary) -> None:
-        self._write(summary_line(summary))
-        if is_url(self._place):
-            storage.write_bytes(self._place, "".join(self._lines).encode())
-
-    def _write(self, text: str) -> None:
         line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {text}\n"
         if is_url(self._place):
             self._lines.append(line)
             return
         with storage.as_output_error(self._place), Path(self._place).open("a", encoding="utf-8") as log:
             log.write(line)
+
+    def end(self, summary: Summary) -> None:
+        self.noted(summary_line(summary))
+        if is_url(self._place):
+            storage.write_bytes(self._place, "".join(self._lines).encode())
 
 
 def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
@@ -190,3 +133,31 @@ def watches(quiet: bool, as_json: bool = False) -> list[Watch]:
     if as_json:
         return [JsonWatch(), LogWatch()]
     return [BarWatch() if sys.stderr.isatty() else LineWatch(), LogWatch()]
+
+
+def show_summary(summary: Summary, out: str, quiet: bool, as_json: bool) -> None:
+    """How it ended: as JSON, as messages of what failed alone, or for people."""
+    if as_json:
+        told = {"verdict": summary.head.word, "verdicts": summary.head.counts()}
+        figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
+        seconds = round(summary.seconds, 3)
+        print(to_json({**told, **figures, "seconds": seconds, "out": out, "runs": outcome_rows(summary)}))
+    elif quiet:
+        for outcome in summary.outcomes:
+            if outcome.status is not RunStatus.OK:
+                print(f"balise: {outcome_line(outcome)}", file=sys.stderr)
+    else:
+        _show_ending(summary, out)
+
+
+def _show_ending(summary: Summary, out: str, most: int = 25) -> None:
+    """The verdicts, the worst first; of many runs those that are not safe."""
+    print(summary_line(summary))
+    rows = ending_rows(summary)
+    remarkable = rows.filter(rows["verdict"] != "safe")
+    shown = rows if rows.height <= most else remarkable.head(most)
+    if shown.height:
+        show_table(shown)
+    if (more := remarkable.height - shown.height) > 0:
+        print(f'{more} more are not safe: `balise sql {out} "SELECT verdict, run_id, error FROM runs"` lists all.')
+    print(f"Tables are in {out}; `balise report {out}` writes pages of them.")

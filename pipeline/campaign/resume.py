@@ -9,29 +9,30 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+
+from pydantic import TypeAdapter
 
 from pipeline import storage
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan, RunJob, digests
+from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from pipeline.storage.address import is_url, join
-from schemas.enums import RunStatus, RunVerdict
+from schemas.arrays import NS_PER_S
 from schemas.errors import OutputError
 
-# What changed as lately as this may change again without showing another time [ns].
-_SETTLED_NS = 2_000_000_000
+_OUTCOMES = TypeAdapter(list[RunOutcome])
 
 
 def proof_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
     """The proof that the tables there now were made of the log in this state; empty where there is none."""
     if is_url(job.address) or is_url(job.out) or not log:
         return ""
-    if max(file.changed_ns for file in log) > time.time_ns() - _SETTLED_NS:
+    if max(file.changed_ns for file in log) > time.time_ns() - WAITS.settled_s * NS_PER_S:
         return ""
     try:
         return _digest(job, log)
@@ -52,30 +53,21 @@ def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
         return
     named = {job.run_id for job in plan.jobs}
     others = [outcome for run_id, outcome in _kept(plan.out).items() if run_id not in named]
-    rows = [asdict(replace(outcome, attempts=1)) for outcome in (*others, *outcomes) if outcome.proof]
+    rows = [replace(outcome, attempts=1) for outcome in (*others, *outcomes) if outcome.proof]
     # It can be done without, and so must not hide why a campaign ends.
     with contextlib.suppress(OutputError):
-        storage.write_bytes(_place(plan.out), json.dumps(rows).encode())
+        storage.write_bytes(_place(plan.out), _OUTCOMES.dump_json(rows))
 
 
 def _kept(out: str) -> dict[str, RunOutcome]:
+    if is_url(out):
+        return {}
     try:
-        rows = json.loads(storage.content_of(_place(out)) or b"[]") if not is_url(out) else []
-        outcomes = [RunOutcome(**row) for row in rows]
-        return {
-            outcome.run_id: replace(
-                outcome,
-                status=RunStatus(outcome.status),
-                verdict=None if outcome.verdict is None else RunVerdict(outcome.verdict),
-                seconds=0.0,
-                log_bytes=0,
-                faults=tuple(outcome.faults),
-            )
-            for outcome in outcomes
-        }
-    except (ValueError, TypeError, OutputError):
+        outcomes = _OUTCOMES.validate_json(storage.content_of(_place(out)) or b"[]")
+    except (ValueError, OutputError):
         # Of another build, or damaged: a copy that is not needed.
         return {}
+    return {outcome.run_id: replace(outcome, seconds=0.0, log_bytes=0) for outcome in outcomes}
 
 
 def _holds(job: RunJob, outcome: RunOutcome) -> bool:

@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.campaign.cluster import DaskEngine
-from pipeline.campaign.engines import Engine
+from pipeline.campaign.engines import Engine, LocalEngine, SerialEngine
 from pipeline.campaign.interruption import Interrupted, listening
 from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
 from pipeline.campaign.plan import Plan, held_by, with_previous
-from pipeline.campaign.processes import LocalEngine
 from pipeline.campaign.resume import keep, unchanged
-from pipeline.campaign.serial import SerialEngine
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
 from pipeline.results.manifest import note_settings

@@ -11,12 +11,12 @@ from typing import Any
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.plan import Plan, software_digest
+from pipeline.campaign.plan import Plan, make_plan, software_digest
 from pipeline.campaign.run import run_campaign
 from pipeline.results import store
 from pipeline.results.manifest import NAME, Manifest, contents_of, own_file_names, read_manifest, write_manifest
 from pipeline.storage.address import Address, join, redacted
-from schemas.config import digest_of
+from schemas.config import Configuration, Vehicle, digest_of
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
@@ -63,15 +63,25 @@ def verify(out: Address, progress: Progress | None = None) -> Verification:
     return Verification(f"{files} files of {len(runs)} runs against {NAME}", tuple(problems))
 
 
-def recompute(out: Address, plan_for: Callable[[str], Plan], jobs: int = 1) -> Verification:
+def recompute(
+    out: Address,
+    logs: Sequence[str],
+    site: Address | None,
+    config: Configuration | None,
+    vehicle: Vehicle,
+    routes: Address | None = None,
+    jobs: int = 1,
+) -> Verification:
     """Replay logs again, in a folder of their own, and hold logs, site and tables against the manifest.
 
-    `plan_for`: the plan of these logs for an output folder. What the manifest does not name is a problem; runs of it
-    whose logs are not given are counted.
+    Without a configuration, with that of the result. What the manifest does not name is a problem; runs of it whose
+    logs are not given are counted.
     """
     manifest = _manifest(out)
+    if site is None:
+        raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
     with tempfile.TemporaryDirectory(prefix="balise-verify-") as folder:
-        plan = plan_for(folder)
+        plan = make_plan(logs, site, folder, config or store.read_config(out), vehicle, routes)
         problems = list(_other_inputs(plan, manifest))
         plan = replace(plan, jobs=tuple(job for job in plan.jobs if job.run_id in manifest["runs"]))
         if plan.jobs:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 
+import polars as pl
+
 from pipeline import storage
 from pipeline.campaign import lock
 from pipeline.campaign.interruption import ENDING
@@ -150,10 +152,19 @@ def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
 
 
 def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
+    """The route by the run's `primary` solution, or the first by name: all of them were on the same train."""
     # Imported here for the same reason.
-    from pipeline.campaign.found_routes import found_route_of
+    from pipeline.ingest.clean import clean
+    from pipeline.matching import match
+    from pipeline.matching.found_route import found_route
+    from pipeline.odometry import odometry_of
 
-    route = found_route_of(run, site, job.vehicle, job.config)
+    cleaned, _ = clean(run, job.config.ingest)
+    solutions, matching = cleaned.solutions(), job.config.matching
+    fixes = cleaned.gnss.filter(pl.col("solution") == ("primary" if "primary" in solutions else solutions[0]))
+    odometry = odometry_of(cleaned.odometer, job.vehicle, job.config)
+    found = match(fixes, odometry, site, job.vehicle, matching, job.config.fix_sigma, cleaned.balise_reads)
+    route = found_route(found, matching.ambiguity_probability)
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 

@@ -45,9 +45,7 @@ class HazardChange:
         return text + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
 
 
-def compare_hazards(
-    a: pl.DataFrame, b: pl.DataFrame, window_s: float = HAZARD_WINDOW_S
-) -> tuple[list[Difference], list[HazardChange]]:
+def compare_hazards(a: pl.DataFrame, b: pl.DataFrame) -> tuple[list[Difference], list[HazardChange]]:
     """Differences of the tables' schemas, and the hazards that appeared, vanished or changed, in time order.
 
     The numbers of hazards (`hazard_id`, `caused_by`) count as changed only where none came or went.
@@ -55,7 +53,7 @@ def compare_hazards(
     schema = [item for item in compare_tables(a.clear(), b.clear(), Hazards) if item.kind == "schema"]
     if any(item.column in {"solution", "hazard", "t_hazard"} for item in schema):
         return schema, []
-    pairs = _matched(a, b, window_s)
+    pairs = _matched(a, b)
     gone = [row for row in range(a.height) if row not in pairs]
     come = [row for row in range(b.height) if row not in set(pairs.values())]
     ids = ["hazard_id", "caused_by"] if gone or come else []
@@ -69,13 +67,13 @@ def compare_hazards(
     return schema, [change for _, change in sorted(changes, key=lambda item: item[0])]
 
 
-def _matched(a: pl.DataFrame, b: pl.DataFrame, window_s: float) -> dict[int, int]:
+def _matched(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
     """Rows of `a` to rows of `b`: each at most once, the nearest in time first."""
     rows_a, rows_b = (
         frame.select("solution", pl.col("hazard").cast(pl.String), t=pl.col("t_hazard").to_physical()).rows()
         for frame in (a, b)
     )
-    window_ns = round(window_s * 1e9)
+    window_ns = round(HAZARD_WINDOW_S * 1e9)
     near = sorted(
         (apart_ns, row_a, row_b)
         for row_a, (solution_a, class_a, t_a) in enumerate(rows_a)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import polars as pl
 
 from pipeline import storage
-from pipeline.diff.hazards import HAZARD_WINDOW_S, HazardChange, compare_hazards
+from pipeline.diff.hazards import HazardChange, compare_hazards
 from pipeline.diff.leading import BALISE_COUNTS, balise_counts, passage_changes, verdict_changes
 from pipeline.diff.tables import Difference, compare_tables
 from pipeline.results import store
@@ -112,20 +112,21 @@ class ResultDiff:
         return {"same": self.same, **asdict(self)}
 
 
-def diff_results(out_a: Address, out_b: Address, hazard_window_s: float = HAZARD_WINDOW_S) -> ResultDiff:
+def diff_results(out_a: Address, out_b: Address) -> ResultDiff:
     """Compare two results run by run; files of the same bytes are not opened.
 
-    Hazards of the same solution and class at most `hazard_window_s` [s] apart are the same hazard.
+    Hazards of the same solution and class at most `HAZARD_WINDOW_S` apart are the same hazard.
     """
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
-    found = [_diff_run(out_a, out_b, run, hazard_window_s) for run in common]
+    found = [_diff_run(out_a, out_b, run) for run in common]
+    others = Counter(column for run in found for column in run.made_otherwise)
     return ResultDiff(
         compared=len(common),
         only_in_a=tuple(run for run in runs_a if run not in set(runs_b)),
         only_in_b=tuple(run for run in runs_b if run not in set(runs_a)),
         runs=tuple(run for run in found if not run.same),
-        notes=_notes(found),
+        notes=tuple(f"{column} differs in {others[column]} runs" for column in _PROVENANCE if others[column]),
     )
 
 
@@ -139,12 +140,7 @@ def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]
     return ["", title, *(f"  {run_id:<{width}}  {text}" for run_id, text in shown), *more]
 
 
-def _notes(runs: list[RunDiff]) -> tuple[str, ...]:
-    counts = Counter(column for run in runs for column in run.made_otherwise)
-    return tuple(f"{column} differs in {counts[column]} runs" for column in _PROVENANCE if counts[column])
-
-
-def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> RunDiff:
+def _diff_run(out_a: Address, out_b: Address, run_id: str) -> RunDiff:
     hazards: list[HazardChange] = []
     differences: list[Difference] = []
     verdicts: tuple[str, ...] = ()
@@ -155,7 +151,7 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, window_s: float) -> R
             continue
         frame_a, frame_b = (_frame(out, table, run_id, content) for out, content in ((out_a, a), (out_b, b)))
         if table == "hazards":
-            found, hazards = compare_hazards(frame_a, frame_b, window_s)
+            found, hazards = compare_hazards(frame_a, frame_b)
         else:
             found = compare_tables(frame_a, frame_b, contract, _KEYS[table])
         if table == "runs":

@@ -104,30 +104,20 @@ def _joined(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti"
 
 def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, int] | None:
     """What differs, and in how many rows."""
-    differs = _float_mask(a, b, tolerance) if a.dtype.is_float() else a.ne_missing(b)
+    differs = a.ne_missing(b)
+    if a.dtype.is_float():
+        near = ((a - b).abs() <= tolerance).fill_null(value=False)
+        differs = (differs & ~near) | a.is_nan().fill_null(value=False) | b.is_nan().fill_null(value=False)
     rows = int(differs.sum())
     if rows == 0:
         return None
     first = differs.arg_true()[0]
-    message = f"{_count(rows, a.len())} differ, first row {first}: {_text(a[first])} became {_text(b[first])}"
+    message = f"{rows} of {a.len()} rows differ, first row {first}: {_text(a[first])} became {_text(b[first])}"
     if a.dtype.is_float():
         largest = (a - b).abs().filter(differs).drop_nans().max()
         if isinstance(largest, float):
             message += f"; by up to {largest:.3g}, tolerance {tolerance:.3g}"
     return message, rows
-
-
-def _float_mask(a: pl.Series, b: pl.Series, tolerance: float) -> pl.Series:
-    frame = pl.DataFrame({"a": a.alias("a"), "b": b.alias("b")})
-    x, y = pl.col("a"), pl.col("b")
-    apart = (x != y) & ~((x - y).abs() <= tolerance)
-    broken = x.is_nan().fill_null(value=False) | y.is_nan().fill_null(value=False)
-    unknown = x.is_null() != y.is_null()
-    return frame.select((apart.fill_null(value=False) | broken | unknown).alias("differs")).to_series()
-
-
-def _count(rows: int, of: int) -> str:
-    return f"{rows} of {of} rows"
 
 
 def _text(value: object) -> str:

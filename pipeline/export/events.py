@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.export.messages import ERROR, INFO, WARNING
+from pipeline.export.messages import Level
 from schemas.enums import Judgement, PassageStatus
 
 Row = Mapping[str, Any]
@@ -19,13 +19,13 @@ def hazard_entries(hazards: pl.DataFrame) -> list[Entry]:
     entries: list[Entry] = []
     for row in _plain(hazards):
         name = f"hazard {row['hazard_id']}"
-        entries.append((row["t_hazard"], ERROR, name, hazard_text(row)))
+        entries.append((row["t_hazard"], Level.ERROR, name, hazard_text(row)))
         moments = (
-            ("t_onset", WARNING, "onset"),
-            ("t_failure", ERROR, "position failure"),
-            ("t_detected", WARNING, f"detected by {row['monitor']}"),
-            ("t_negated", INFO, "negated"),
-            ("t_end", INFO, "end"),
+            ("t_onset", Level.WARNING, "onset"),
+            ("t_failure", Level.ERROR, "position failure"),
+            ("t_detected", Level.WARNING, f"detected by {row['monitor']}"),
+            ("t_negated", Level.INFO, "negated"),
+            ("t_end", Level.INFO, "end"),
         )
         entries += [(row[key], level, name, text) for key, level, text in moments if row[key] is not None]
     return entries
@@ -46,7 +46,7 @@ def alarm_entries(alarms: pl.DataFrame) -> list[Entry]:
     for row in _plain(alarms):
         name = f"alarm {row['alarm_id']}"
         text = f"{', '.join(row['monitors'])}; verdict {row['verdict']}, suspect {row['suspect']}"
-        entries += [(row["t_start"], WARNING, name, text), (row["t_end"], INFO, name, "last fail")]
+        entries += [(row["t_start"], Level.WARNING, name, text), (row["t_end"], Level.INFO, name, "last fail")]
     return entries
 
 
@@ -57,17 +57,12 @@ def passage_entries(passages: pl.DataFrame) -> list[Entry]:
         t_ns = row["t_offered"] if row["t_offered"] is not None else row["t_true"]
         if t_ns is None:
             continue
+        accepted, wrong = row["status"] == PassageStatus.ACCEPTED, row["judgement"] == Judgement.WRONG
+        level = Level.WARNING if not accepted else Level.ERROR if wrong else Level.INFO
         error = "" if row["location_error_m"] is None else f", location error {row['location_error_m']:.2f} m"
         judged = "" if row["judgement"] is None else f", position {row['judgement']}"
-        entries.append((t_ns, _passage_level(row), row["balise_id"], f"{row['status']}{judged}{error}"))
+        entries.append((t_ns, level, row["balise_id"], f"{row['status']}{judged}{error}"))
     return entries
-
-
-def _passage_level(row: Row) -> int:
-    """An error where a wrong position was accepted."""
-    if row["status"] != PassageStatus.ACCEPTED:
-        return WARNING
-    return ERROR if row["judgement"] == Judgement.WRONG else INFO
 
 
 def _plain(frame: pl.DataFrame) -> list[dict[str, Any]]:

@@ -11,8 +11,7 @@ from xml.sax.saxutils import escape, quoteattr
 import polars as pl
 
 from pipeline.export.events import hazard_text
-from pipeline.export.places import Ground, ground_of
-from pipeline.export.positions import positions_of
+from pipeline.export.places import Ground, ground_of, positions_of
 from schemas.arrays import Floats
 from schemas.run import RunTables, Site
 
@@ -103,7 +102,8 @@ def _placed(frame: pl.DataFrame, site: Site) -> Iterator[tuple[dict[str, Any], t
 
 
 def _point(kind: str, row: Mapping[str, Any], ground: tuple[float, float, float]) -> Feature:
-    named = {"kind_of_balise" if name == "kind" else name: _plain(value) for name, value in row.items()}
+    plain = {name: _utc(value) if isinstance(value, datetime) else value for name, value in row.items()}
+    named = {"kind_of_balise" if name == "kind" else name: value for name, value in plain.items()}
     return _feature("Point", _place(*ground), {"kind": kind, **named})
 
 
@@ -135,7 +135,3 @@ def _lat_lon(latitude: float, longitude: float) -> str:
 
 def _utc(t: datetime) -> str:
     return t.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def _plain(value: Any) -> Any:
-    return _utc(value) if isinstance(value, datetime) else value

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cache
 from typing import Any, Literal
 
 import polars as pl
 
-from pipeline.export.cdr import Fields, cdr_messages, definition
 from schemas.arrays import NS_PER_S
-
-# descriptor.proto: FieldDescriptorProto.Type and Label
-_DOUBLE, _INT64, _FIXED32, _BOOL, _STRING, _MESSAGE, _ENUM = 1, 3, 7, 8, 9, 11, 14
-_OPTIONAL, _REPEATED = 1, 3
-_TYPES: Mapping[str, int] = {"double": _DOUBLE, "int64": _INT64, "fixed32": _FIXED32, "bool": _BOOL, "string": _STRING}
 
 Encoding = Literal["protobuf", "cdr"]
 
@@ -28,7 +24,15 @@ LOG: Fields = (
 GEOJSON: Fields = (("geojson", "string"),)
 """foxglove.GeoJSON."""
 
-INFO, WARNING, ERROR = 2, 3, 4
+
+class Level(IntEnum):
+    """foxglove.Log levels that events have."""
+
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+
+
 # Kinds that are enumerations: name and words in the order of their numbers.
 _ENUMS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "level": ("Level", ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")),
@@ -125,26 +129,29 @@ def message_class(name: str, fields: Fields) -> Any:
 
 
 def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> None:
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto
+
+    def add(kind: str, **more: Any) -> None:
+        label, of_type = more.pop("label", "OPTIONAL"), FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
+        of_label = FieldDescriptorProto.Label.Value(f"LABEL_{label}")
+        message.field.add(name=field, number=number, type=of_type, label=of_label, **more)
+
     if kind == "time":
-        stamp = ".google.protobuf.Timestamp"
-        message.field.add(name=field, number=number, type=_MESSAGE, label=_OPTIONAL, type_name=stamp)
+        add("message", type_name=".google.protobuf.Timestamp")
     elif kind in _ENUMS:
         enum, words = _ENUMS[kind]
         values = message.enum_type.add(name=enum)
         for value, word in enumerate(words):
             values.value.add(name=word, number=value)
-        message.field.add(name=field, number=number, type=_ENUM, label=_OPTIONAL, type_name=f".{name}.{enum}")
+        add("enum", type_name=f".{name}.{enum}")
     elif kind == "doubles":
-        message.field.add(name=field, number=number, type=_DOUBLE, label=_REPEATED)
+        add("double", label="REPEATED")
     elif name.startswith("foxglove."):
-        message.field.add(name=field, number=number, type=_TYPES[kind], label=_OPTIONAL)
+        add(kind)
     else:
         # With presence: absent means not known, which a plain proto3 field would show as zero.
         message.oneof_decl.add(name=f"_{field}")
-        index = len(message.oneof_decl) - 1
-        message.field.add(
-            name=field, number=number, type=_TYPES[kind], label=_OPTIONAL, proto3_optional=True, oneof_index=index
-        )
+        add(kind, proto3_optional=True, oneof_index=len(message.oneof_decl) - 1)
 
 
 def _kind(dtype: pl.DataType) -> str:
@@ -172,3 +179,53 @@ def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
         else:
             setattr(message, field, value)
     return bytes(message.SerializeToString(deterministic=True))
+
+
+Fields = tuple[tuple[str, str], ...]
+"""Names and kinds: `time`, `double`, `int64`, `fixed32`, `level`, `bool`, `string`; `int8`, `uint8`, `uint16` (ROS 2
+only), `doubles` and `covariance type` (protobuf only).
+"""
+
+_HEADER = b"\x00\x01\x00\x00"
+# Kind: type in the definition, format, alignment; times and strings are laid out by themselves.
+_PLAIN = {
+    "double": ("float64", "<d", 8),
+    "int64": ("int64", "<q", 8),
+    "fixed32": ("uint32", "<I", 4),
+    "level": ("uint8", "<B", 1),
+    "bool": ("bool", "<?", 1),
+    "int8": ("int8", "<b", 1),
+    "uint8": ("uint8", "<B", 1),
+    "uint16": ("uint16", "<H", 2),
+}
+_UNKNOWN: Mapping[str, Any] = {"double": float("nan"), "string": "", "bool": False}
+_TIME = "\n" + "=" * 80 + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+
+
+def definition(fields: Fields) -> str:
+    """The definition text as it stands in a bag."""
+    kinds = {"time": "builtin_interfaces/Time", "string": "string"} | {kind: row[0] for kind, row in _PLAIN.items()}
+    lines = [f"{kinds[kind]} {name}" for name, kind in fields]
+    return "\n".join(lines) + (_TIME if any(kind == "time" for _, kind in fields) else "\n")
+
+
+def cdr_messages(fields: Fields, rows: Iterator[Mapping[str, Any]]) -> Iterator[bytes]:
+    """One message per row. What is not known is NaN, an empty text or false: this encoding has no null."""
+    for row in rows:
+        content = bytearray()
+        for name, kind in fields:
+            value = row[name] if row[name] is not None else _UNKNOWN[kind]
+            _append(content, kind, value)
+        yield _HEADER + bytes(content)
+
+
+def _append(content: bytearray, kind: str, value: Any) -> None:
+    if kind == "time":
+        seconds, rest = divmod(value, NS_PER_S)
+        content += bytes(-len(content) % 4) + struct.pack("<iI", seconds, rest)
+    elif kind == "string":
+        text = value.encode() + b"\0"
+        content += bytes(-len(content) % 4) + struct.pack("<I", len(text)) + text
+    else:
+        _, form, alignment = _PLAIN[kind]
+        content += bytes(-len(content) % alignment) + struct.pack(form, value)

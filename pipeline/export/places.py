@@ -1,4 +1,4 @@
-"""Where results are on the ground: net element and measure back to WGS 84, by the surveyed track."""
+"""Where results are on the ground: net element and measure back to WGS 84, by the surveyed track, and of a solution."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.track.geodesy import moved_deg, points_of
 from pipeline.track.survey import Track, track_of
-from schemas.arrays import Floats, Ints
+from schemas.arrays import Floats, Ints, floats
 from schemas.run import Site
 
 _POINTS = 3000
@@ -101,9 +101,14 @@ def stretches_of(epochs: pl.DataFrame) -> Stretches:
 def ground_at(track: pl.DataFrame, stretches: Stretches, path_m: Floats, margin_m: float = 50.0) -> Ground:
     """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
     best, chosen = np.full(len(path_m), np.inf), np.full(len(path_m), -1, dtype=np.int64)
-    lengths = _element_ends(track)
+    survey = track_of(track)
     for number, element in enumerate(stretches.elements):
-        low, high = _path_range(stretches, number, lengths.get(element))
+        # Path positions of the whole element, not just of the epochs on it.
+        ends = [stretches.first_m[number], stretches.last_m[number]]
+        if element in survey.index:
+            measures = survey.measure_m[survey.vertices(survey.index[element])][[0, -1]]
+            ends += list(stretches.offset_m[number] + stretches.sign[number] * measures)
+        low, high = min(ends), max(ends)
         away = np.maximum(np.maximum(low - path_m, path_m - high), 0.0)
         nearer = (away < best) & (away <= margin_m)
         best[nearer], chosen[nearer] = away[nearer], number
@@ -175,18 +180,49 @@ def _on_element(track: Track, number: int, measure_m: Floats) -> tuple[Floats, F
     return (*along, heading[segment])  # type: ignore[return-value]
 
 
-def _element_ends(track: pl.DataFrame) -> dict[str, tuple[float, float]]:
-    survey = track_of(track)
-    return {
-        name: (float(survey.measure_m[rows][0]), float(survey.measure_m[rows][-1]))
-        for _, name, rows in survey.elements()
+_COVARIANCE = ("ee", "en", "eu", "nn", "nu", "uu")
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Frames of `t, latitude_deg, longitude_deg, height_m`, rows without a position left out.
+
+    `gnss` is the corrected position that was matched (of the balise antenna, at its time of validity), `matched`
+    its foot on the rails, `truth` where the evidence puts the train on the rails. Heights are those of the survey,
+    null on a 2-D one.
+    """
+
+    gnss: pl.DataFrame
+    matched: pl.DataFrame
+    truth: pl.DataFrame
+
+
+def positions_of(epochs: pl.DataFrame, site: Site) -> Positions:
+    """Positions of one solution's epochs. Truth is the path position less the error along it (CONTRACT section 3)."""
+    column = {name: floats(epochs, name) for name in _NEEDED}
+    rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
+    stretches = stretches_of(epochs)
+    sign = sign_of(epochs, stretches)
+    gnss = beside(rails, sign, column["cross_track_m"], column["vertical_m"])
+    true_path = column["path_m"] - column["direction"] * column["error_along_m"]
+    truth = ground_at(site.track, stretches, true_path)
+    return Positions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))
+
+
+_NEEDED = ("measure_m", "path_m", "cross_track_m", "vertical_m", "direction", "error_along_m")
+
+
+def as_gnss(frame: pl.DataFrame) -> pl.DataFrame:
+    """Positions in the columns of the `gnss` stream that position messages are made of; covariance not known."""
+    unknown = [pl.lit(None, dtype=pl.Float64).alias(f"cov_{axes}_m2") for axes in _COVARIANCE]
+    return frame.with_columns(*unknown, fix=pl.lit("estimated"))
+
+
+def _frame(t: pl.Series, ground: Ground) -> pl.DataFrame:
+    columns = {
+        "latitude_deg": ground.latitude_deg,
+        "longitude_deg": ground.longitude_deg,
+        "height_m": ground.height_m,
     }
-
-
-def _path_range(stretches: Stretches, number: int, ends: tuple[float, float] | None) -> tuple[float, float]:
-    """Path positions of a whole element, not just of the epochs on it."""
-    low, high = float(stretches.first_m[number]), float(stretches.last_m[number])
-    if ends is None:
-        return low, high
-    places = [stretches.offset_m[number] + stretches.sign[number] * end for end in ends]
-    return float(min(low, *places)), float(max(high, *places))
+    frame = pl.DataFrame({"t": t, **columns}).with_columns(pl.col(pl.Float64).fill_nan(None))
+    return frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())

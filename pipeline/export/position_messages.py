@@ -7,8 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.export.cdr import Fields, cdr_messages
-from pipeline.export.messages import Topic, message_topic
+from pipeline.export.messages import Fields, Topic, cdr_messages, message_topic
 from schemas.enums import Fix
 
 LOCATION_FIX = "foxglove.LocationFix"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import polars as pl
 
@@ -34,6 +34,13 @@ def with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
         schema = dict.fromkeys(columns_of(name, UNKNOWN, unit), pl.Float64)
         series += pl.DataFrame(rows, schema=schema).get_columns()
     return frame.with_columns(series)
+
+
+def bounds_of(names: Collection[str]) -> dict[str, tuple[str, str]]:
+    """Per figure that has bounds the columns that hold them: `mtbf_low_h` and `mtbf_high_h` of `mtbf_h`."""
+    parts = [(low.rpartition("_low"), low) for low in names if "_low" in low]
+    pairs = {head + unit: (low, f"{head}_high{unit}") for (head, _, unit), low in parts}
+    return {figure: pair for figure, pair in pairs.items() if {figure, *pair} <= set(names)}
 
 
 def continuity(t_s: float, mtbf_h: float) -> float:

@@ -12,7 +12,7 @@ from pipeline.figures.bounds import clopper_pearson
 from pipeline.line.classes import KEYS
 from pipeline.line.pieces import Pieces
 from pipeline.line.spans import State
-from pipeline.site.windows import window_findings
+from pipeline.site.alike import window_findings
 from pipeline.track.network import Network, network_of
 from schemas.arrays import Bools, Floats, floats
 from schemas.config import LdsConfig

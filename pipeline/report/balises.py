@@ -1,10 +1,12 @@
-"""What became of each balise: right, lost, could not be checked, wrong; on the pages of runs and of the campaign."""
+"""What the pages of runs and of the campaign share: what became of each balise, and of each architecture."""
 
 from __future__ import annotations
 
 import polars as pl
 
 from pipeline.report.columns import frame_table
+from pipeline.report.markup import section
+from pipeline.safety.tally import architecture_figures
 from schemas.campaign import CampaignBalises
 from schemas.enums import BaliseKind, Judgement, PassageStatus
 
@@ -45,3 +47,24 @@ def balise_table(identity: str, caption: str, balises: pl.DataFrame) -> str:
     order = [True] * len(worst_first)
     shown = balises.sort(*worst_first, "balise_id", descending=[*order, False], nulls_last=True)
     return frame_table(identity, caption, shown, _COLUMNS, CampaignBalises)
+
+
+_NOTE = (
+    "<p>Reactive: a solution diagnosed by itself (LOC Fig. 4). Composite: two solutions compared, both needed (LOC "
+    "Fig. 3); blind to what they share. Reactive 1oo2: one of two such channels is enough (LOC eq. 11). Judged after "
+    "the fact on the same faults.</p>"
+)
+_ARCHITECTURES = (
+    *("architecture", "solution", "other", "hazards", "detected", "failures", "missed", "missed_share"),
+    *("common_missed", "time_to_detect_median_s", "time_to_detect_max_s", "alarms", "false_alarms"),
+    *("false_alarm_rate_per_h", "wrong_in_use_s", "availability", "mtbf_h", "continuity_15s"),
+)
+
+
+def architectures_section(identity: str, counts: pl.DataFrame) -> str:
+    """`counts` as of `pipeline.safety.tally`; nothing where there is but one solution."""
+    if counts["other"].null_count() == counts.height:
+        return ""
+    found = architecture_figures(counts)
+    shown = frame_table(f"table-{identity}", "Composite and reactive fail-safety side by side", found, _ARCHITECTURES)
+    return section(identity, "Architectures", _NOTE, shown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
@@ -11,10 +12,9 @@ import polars as pl
 from pipeline.figures.campaign_figures import failures_of
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.figures.verdict import head_of, run_verdicts, word_of
-from pipeline.report.architectures import architectures_section
-from pipeline.report.availability import availability_map
-from pipeline.report.balises import balise_table, lost_shares, outcome
+from pipeline.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
+from pipeline.report.ground import availability_map
 from pipeline.report.headline import campaign_headline, run_headline, wrong_acceptances
 from pipeline.report.markup import (
     Cell,
@@ -30,8 +30,8 @@ from pipeline.report.markup import (
     tiles,
     verdict_head,
 )
-from pipeline.report.run_page import Made, configuration, hazard_cell
-from pipeline.report.words import plural
+from pipeline.report.run_page import ALLOWED, Made, configuration, hazard_cell
+from pipeline.report.words import plots_of, plural
 from pipeline.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict
@@ -64,14 +64,7 @@ _HAZARD_COLUMNS = (
     *("hazardous_s", "hazardous_may_s", "size_m", "balise_ids", "failure_mode", "t_onset", "suspect"),
 )
 _LEVEL_COLUMNS = ("service_level", "allowed_s", "failures", "within", "exceeded", "failures_judged", "within_share")
-_PLOTS = (
-    ("classes", "Hazards by class", "In time, too late, could not be checked."),
-    ("detection", "Time to detect", "Share of all hazards detected by then, and of all wrong positions in use no "
-     "longer; upright lines are the allowed T_D of the service levels. A curve that ends below 1 shows what was never "
-     "detected."),
-    ("location", "Location error at virtual balises", "Positive: offered early. Offers by what became of them."),
-    ("map", "Availability of the TVB", "Share of epochs with a valid TVB while moving, by place; crosses are hazards."),
-)  # fmt: skip
+_TONES = {"unsafe": "bad", "failed": "bad", "unproven": "doubt", "safe": "good"}
 # What comes first in the list of runs; failed ones, which have no verdict, after the unsafe.
 _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunVerdict.SAFE.value: 3}
 
@@ -80,14 +73,16 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
     head, named = campaign_headline(campaign.runs, campaign.passages, campaign.hazards, made.config)
+    # Each run counts once, by the worst of its solutions.
+    counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
-        tiles(_verdict_tiles(campaign.runs)),
+        tiles((f"runs {name}", str(count), _TONES[name] if count else "") for name, count in counts.items()),
         pairs(_facts(campaign, solutions)),
         section("runs", "Runs", _runs_table(campaign, made)),
         *(_solution(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
         _map_in_doubt(campaign.derived["map"]),
-        section("provenance", "Provenance", _provenance(campaign.runs), _budget(made), configuration(made)),
+        _provenance(campaign.runs, made),
     ]
     safety = made.config.safety
     data = {
@@ -108,21 +103,12 @@ def _only(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     return frame.filter(pl.col("solution") == name)
 
 
-def _verdict_tiles(runs: pl.DataFrame) -> list[tuple[str, str, str]]:
-    """Runs by verdict, each counted once by the worst of its solutions."""
-    tones = {"unsafe": "bad", "failed": "bad", "unproven": "doubt", "safe": "good"}
-    counts = head_of(run_verdicts(runs).values()).counts()
-    return [(f"runs {name}", str(count), tones[name] if count else "") for name, count in counts.items()]
-
-
 def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
     """When, where, with what, by which program."""
     runs = campaign.runs
     begun, ended = runs.select(pl.col("t_start").min(), pl.col("t_end").max()).row(0)
     elements = campaign.pieces["netelement_id"].n_unique()
-    trains = runs.select(pl.col("vehicle").cast(pl.String).fill_null("not known").value_counts(sort=True)).unnest(
-        "vehicle"
-    )
+    trains = runs["vehicle"].cast(pl.String).fill_null("not known").value_counts(sort=True)
     rates = runs["gnss_rate_hz"].drop_nulls().unique().sort().to_list()
     once = runs.unique("run_id")
     hours, km = (
@@ -154,17 +140,13 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
     )
     why = _whys(campaign, made)
 
-    def verdict(row: Row) -> Cell:
-        word = word_of(row["verdict"])
-        return Cell(word, str(row["order"]), badge(word))
-
     def digest(row: Row) -> Cell:
         whole = row["input_digest"]
         short = whole[:12]
         return Cell(short, whole, f'<span title="{escape(whole)}">{escape(short)}</span>')
 
     special = {
-        "verdict": verdict,
+        "verdict": lambda row: Cell(word := word_of(row["verdict"]), str(row["order"]), badge(word)),
         "run_id": lambda row: Cell(
             row["run_id"], row["run_id"], link(campaign.hrefs[row["run_id"]], row["run_id"], data_run="")
         ),
@@ -195,7 +177,6 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
     found, levels, balises = (_only(campaign.derived[table], name) for table in ("figures", "detection", "balises"))
     said = "".join(f"<p>{escape(text)}</p>" for text in (*plain_statements(found), *level_statements(levels)))
     note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
-    title = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
     rows = found.drop("solution").iter_rows(named=True)
     caption = "All figures of the campaign"
     return section(
@@ -203,9 +184,9 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
         f"Solution {name}" if several else "Balises, hazards, figures",
         balise_table(f"table-balises-{key}", "Balises over all runs, the worst first", lost_shares(balises)),
         _hazards_table(key, _only(campaign.hazards, name), campaign),
-        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in _PLOTS),
+        *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in plots_of("campaign")),
         said,
-        frame_table(f"table-levels-{key}", title, levels, _LEVEL_COLUMNS, CampaignDetection),
+        frame_table(f"table-levels-{key}", ALLOWED, levels, _LEVEL_COLUMNS, CampaignDetection),
         note,
         *(figures(f"table-figures-{key}", caption, row, CampaignFigures) for row in rows),
     )
@@ -236,8 +217,10 @@ def _map_in_doubt(places: pl.DataFrame) -> str:
 
 def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
     runs, hazards, passages = (_only(frame, name) for frame in (campaign.runs, campaign.hazards, campaign.passages))
+    counts = Counter(hazards.select(pl.col("hazard").cast(pl.String), "within_budget").rows())
     return {
-        "classes": [[kind.value, *_outcomes(hazards.filter(pl.col("hazard") == kind))] for kind in Hazard],
+        # Within the budget, beyond it, not known.
+        "classes": [[kind.value, *(counts[kind.value, held] for held in (True, False, None))] for kind in Hazard],
         "runs": runs.height,
         "runs_with_truth": runs["evidence"].is_in(TRUTH).sum(),
         "hazards": hazards.height,
@@ -247,12 +230,6 @@ def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
         "location": _location(passages),
         "map": availability_map(_only(campaign.pieces, name), hazards, made.site),
     }
-
-
-def _outcomes(hazards: pl.DataFrame) -> list[int]:
-    """Within the budget, beyond it, not known."""
-    within = hazards["within_budget"]
-    return [int((within == held).sum()) for held in (True, False)] + [within.null_count()]
 
 
 def _sorted(values: pl.Series) -> list[float]:
@@ -273,12 +250,9 @@ def _location(passages: pl.DataFrame) -> Json:
     return [list(row) for row in counts.iter_rows()]
 
 
-def _provenance(runs: pl.DataFrame) -> str:
+def _provenance(runs: pl.DataFrame, made: Made) -> str:
     names = ("software", "contract", "config_digest")
-    return pairs((name, ", ".join(runs[name].unique().sort().to_list())) for name in names)
-
-
-def _budget(made: Made) -> str:
-    level = made.config.hazards.service_level
-    allowed = number(made.config.budget_s, 4)
-    return f"<p>A wrong position may be in use for {allowed} s (service level {escape(level)}).</p>"
+    digests = pairs((name, ", ".join(runs[name].unique().sort().to_list())) for name in names)
+    level, allowed = escape(made.config.hazards.service_level), number(made.config.budget_s, 4)
+    budget = f"<p>A wrong position may be in use for {allowed} s (service level {level}).</p>"
+    return section("provenance", "Provenance", digests, budget, configuration(made))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import dataframely as dy
 import polars as pl
 
+from pipeline.figures.estimates import bounds_of
 from pipeline.report.markup import UNKNOWN, Cell, cell, number, table
 from pipeline.report.words import OPINIONS, TITLES, WORDS
 
@@ -37,23 +38,32 @@ def frame_table(
 ) -> str:
     """A frame as a table; `names`: all columns unless said otherwise. Bounds stand beside their figure."""
     special = special or {}
-    shown = list(names) or [name for name in frame.columns if not _is_bound(name, frame.columns)]
+    shown = list(names) or _figure_names(frame.columns)
+    bounds = bounds_of(frame.columns)
     meanings = _meanings(contract)
     rows = [
-        [special[name](row) if name in special else _cell(row, name) for name in shown]
+        [special[name](row) if name in special else _cell(row, name, bounds.get(name)) for name in shown]
         for row in frame.iter_rows(named=True)
     ]
     return table(identity, caption, [(title(name), meanings.get(name, "")) for name in shown], rows)
 
 
-def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema], names: Sequence[str] = ()) -> str:
+def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) -> str:
     """One row as a table downwards: the name of each column as in the data, its value with unit and bounds, and what
     it means.
     """
-    shown = list(names) or [name for name in row if not _is_bound(name, row)]
-    meanings = _meanings(contract)
-    rows = [[Cell(name, name), Cell(_text(row, name)), Cell(meanings[name], meanings[name])] for name in shown]
+    meanings, bounds = _meanings(contract), bounds_of(row)
+    rows = [
+        [Cell(name, name), Cell(_text(row, name, bounds.get(name))), Cell(meanings[name], meanings[name])]
+        for name in _figure_names(row)
+    ]
     return table(identity, caption, [("figure", "column in the data"), ("value", ""), ("meaning", "")], rows)
+
+
+def _figure_names(names: Collection[str]) -> list[str]:
+    """The columns that are no bounds of others."""
+    beside = {bound for pair in bounds_of(names).values() for bound in pair}
+    return [name for name in names if name not in beside]
 
 
 def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:
@@ -76,23 +86,10 @@ def title(name: str) -> str:
     return f"{words} [{_UNITS[ending]}]" if ending else words
 
 
-def _is_bound(name: str, names: Sequence[str] | Row) -> bool:
-    stem, ending = _parts(name)
-    figure, _, part = stem.rpartition("_")
-    return part in ("low", "high") and f"{figure}{ending}" in names
-
-
-def _bounds(row: Row, name: str) -> tuple[float | None, float | None] | None:
-    """Lower and upper bound of a figure that has some."""
-    stem, ending = _parts(name)
-    low, high = (f"{stem}_{part}{ending}" for part in ("low", "high"))
-    return (row[low], row[high]) if low in row and high in row else None
-
-
-def _cell(row: Row, name: str) -> Cell:
+def _cell(row: Row, name: str, bounds: tuple[str, str] | None) -> Cell:
     value = row[name]
-    if bounds := _bounds(row, name):
-        return Cell(_bounded(value, *bounds, UNKNOWN), value)
+    if bounds:
+        return Cell(_bounded(value, row[bounds[0]], row[bounds[1]], UNKNOWN), value)
     if isinstance(value, list) and len(value) > _MOST_NAMES:
         value = [*value[:_MOST_NAMES], f"and {len(value) - _MOST_NAMES} more"]
     plain = cell(value, 4)
@@ -109,10 +106,10 @@ def _tone(name: str, value: object) -> str:
     return _TONES.get(name, "") if value else ""
 
 
-def _text(row: Row, name: str) -> str:
+def _text(row: Row, name: str, bounds: tuple[str, str] | None) -> str:
     value, unit = row[name], _UNITS.get(_parts(name)[1], "")
-    if bounds := _bounds(row, name):
-        text = _bounded(value, *bounds, "not known")
+    if bounds:
+        text = _bounded(value, row[bounds[0]], row[bounds[1]], "not known")
     else:
         text = "not known" if value is None else cell(value, 4).text
     return text if text == "not known" else f"{text} {unit}".strip()

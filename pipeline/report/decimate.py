@@ -11,8 +11,6 @@ from schemas.arrays import Bools, Floats, Ints
 BINS = 2500
 WHOLE_SERIES = 4 * BINS
 """A series of no more values is sent as it is."""
-DETAIL_EPOCHS = 6000
-BAND_PIECES = 3000
 
 
 def kept_rows(values: Floats, whole: Bools, bins: int = BINS) -> Ints:
@@ -61,7 +59,7 @@ def _edges_of(known: Bools, edges: Ints) -> Ints:
     return np.concatenate([chosen - 1, chosen])
 
 
-def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int = DETAIL_EPOCHS) -> Bools:
+def detail_rows(t_ns: Ints, moments_ns: Ints, reach_s: float = 60.0, limit: int = 6000) -> Bools:
     """Rows near the moments that matter, with a reach that is halved until no more than `limit` are left."""
     reach_ns = reach_s * 1e9
     if not len(moments_ns) or not len(t_ns):
@@ -84,7 +82,7 @@ class Band:
     end_ms: int
 
 
-def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = BAND_PIECES) -> Band:
+def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 3000) -> Band:
     """A state over time as pieces; `gap_code` fills what is longer than `hold_ms` after an epoch.
 
     Codes are ordered by how bad they are. Where there are too many pieces, neighbours are drawn together and

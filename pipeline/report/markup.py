@@ -12,6 +12,7 @@ from datetime import datetime
 from functools import cache
 from html import escape
 from importlib.resources import files
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -140,30 +141,8 @@ def page(title: str, heading: str, body: str, data: str, script: str, foot: str)
         f"default-src 'none'; script-src {_digest(code)}; style-src {_digest(shared)} {_digest(printed)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>{escape(title)}</title>
-<link rel="icon" href="data:,">
-<style>{shared}</style>
-<style>{printed}</style>
-</head>
-<body>
-<a class="skip" href="#content">Skip to the content</a>
-<header>{heading}</header>
-<main id="content">
-{_numbered(body)}
-</main>
-<noscript><p>Tables can be read without scripts; drawings need them.</p></noscript>
-<script type="application/json" id="data">{data}</script>
-<script>{code}</script>
-</body>
-</html>
-"""
+    parts = {"heading": heading, "body": _numbered(body), "data": data, "code": code, "shared": shared}
+    return Template(_text("page.html")).substitute(parts, policy=policy, title=escape(title), printed=printed)
 
 
 @cache

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from html import escape
 from io import BytesIO
 
 import polars as pl
 
-from pipeline.export.places import Stretches, stretches_of
+from pipeline.export.places import stretches_of
 from pipeline.report.columns import frame_table
 from pipeline.report.markup import section
+from pipeline.report.words import some_of
 from pipeline.results.store import file_name
 
 _NOTE = (
@@ -39,8 +39,10 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
         .group_by("netelement_id")
         .agg(probability=pl.col("path_probability").min(), t_start=pl.col("t").min(), t_end=pl.col("t").max())
     )
+    directions = ["AB" if sign > 0 else "BA" for sign in ways.sign.tolist()]
+    found = {"netelement_id": ways.elements, "direction": directions, "from_m": ways.first_m}
     return (
-        _directions(ways)
+        pl.DataFrame(found)
         .join(told, on="netelement_id", how="left")
         .sort("from_m")
         .select(
@@ -54,11 +56,6 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
     )
 
 
-def _directions(ways: Stretches) -> pl.DataFrame:
-    directions = ["AB" if sign > 0 else "BA" for sign in ways.sign.tolist()]
-    return pl.DataFrame({"netelement_id": ways.elements, "direction": directions, "from_m": ways.first_m})
-
-
 def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float) -> str:
     """The route with its doubtful stretches, and both files to take away; nothing without matched positions."""
     if epochs["path_m"].null_count() == epochs.height:
@@ -67,26 +64,19 @@ def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float)
     if route is None:
         return section(identity, "Route found", f"<p>{_TURNED}</p>")
     doubtful = route.filter("doubtful")["netelement_id"].to_list()
-    said = f"In doubt: {_some(doubtful)}." if doubtful else "No stretch is in doubt."
+    said = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
+    parquet = BytesIO()
+    route.write_parquet(parquet)
+    files = {"csv": route.write_csv().encode(), "parquet": parquet.getvalue()}
+    downloads = " ".join(_download(run_id, ending, content) for ending, content in files.items())
     shown = route.select("doubtful", "netelement_id", "direction", "probability", "t_start", "t_end")
     return section(
         identity,
         "Route found",
-        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {_downloads(run_id, route)}</p>',
+        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {downloads}</p>',
         f"<p>{_NOTE}</p>",
         frame_table(f"table-{identity}", "Route found, in the order of the path", shown),
     )
-
-
-def _some(names: Sequence[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
-
-
-def _downloads(run_id: str, route: pl.DataFrame) -> str:
-    parquet = BytesIO()
-    route.write_parquet(parquet)
-    return f"{_download(run_id, 'csv', route.write_csv().encode())} {_download(run_id, 'parquet', parquet.getvalue())}"
 
 
 def _download(run_id: str, ending: str, content: bytes) -> str:

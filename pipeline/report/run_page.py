@@ -13,10 +13,10 @@ import polars as pl
 from pipeline.figures.campaign_tables import campaign_balises, with_truth
 from pipeline.figures.known_counts import known_counts
 from pipeline.figures.verdict import LEVEL_LISTS
-from pipeline.report.architectures import architectures_section
-from pipeline.report.balises import balise_table, lost_shares, outcome
+from pipeline.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
-from pipeline.report.headline import run_headline
+from pipeline.report.ground import plan_data
+from pipeline.report.headline import FILES, JUDGES, facts, file_table, run_headline, tile_figures
 from pipeline.report.markup import (
     Cell,
     Json,
@@ -29,11 +29,9 @@ from pipeline.report.markup import (
     tiles,
     verdict_head,
 )
-from pipeline.report.plan_view import plan_data
 from pipeline.report.route_found import route_section
-from pipeline.report.run_facts import FILES, JUDGES, facts, file_table, tile_figures
 from pipeline.report.series import MOMENTS, moments_of, reasons, stanford_data, time_data
-from pipeline.report.words import WORDS
+from pipeline.report.words import WORDS, plots_of
 from schemas.campaign import CampaignLevels
 from schemas.config import Configuration
 from schemas.enums import TRUTH
@@ -53,28 +51,7 @@ _PASSAGES = (
 _ALARMS = (
     *("t_start", "t_end", "verdict", "monitors", "peak_ratio", "suspect", "hazard_id", "netelement_id", "measure_m"),
 )
-_PLOTS = (
-    ("balises", "Balises along the path", "Location error of each offer where it is known, early is positive; dashed: "
-     "the limit beyond which a position is wrong. Below: offers of unknown error, and balises that were lost."),
-    ("plan", "Plan", "GNSS positions by what the evidence says of them, balises by the worst that became of them."),
-    ("bands", "State of the system over time", "Where nothing is drawn there was no epoch. Hazards are shaded; of the "
-     "chosen one the dotted line is the begin of the fault, the dashed one the failure, the solid one the detection."),
-    ("speed", "Speed", ""),
-    ("along", "Error along the track", "Positive: ahead of the train. Drawn where it is known to 5 m, else GNSS minus "
-     "odometer. Dashed: the confidence interval, and the limit beyond which a position is wrong. Dotted, where it was "
-     "computed: the largest fault that no monitor would have noticed."),
-    ("across", "Error across the track and of height", "Without truth: residual against the surveyed track."),
-    ("linking", "Distance since the last accepted balise", "Bars are the expectation windows of the balises offered, "
-     "in odometer distance; marks are the offers."),
-    ("exposure", "Exposure", "Time since the last linked TVB or accepted balise."),
-    ("monitors-along", "Monitors along the track", "Value over threshold: beyond 1 or -1 the monitor fails."),
-    ("monitors-cross", "Monitors across the track", "Value over threshold."),
-    ("monitors-up", "Monitors of height", "Value over threshold."),
-    ("monitors-other", "Other monitors", "Value over threshold."),
-    ("states", "State of every monitor", "Not evaluated is not the same as passed."),
-    ("stanford", "Stanford diagram", "Epochs of known error: error along the track against the confidence claimed. "
-     "Below the diagonal the claim was wrong."),
-)  # fmt: skip
+ALLOWED = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
 _KEYS = "Keys: n p next and previous hazard, + - 0 zoom, ← → time, [ ] previous and next run"
 
 
@@ -111,19 +88,24 @@ def run_page(
     parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
     side_by_side = "" if architectures is None else architectures_section("architectures", architectures)
     told = pairs(facts(rows, tables, metadata))
-    body = "\n".join([told, _navigation(names), *parts, side_by_side, _provenance(metadata, made)])
+    digests = pairs(sorted((name, value) for name, value in metadata.items() if not name.endswith(FILES)))
+    provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration(made))
+    body = "\n".join([told, _navigation(names), *parts, side_by_side, provenance])
+    hazards = made.config.hazards
     data = {
         "run": tables.run_id,
-        "limits": _limits(made.config),
+        "limits": {
+            "ci_limit_m": made.config.lds.ci_limit_m,
+            "failure_limit_m": hazards.failure_limit_m,
+            "shift_limit_m": hazards.shift_limit_m,
+            "budget_s": made.config.budget_s,
+        },
         "order": [row["solution"] for row in rows],
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
     head = run_headline(rows, tables.passages, tables.hazards, made.config)
-    heading = (
-        verdict_head(head.word, head.worst, head.reasons)
-        + _ways(neighbours or Neighbours())
-        + f"<h1>Run {escape(tables.run_id)}</h1>"
-    )
+    verdict, ways = verdict_head(head.word, head.worst, head.reasons), _ways(neighbours or Neighbours())
+    heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
 
@@ -137,15 +119,6 @@ def _ways(neighbours: Neighbours) -> str:
     return f'<p class="ways">{" · ".join(ways)}</p>'
 
 
-def _limits(config: Configuration) -> Json:
-    return {
-        "ci_limit_m": config.lds.ci_limit_m,
-        "failure_limit_m": config.hazards.failure_limit_m,
-        "shift_limit_m": config.hazards.shift_limit_m,
-        "budget_s": config.budget_s,
-    }
-
-
 def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
     epochs, passages, hazards, alarms = (
         frame.filter(pl.col("solution") == name)
@@ -156,14 +129,12 @@ def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
         "time": time_data(epochs, moments_ns, made.config.align.gap_reset_s),
         "plan": plan_data(epochs, passages, made.site, moments_ns),
         "stanford": stanford_data(epochs, made.config.lds.ci_limit_m),
-        "hazards": [_hazard_data(row) for row in hazards.iter_rows(named=True)],
+        "hazards": [
+            {"id": row["hazard_id"], "class": row["hazard"], **{name: _milliseconds(row[name]) for name in MOMENTS}}
+            for row in hazards.iter_rows(named=True)
+        ],
         "passages": [_passage_data(row) for row in passages.with_columns(outcome=outcome()).iter_rows(named=True)],
     }
-
-
-def _hazard_data(row: Row) -> Json:
-    moments = {name: _milliseconds(row[name]) for name in MOMENTS}
-    return {"id": row["hazard_id"], "class": row["hazard"], **moments}
 
 
 def _passage_data(row: Row) -> Json:
@@ -213,101 +184,67 @@ def _navigation(names: list[str]) -> str:
 
 
 def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
-    name = row["solution"]
-    notes = _notices(row)
+    """All sections of one solution; of one that failed what reading and matching found out."""
+    name, told = row["solution"], [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
+    items = "".join(f"<li>{escape(text)}</li>" for text in told)
+    notes = f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
     if not name:
         return notes
     own = pl.col("solution") == name
-    hazards, passages, alarms, epochs = (
-        frame.filter(own) for frame in (tables.hazards, tables.passages, tables.alarms, tables.epochs)
+    hazards, passages, alarms, epochs, runs = (
+        frame.filter(own) for frame in (tables.hazards, tables.passages, tables.alarms, tables.epochs, tables.runs)
     )
-    runs = tables.runs.filter(own)
     known = known_counts(runs).row(0, named=True)
-    balises = _balises(tables.run_id, passages, runs)
+    named = (frame.with_columns(run_id=pl.lit(tables.run_id)) for frame in (passages, runs))
+    balises = lost_shares(campaign_balises(with_truth(*named)))
+    levels = pl.DataFrame({name: row[column] or [] for name, column in LEVEL_LISTS.items()})
+
+    def part(part_name: str, title: str, *content: str) -> str:
+        return section(f"{part_name}-{key}", title, *content)
+
+    def rows(part_name: str, caption: str, frame: pl.DataFrame, *given: Any) -> str:
+        return frame_table(f"table-{part_name}-{key}", caption, frame, *given)
+
+    in_order = "Passages of balises, in order of time"
     shown = tiles(tile_figures(known, balises, made.config.hazards.unknown_share_limit))
-    sure = made.config.matching.ambiguity_probability
     parts = [
-        section(f"figures-{key}", f"Summary of {name}" if several else "Summary", shown, notes),
-        section(f"hazards-{key}", "Hazards", _hazards(key, row, hazards)),
-        section(f"balises-{key}", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
-        _drawings(key),
-        section(f"passages-{key}", "Passages", _passages(key, passages)),
-        section(f"levels-{key}", "Service levels", _levels(key, row)),
-        section(f"alarms-{key}", "Alarms", _alarms(key, alarms)),
-        section(f"reasons-{key}", "Monitors not evaluated", _reasons(key, epochs)),
-        route_section(f"route-{key}", tables.run_id, epochs, sure),
-        section(f"all-{key}", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
+        part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
+        part("hazards", "Hazards", _hazards(key, row, hazards)),
+        part("balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
+        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in plots_of("run"))),
+        part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
+        part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
+        part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
+        part("reasons", "Monitors not evaluated", rows("reasons", "Why monitors could not judge", reasons(epochs))),
+        route_section(f"route-{key}", tables.run_id, epochs, made.config.matching.ambiguity_probability),
+        part("all", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
     ]
-    opening = f'<div class="solution" id="{key}" data-solution="{escape(name)}">'
-    return opening + "\n".join(parts) + "</div>"
+    return f'<div class="solution" id="{key}" data-solution="{escape(name)}">' + "\n".join(parts) + "</div>"
 
 
-def _notices(row: Row) -> str:
-    """The error, and what reading and matching found out."""
-    told = [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
-    items = "".join(f"<li>{escape(text)}</li>" for text in told)
-    return f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
-
-
-def _balises(run_id: str, passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
-    named = (frame.with_columns(run_id=pl.lit(run_id)) for frame in (passages, runs))
-    return lost_shares(campaign_balises(with_truth(*named)))
-
-
-def _drawings(key: str) -> str:
-    return section(f"drawings-{key}", "Drawings", *(figure(f"{key}-{plot}", *told) for plot, *told in _PLOTS))
-
-
-def _levels(key: str, run: Row) -> str:
-    """What the run would be worth at each service level."""
-    shown = pl.DataFrame({name: run[column] or [] for name, column in LEVEL_LISTS.items()})
-    title = "Wrong positions in use against the allowed T_D (TVB eq. 7)"
-    return frame_table(f"table-levels-{key}", title, shown, contract=CampaignLevels)
+def _status(row: Row) -> Cell:
+    word = WORDS[row["status"]]
+    return Cell(word, word, tone="" if row["status"] == "accepted" else "lost")
 
 
 def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
-    if hazards.is_empty():
-        if run["evidence"] is None:
-            return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
-        if run["evidence"] not in TRUTH:
-            return (
-                '<p class="notice partial">No hazard was found, but the odometer alone can only show that a position'
-                " was wrong, never that it was right.</p>"
-            )
-        share = run["share_unknown"]
-        left = (
-            "no position was in use" if share is None else f"{share:.1%} of the moving time in use could not be checked"
+    if hazards.height:
+        caption = "Hazards; a link zooms every drawing to its hazard"
+        return frame_table(f"table-hazards-{key}", caption, hazards, _HAZARDS, Hazards, {"hazard_id": _hazard_name})
+    if run["evidence"] is None:
+        return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
+    if run["evidence"] not in TRUTH:
+        return (
+            '<p class="notice partial">No hazard was found, but the odometer alone can only show that a position'
+            " was wrong, never that it was right.</p>"
         )
-        return f'<p class="none">No hazard was found, judged by {JUDGES[run["evidence"]]}; {left}.</p>'
-
-    def named(row: Row) -> Cell:
-        return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
-
-    caption = "Hazards; a link zooms every drawing to its hazard"
-    return frame_table(f"table-hazards-{key}", caption, hazards, _HAZARDS, Hazards, {"hazard_id": named})
+    share = run["share_unknown"]
+    left = "no position was in use" if share is None else f"{share:.1%} of the moving time in use could not be checked"
+    return f'<p class="none">No hazard was found, judged by {JUDGES[run["evidence"]]}; {left}.</p>'
 
 
-def _passages(key: str, passages: pl.DataFrame) -> str:
-    def status(row: Row) -> Cell:
-        word = WORDS[row["status"]]
-        return Cell(word, word, tone="" if row["status"] == "accepted" else "lost")
-
-    caption = "Passages of balises, in order of time"
-    return frame_table(f"table-passages-{key}", caption, passages, _PASSAGES, Passages, {"status": status})
-
-
-def _alarms(key: str, alarms: pl.DataFrame) -> str:
-    return frame_table(f"table-alarms-{key}", "Alarm episodes", alarms, _ALARMS, Alarms)
-
-
-def _reasons(key: str, epochs: pl.DataFrame) -> str:
-    return frame_table(f"table-reasons-{key}", "Why monitors could not judge", reasons(epochs))
-
-
-def _provenance(metadata: Mapping[str, str], made: Made) -> str:
-    digests = {name: value for name, value in metadata.items() if not name.endswith(FILES)}
-    shown = pairs(sorted(digests.items()))
-    return section("provenance", "Provenance", file_table(metadata), shown, configuration(made))
+def _hazard_name(row: Row) -> Cell:
+    return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
 
 
 def configuration(made: Made) -> str:

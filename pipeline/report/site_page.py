@@ -22,7 +22,9 @@ def site_page(name: str, site: Site) -> str:
     findings = [(one.severity, one.place, one.message, one.remedy) for one in site.findings]
     doubtful = sum(severity != "note" for severity, *_ in findings)
     km = f"{elements['length_m'].sum() / 1000:.2f} km"
-    balises = 0 if site.balises is None else site.balises.height
+    columns = ("balise_id", "netelement_id", "measure_m", "kind", "location_accuracy_m")
+    rows = [] if site.balises is None else site.balises.select(columns).rows()
+    balises = len(rows)
     figures = [
         ("Net elements", str(elements.height), ""),
         ("Track", km, ""),
@@ -36,11 +38,13 @@ def site_page(name: str, site: Site) -> str:
             section("plan", "Plan", figure("site", "Net elements and balises, in metres", told)),
             section("findings", "What is doubtful", _rows("findings", "Findings", _FINDING_HEADS, findings)),
             section("elements", "Net elements", _rows("elements", "Net elements", _ELEMENT_HEADS, elements.rows())),
-            section("balises", "Balises", _rows("balises", "Balises", _BALISE_HEADS, _balise_rows(site))),
+            section("balises", "Balises", _rows("balises", "Balises", _BALISE_HEADS, rows)),
         ]
     )
     heading = f"<h1>Site {escape(name)}</h1>"
-    return page(f"Site {name}", heading, body, script_json(_plan(site)), "site.js", SOFTWARE)
+    # Metres east and north of the first point.
+    plan = {"elements": [packed_line(*line) for line in element_lines_m(site)], "balises": _marks(site)}
+    return page(f"Site {name}", heading, body, script_json(plan), "site.js", SOFTWARE)
 
 
 _FINDING_HEADS = [(name, "") for name in ("severity", "place", "what", "what to do")]
@@ -57,18 +61,6 @@ _BALISE_HEADS = [(name, "") for name in ("balise", "net element", "measure [m]",
 
 def _rows(identity: str, caption: str, heads: list[tuple[str, str]], rows: Sequence[tuple[object, ...]]) -> str:
     return table(identity, caption, heads, [[cell(value, 6) for value in row] for row in rows])
-
-
-def _balise_rows(site: Site) -> list[tuple[object, ...]]:
-    if site.balises is None:
-        return []
-    columns = ("balise_id", "netelement_id", "measure_m", "kind", "location_accuracy_m")
-    return site.balises.select(columns).rows()
-
-
-def _plan(site: Site) -> Json:
-    """Lines and marks in metres east and north of the first point."""
-    return {"elements": [packed_line(*line) for line in element_lines_m(site)], "balises": _marks(site)}
 
 
 def _marks(site: Site) -> list[Json]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import quote
@@ -15,8 +15,8 @@ from pipeline import storage
 from pipeline.campaign.plan import software_digest
 from pipeline.campaign.workers import each
 from pipeline.figures.campaign_figures import derived_tables
-from pipeline.report.availability import availability_pieces, together
 from pipeline.report.campaign_page import Campaign, campaign_page
+from pipeline.report.ground import availability_pieces, together
 from pipeline.report.run_page import Made, Neighbours, run_page
 from pipeline.report.shares import Share, known_shares, remember
 from pipeline.results import catalogue
@@ -33,10 +33,9 @@ from pipeline.safety.side_by_side import side_by_side
 from pipeline.safety.tally import added
 from pipeline.storage import files
 from schemas.config import Configuration, to_toml
-from schemas.run import RunTables, Site
+from schemas.run import Site
 from schemas.tables import TABLES
 
-_PAGES_PER_PROCESS = 20
 # The end of a page: what it was made from.
 _MARK = "<!-- {} -->\n"
 
@@ -64,49 +63,38 @@ def write_report(
     default one per core where there are many; `progress` is told how many pages of how many are done.
     """
     names = {run: page_name(run) for run in complete_runs(out)}
-    made = _made(out, site)
+    config = read_config(out)
+    made = Made(config or Configuration(), None if config is None else to_toml(config), site)
     states = catalogue.states(out, *TABLES) or {}
     shares = known_shares(out, states, _settings_digest(made))
-    beside = _neighbours(names)
+    ways = [None, *((run, quote(name)) for run, name in names.items()), None]
+    beside = {run: Neighbours(ways[at], ways[at + 2]) for at, run in enumerate(names)}
     pages = [
         _Page(out, run, out / "report" / "runs" / name, made, beside[run], shares[run].content if run in shares else "")
         for run, name in names.items()
     ]
     left = [page for page in pages if not _is_there(page)]
-    for done, share in enumerate(each(_written, left, jobs or _worth(len(left))), start=len(pages) - len(left) + 1):
+    # Starting a process takes as long as some pages.
+    jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
+    for done, share in enumerate(each(_written, left, jobs), start=len(pages) - len(left) + 1):
         shares[share.run] = share
         if progress is not None:
             progress(done, len(pages))
     if states == catalogue.states(out, *TABLES):
         remember(out, states, _settings_digest(made), shares)
-    _remove_others(out / "report" / "runs", {page.path.name for page in pages})
+    folder, own = out / "report" / "runs", {page.path.name for page in pages}
+    for name in files.list_dir(folder):
+        if name.endswith(".html") and name not in own:
+            storage.remove(folder / name)
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
     index = out / "report" / "index.html"
     storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, shares), made).encode())
     return [index, *(page.path for page in pages)]
 
 
-def _remove_others(folder: Path, names: Collection[str]) -> None:
-    """Remove pages of runs that are no longer in the result."""
-    for name in files.list_dir(folder):
-        if name.endswith(".html") and name not in names:
-            storage.remove(folder / name)
-
-
 def page_name(run_id: str) -> str:
     """File name of a run's page."""
     return f"{file_name(run_id)}.html"
-
-
-def _neighbours(names: dict[str, str]) -> dict[str, Neighbours]:
-    """The pages before and after each run's."""
-    ways = [None, *((run, quote(name)) for run, name in names.items()), None]
-    return {run: Neighbours(ways[at], ways[at + 2]) for at, run in enumerate(names)}
-
-
-def _worth(pages: int) -> int:
-    """Processes that so many pages are worth: starting one takes as long as some pages."""
-    return min(os.cpu_count() or 1, 1 + pages // _PAGES_PER_PROCESS)
 
 
 def _is_there(page: _Page) -> bool:
@@ -131,18 +119,14 @@ def _written(page: _Page) -> Share:
     metadata = metadata_of(contents["runs"] or b"")
     check_site(page.made.site, metadata.get("site_digest"), page.run)
     tables = read_run(page.out, page.run)
-    share = _share(page, tables, _digest(contents))
+    several, config = tables.runs.height > 1, page.made.config
+    judged = (tables.epochs, tables.hazards, tables.alarms, tables.runs)
+    tallies = side_by_side(*judged, config) if several else None
+    share = Share(page.run, _digest(contents), availability_pieces(tables.epochs.lazy()), tallies)
     if not _is_there(replace(page, content=share.content)):
         html = run_page(tables, metadata, page.made, share.tallies, page.neighbours)
         storage.write_bytes(page.path, html.encode() + _mark(page, share.content))
     return share
-
-
-def _share(page: _Page, tables: RunTables, content: str) -> Share:
-    tallies = None
-    if tables.runs.height > 1:
-        tallies = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, page.made.config)
-    return Share(page.run, content, availability_pieces(tables.epochs.lazy()), tallies)
 
 
 def _digest(contents: Mapping[str, bytes | None]) -> str:
@@ -163,11 +147,6 @@ def _mark(page: _Page, content: str) -> bytes:
 def _settings_digest(made: Made) -> str:
     """SHA-256 over the program and the configuration."""
     return hashlib.sha256(f"{software_digest()}\n{made.config_text}".encode()).hexdigest()
-
-
-def _made(out: Path, site: Site | None) -> Made:
-    config = read_config(out)
-    return Made(config or Configuration(), None if config is None else to_toml(config), site)
 
 
 def _campaign(out: Path, made: Made, hrefs: dict[str, str], shares: Mapping[str, Share]) -> Campaign:

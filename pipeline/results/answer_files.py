@@ -17,6 +17,15 @@ _MOST_ROWS = 1_048_575
 _TIMES = "yyyy-mm-dd hh:mm:ss.000"
 
 
+def write_answer(answer: pl.DataFrame, csv: Path | None, parquet: Path | None, xlsx: Path | None) -> list[Path]:
+    """Write the formats that are asked for; returns the files, without standard output."""
+    formats = {csv: write_csv, parquet: write_parquet, xlsx: write_xlsx}
+    for file, write in formats.items():
+        if file is not None:
+            write(answer, file)
+    return [file for file in formats if file is not None and str(file) != "-"]
+
+
 def write_csv(answer: pl.DataFrame, file: Path) -> None:
     """Comma-separated text with a heading; lists as words with blanks between them. `-` is standard output."""
     text = _flat(answer).write_csv(datetime_format="%Y-%m-%dT%H:%M:%S%.9fZ")

@@ -44,6 +44,12 @@ def fresh(out: Address, table: str) -> pl.LazyFrame | None:
     return None if found is None else _kept(out, table, found)
 
 
+def scan(out: Address, table: str) -> pl.LazyFrame:
+    """This table of all complete runs: from the catalogue where it is fresh, else from the runs' own files."""
+    kept = fresh(out, table)
+    return store.read_table(out, table) if kept is None else kept
+
+
 def digest(out: Address, table: str) -> str | None:
     """SHA-256 over the contract and the versions of this table's files; none where files have no version."""
     found = states(out, table)

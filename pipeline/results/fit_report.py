@@ -26,7 +26,10 @@ class FitReport:
         told = [f"does not fit: {problem}" for problem in self.problems]
         if "Fit" in self.tables:
             misfits = self.tables["Fit"].filter(pl.col("state") == State.MISFIT.value)
-            told += [f"does not fit: {row['check']}: {row['found']} {row['cause']}".rstrip() for row in _rows(misfits)]
+            told += [
+                f"does not fit: {row['check']}: {row['found']} {row['cause']}".rstrip()
+                for row in misfits.iter_rows(named=True)
+            ]
         if "Lines that mend it" in self.tables:
             told += self.tables["Lines that mend it"]["toml"].to_list()
         return told
@@ -77,7 +80,3 @@ def _checks(found: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
         if one.placeholders
     ]
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")
-
-
-def _rows(table: pl.DataFrame) -> list[dict[str, str]]:
-    return list(table.iter_rows(named=True))

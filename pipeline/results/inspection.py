@@ -16,6 +16,7 @@ from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.receivers.csv_draft import draft_mapping
 from pipeline.results import store
 from pipeline.results.fit_report import FitReport, fit_report
+from pipeline.results.terminal import show_tables
 from pipeline.site.read import is_geojson, read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
@@ -71,6 +72,13 @@ def inspect_csv(path: Path) -> dict[str, pl.DataFrame]:
     return {STARTING_CONFIG: pl.DataFrame({"toml": draft_mapping(path).splitlines()})}
 
 
+def show(tables: Mapping[str, pl.DataFrame]) -> None:
+    """Print the tables; what is to be saved as configuration last, without a frame."""
+    show_tables({name: table for name, table in tables.items() if name != STARTING_CONFIG})
+    if STARTING_CONFIG in tables:
+        print("\n".join(tables[STARTING_CONFIG]["toml"]))
+
+
 def inspect_log(
     path: Address, config: IngestConfig, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> dict[str, pl.DataFrame]:
@@ -100,7 +108,8 @@ def inspect_log(
 def _stream_row(stream: StreamSummary) -> dict[str, object]:
     row = {item.name: getattr(stream, item.name) for item in fields(stream)}
     for name in ("t_start", "t_end"):
-        row[name] = _instant(row.pop(f"{name}_ns"))
+        t_ns = row.pop(f"{name}_ns")
+        row[name] = None if t_ns is None else datetime.fromtimestamp(t_ns / 1e9, UTC)
     return {**row, "fix_mix": _value(stream.fix_mix), "columns": " ".join(stream.columns)}
 
 
@@ -108,10 +117,6 @@ def _topic_row(topic: TopicSummary) -> dict[str, object]:
     row = {item.name: getattr(topic, item.name) for item in fields(topic) if item.name != "fields"}
     mapping = ", ".join(f"{column} = {source}" for column, source in topic.mapping.items())
     return {**row, "stream": topic.stream or "left over", "mapping": mapping}
-
-
-def _instant(t_ns: int | None) -> datetime | None:
-    return None if t_ns is None else datetime.fromtimestamp(t_ns / 1e9, UTC)
 
 
 def inspect_site(
@@ -123,17 +128,18 @@ def inspect_site(
     With a result also how far its runs lay beside each net element and above it, against what both sigmas allow.
     """
     # What they need takes long to load, and a log needs none of it.
+    from pipeline.site.alike import parallel_findings, window_findings
     from pipeline.site.describe import describe_site, elements_table, without_balises
-    from pipeline.site.parallels import parallel_findings
     from pipeline.site.survey_findings import survey_findings
-    from pipeline.site.windows import window_findings
 
     site = read_site(path)
-    description = describe_site(site)
-    figures = {item.name: getattr(description, item.name) for item in fields(description) if item.name != "findings"}
     alike = (*window_findings(site), *parallel_findings(site, matching or MatchingConfig()))
-    found = (*description.findings, *without_balises(site.balises), *alike)
-    tables = {"Site": _figures(figures), "Elements": elements_table(site), "Findings": findings_table(found)}
+    found = (*site.findings, *without_balises(site.balises), *alike)
+    tables = {
+        "Site": _figures(describe_site(site)),
+        "Elements": elements_table(site),
+        "Findings": findings_table(found),
+    }
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))

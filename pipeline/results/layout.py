@@ -6,9 +6,11 @@ where it has few rows; else columns are left out, and the last line says how man
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 _GAP = 2
 _HEADING_LINES = 3
@@ -48,7 +50,8 @@ class Column:
     @property
     def least_heading(self) -> int:
         """The width at which the heading takes no more than its lines."""
-        widths = range(max(1, *map(len, _parts(self.heading))), len(self.heading) + 1)
+        longest = max(map(len, re.split(r"\s+|(?<=_)", self.heading)))
+        widths = range(max(1, longest), len(self.heading) + 1)
         fits = (width for width in widths if len(_broken_heading(self.heading, width)) <= _HEADING_LINES)
         return next(fits, max(1, len(self.heading)))
 
@@ -113,43 +116,31 @@ def _lines(columns: Sequence[Column], widths: list[int], broken: bool) -> list[s
     if not any(column.heading for column in columns):
         lines = []
     for cells in zip(*(column.cells for column in columns), strict=True):
-        lines += _row([_folded(cell, width) for cell, width in zip(cells, widths, strict=True)], widths, rights)
+        folded = [
+            [cell] if len(cell) <= width else textwrap.wrap(cell, width, break_on_hyphens=False) or [""]
+            for cell, width in zip(cells, widths, strict=True)
+        ]
+        lines += _row(folded, widths, rights)
     return lines
 
 
 def _row(parts: list[list[str]], widths: list[int], rights: list[bool]) -> list[str]:
     """One row of the table, as many lines as its deepest cell."""
-    depth = max(map(len, parts))
-    lines = []
-    for at in range(depth):
-        cells = [part[at] if at < len(part) else "" for part in parts]
-        aligned = [
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(cells, widths, rights, strict=True)
-        ]
-        lines.append((" " * _GAP).join(aligned).rstrip())
-    return lines
+    signs = [">" if right else "<" for right in rights]
+    return [
+        (" " * _GAP).join(f"{c:{s}{w}}" for c, s, w in zip(cells, signs, widths, strict=True)).rstrip()
+        for cells in zip_longest(*parts, fillvalue="")
+    ]
 
 
-def _folded(cell: str, width: int) -> list[str]:
-    if len(cell) <= width:
-        return [cell]
-    return textwrap.wrap(cell, width, break_on_hyphens=False) or [""]
+class _Headings(textwrap.TextWrapper):
+    """Breaks behind `_` and at blanks."""
+
+    wordsep_re = re.compile(r"(\s+|(?<=_))")
 
 
 def _broken_heading(heading: str, width: int) -> list[str]:
-    """The heading in lines of at most `width`, broken behind `_` and at blanks."""
-    lines = [""]
-    for part in _parts(heading):
-        if lines[-1] and len((lines[-1] + part).rstrip()) > width:
-            lines.append("")
-        lines[-1] += part
-    return [piece for line in lines for piece in (textwrap.wrap(line, width) or [""])]
-
-
-def _parts(heading: str) -> list[str]:
-    pieces = heading.replace("_", "_\n").replace(" ", " \n").split("\n")
-    return pieces if any(pieces) else [""]
+    return _Headings(width).wrap(heading) or [""]
 
 
 def _total(widths: Sequence[int]) -> int:

@@ -12,7 +12,6 @@ import json
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
@@ -32,22 +31,14 @@ _AT_ONCE = 500
 Manifest = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class SettingsFiles:
-    """The configuration and the vehicle file of a call; None where the defaults served."""
-
-    configuration: FileDigest | None = None
-    vehicle: FileDigest | None = None
+SettingsFiles = Mapping[str, Any]
+"""The `configuration` and the `vehicle` file of a call; None where the defaults served."""
 
 
-NO_FILES = SettingsFiles()
-
-
-def settings_files(configuration: Path | None, vehicle: Path | None) -> SettingsFiles:
+def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
     """The files as they were given."""
-    return SettingsFiles(
-        *(None if path is None else storage.file_digests(path)[0] for path in (configuration, vehicle))
-    )
+    given = {"configuration": configuration, "vehicle": vehicle}
+    return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in given.items()}
 
 
 def listing(listed: Iterable[tuple[str, int, str]]) -> str:
@@ -59,9 +50,8 @@ def note_settings(out: Address, config_digest: str, given: SettingsFiles) -> Non
     """Keep the names of this call's settings files, before any run is made with them."""
     found = _earlier(out)
     known = found["settings"].setdefault(config_digest, [])
-    entry = {name: _file(file) for name, file in (("configuration", given.configuration), ("vehicle", given.vehicle))}
-    if entry not in known:
-        known.append(entry)
+    if given not in known:
+        known.append(given)
         _write(out, found)
 
 
@@ -184,11 +174,11 @@ def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
 
 
 def _files(listed: str | None) -> list[dict[str, Any]]:
-    return [_file(FileDigest(*file)) or {} for file in json.loads(listed or "[]")]
+    return [_file(FileDigest(*file)) for file in json.loads(listed or "[]")]
 
 
-def _file(file: FileDigest | None) -> dict[str, Any] | None:
-    return None if file is None else {"name": file.name, "bytes": file.size_bytes, "sha256": file.sha256}
+def _file(file: FileDigest) -> dict[str, Any]:
+    return {"name": file.name, "bytes": file.size_bytes, "sha256": file.sha256}
 
 
 def _own_files(out: Address) -> dict[str, dict[str, Any]]:

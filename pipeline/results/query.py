@@ -14,11 +14,10 @@ from pathlib import Path
 import dataframely as dy
 import polars as pl
 
-from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.results.source import source_of
 from pipeline.storage import parquet
-from pipeline.storage.address import Address, is_url, join
+from pipeline.storage.address import Address, join
 from schemas.campaign import CAMPAIGN_TABLES
 from schemas.dictionary import dictionary_frame
 from schemas.errors import UsageError
@@ -65,8 +64,9 @@ def run_sql(
     try:
         return pl.SQLContext(tables).execute(sql).collect()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UsageError(
-            f"cannot be answered: {_told(_first_line(error), tables, others or {})}",
+            f"cannot be answered: {_told(said, tables, others or {})}",
             place="SQL",
             expected=_EXPECTED,
             remedy=_REMEDY,
@@ -106,12 +106,12 @@ def _check_query(sql: str, allow_files: bool) -> None:
 
 def _tables(out: Address, sql: str, prefix: str = "") -> dict[str, pl.LazyFrame]:
     """What the query may name: ten thousand addresses take their time, remote tables their transfer."""
-    runs = store.complete_runs(out)
+    store.complete_runs(out)
 
     def named(names: Iterable[str]) -> list[str]:
         return [name for name in names if re.search(rf"\b{prefix}{name}\b", sql, re.IGNORECASE)]
 
-    found = {name: _scan(out, name, runs) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
+    found = {name: catalogue.scan(out, name) for name in named(TABLES)} | _campaign_tables(out, named(CAMPAIGN_TABLES))
     return {f"{prefix}{name}": frame for name, frame in found.items()}
 
 
@@ -161,23 +161,12 @@ def _told(said: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) 
     return said
 
 
-def _scan(out: Address, table: str, runs: list[str]) -> pl.LazyFrame:
-    kept = catalogue.fresh(out, table)
-    if kept is not None:
-        return kept
-    return store.scan_runs(out, table, runs)
-
-
 def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFrame]:
     """`campaign/runs.parquet` as `campaign_runs`, and so on; those that are not there are left out."""
-    addresses = {name: join(join(out, "campaign"), f"{name.removeprefix('campaign_')}.parquet") for name in names}
-    contents: Mapping[str, bytes | Path]
-    if is_url(out):
-        contents = storage.read_many([str(address) for address in addresses.values()])
-    else:
-        contents = {str(address): Path(address) for address in addresses.values() if Path(address).exists()}
-    there = {name: str(address) for name, address in addresses.items() if str(address) in contents}
-    return {name: _campaign_table(name, contents[place]) for name, place in there.items()}
+    folder = join(out, "campaign")
+    places = {name: str(join(folder, f"{name.removeprefix('campaign_')}.parquet")) for name in names}
+    found = store.sources(list(places.values()))
+    return {name: _campaign_table(name, found[place]) for name, place in places.items() if place in found}
 
 
 def _campaign_table(name: str, source: bytes | Path) -> pl.LazyFrame:
@@ -187,7 +176,3 @@ def _campaign_table(name: str, source: bytes | Path) -> pl.LazyFrame:
         remedy = "`balise replay` with the same --out writes it again."
         raise UsageError(f"cannot be read: {error}", place=f"table `{name}`", remedy=remedy) from None
     return source_of(frame.schema, lambda columns, _: iter([frame.select(columns)]))
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -196,10 +196,15 @@ def completed_runs(out: Address, among: Sequence[str] | None = None) -> dict[str
     """Metadata of each complete run, or of those among these, without reading any table."""
     runs = run_ids(out) if among is None else among
     addresses = {str(table_address(out, _MARKER, run)): run for run in runs}
-    if is_url(out):
-        contents = storage.read_many(list(addresses))
-        return {run: metadata_of(contents[place]) for place, run in addresses.items() if place in contents}
-    return {run: metadata_of(Path(place)) for place, run in addresses.items() if Path(place).exists()}
+    found = sources(list(addresses))
+    return {run: metadata_of(found[place]) for place, run in addresses.items() if place in found}
+
+
+def sources(places: Sequence[str]) -> Mapping[str, bytes | Path]:
+    """Those of these files of one result that are there: the content of those in a store, in one go, else the path."""
+    if places and is_url(places[0]):
+        return storage.read_many(list(places))
+    return {place: Path(place) for place in places if Path(place).exists()}
 
 
 def metadata_of(source: Path | bytes) -> dict[str, str]:

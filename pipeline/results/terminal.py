@@ -46,7 +46,11 @@ def show_tables(tables: Mapping[str, pl.DataFrame]) -> None:
 
 def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
     """A frame as aligned text, two blanks between columns, in lines of at most `width` characters."""
-    return fitted(_columns(frame), width) if frame.width else []
+    columns = [
+        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric())
+        for name, dtype in frame.schema.items()
+    ]
+    return fitted(columns, width) if columns else []
 
 
 def screen_width() -> int | None:
@@ -54,13 +58,6 @@ def screen_width() -> int | None:
     if sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit():
         return shutil.get_terminal_size().columns
     return None
-
-
-def _columns(frame: pl.DataFrame) -> list[Column]:
-    return [
-        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric())
-        for name, dtype in frame.schema.items()
-    ]
 
 
 def _coloured(line: str) -> str:

@@ -6,23 +6,21 @@ Touches a result to read it. It counts what the judge has said and judges no pos
 
 from __future__ import annotations
 
-from importlib.resources import files
-
 import polars as pl
 
-from pipeline.safety.architectures import architectures_table, fail_safety_table
+from pipeline.safety.architectures import architectures_table, continuity_table, fail_safety_table
 from pipeline.safety.budget import (
     allocation_table,
     allowed_table,
     demands_table,
+    published,
     substantiation_table,
     tolerable_table,
 )
-from pipeline.safety.continuity import continuity_table
 from pipeline.safety.markov import markov_table
 from schemas.config import SafetyConfig
 
-__all__ = ["errata_table", "safety_tables"]
+__all__ = ["safety_tables"]
 
 
 def safety_tables(config: SafetyConfig) -> dict[str, pl.DataFrame]:
@@ -37,10 +35,6 @@ def safety_tables(config: SafetyConfig) -> dict[str, pl.DataFrame]:
         "fail_safety": fail_safety_table(config),
         "continuity": continuity_table(),
         "substantiation": substantiation_table(config),
-        "errata": errata_table(),
+        # What is printed wrongly (`misprint`), lost or left open in the papers, and what stands here instead.
+        "errata": published("errata"),
     }
-
-
-def errata_table() -> pl.DataFrame:
-    """What is printed wrongly (`misprint`), lost or left open in the papers, and what stands here instead."""
-    return pl.read_csv((files(__name__) / "errata.csv").read_bytes(), infer_schema=False).fill_null("")

@@ -11,7 +11,7 @@ from pipeline.figures.campaign_figures import derived_tables
 from pipeline.figures.map_errors import map_suspects
 from pipeline.results import catalogue, store
 from pipeline.results.terminal import show_tables, tall, to_json
-from pipeline.safety.reading import figures_for_reading
+from pipeline.safety.reading import figures_for_reading, some_of, source_files
 from pipeline.safety.sensitivity import Replay, sensitivity
 from pipeline.safety.sentences import (
     level_statements,
@@ -21,7 +21,6 @@ from pipeline.safety.sentences import (
     verdict_statement,
 )
 from pipeline.safety.side_by_side import EPOCH_COLUMNS, side_by_side
-from pipeline.safety.sources import some_of, source_files
 from pipeline.safety.tally import added, architecture_figures
 from pipeline.storage.address import Address
 from schemas.config import Configuration
@@ -58,7 +57,7 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
     if config is not None:
         settings = settings.model_copy(update={"safety": config.safety})
     names = ("runs", "hazards", "passages", "alarms")
-    runs, hazards, passages, alarms = (_table(out, name) for name in names)
+    runs, hazards, passages, alarms = (catalogue.scan(out, name).collect() for name in names)
     derived = derived_tables(runs, hazards, passages, alarms, settings)
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
@@ -82,12 +81,6 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
         *level_statements(derived["detection"]),
     ]
     return Assessment(said, tables)
-
-
-def _table(out: Address, name: str) -> pl.DataFrame:
-    """From the catalogue where it is fresh; nothing is written."""
-    kept = catalogue.fresh(out, name)
-    return (store.read_table(out, name) if kept is None else kept).collect()
 
 
 def compare_architectures(

@@ -8,13 +8,13 @@ to P3 at HR_Diag, P1 to P2 at mu = 1/T_D; P2 and P3 are not left.
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.safety.budget import S_PER_H, allowed_time_to_detect_s
+from pipeline.safety.budget import S_PER_H, levels_table
 from schemas.config import SafetyConfig
 
 
@@ -86,13 +86,13 @@ def lds_hazard_rate_per_h(hr_sbas_per_h: float, time_to_detect_s: float) -> floa
     return hr_sbas_per_h * time_to_detect_s / S_PER_H
 
 
-def markov_table(config: SafetyConfig, times_h: tuple[float, ...] = (0.25, 1.0, 8.0)) -> pl.DataFrame:
+def markov_table(config: SafetyConfig) -> pl.DataFrame:
     """Per service level, each with its allowed T_D, at T_D and later: exact, numeric, approximated."""
     rows = []
-    for level, service in config.service_levels.items():
-        allowed_h = allowed_time_to_detect_s(config.thr_vb_per_h, service.hazard_rate_per_h) / S_PER_H
-        model = LdsModel(service.hazard_rate_per_h, config.diagnosis_hazard_rate_per_h, allowed_h)
-        rows += [_markov_row(level, model, t_h, config.thr_vb_per_h) for t_h in (allowed_h, *times_h)]
+    for level, rate, allowed_s in levels_table(config).iter_rows():
+        model = LdsModel(rate, config.diagnosis_hazard_rate_per_h, allowed_s / S_PER_H)
+        times_h = (model.time_to_detect_h, 0.25, 1.0, 8.0)
+        rows += [_markov_row(level, model, t_h, config.thr_vb_per_h) for t_h in times_h]
     return pl.DataFrame(rows)
 
 
@@ -106,10 +106,7 @@ def _markov_row(level: str, model: LdsModel, t_h: float, thr_per_h: float) -> di
         "mu_per_h": model.mu_per_h,
         "time_to_detect_s": model.time_to_detect_h * S_PER_H,
         "t_h": t_h,
-        "p0": state.p0,
-        "p1": state.p1,
-        "p2": state.p2,
-        "p3": state.p3,
+        **asdict(state),
         "p1_approximate": approximate_p1(model),
         "approximation_error": approximation_error(model, t_h),
         "p1_numeric": solved.p1,

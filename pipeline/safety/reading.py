@@ -1,42 +1,20 @@
-"""Tables of an assessment as a person reads them: each figure with its bounds, its unit and where it comes from."""
+"""Tables of an assessment as a person reads them: figures with bounds and source, and what a result was made from."""
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
 import polars as pl
 
+from pipeline import storage
+from pipeline.figures.estimates import bounds_of
+from pipeline.results.manifest import NAME, read_manifest
+from pipeline.safety.budget import published
+from pipeline.storage.address import Address, join
 from schemas.campaign import CampaignFigures
-
-# By the beginning of the figure's name, the first that fits; docs/domain.md is DOMAIN.
-_SOURCES = {
-    "runs_unsafe": "DOMAIN 5.4",
-    "runs_unproven": "DOMAIN 5.4",
-    "runs_safe": "DOMAIN 5.4",
-    "runs": "count",
-    "hours_needed": "Poisson, 95 %, against THR_VB (TVB section 3)",
-    "hours_still_needed": "Poisson, 95 %, against THR_VB (TVB section 3)",
-    "hours": "DOMAIN 5.1",
-    "hazard": "DIAG, section Hazards; DOMAIN 5.3",
-    "missed": "DIAG, section Hazards; DOMAIN 5.3",
-    "beyond_budget": "TVB eq. 7; DOMAIN 5.3",
-    "failures": "TVB eq. 7; DOMAIN 5.3",
-    "false_alarm": "DOMAIN 3 and 5.3",
-    "accepted": "DOMAIN 4",
-    "unsafe": "DOMAIN 5.2",
-    "unproven": "DOMAIN 5.2",
-    "outage": "count of gaps (dictionary, `runs`)",
-    "trusted": "LOC eq. 8",
-    "mtbf": "LOC eq. 8",
-    "continuity": "LOC eq. 8",
-    "share_p": "TVB, Markov model; DOMAIN 4",
-    "share_unknown": "DOMAIN 5.2",
-    "stanford": "Stanford diagram, along track",
-    "thr_vb": "TVB section 3",
-    "undetected": "docs/domain.md section 5.6",
-    "physical_spacing": "docs/domain.md section 5.6",
-}
 
 
 def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
@@ -45,16 +23,12 @@ def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
 
 
 def _figures(row: Mapping[str, Any]) -> pl.DataFrame:
-    bounds = {_bounded(name) for name in row if _is_bound(name)}
+    bounds = bounds_of(row)
+    beside = {"solution", *(name for name in row if re.search("_(low|high)(_|$)", name))}
     rows = [
-        (
-            name,
-            row[name],
-            *(_bound(row, name, side) if name in bounds else None for side in ("low", "high")),
-            *_told(name),
-        )
-        for name in row
-        if name != "solution" and not _is_bound(name)
+        (name, value, *(row.get(bound) for bound in bounds.get(name, ("", ""))), *_told(name))
+        for name, value in row.items()
+        if name not in beside
     ]
     kinds = {"figure": pl.String, "value": pl.Float64, "low": pl.Float64, "high": pl.Float64}
     return pl.DataFrame(rows, schema={**kinds, "unit": pl.String, "source": pl.String}, orient="row", strict=False)
@@ -64,23 +38,43 @@ def _told(name: str) -> tuple[str, str]:
     """Unit, and paper or clause."""
     column = CampaignFigures.columns()[name]
     unit = str((column.metadata or {}).get("unit", "")) or "1"
-    return unit, next((source for start, source in _SOURCES.items() if name.startswith(start)), "")
+    # By the beginning of the figure's name, the first that fits; docs/domain.md is DOMAIN.
+    sources = published("figure_sources").iter_rows()
+    return unit, next((source for start, source in sources if name.startswith(start)), "")
 
 
-def _is_bound(name: str) -> bool:
-    return any(f"_{side}" in name and _bounded(name) != name for side in ("low", "high")) and "upper" not in name
+_SCHEMA = {"kind": pl.String, "of": pl.String, "name": pl.String, "bytes": pl.Int64, "sha256": pl.String}
 
 
-def _bounded(name: str) -> str:
-    """The figure that a bound belongs to: `mtbf_h` of `mtbf_low_h`."""
-    for side in ("low", "high"):
-        head, found, tail = name.rpartition(f"_{side}")
-        if found and (not tail or tail.startswith("_")):
-            return head + tail
-    return name
+def source_files(out: Address) -> pl.DataFrame:
+    """`kind, of, name, bytes, sha256`: manifest, program, settings, site and logs; none without a manifest."""
+    manifest = read_manifest(out)
+    if manifest is None:
+        return pl.DataFrame(schema=_SCHEMA)
+    content = storage.content_of(join(out, NAME)) or b""
+    rows: list[tuple[str, str, str, int | None, str]] = [
+        ("manifest", "", NAME, len(content), hashlib.sha256(content).hexdigest())
+    ]
+    made = {(run["software"], run["software_digest"]) for run in manifest["runs"].values()}
+    rows += [("program", "", software or "", None, digest or "") for software, digest in sorted(made, key=str)]
+    for entries in manifest["settings"].values():
+        rows += [_row(kind, "", file) for entry in entries for kind, file in entry.items() if file]
+    for listed in manifest["sites"].values():
+        rows += [_row("site", "", file) for file in listed]
+    for run_id, run in manifest["runs"].items():
+        rows += [_row("log", run_id, file) for file in run["log"]]
+    return pl.DataFrame(rows, schema=_SCHEMA, orient="row").unique(maintain_order=True)
 
 
-def _bound(row: Mapping[str, Any], name: str, side: str) -> Any:
-    """The bound of a figure; its side stands before the unit."""
-    names = [column for column in row if _is_bound(column) and _bounded(column) == name and f"_{side}" in column]
-    return row[names[0]] if names else None
+def some_of(sources: pl.DataFrame, most: int = 8) -> pl.DataFrame:
+    """The sources as they fit a screen: digests shortened, and not all logs of many."""
+    logs = sources.filter(pl.col("kind") == "log")
+    shown = pl.concat([sources.filter(pl.col("kind") != "log"), logs.head(most)])
+    if (more := logs.height - most) > 0:
+        rest = pl.DataFrame([("log", f"and {more} more", NAME, None, "")], schema=_SCHEMA, orient="row")
+        shown = pl.concat([shown, rest])
+    return shown.with_columns(pl.col("sha256").str.head(16))
+
+
+def _row(kind: str, of: str, file: dict[str, Any]) -> tuple[str, str, str, int, str]:
+    return kind, of, file["name"], file["bytes"], file["sha256"]

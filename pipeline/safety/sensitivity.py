@@ -8,21 +8,33 @@ need the logs again.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import polars as pl
 
+from pipeline.campaign import make_plan, run_campaign
 from pipeline.figures.verdict import head_of, level_counts, run_verdicts, verdict_of
 from pipeline.results import store
-from schemas.config import Configuration
+from schemas.config import Configuration, Vehicle
 from schemas.enums import RunStatus
+from schemas.errors import UsageError
 
 # Shares of the configured value: a half and half as much again; two to five sigma round the usual three.
 _VARIED = {"failure_limit_m": (0.5, 1.5), "evidence_factor": (2.0 / 3.0, 4.0 / 3.0, 5.0 / 3.0)}
 _TABLES, _REPLAYED, _NEEDED = "from tables", "replayed", "needs --logs"
 
-Row = dict[str, object]
-Replay = Callable[[Configuration, str], None]
+Row = dict[str, Any]
+Replay = Callable[[Configuration, str], object]
+
+
+def replayed(logs: Sequence[str], site: str | None, vehicle: Vehicle, jobs: int) -> Replay | None:
+    """How to replay these logs with another configuration; none without logs. Raises `UsageError` without a site."""
+    if not logs:
+        return None
+    if site is None:
+        raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
+    return lambda settings, to: run_campaign(make_plan(logs, site, to, settings, vehicle), jobs=jobs)
 
 
 def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:
@@ -54,14 +66,10 @@ def at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.
 def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
     if row["status"] == RunStatus.FAILED:
         return row
-    spent, may = (list(_floats(row[name])) for name in ("failure_hazardous_s", "failure_hazardous_may_s"))
+    spent, may = (row[name] or [] for name in ("failure_hazardous_s", "failure_hazardous_may_s"))
     within, beyond = level_counts(spent, may, allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
     return {**counted, "verdict": verdict_of(counted, config.hazards.unknown_share_limit).value}
-
-
-def _floats(values: object) -> Iterable[float]:
-    return values if isinstance(values, list) else []
 
 
 def _varied(runs: pl.DataFrame, config: Configuration, key: str, value: float, replay: Replay | None) -> Row:

@@ -11,8 +11,6 @@ from schemas.enums import RunStatus, Verdict
 
 Row = dict[str, object]
 
-_WORTH_SAYING_S = 1.0
-
 
 def verdict_statement(runs: pl.DataFrame) -> str:
     """The verdict of the campaign with its counts: the first words of what is said."""
@@ -55,7 +53,7 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
     for (solution,), rows in done.group_by("solution", maintain_order=True):
         held_s, seen_s = (float(rows[name].sum()) for name in ("held_s", "evidence_s"))
-        if held_s - seen_s >= _WORTH_SAYING_S:
+        if held_s - seen_s >= 1.0:  # less is not worth saying
             without = rows["evidence"].null_count()
             said.append(
                 f"{solution}: in {(held_s - seen_s) / 3600.0:.3g} of {held_s / 3600.0:.3g} h the position could not be"

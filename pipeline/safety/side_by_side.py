@@ -18,8 +18,7 @@ from pipeline.epochs.timeline import held_s, nominal_period_s, uptime
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.single import channel_monitor, on_path_of, paired
-from pipeline.safety.composite_alarms import Solution, verdict_of_both
-from pipeline.safety.fault_counts import fault_counts, faults_of_pair
+from pipeline.safety.fault_counts import Solution, fault_counts, faults_of_pair, verdict_of_both
 from pipeline.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import NS_PER_S, Bools, times_ns
 from schemas.config import Configuration

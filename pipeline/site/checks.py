@@ -17,17 +17,29 @@ from schemas.arrays import Bools, Floats
 from schemas.enums import Navigability
 from schemas.run import Finding
 
-# Ends that a relation joins: up to `GAP_COUNTS_M` is survey noise; above, the gap is a finding and counts as
-# track; beyond this the path position would be wrong by a position failure, so the site is refused.
-GAP_LIMIT_M = 20.0
-NEAR_ENDS_M = 5.0
-# Two ends that point at each other so far apart are one track with a piece missing; a curve turns less in between.
-FACING_REACH_M = 300.0
-FACING_COSINE = 0.94
-LENGTH_TOLERANCE = 1e-3
-CHORD_ERROR_M = 0.25
 # Of a finding about one balise: this and its id.
 BALISE_PLACE = "balises: "
+
+
+@dataclass(frozen=True)
+class Limits:
+    """From where on a survey is remarkable, or broken."""
+
+    gap_m: float = 20.0
+    """Between ends that a relation joins: beyond this the path position would be wrong by a position failure, so the
+    site is refused. Up to `GAP_COUNTS_M` it is survey noise; between the two a finding, and counts as track."""
+    near_ends_m: float = 5.0
+    facing_reach_m: float = 300.0
+    """Two ends that point at each other so far apart are one track with a piece missing."""
+    facing_cosine: float = 0.94
+    """A curve turns less in between."""
+    length_share: float = 1e-3
+    """By which a declared length may differ from that of the geometry."""
+    chord_error_m: float = 0.25
+    """By which straight lines between points may leave the curve."""
+
+
+LIMITS = Limits()
 
 
 @dataclass
@@ -143,11 +155,11 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
         if length < GAP_COUNTS_M:
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
-            if abs(declared - length) > max(MEASURE_TOLERANCE_M, LENGTH_TOLERANCE * length):
+            if abs(declared - length) > max(MEASURE_TOLERANCE_M, LIMITS.length_share * length):
                 text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
                 found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         error = chord_errors_m(track, part).max(initial=0.0)
-        if error > CHORD_ERROR_M:
+        if error > LIMITS.chord_error_m:
             spacing = float(np.diff(geometric).max())
             text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by {error:.2f} m"
             found.findings.append(Finding("note", place, text, "Survey curves with closer points."))
@@ -185,8 +197,8 @@ def _check_gaps(track: Track, found: Remarks) -> None:
         one, other = places[track.index[a], position_a], places[track.index[b], position_b]
         gap = float(np.linalg.norm(one - other))
         text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
-        if gap > GAP_LIMIT_M and navigability != Navigability.NONE.value:
-            found.breaches.append(f"links: {text}; expected at most {GAP_LIMIT_M:g} m")
+        if gap > LIMITS.gap_m and navigability != Navigability.NONE.value:
+            found.breaches.append(f"links: {text}; expected at most {LIMITS.gap_m:g} m")
         elif gap > GAP_COUNTS_M:
             remedy = "The straight line between them counts as track; survey the missing piece."
             found.findings.append(Finding("warning", "links", text, remedy))
@@ -227,15 +239,15 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
 
 def _nearly_met(places: Floats, inward: Floats, free: np.ndarray) -> list[tuple[int, int, float]]:
     """Pairs of ends, and how far apart they are."""
-    near = _pairs_within(places, NEAR_ENDS_M)
+    near = _pairs_within(places, LIMITS.near_ends_m)
     onward = np.einsum("ij,ij->i", inward[near[:, 0]], inward[near[:, 1]]) < 0.0
     near = near[onward & free[near].any(axis=1)]
     alone = np.flatnonzero(free)
-    far = alone[_pairs_within(places[alone], FACING_REACH_M)]
+    far = alone[_pairs_within(places[alone], LIMITS.facing_reach_m)]
     way = places[far[:, 1]] - places[far[:, 0]]
     gap = np.linalg.norm(way, axis=1)
     ahead = [sign * np.einsum("ij,ij->i", inward[far[:, side]], way) for side, sign in ((0, -1.0), (1, 1.0))]
-    facing = (gap > NEAR_ENDS_M) & (np.minimum(*ahead) > gap * FACING_COSINE)
+    facing = (gap > LIMITS.near_ends_m) & (np.minimum(*ahead) > gap * LIMITS.facing_cosine)
     nearest: dict[int, int] = {}
     for row in np.flatnonzero(facing)[np.argsort(gap[facing], kind="stable")].tolist():
         for end in far[row].tolist():
@@ -284,7 +296,7 @@ def route_breaches(track: Track, route: pl.DataFrame) -> list[str]:
         end = places[track.index[a], 1 if direction_a == "AB" else 0]
         start = places[track.index[b], 0 if direction_b == "AB" else 1]
         gap = float(np.linalg.norm(end - start))
-        if gap > GAP_LIMIT_M and leg == other_leg:
+        if gap > LIMITS.gap_m and leg == other_leg:
             text = f"{a} ({direction_a}) ends {gap:.0f} m from where {b} ({direction_b}) begins"
-            breaches.append(f"route: {text}; expected at most {GAP_LIMIT_M:g} m")
+            breaches.append(f"route: {text}; expected at most {LIMITS.gap_m:g} m")
     return breaches

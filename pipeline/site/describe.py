@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -13,66 +12,41 @@ from pipeline.track.survey import Track, track_of
 from schemas.run import Finding, Site
 
 
-@dataclass(frozen=True)
-class SiteDescription:
-    """Figures of a site; lengths and spacings in metres, `box_deg` south, west, north, east.
+def describe_site(site: Site) -> dict[str, object]:
+    """Figures of a site by name; lengths and spacings in metres, `box_deg` south, west, north, east.
 
     `parts` counts connected pieces of network, `switches` ends from which more than one way leads on.
     """
-
-    elements: int
-    points: int
-    length_m: float
-    longest_m: float
-    shortest_m: float
-    dimensions: str
-    spacing_median_m: float
-    spacing_max_m: float
-    sigma_median_m: float | None
-    without_sigma: int
-    relations: dict[str, int]
-    parts: int
-    switches: int
-    open_ends: int
-    balises: dict[str, int]
-    route_elements: int | None
-    box_deg: tuple[float, float, float, float]
-    findings: tuple[Finding, ...]
-
-
-def describe_site(site: Site) -> SiteDescription:
-    """Figures and findings of a site."""
     track = track_of(site.track)
     network = network_of(track, site.links)
-    spacing = _spacing_m(track)
+    spacing = np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
     known = track.sigma_m[np.isfinite(track.sigma_m)]
     kinds = [] if site.balises is None else site.balises["kind"].cast(str).to_list()
     ways = [len(edges) for edges in network.successors]
-    return SiteDescription(
-        elements=len(track.ids),
-        points=len(track.measure_m),
-        length_m=float(track.length_m.sum()),
-        longest_m=float(track.length_m.max()),
-        shortest_m=float(track.length_m.min()),
-        dimensions=_dimensions(track),
-        spacing_median_m=float(np.median(spacing)),
-        spacing_max_m=float(spacing.max()),
-        sigma_median_m=float(np.median(known)) if len(known) else None,
-        without_sigma=int(np.isnan(track.sigma_m).sum()),
-        relations=dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
-        parts=_parts(network),
-        switches=sum(count > 1 for count in ways),
-        open_ends=sum(count == 0 for count in ways),
-        balises=dict(sorted(Counter(kinds).items())),
-        route_elements=None if site.route is None else site.route.height,
-        box_deg=(
+    return {
+        "elements": len(track.ids),
+        "points": len(track.measure_m),
+        "length_m": float(track.length_m.sum()),
+        "longest_m": float(track.length_m.max()),
+        "shortest_m": float(track.length_m.min()),
+        "dimensions": _dimensions(track),
+        "spacing_median_m": float(np.median(spacing)),
+        "spacing_max_m": float(spacing.max()),
+        "sigma_median_m": float(np.median(known)) if len(known) else None,
+        "without_sigma": int(np.isnan(track.sigma_m).sum()),
+        "relations": dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
+        "parts": _parts(network),
+        "switches": sum(count > 1 for count in ways),
+        "open_ends": sum(count == 0 for count in ways),
+        "balises": dict(sorted(Counter(kinds).items())),
+        "route_elements": None if site.route is None else site.route.height,
+        "box_deg": (
             float(track.latitude_deg.min()),
             float(track.longitude_deg.min()),
             float(track.latitude_deg.max()),
             float(track.longitude_deg.max()),
         ),
-        findings=site.findings,
-    )
+    }
 
 
 def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
@@ -105,11 +79,6 @@ def elements_table(site: Site) -> pl.DataFrame:
     ]
     columns = ("netelement_id", "length_m", "points", "balises", "before_start", "after_end")
     return pl.DataFrame(rows, schema=list(columns), orient="row")
-
-
-def _spacing_m(track: Track) -> np.ndarray:
-    """Distance between neighbouring points of each element, by measure."""
-    return np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
 
 
 def _dimensions(track: Track) -> str:

@@ -46,11 +46,16 @@ def read_site(path: Path | str) -> Site:
     breaches: list[str] = []
     track, network, notes = _read_track(files, breaches)
     links = _read_links(files, network, breaches)
-    balises = _read_table(files, "balises", breaches)
-    route = _read_route(files, breaches)
+    raw = _load(files, "balises", breaches)
+    balises = None if raw is None else typed_table(raw, "balises", breaches)
+    name = next((name for name in files if name.startswith("route.")), None)
+    route = None if name is None else route_table(name, files[name], breaches)
+    route = None if route is None else route.drop("leg")  # that of every run over this site, in one piece
     if breaches or track is None or links is None:
         raise _refusal(path, breaches)
     lengths = network.declared_length_m if network else {}
+    unchecked = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
+    notes += [Finding("note", name, "has no page checksums: damage to it may not be seen") for name in unchecked]
     found = remarks(track, links, balises, route, lengths)
     if found.breaches:
         raise _refusal(path, found.breaches)
@@ -59,7 +64,7 @@ def read_site(path: Path | str) -> Site:
         links=Links.validate(found.links, cast=True),
         balises=None if balises is None else Balises.validate(balises, cast=True),
         route=None if route is None else Route.validate(route, cast=True),
-        findings=tuple(notes + _without_checksums(files) + found.findings),
+        findings=tuple(notes + found.findings),
         digest=_digest(files),
         files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
@@ -91,12 +96,6 @@ def is_geojson(address: Path | str) -> bool:
     return name_of(address).lower().endswith(".geojson")
 
 
-def _without_checksums(files: dict[str, bytes]) -> list[Finding]:
-    text = "has no page checksums: damage to it may not be seen"
-    names = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
-    return [Finding("note", name, text) for name in names]
-
-
 def _digest(files: dict[str, bytes]) -> str:
     """SHA-256 over names and contents."""
     parts = [f"{name} {hashlib.sha256(data).hexdigest()}\n" for name, data in sorted(files.items())]
@@ -111,11 +110,6 @@ def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
     name = next((name for name in files if name.startswith(f"{table}.")), None)
     return None if name is None else load_table(name, files[name], breaches)
-
-
-def _read_table(files: dict[str, bytes], table: str, breaches: list[str]) -> pl.DataFrame | None:
-    raw = _load(files, table, breaches)
-    return None if raw is None else typed_table(raw, table, breaches)
 
 
 def _read_track(
@@ -149,13 +143,6 @@ def _read_links(files: dict[str, bytes], network: Network | None, breaches: list
     if raw is None:
         return Links.create_empty()
     return typed_table(raw, "links", breaches)
-
-
-def _read_route(files: dict[str, bytes], breaches: list[str]) -> pl.DataFrame | None:
-    """The route of every run over this site."""
-    name = next((name for name in files if name.startswith("route.")), None)
-    route = None if name is None else route_table(name, files[name], breaches)
-    return None if route is None else route.drop("leg")
 
 
 def _in_degrees(raw: RawTable) -> RawTable:
@@ -223,7 +210,9 @@ def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.Da
     for part in frame.partition_by("netelement_id", maintain_order=True):
         name, missing = part["netelement_id"][0], part["measure_m"].null_count()
         if missing == part.height:
-            part = part.with_columns(pl.Series("measure_m", _geometric(part)))
+            track = track_of(part.with_columns(pl.lit(0.0).alias("measure_m")))
+            geometric = geometric_measures_m(track.latitude_deg, track.longitude_deg, track.height_m)
+            part = part.with_columns(pl.Series("measure_m", geometric))
         elif missing:
             breaches.append(f"{file}: column measure_m: element {name} has a measure at some points only")
         elif not (part["measure_m"].diff().drop_nulls() > 0).all():
@@ -232,8 +221,3 @@ def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.Da
             breaches.append(f"{file}: column measure_m: element {name} does not increase at point {row} ({at:g} m)")
         parts.append(part)
     return pl.concat(parts)
-
-
-def _geometric(part: pl.DataFrame) -> np.ndarray:
-    track = track_of(part.with_columns(pl.lit(0.0).alias("measure_m")))
-    return geometric_measures_m(track.latitude_deg, track.longitude_deg, track.height_m)

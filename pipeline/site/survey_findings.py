@@ -26,6 +26,9 @@ def survey_findings(
     passages = [_passages(frame, config) for frame in epochs]
     if not passages:
         return pl.DataFrame(schema=SURVEY_COLUMNS)
+    survey = pl.DataFrame(schema={"netelement_id": pl.String, "survey_m2": pl.Float64})
+    if track is not None:
+        survey = track.group_by("netelement_id").agg((pl.col("sigma_m") ** 2).mean().alias("survey_m2"))
     weight = 1.0 / pl.col("variance_m2")
     merged = (
         pl.concat(passages)
@@ -36,7 +39,7 @@ def survey_findings(
             ((pl.col("residual_m") * weight).sum() / weight.sum()).alias("residual_m"),
             (1.0 / weight.sum()).alias("variance_m2"),
         )
-        .join(_survey_variance(track), on="netelement_id", how="left")
+        .join(survey, on="netelement_id", how="left")
     )
     variance = pl.col("variance_m2") + pl.col("survey_m2").fill_null(0.0)
     return (
@@ -86,9 +89,3 @@ def _passages(epochs: pl.DataFrame, config: MatchingConfig) -> pl.DataFrame:
         .group_by("netelement_id", "axis")
         .agg(pl.col("epochs").sum(), pl.col("residual_m", "variance_m2").mean())
     )
-
-
-def _survey_variance(track: pl.DataFrame | None) -> pl.DataFrame:
-    if track is None:
-        return pl.DataFrame(schema={"netelement_id": pl.String, "survey_m2": pl.Float64})
-    return track.group_by("netelement_id").agg((pl.col("sigma_m") ** 2).mean().alias("survey_m2"))

@@ -48,7 +48,10 @@ _TRUTH = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no"
 def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
     """A Parquet or CSV file as it stands, or a breach."""
     try:
-        return _parquet(file, data) if file.endswith(".parquet") else _csv(file, data)
+        if not file.endswith(".parquet"):
+            return _with_epsg(file, read_table(data, infer=False), epsg_in(comments_of(data)))
+        named = {name.lower(): value for name, value in metadata_of(data).items()}.get("epsg")
+        return _with_epsg(file, read_parquet(data), named)
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
         kind = "Parquet" if file.endswith(".parquet") else "CSV"
         breaches.append(f"{file}: cannot be read as {kind} ({str(error).splitlines()[0]})")
@@ -65,15 +68,6 @@ def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame 
     frame = conform_to(known, recorded, raw.file, found, _DEFAULTS)
     breaches += [line_of(breach) for breach in found]
     return None if found else frame.with_columns(pl.col(pl.Enum).cast(pl.String))
-
-
-def _parquet(file: str, data: bytes) -> RawTable:
-    named = {name.lower(): value for name, value in metadata_of(data).items()}.get("epsg")
-    return _with_epsg(file, read_parquet(data), named)
-
-
-def _csv(file: str, data: bytes) -> RawTable:
-    return _with_epsg(file, read_table(data, infer=False), epsg_in(comments_of(data)))
 
 
 def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.matching.candidates import candidates_of, segments_of
-from pipeline.site.checks import NEAR_ENDS_M
+from pipeline.site.checks import LIMITS
 from pipeline.survey.kilometres import spans
 from pipeline.survey.network import Network
 from pipeline.survey.pieces import COLUMNS, SAME_TRACK_M, SHAPE_M, Piece
@@ -182,7 +182,7 @@ def _open_ends(ground: Ground) -> Iterator[Finding]:
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
     # Farther aside is the next track.
     found = candidates_of(points, ground, segments_of(track), 2 * SAME_TRACK_M)
-    middle = np.minimum(found.along_m, found.left_m) > NEAR_ENDS_M
+    middle = np.minimum(found.along_m, found.left_m) > LIMITS.near_ends_m
     for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
         end, other = int(found.step[near]), track.ids[int(found.element[near])]
         beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.site.checks import GAP_LIMIT_M, remarks
+from pipeline.site.checks import LIMITS, remarks
 from pipeline.site.describe import without_balises
 from pipeline.storage.writing import replace_files
 from pipeline.survey.balises import balises_every, balises_of_list
@@ -49,8 +49,8 @@ def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: 
         spacing = _number(text.removesuffix("m"))
         if spacing is None or not 1.0 <= spacing <= 1e6:
             raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
-    if not 0.0 <= join_m <= GAP_LIMIT_M:
-        raise UsageError("is no reach", place=f"--join {join_m:g}", expected=f"0 to {GAP_LIMIT_M:g} m")
+    if not 0.0 <= join_m <= LIMITS.gap_m:
+        raise UsageError("is no reach", place=f"--join {join_m:g}", expected=f"0 to {LIMITS.gap_m:g} m")
     if not surveys:
         raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
     return Wish(surveys, spacing, None if spacing or balises is None else Path(balises), epsg, join_m, flat)

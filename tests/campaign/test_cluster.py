@@ -15,6 +15,7 @@ from benchmarks.cluster import Cluster
 from pipeline.campaign import run_campaign
 from pipeline.campaign.cluster import lost_scheduler
 from pipeline.campaign.outcome import lost, overdue
+from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from schemas.enums import RunStatus
 from schemas.errors import UsageError
@@ -114,7 +115,7 @@ def test_killed_worker_and_scheduler(
 
 
 def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.campaign.cluster._CONNECT_S", 1.0)
+    monkeypatch.setattr(WAITS, "scheduler_s", 1.0)
     with pytest.raises(UsageError, match="Dask scheduler does not answer"):
         run_campaign(plan_of(small_trial, tmp_path), scheduler="tcp://127.0.0.1:9")
     assert str(lost_scheduler("tls://KEY:sec/ret@host:9")).startswith("tls://host:9: the Dask scheduler")
@@ -124,7 +125,7 @@ def test_cluster_that_lost_its_workers(
     small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Said within seconds, with what is done and what to do; given up after the patience."""
-    monkeypatch.setattr("pipeline.campaign.loop._PATIENCE_S", 20.0)
+    monkeypatch.setattr(WAITS, "lonely_s", 20.0)
     clock = Hurried(monkeypatch, "cluster")
     cluster.kill_workers()
     spy = Spy(lambda *_: clock.hurry(2.0))

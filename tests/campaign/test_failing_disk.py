@@ -58,7 +58,7 @@ def campaign(
 
 
 def _engine() -> object:
-    from pipeline.campaign.serial import SerialEngine
+    from pipeline.campaign.engines import SerialEngine
 
     return SerialEngine(3600.0)
 

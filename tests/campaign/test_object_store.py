@@ -17,6 +17,7 @@ from pipeline import storage
 from pipeline.campaign import lock, make_plan, run_campaign
 from pipeline.campaign.lock import locked
 from pipeline.campaign.verify import verify
+from pipeline.campaign.waits import WAITS
 from pipeline.results import catalogue, store
 from pipeline.results.manifest import read_manifest
 from pipeline.results.query import run_sql
@@ -239,9 +240,9 @@ def test_store_that_is_not_there(bucket: str, small_trial: SmallTrial) -> None:
 
 @pytest.fixture
 def _quick_beat(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "_BEAT_S", 0.4)
+    monkeypatch.setattr(WAITS, "lock_beat_s", 0.4)
     # Nobody waits for all of it but who finds a lock of a dead campaign.
-    monkeypatch.setattr(lock, "_SILENCE_S", 60.0)
+    monkeypatch.setattr(WAITS, "lock_silence_s", 60.0)
 
 
 @pytest.mark.usefixtures("_quick_beat")
@@ -267,7 +268,7 @@ def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
 
 @pytest.mark.usefixtures("_quick_beat")
 def test_lock_of_a_dead_campaign_is_taken_over(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "_SILENCE_S", 1.0)
+    monkeypatch.setattr(WAITS, "lock_silence_s", 1.0)
     storage.write_bytes(f"{bucket}/dead/.lock", b"somebody 7")
     with locked(f"{bucket}/dead"):
         assert b"somebody" not in storage.read_many([f"{bucket}/dead/.lock"])[f"{bucket}/dead/.lock"]

@@ -12,9 +12,9 @@ import pytest
 from rich.console import Console
 
 import cli
-from pipeline.campaign import Plan, RunOutcome, Summary, progress, tally
+from pipeline.campaign import Plan, RunOutcome, Summary, progress, watch
 from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
-from pipeline.campaign.tally import Tally
+from pipeline.campaign.watch import Tally
 from schemas.enums import RunStatus, RunVerdict
 from tests.campaign.compare import plan_of
 from tests.conftest import SmallTrial
@@ -37,7 +37,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (progress, tally):
+    for module in (progress, watch):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
@@ -115,11 +115,11 @@ def test_log_beside_the_results(plan: Plan) -> None:
 
 def test_the_verdict_is_the_first_word() -> None:
     summary = Summary(4, (OK, BAD, OLD), 5.0)
-    assert tally.summary_line(summary).startswith("unsafe: 1 unsafe, 0 unproven, 1 safe, 1 failed; 3 of 4 runs")
-    assert tally.outcome_line(OLD) == "c: skipped, unsafe"
+    assert watch.summary_line(summary).startswith("unsafe: 1 unsafe, 0 unproven, 1 safe, 1 failed; 3 of 4 runs")
+    assert watch.outcome_line(OLD) == "c: skipped, unsafe"
     partial = RunOutcome("d", RunStatus.PARTIAL, "cut off", verdict=RunVerdict.UNPROVEN)
-    assert tally.outcome_line(partial) == "d: unproven, partial: cut off"
-    rows = tally.outcome_rows(summary)
+    assert watch.outcome_line(partial) == "d: unproven, partial: cut off"
+    rows = watch.outcome_rows(summary)
     assert rows.columns[:3] == ["verdict", "run_id", "status"]
     assert rows["verdict"].to_list() == ["safe", "failed", "unsafe"]
 

@@ -11,6 +11,7 @@ import pytest
 from pipeline import storage
 from pipeline.campaign import make_plan, resume, run_campaign
 from pipeline.campaign.outcome import failure_of
+from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from schemas.config import Configuration, LdsConfig
 from schemas.errors import InputError
@@ -23,7 +24,7 @@ def settled(
     small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[SmallTrial, Path]:
     """A trial and its result of one run, complete by whatever campaign; files count as settled at once."""
-    monkeypatch.setattr(resume, "_SETTLED_NS", 0)
+    monkeypatch.setattr(WAITS, "settled_s", 0.0)
     trial = SmallTrial(small_trial.site, tmp_path / "runs")
     shutil.copytree(small_trial.paths[0], trial.runs / "run0")
     assert run_campaign(plan_of(trial, tmp_path / "out")).skipped == 0
@@ -80,7 +81,7 @@ def test_a_log_that_was_just_written_is_read_again(
 ) -> None:
     """It may change once more within the same tick of the clock."""
     trial, out = settled
-    monkeypatch.setattr(resume, "_SETTLED_NS", 3600 * 10**9)
+    monkeypatch.setattr(WAITS, "settled_s", 3600.0)
     run_campaign(plan_of(trial, out), force=True)
     assert resume.unchanged(plan_of(trial, out)) == []
 

@@ -6,8 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.export.places import beside, ground_at, ground_of, plane_m, stretches_of
-from pipeline.export.positions import positions_of
+from pipeline.export.places import beside, ground_at, ground_of, plane_m, positions_of, stretches_of
 from pipeline.track.geodesy import distance_m
 from tests.export.conftest import Result
 

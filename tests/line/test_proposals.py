@@ -14,8 +14,8 @@ import pytest
 from pipeline.line.proposals import site_balises
 from pipeline.line.write import LineResult, read_points, write_line
 from pipeline.results.store import write_run
+from pipeline.site.alike import window_findings
 from pipeline.site.read import read_site
-from pipeline.site.windows import window_findings
 from schemas.conform import dtypes
 from schemas.errors import BaliseError, UsageError
 from schemas.inputs import Balises

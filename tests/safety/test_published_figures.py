@@ -6,26 +6,24 @@ import polars as pl
 import pytest
 
 from pipeline.figures.bounds import hours_to_substantiate
+from pipeline.figures.estimates import continuity
 from pipeline.safety import safety_tables
 from pipeline.safety.architectures import (
+    APV_CONTINUITY_RISK,
+    REQUIRED_MTBF_ONBOARD_H,
     composite_rate_per_h,
     failure_probability,
     hazard_rate_with_linking_per_h,
     hazard_rate_with_testing_per_h,
     linking_time_s,
+    mtbf_h,
+    mtbf_one_of_two_h,
 )
 from pipeline.safety.budget import (
     allowed_table,
     allowed_time_to_detect_s,
     demands_per_hour,
     tolerable_gnss_rate_per_h,
-)
-from pipeline.safety.continuity import (
-    APV_CONTINUITY_RISK,
-    REQUIRED_MTBF_ONBOARD_H,
-    continuity,
-    mtbf_h,
-    mtbf_one_of_two_h,
 )
 from pipeline.safety.markov import lds_hazard_rate_per_h
 from schemas.config import SafetyConfig

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.site.parallels import most_claimed, parallel_findings
+from pipeline.site.alike import most_claimed, parallel_findings
 from schemas.config import MatchingConfig
 from tests.matching.builders import line, matched, run, site
 from tests.matching.ladder import ladder

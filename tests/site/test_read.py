@@ -176,7 +176,7 @@ def test_mixed_dimensions_are_said(tmp_path: Path) -> None:
     )
     site = read_site(builders.write(tmp_path, track=mixed, links=builders.links()))
     assert any("1 of 4 elements lack heights" in finding.message for finding in site.findings)
-    assert describe_site(site).dimensions == "mixed: 1 of 4 elements 2-D"
+    assert describe_site(site)["dimensions"] == "mixed: 1 of 4 elements 2-D"
 
 
 def test_all_breaches_come_at_once(tmp_path: Path) -> None:
@@ -295,9 +295,9 @@ def test_arrow_types_of_other_writers_are_taken(tmp_path: Path) -> None:
 def test_a_real_network_is_read_whole(tmp_path: Path) -> None:
     (tmp_path / "track.geojson").write_bytes((INFRABEL / "network_airport.geojson").read_bytes())
     found = describe_site(read_site(tmp_path))
-    assert (found.elements, sum(found.relations.values()), found.parts) == (74, 142, 1)
-    assert found.length_m == pytest.approx(56_008.0, abs=1.0)
-    assert found.dimensions == "2-D"
+    assert (found["elements"], sum(found["relations"].values()), found["parts"]) == (74, 142, 1)
+    assert found["length_m"] == pytest.approx(56_008.0, abs=1.0)
+    assert found["dimensions"] == "2-D"
 
 
 def test_a_relation_that_turns_back_is_not_navigable(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.site.windows import window_findings
+from pipeline.site.alike import window_findings
 from schemas.inputs import Balises
 from schemas.run import Site
 from tests.matching import builders

@@ -117,10 +117,10 @@ def test_no_manifest_is_one_error(out: Path, tmp_path: Path) -> None:
 
 
 def test_logs_are_replayed_again_and_compared(out: Path, small_trial: SmallTrial, tmp_path: Path) -> None:
-    same = recompute(out, lambda to: make_plan([str(small_trial.paths[0])], small_trial.site, to))
+    same = recompute(out, [str(small_trial.paths[0])], small_trial.site, None, Vehicle())
     assert (same.problems, same.compared) == ((), "1 of 3 runs replayed again")
     other = shutil.copytree(small_trial.paths[2], tmp_path / "run1")
-    wrong = recompute(out, lambda to: make_plan([str(other)], small_trial.site, to))
+    wrong = recompute(out, [str(other)], small_trial.site, None, Vehicle())
     found = {what: expected for what, _, expected in wrong.problems}
     assert found["run run1, settings"] == "--vehicle train7.toml"
     assert {"run run1, log gnss.parquet", "run run1, epochs", "run run1, runs"} <= set(found)
