@@ -12,7 +12,7 @@ from pipeline.line.pieces import Pieces
 from pipeline.line.spans import FIRST_LOSS, State
 from pipeline.line.trials import fewest
 from schemas.conform import conform
-from schemas.line import LOSSES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
+from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
 
 KEYS = ["piece", "growing"]
 _TRIALS = ["bad", "passes", "wrong_in_use", "unjudged"]
@@ -64,6 +64,8 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
     state, cause = pl.col("state"), pl.col("cause")
+    usual = pl.col("satellites").filter(state == int(State.RIGHT)).median().over("run_id")
+    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
     right, wrong = state == int(State.RIGHT), state == int(State.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
     hour = pl.col("t").dt.strftime("%H").unique()
@@ -82,6 +84,7 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
             wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
             unsafe=(cause == LineCause.UNSAFE_ACCEPTANCE.value).sum(),
             days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),
+            few_satellites=(pl.col("few") & lost).sum(),
             monitors=pl.col("monitor").drop_nulls(),
             **{f"lost_{one.value}": (cause == one.value).sum() for one in LOSSES},
         )
@@ -123,7 +126,9 @@ def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
     """What speaks most against a piece, the first that applies."""
     lost = pl.concat_list(f"lost_{one.value}" for one in LOSSES).list.arg_max()
-    most_lost = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    named = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    few = named.is_in(SHORT_OF_SATELLITES) & (2 * pl.col("few_satellites") > pl.col("lost"))
+    most_lost = pl.when(few).then(pl.lit(LineCause.FEW_SATELLITES.value)).otherwise(named)
     some = {
         name: pl.col(name) > 0 for name in ("unsafe", "wrong_in_use", "wrong_track", "lost", "right", "after_alarm")
     }

@@ -58,12 +58,14 @@ def _trains(runs: pl.DataFrame) -> Iterator[str]:
             f"The runs were replayed with {kinds} settings or vehicle files; their passes are counted together. "
             "Positions are those of the balise antenna: how a piece looks to the rest of a longer train is not known."
         )
-    yield "The tables hold neither train lengths nor C/N0 nor satellites in view: no cause is derived from them."
+    yield "The tables hold neither train lengths nor C/N0: no cause is derived from them."
 
 
 def _rest(passes: pl.DataFrame, table: pl.DataFrame, figures: pl.DataFrame) -> Iterator[str]:
     if passes.is_empty():
         yield "No run has a place that the evidence knows on this site."
+    elif passes["satellites"].is_null().all():
+        yield "The runs do not tell how many satellites were used: no cause is derived from that."
     if figures.is_empty():
         yield "No piece is suitable: there is nothing to propose."
     elif figures["points"].max() and (figures["points_served"] < figures["points"]).any():
