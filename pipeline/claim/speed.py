@@ -14,11 +14,15 @@ from schemas.arrays import NS_PER_S, Floats, Ints
 
 @dataclass(frozen=True)
 class SpeedErrors:
-    """Per window: its end, length, mean estimated speed, and estimate minus truth as an interval (NaN: not known)."""
+    """Per window: its end, length, largest estimated speed, and the mean of estimate minus truth as an interval.
+
+    NaN where the evidence does not know it. The mean is beyond the limit at the largest speed only if some instant is
+    beyond the limit at its own speed (limits grow with speed); a mean within says nothing of the instants.
+    """
 
     t_ns: Ints
     length_s: Floats
-    speed_kmh: Floats
+    fastest_kmh: Floats
     low_kmh: Floats
     high_kmh: Floats
 
@@ -46,8 +50,8 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     least = run_m - (front.high_m[last] - front.low_m[first])
     most = run_m - (front.low_m[last] - front.high_m[first])
     low, high = (np.where(known, (estimated - way_m) / length, np.nan) for way_m in (most, least))
-    speeds = (estimated / length, low, high)
-    return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in speeds))
+    fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
+    return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in (fastest, low, high)))
 
 
 def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:
