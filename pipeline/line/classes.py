@@ -54,9 +54,9 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     dated = passes.with_columns(
         day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
     )
-    worst = dated.sort("judged", "state", "cause", descending=[True, True, False]).group_by(
-        *KEYS, "day", maintain_order=True
-    )
+    # Of passes as bad as each other the one with the fewest satellites, those that tell none last.
+    order, falling = ("judged", "state", "cause", "satellites"), [True, True, False, False]
+    worst = dated.sort(order, descending=falling, nulls_last=True).group_by(*KEYS, "day", maintain_order=True)
     claimed = dated.group_by(*KEYS, "day").agg(pl.col("claimed").any())
     return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
 

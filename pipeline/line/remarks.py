@@ -10,6 +10,9 @@ from pipeline.line.classes import passes_needed
 from schemas.enums import TRUTH
 from schemas.line import LineCriteria, LineDirection
 
+# So many net elements are named; the table has the rest.
+_NAMED = 8
+
 
 def remarks(
     runs: pl.DataFrame, passes: pl.DataFrame, table: pl.DataFrame, figures: pl.DataFrame, criteria: LineCriteria
@@ -45,10 +48,16 @@ def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
 
 
 def _sides(table: pl.DataFrame) -> Iterator[str]:
-    passed = table.filter(pl.col("passes") > 0)
-    for side in LineDirection:
-        if passed.height and passed.filter(pl.col("direction") == side.value).is_empty():
-            yield f"No run in the direction of {side.value} measure: that direction is unknown everywhere."
+    """Net elements that runs passed in one direction only; a wrong track condemns both, whichever was run."""
+    run = table.filter(pl.col("passes") > pl.col("lost_wrong_track"))
+    sides = run.group_by("netelement_id", maintain_order=True).agg(pl.col("direction").unique())
+    for side, other in (tuple(LineDirection), tuple(reversed(LineDirection))):
+        lone = sides.filter(pl.col("direction") == [other.value])["netelement_id"].to_list()
+        if lone:
+            yield (
+                f"No run in the direction of {side.value} measure on {', '.join(lone[:_NAMED])}"
+                f"{f' and {len(lone) - _NAMED} more' if len(lone) > _NAMED else ''}: that direction is unknown there."
+            )
 
 
 def _trains(runs: pl.DataFrame) -> Iterator[str]:

@@ -167,6 +167,8 @@ def test_runs_of_one_direction_without_truth(tmp_path: Path, site: Site) -> None
     write_tables(tmp_path, 1, epochs_of(2, (), falling=False).filter(pl.col("path_m") < SPLIT_M - 100.0))
     remarks = write_line(tmp_path, site, CRITERIA).remarks
     assert any(text.startswith("1 of 2 runs have neither") for text in remarks)
+    assert any("growing measure on B:" in text for text in remarks)
+    assert any("falling measure on A:" in text for text in remarks)
     write_tables(tmp_path, 0, epochs_of(0, falling=False).filter(pl.col("path_m") < SPLIT_M - 100.0))
     assert any("direction of falling measure" in text for text in write_line(tmp_path, site, CRITERIA).remarks)
 
