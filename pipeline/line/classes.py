@@ -10,7 +10,7 @@ import polars as pl
 from pipeline.figures.bounds import clopper_pearson
 from pipeline.line.pieces import Pieces
 from pipeline.line.spans import FIRST_LOSS, State
-from pipeline.line.trials import fewest
+from pipeline.line.trials import trials_needed
 from schemas.conform import conform
 from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
 
@@ -161,14 +161,5 @@ def _bounds(
         for events in (bad, bad + unjudged, wrong + unjudged)
     )
     share = bad / number if number else None
-    return share, low.low, high.high, unsafe.high, passes_needed(bad + unjudged, number + unjudged, criteria)
-
-
-def passes_needed(bad: int, number: int, criteria: LineCriteria) -> int | None:
-    """Further right passes until the upper bound of the share lost keeps the limit; None beyond all reason."""
-
-    def kept(more: int) -> bool:
-        high = clopper_pearson(bad, number + more, criteria.confidence).high
-        return high is not None and high <= criteria.loss_limit
-
-    return fewest(kept)
+    needed = trials_needed(bad + unjudged, number + unjudged, criteria.loss_limit, criteria.confidence)
+    return share, low.low, high.high, unsafe.high, needed

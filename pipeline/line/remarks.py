@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import polars as pl
 
-from pipeline.line.classes import passes_needed
+from pipeline.line.trials import trials_needed
 from schemas.enums import TRUTH
 from schemas.line import LineCriteria, LineDirection
 
@@ -37,7 +37,10 @@ def _evidence(runs: pl.DataFrame) -> Iterator[str]:
 
 
 def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
-    needed, most = passes_needed(0, 0, criteria), max(table["passes"].to_list(), default=0)
+    needed, most = (
+        trials_needed(0, 0, criteria.loss_limit, criteria.confidence),
+        max(table["passes"].to_list(), default=0),
+    )
     if needed is None or most < needed:
         yield (
             f"Too few passes: a piece has {most} at most, and {needed or 'more than can be'} without a loss are needed "

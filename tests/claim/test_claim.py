@@ -28,9 +28,9 @@ from pipeline.claim.tally import (
     of_availability,
     of_rate,
     of_share,
-    runs_needed,
     tally,
 )
+from pipeline.line import trials_needed
 from pipeline.results import store
 from schemas.config import Configuration
 from schemas.errors import ConfigError, SiteError
@@ -173,7 +173,7 @@ def test_what_few_runs_show() -> None:
     # 0.025^(1/78) = 0.95381 and 0.025^(1/79) = 0.95439: seventy-nine runs without exception.
     assert of_share(Tally(trials=78, kept=78, held_s=7800.0), 0.954).finding is Finding.NOT_SHOWN
     assert of_share(Tally(trials=79, kept=79), 0.954).finding is Finding.MET
-    assert runs_needed(Tally(trials=70, kept=70), 0.954) == 9
+    assert trials_needed(0, 70, 1.0 - 0.954) == 9
     # One of them not known counts as broken; ten broken of ten cannot be 95.4 %.
     assert of_share(Tally(trials=79, kept=78), 0.954).finding is Finding.NOT_SHOWN
     assert of_share(Tally(trials=10, broken=10), 0.954).finding is Finding.NOT_MET

@@ -5,8 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.line import distinct
-from pipeline.line.classes import passes_needed, piece_classes
+from pipeline.line import distinct, trials_needed
+from pipeline.line.classes import piece_classes
 from pipeline.line.spans import State
 from schemas.line import LineCriteria
 from schemas.run import Site
@@ -225,9 +225,9 @@ def test_passes_of_one_day_count_as_one_by_option(passes: pl.DataFrame, site: Si
 
 
 @pytest.mark.parametrize(("bad", "number", "needed"), [(0, 0, 36), (0, 30, 6), (0, 50, 0), (1, 0, 54)])
-def test_passes_needed(bad: int, number: int, needed: int) -> None:
+def test_trials_needed(bad: int, number: int, needed: int) -> None:
     """1 - 0.025^(1/36) = 0.0974 keeps 10 %, 1 - 0.025^(1/35) = 0.10003 does not."""
-    assert passes_needed(bad, number, CRITERIA) == needed
+    assert trials_needed(bad, number, CRITERIA.loss_limit) == needed
 
 
 def test_hours_may_be_asked_for(passes: pl.DataFrame, site: Site) -> None:
