@@ -475,11 +475,12 @@ def line(
     """Say of each piece of track whether virtual balises may be placed there, and propose some."""
     from pipeline.line import write_line
     from pipeline.line.write import read_points
-    from schemas.config import load_settings
+    from schemas.config import read_toml, settings_from
     from schemas.line import LineCriteria
 
-    given = None if points is None else read_points(points)
-    found = write_line(out, _ground(site), load_settings(criteria, LineCriteria), solution, given, to)
+    given, keys = None if points is None else read_points(points), "docs/line.md lists every key."
+    decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
+    found = write_line(out, _ground(site), decided, solution, given, to)
     told = {"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)}
     tables = {"Pieces of track": found.summary, "Proposals": found.proposals}
     files = f"{len(found.files)} files; begin with {found.files[0]}"

@@ -23,6 +23,12 @@ RUNS = 50
 # Chainage from, to, the causes that may be named there, and the fault that makes the place bad.
 PLACES: dict[str, tuple[float, float, tuple[str, ...], dict[str, object]]] = {
     "tunnel mouth": (2000.0, 2300.0, ("outage",), {"kind": "outage"}),
+    "cutting": (
+        3200.0,
+        3500.0,
+        ("few_satellites",),
+        {"kind": "outage", "target": "satellites", "below_deg": 45.0},
+    ),
     "station roof": (4000.0, 4150.0, ("alarm", "wrong"), {"kind": "noise", "sigma_m": 15.0}),
     "facade": (
         6000.0,
@@ -33,19 +39,19 @@ PLACES: dict[str, tuple[float, float, tuple[str, ...], dict[str, object]]] = {
     "neighbour track": (
         8000.0,
         8400.0,
-        ("ambiguous_track", "wrong_track", "alarm"),
+        ("ambiguous_track", "wrong_track"),
         {"kind": "bias", "target": "cross", "size_m": 2.3},
     ),
 }
 _END_M = 11000.0
+# D is surveyed against the line.
+_ELEMENTS = (("A", 0.0, 5000.0), ("B", 5000.0, 8000.0), ("C", 8000.0, 8400.0), ("D", 11500.0, 8400.0))
 # A position that is wrong by this much says that it is elsewhere, and a span reaches from one epoch to the next.
 _REACH_M = 100.0
 
 
 def scenario(runs: int = RUNS) -> Scenario:
     """A line of 11.5 km with a track beside it at 8 km; every other run goes the other way."""
-    faults = [{**fault, "at_m": begin, "until_m": end} for begin, end, _, fault in PLACES.values()]
-    back = [{**fault, "at_m": end, "until_m": begin} for begin, end, _, fault in PLACES.values()]
     ahead = {"start_m": 200.0, "phases": [{"speed_mps": 30.0}, {"stop_at_m": _END_M}]}
     home = {"start_m": _END_M, "direction": "falling", "phases": [{"speed_mps": 30.0}, {"stop_at_m": 200.0}]}
     data = {
@@ -59,25 +65,53 @@ def scenario(runs: int = RUNS) -> Scenario:
         },
         "line": {
             "sections": [{"length_m": 2000.0}, {"length_m": 600.0, "radius_m": 1500.0}],
-            "elements": [{"id": "A", "length_m": 5000.0}, {"id": "B", "length_m": 6500.0, "reversed": True}],
+            "elements": [
+                *({"id": name, "length_m": end - begin} for name, begin, end in _ELEMENTS[:-1]),
+                {"id": "D", "length_m": 3100.0, "reversed": True},
+            ],
             "parallels": [{"id": "P", "from_m": 8000.0, "to_m": 8400.0, "left_m": 4.5}],
             "balises": [{"id": f"VB{at}", "at_m": float(at)} for at in range(600, 11000, 800)],
         },
-        "gnss": {"rate_hz": 2.0, "sigma_east_m": 0.7, "sigma_north_m": 0.7},
+        "gnss": {"rate_hz": 2.0, "sky": {"solutions": {"primary": ["gps", "galileo"]}, "record_ranges": False}},
         "odometer": {"rate_hz": 10.0},
         "reference": {"rate_hz": 5.0},
         "runs": [
-            {"id": f"r{number:02d}", "motion": home if number % 2 else ahead, "faults": back if number % 2 else faults}
+            {
+                "id": f"r{number:02d}",
+                "motion": home if number % 2 else ahead,
+                "faults": _faults(-1 if number % 2 else 1),
+            }
             for number in range(runs)
         ],
     }
     return settings_from(data, Scenario, "benchmark")
 
 
+def _faults(sense: int) -> list[dict[str, object]]:
+    """What goes wrong on the way along growing (1) or falling chainage; what lies aside is towards the track there."""
+    found: list[dict[str, object]] = []
+    for begin, end, _, fault in PLACES.values():
+        at_m, until_m = (begin, end) if sense > 0 else (end, begin)
+        aside: dict[str, object] = {}
+        if fault.get("target") == "cross":
+            aside["size_m"] = sense * float(str(fault["size_m"]))
+        found.append({**fault, **aside, "at_m": at_m, "until_m": until_m})
+    return found
+
+
+def _write(out: Path, runs: int) -> None:
+    """The trial, with the track beside joined to the line at both ends: a scenario has no turnouts."""
+    write_trial(scenario(runs), out)
+    links = pl.read_parquet(out / "site" / "links.parquet")
+    ends = [("B", 1, "P", 0), ("P", 1, "D", 1)]
+    turnouts = pl.DataFrame([(*end, "both") for end in ends], schema=links.schema, orient="row")
+    pl.concat([links, turnouts]).write_parquet(out / "site" / "links.parquet")
+
+
 def measure(out: Path, runs: int = RUNS) -> list[Figure]:
     """Replay the trial once and hold the classes against the places."""
     if not (out / "trial" / "site").exists():
-        write_trial(scenario(runs), out / "trial")
+        _write(out / "trial", runs)
     vehicle = scenario(runs).vehicle
     plan = make_plan(
         [str(out / "trial" / "runs")], str(out / "trial" / "site"), str(out / "tables"), Configuration(), vehicle
@@ -90,8 +124,9 @@ def measure(out: Path, runs: int = RUNS) -> list[Figure]:
 
 def _chainage() -> pl.Expr:
     middle = 0.5 * (pl.col("from_m") + pl.col("to_m"))
-    return (
-        pl.when(pl.col("netelement_id") == "A").then(middle).when(pl.col("netelement_id") == "B").then(11500.0 - middle)
+    return pl.coalesce(
+        pl.when(pl.col("netelement_id") == name).then(begin + middle if end > begin else begin - middle)
+        for name, begin, end in _ELEMENTS
     )
 
 

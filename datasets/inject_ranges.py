@@ -126,11 +126,12 @@ def _refuse_unsolved(fixes: pl.DataFrame, ranges: _Ranges, unsolved: Bools) -> N
 
 
 def _moved(fixes: pl.DataFrame, ranges: _Ranges, before: Solution, after: Solution, touched: Bools) -> pl.DataFrame:
-    """Positions, covariances and protection levels of touched epochs; epochs without solution are lost."""
+    """Positions, covariances, protection levels and satellites used of touched epochs; those without solution go."""
     stamps = fixes["t"].to_physical().to_numpy()
     place = np.searchsorted(ranges.t_ns, stamps).clip(max=ranges.t_ns.size - 1)
     here = (ranges.t_ns[place] == stamps) & touched[place]
     step = np.where(here[:, None], np.nan_to_num(after.error_m[place] - before.error_m[place]), 0.0)
+    fewer = (before.used.sum(axis=1) - after.used.sum(axis=1))[place] * here
     wider = np.nan_to_num(after.covariance_m2[place] - before.covariance_m2[place]) * here[:, None, None]
     latitude, longitude, height = (
         fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")
@@ -145,7 +146,8 @@ def _moved(fixes: pl.DataFrame, ranges: _Ranges, before: Solution, after: Soluti
         **_levels(fixes, before, after, place, here),
     }
     series = [pl.Series(name, values, nan_to_null=True) for name, values in columns.items()]
-    return fixes.with_columns(series).filter(pl.Series(~(here & ~after.solved[place])))
+    counted = (pl.col("satellites") - pl.Series(fewer)).clip(lower_bound=0)
+    return fixes.with_columns(*series, satellites=counted).filter(pl.Series(~(here & ~after.solved[place])))
 
 
 def _levels(

@@ -158,7 +158,9 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     ride = _ride(context, solution, matches)
     bench = Bench(ride.solution, context.evidence, ride.odometry, context.vehicle, context.config)
     judged = judge(bench, context.run.reference, context.run.faults)
-    epochs = pl.concat([ride.solution.epochs, judged.epochs_columns], how="horizontal")
+    # The direction of travel is the judge's, which the errors are signed by, not the train's own.
+    seen, recorded = ride.solution.epochs.drop("direction"), ride.solution.fixes.select("satellites")
+    epochs = pl.concat([seen, judged.epochs_columns, recorded], how="horizontal")
     row = summarise(_results(context, ride, judged, epochs), context.config, _made(context))
     found = {"hazards": judged.hazards, "passages": judged.passages, "alarms": judged.alarms}
     return {**found, "epochs": epochs, "runs": row}

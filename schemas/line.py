@@ -29,6 +29,9 @@ class LineCriteria(Settings):
     hours_least: Annotated[int, Field(strict=True, ge=1, le=24)] = 1
     # A pass that the evidence saw on less of a piece says nothing good of it.
     coverage: Probability = 0.8
+    # A lost pass had few satellites with at most this share of the median over the right passes of its run: half of the
+    # sky hidden leaves about half of them, and in the open their number changes by a quarter.
+    satellites_share: Probability = 0.7
     # A position on a wrong track condemns the tracks this near: the tables do not say which one the train was on.
     beside_m: Positive = 25.0
     # Distances of balises to propose: DOMAIN section 4.
@@ -58,6 +61,7 @@ class LineCause(StrEnum):
     AMBIGUOUS = "ambiguous_track"
     CONFIDENCE = "confidence"
     ALARM = "alarm"
+    FEW_SATELLITES = "few_satellites"
     FEW_PASSES = "few_passes"
     FEW_HOURS = "few_hours"
     NOT_JUDGED = "not_judged"
@@ -71,6 +75,10 @@ LOSSES = (
     *(LineCause.AMBIGUOUS, LineCause.CONFIDENCE, LineCause.ALARM),
 )
 """Causes of passes that are counted apart in `LinePieces`."""
+
+
+SHORT_OF_SATELLITES = (LineCause.AMBIGUOUS.value, LineCause.CONFIDENCE.value, LineCause.ALARM.value)
+"""Causes that few satellites explain; wrong positions and missing ones are named as such."""
 
 
 class LineDirection(StrEnum):
@@ -101,6 +109,7 @@ class LinePieces(dy.Schema):
     lost_ambiguous_track = count("passes lost or wrong with the cause ambiguous_track")
     lost_confidence = count("passes lost or wrong with the cause confidence")
     lost_alarm = count("passes lost or wrong with the cause alarm")
+    few_satellites = count("passes lost where the receiver used few satellites, whatever their cause")
     claimed_wrongly = count("passes on which a wrong position in use claimed this piece; the train was elsewhere")
     unknown = count("further passes that the evidence could not judge")
     unjudged = count("of these in runs with a reference, which should have told: each upper bound counts them as lost")

@@ -191,12 +191,15 @@ class _EpochsAfterMonitors(dy.Schema):
     )
     error_up_m = real("m", "height minus truth; null beyond the failure limit along")
     direction = dy.Int8(
-        nullable=True, description="direction of travel along growing path: 1 or -1", metadata={"unit": "1"}
+        nullable=True,
+        description="direction of travel along growing path: 1 or -1; without an odometer that of the evidence",
+        metadata={"unit": "1"},
     )
     gate_probability = real("1", "causal probability of the path, used for detection", min=0, max=1)
     odometer_scale = real("1", "scale in use at this epoch (true over odometer distance)")
     latency_s = real("s", "GNSS latency in use at this epoch")
     hpl_m = real("m", "horizontal protection level of the receiver", min=0)
+    satellites = dy.Int64(nullable=True, min=0, description="satellites used, as recorded", metadata={"unit": "1"})
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
     in_use = flag("fix valid, unambiguous, confident, not blocked (DOMAIN section 5.2)")

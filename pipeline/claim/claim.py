@@ -151,6 +151,7 @@ _NEVER = {
     ("start", "nothing known"): "a recording begins after switch-on, so times are too short; worst: time to a TVB or "
     "an accepted balise",
     ("cold_movement", ALL): "a train without power records nothing",
+    ("speed_accuracy", ALL): "speed is compared as a mean over a window; what lies within it is not seen",
     ("availability", ALL): "the confidence of speed is not recorded, and gaps of the log are not counted",
 }
 
@@ -202,8 +203,8 @@ def _notes(runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahe
         said.append(f"{late} of {runs.height} runs have no figure of latency: safe front ends are not widened for it.")
     said.append(
         "No recording can show maxima demanded without a probability (MAPO, MAPU, MASO, MASU, below 30 km/h, way "
-        "without balise), start of mission, cold movement and availability: they can only be found broken. "
-        "`--csv` has the reasons."
+        "without balise), accuracy of speed, start of mission, cold movement and availability: they can "
+        "only be found broken. `--csv` has the reasons."
     )
     said.append("Nothing is said of the rear end: the length of the train is not recorded.")
     return said

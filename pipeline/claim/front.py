@@ -30,7 +30,7 @@ class Front:
     `path_m`: estimate of the balise antenna, `front_m`: estimated front end, both path positions. `over_m`: estimate
     minus min safe front end, `under_m`: max safe front end minus estimate. `low_m`, `high_m`: error of the estimate in
     the direction of travel, as an interval. `proved`: the interval is complete and the track is right; `judged`: it may
-    show an exceedance; `wrong_track`: the track is wrong for certain.
+    show an exceedance; `wrong_track`: the track is wrong for certain. `speed_late_s`: speeds are means over so long.
     """
 
     clock: Clock
@@ -44,6 +44,7 @@ class Front:
     judged: Bools
     wrong_track: Bools
     speed_mps: Floats
+    speed_late_s: float
     direction: Floats
     where: Placed
 
@@ -106,6 +107,7 @@ def front_of(
         judged=there & known & (right | (wrong & ~elsewhere)),
         wrong_track=gnss & elsewhere,
         speed_mps=speed,
+        speed_late_s=config.align.speed_window_s,
         direction=direction,
         where=_areas_at(front, epochs, areas, method.area_reach_m),
     )

@@ -14,11 +14,15 @@ from schemas.arrays import NS_PER_S, Floats, Ints
 
 @dataclass(frozen=True)
 class SpeedErrors:
-    """Per window: its end, length, mean estimated speed, and estimate minus truth as an interval (NaN: not known)."""
+    """Per window: its end, length, largest estimated speed, and the mean of estimate minus truth as an interval.
+
+    NaN where the evidence does not know it. The mean is beyond the limit at the largest speed only if some instant is
+    beyond the limit at its own speed (limits grow with speed); a mean within says nothing of the instants.
+    """
 
     t_ns: Ints
     length_s: Floats
-    speed_kmh: Floats
+    fastest_kmh: Floats
     low_kmh: Floats
     high_kmh: Floats
 
@@ -43,11 +47,13 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     run_m = sense * (front.path_m[last] - front.path_m[first])
     # The evidence calls the position itself right at both ends, so path less error is where the train was.
     known = front.proved[first] & front.proved[last]
-    least = run_m - (front.high_m[last] - front.low_m[first])
-    most = run_m - (front.low_m[last] - front.high_m[first])
+    # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
+    late_m = front.speed_late_s * np.abs(front.speed_mps[last] - front.speed_mps[first])
+    least = run_m - (front.high_m[last] - front.low_m[first]) - late_m
+    most = run_m - (front.low_m[last] - front.high_m[first]) + late_m
     low, high = (np.where(known, (estimated - way_m) / length, np.nan) for way_m in (most, least))
-    speeds = (estimated / length, low, high)
-    return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in speeds))
+    fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
+    return SpeedErrors(clock.t_ns[last], length, *(speed * KMH_PER_MPS for speed in (fastest, low, high)))
 
 
 def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:

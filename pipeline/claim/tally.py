@@ -21,7 +21,7 @@ from pipeline.figures.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.line import fewest
+from pipeline.line import trials_needed
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 
 S_PER_H = 3600.0
@@ -149,17 +149,8 @@ def of_share(found: Tally, share: float) -> Shown:
         return Shown(Finding.MET, measured, 0.0)
     finding = Finding.NOT_MET if most is not None and most < share else Finding.NOT_SHOWN
     hours = found.held_s / found.trials / S_PER_H
-    needed = runs_needed(found, share)
+    needed = trials_needed(found.trials - found.kept, found.trials, 1.0 - share)
     return Shown(finding, measured, needed * hours if hours > 0 and needed is not None else None)
-
-
-def runs_needed(found: Tally, share: float) -> int | None:
-    """Further runs, all kept, that show the share."""
-
-    def shown(more: int) -> bool:
-        return (clopper_pearson(found.kept + more, found.trials + more).low or 0.0) >= share
-
-    return fewest(shown)
 
 
 def of_rate(found: Tally, rate_per_h: float) -> Shown:

@@ -100,6 +100,7 @@ def _epochs(bench: Bench, spans: Sequence[tuple[int, int]], across: tuple[Floats
             pl.Series("error_up_m", across[1], nan_to_null=True),
             judgement_words(judged.code),
             pl.Series("in_use", bench.used_s > 0.0),
+            pl.Series("direction", bench.positions.direction, dtype=pl.Int8),
             lds_states(bench.epochs, judged, bench.odometer_wrong),
             pl.Series("suspect_after_the_fact", suspect),
             pl.select(pl.when(pl.Series(sure)).then(pl.Series(moving)).alias("moving")).to_series(),

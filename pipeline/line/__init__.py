@@ -8,7 +8,7 @@ Touches results, to read, and the folder that it writes.
 `write` and `page` are files.
 """
 
-from pipeline.line.trials import distinct, fewest
+from pipeline.line.trials import distinct, trials_needed
 from pipeline.line.write import write_line
 
-__all__ = ["distinct", "fewest", "write_line"]
+__all__ = ["distinct", "trials_needed", "write_line"]

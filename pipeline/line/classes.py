@@ -10,9 +10,9 @@ import polars as pl
 from pipeline.figures.bounds import clopper_pearson
 from pipeline.line.pieces import Pieces
 from pipeline.line.spans import FIRST_LOSS, State
-from pipeline.line.trials import fewest
+from pipeline.line.trials import trials_needed
 from schemas.conform import conform
-from schemas.line import LOSSES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
+from schemas.line import LOSSES, SHORT_OF_SATELLITES, LineCause, LineCriteria, LineDirection, LinePieces, PieceClass
 
 KEYS = ["piece", "growing"]
 _TRIALS = ["bad", "passes", "wrong_in_use", "unjudged"]
@@ -54,9 +54,9 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     dated = passes.with_columns(
         day=pl.col("t").dt.date(), judged=pl.when(pl.col("state") >= int(FIRST_LOSS)).then(3).otherwise(state)
     )
-    worst = dated.sort("judged", "state", "cause", descending=[True, True, False]).group_by(
-        *KEYS, "day", maintain_order=True
-    )
+    # Of passes as bad as each other the one with the fewest satellites, those that tell none last.
+    order, falling = ("judged", "state", "cause", "satellites"), [True, True, False, False]
+    worst = dated.sort(order, descending=falling, nulls_last=True).group_by(*KEYS, "day", maintain_order=True)
     claimed = dated.group_by(*KEYS, "day").agg(pl.col("claimed").any())
     return worst.first().drop("claimed").join(claimed, on=[*KEYS, "day"])
 
@@ -64,6 +64,8 @@ def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Counts per piece and direction; hours of the day are those of all right passes."""
     state, cause = pl.col("state"), pl.col("cause")
+    usual = pl.col("satellites").filter(state == int(State.RIGHT)).median().over("run_id")
+    passes = passes.with_columns(few=pl.col("satellites") <= criteria.satellites_share * usual)
     right, wrong = state == int(State.RIGHT), state == int(State.WRONG_IN_USE)
     lost = (state >= int(FIRST_LOSS)) & ~wrong
     hour = pl.col("t").dt.strftime("%H").unique()
@@ -82,6 +84,7 @@ def _counted(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
             wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
             unsafe=(cause == LineCause.UNSAFE_ACCEPTANCE.value).sum(),
             days=pl.col("t").filter(right | lost | wrong).dt.date().n_unique(),
+            few_satellites=(pl.col("few") & lost).sum(),
             monitors=pl.col("monitor").drop_nulls(),
             **{f"lost_{one.value}": (cause == one.value).sum() for one in LOSSES},
         )
@@ -123,7 +126,9 @@ def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
     """What speaks most against a piece, the first that applies."""
     lost = pl.concat_list(f"lost_{one.value}" for one in LOSSES).list.arg_max()
-    most_lost = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    named = lost.replace_strict(dict(enumerate(one.value for one in LOSSES)), return_dtype=pl.String)
+    few = named.is_in(SHORT_OF_SATELLITES) & (2 * pl.col("few_satellites") > pl.col("lost"))
+    most_lost = pl.when(few).then(pl.lit(LineCause.FEW_SATELLITES.value)).otherwise(named)
     some = {
         name: pl.col(name) > 0 for name in ("unsafe", "wrong_in_use", "wrong_track", "lost", "right", "after_alarm")
     }
@@ -156,14 +161,5 @@ def _bounds(
         for events in (bad, bad + unjudged, wrong + unjudged)
     )
     share = bad / number if number else None
-    return share, low.low, high.high, unsafe.high, passes_needed(bad + unjudged, number + unjudged, criteria)
-
-
-def passes_needed(bad: int, number: int, criteria: LineCriteria) -> int | None:
-    """Further right passes until the upper bound of the share lost keeps the limit; None beyond all reason."""
-
-    def kept(more: int) -> bool:
-        high = clopper_pearson(bad, number + more, criteria.confidence).high
-        return high is not None and high <= criteria.loss_limit
-
-    return fewest(kept)
+    needed = trials_needed(bad + unjudged, number + unjudged, criteria.loss_limit, criteria.confidence)
+    return share, low.low, high.high, unsafe.high, needed

@@ -22,11 +22,12 @@ _SIGNS = {
     LineCause.AMBIGUOUS: "T",
     LineCause.CONFIDENCE: "C",
     LineCause.ALARM: "A",
+    LineCause.FEW_SATELLITES: "S",
 }
 _WIDTH, _LANE, _ROW_PIECES = 1100.0, 22.0, 100
 _OPEN = ("piece_class", "cause", "netelement_id", "from_m", "to_m", "direction", "passes", "right", "lost")
-_COLUMNS = (*_OPEN, "wrong_in_use", "claimed_wrongly", "unknown", "unjudged", "after_alarm", "loss_share",
-            "unsafe_high",
+_COLUMNS = (*_OPEN, "wrong_in_use", "few_satellites", "claimed_wrongly", "unknown", "unjudged", "after_alarm",
+            "loss_share", "unsafe_high",
             "passes_needed", "hours_of_day", "days", "monitors", "largest_undetected_m")  # fmt: skip
 
 

@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from pipeline.export.places import Stretches, ground_of, stretches_of
 from pipeline.line.pieces import Pieces, plane_of
-from pipeline.line.spans import FIRST_LOSS, State, directions_of, spans_of, states_of
+from pipeline.line.spans import FIRST_LOSS, State, spans_of, states_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration
-from schemas.enums import BaliseKind, Direction, Judgement, PassageStatus
+from schemas.enums import BaliseKind, Judgement, PassageStatus
 from schemas.line import LineCause, LineCriteria
 from schemas.run import Site
 
@@ -29,15 +29,15 @@ CAUSES = {
     State.WRONG_TRACK: LineCause.WRONG_TRACK,
     State.WRONG_IN_USE: LineCause.WRONG,
 }
-_PASSES: dict[str, pl.DataType | type[pl.DataType]] = {
+_OUTCOMES: dict[str, pl.DataType | type[pl.DataType]] = {
     "piece": pl.Int64,
     "growing": pl.Boolean,
     "state": pl.Int64,
     "cause": pl.String,
     "claimed": pl.Boolean,
-    "monitor": pl.String,
     "t": pl.Datetime("ns", "UTC"),
 }
+_PASSES = _OUTCOMES | {"monitor": pl.String, "satellites": pl.Float64}
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ def passes_of(
     config: Configuration,
 ) -> pl.DataFrame:
     """One row per piece and direction that a run of one solution touched: `piece, growing, state, cause, claimed,
-    monitor, t`.
+    t, monitor, satellites`.
 
     The place is the train's by the evidence. `claimed`: the train was elsewhere when a position in use, judged wrong,
-    said that it was here.
+    said that it was here. `satellites`: the fewest used where the pass was at its worst.
     """
     epochs = epochs.sort("t")
     if epochs.height < 2:
@@ -81,9 +81,9 @@ def passes_of(
     legs, states = stretches_of(epochs), states_of(epochs, alarms["t_start"], config)
     spans = spans_of(epochs, states, config)
     hits = laid_on(spans, legs, ground.pieces)
-    parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, legs, ground.pieces)]
+    parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, epochs, legs, ground.pieces)]
     parts += _misleading(epochs, states, legs, ground, criteria)
-    return _with_monitors(_merged(pl.concat(parts)), hits, alarms)
+    return _explained(_merged(pl.concat(parts)), hits, alarms)
 
 
 def laid_on(spans: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
@@ -121,7 +121,7 @@ def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
     order = ("low_m", "high_m", "from_m", "to_m") if sign > 0 else ("high_m", "low_m", "to_m", "from_m")
     names = ("low", "high", "begin", "end")
     places = {name: sign * (pl.col(column) - offset_m) for name, column in zip(names, order, strict=True)}
-    return spans.select("state", "t", "one", "other", growing=pl.col("direction") * sign > 0, **places)
+    return spans.select("state", "t", "one", "other", "satellites", growing=pl.col("direction") * sign > 0, **places)
 
 
 def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.DataFrame:
@@ -138,35 +138,32 @@ def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.Dat
 
 
 def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
-    """Rows of `_PASSES` with the cause that the state has, or another."""
+    """Rows of `_OUTCOMES` with the cause that the state has, or another."""
     names = {int(state): found.value for state, found in CAUSES.items()}
     own = pl.col("state").replace_strict(names, default=LineCause.NONE.value, return_dtype=pl.String)
     told = own if cause is None else pl.lit(cause.value)
     claimed = cause is LineCause.CLAIMED_WRONGLY
-    monitor = pl.lit(None, pl.String)
-    return frame.with_columns(cause=told, claimed=pl.lit(claimed), monitor=monitor).select(
-        pl.col(name).cast(dtype) for name, dtype in _PASSES.items()
+    return frame.with_columns(cause=told, claimed=pl.lit(claimed)).select(
+        pl.col(name).cast(dtype) for name, dtype in _OUTCOMES.items()
     )
 
 
-def _unsafe(passages: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
-    """Pieces of virtual balises that were accepted at a wrong place."""
+def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
+    """Pieces of virtual balises that were accepted at a wrong place, in the direction in which the train went."""
     unsafe = passages.filter(
         (pl.col("status") == PassageStatus.ACCEPTED.value)
         & (pl.col("judgement") == Judgement.WRONG.value)
         & (pl.col("kind") == BaliseKind.VIRTUAL.value)
     ).with_columns(t=pl.coalesce("t_offered", "t_true"))
-    forward = unsafe["direction"].cast(pl.String) == Direction.GROWING.value
-    ahead = forward.replace_strict({True: 1.0, False: -1.0}, return_dtype=pl.Float64)
-    return _rows(_named(unsafe.with_columns(ahead=ahead), legs, pieces), LineCause.UNSAFE_ACCEPTANCE)
+    there = unsafe.sort("t").join_asof(epochs.select("t", ahead="direction"), on="t")
+    return _rows(_named(there, legs, pieces), LineCause.UNSAFE_ACCEPTANCE)
 
 
 def _misleading(
     epochs: pl.DataFrame, states: Ints, legs: Stretches, ground: Ground, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
     """Pieces that wrong positions in use claimed, and those beside a position on a wrong track."""
-    told = epochs.with_columns(state=pl.Series(states), ahead=pl.Series(directions_of(epochs)))
-    told = told.filter(pl.col("netelement_id").is_not_null())
+    told = epochs.with_columns(state=pl.Series(states), ahead="direction").filter(pl.col("netelement_id").is_not_null())
     track = pl.col("error_low_m").is_null()
     in_use = pl.col("state") == int(State.WRONG_IN_USE)
     claims = _named(told.filter(in_use & ~track), legs, ground.pieces)
@@ -194,10 +191,10 @@ def _named(rows: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
     for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():
         if (element := pieces.track.index.get(name)) is None or at is None:
             continue
-        ways = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1.0, -1.0) else set()
+        ways = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1, -1) else set()
         for growing in ways or {True, False}:
             found.setdefault((int(pieces.at(element, np.array([at]))[0]), growing), t)
-    schema = {name: _PASSES[name] for name in ("piece", "growing", "state", "t")}
+    schema = {name: _OUTCOMES[name] for name in ("piece", "growing", "state", "t")}
     table = [(piece, growing, int(State.WRONG_IN_USE), t) for (piece, growing), t in found.items()]
     return pl.DataFrame(table, schema=schema, orient="row")
 
@@ -215,9 +212,11 @@ def _merged(rows: pl.DataFrame) -> pl.DataFrame:
     return pl.concat([kept, lone.with_columns(state=pl.lit(int(State.UNSEEN)).cast(pl.Int64))])
 
 
-def _with_monitors(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:
-    """The monitor that failed first in an alarm that began on the piece."""
-    first = alarms.select(t="t_start", failed=pl.col("monitors").list.first()).unique("t")
+def _explained(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:
+    """With the monitor that failed first in an alarm that began on the piece, and the satellites at the worst place."""
+    keys = ["piece", "growing"]
+    worst = hits.filter(pl.col("state") == pl.col("state").max().over(keys)).group_by(keys).agg(pl.min("satellites"))
+    first = alarms.select(t="t_start", monitor=pl.col("monitors").list.first()).unique("t")
     begun = hits.filter(pl.col("state") >= int(FIRST_LOSS)).join(first, on="t", how="inner")
-    told = begun.sort("t").group_by("piece", "growing", maintain_order=True).agg(pl.col("failed").first())
-    return passes.join(told, on=["piece", "growing"], how="left").with_columns(monitor="failed").drop("failed")
+    failed = begun.sort("t").group_by(keys, maintain_order=True).agg(pl.first("monitor"))
+    return passes.join(failed, on=keys, how="left").join(worst, on=keys, how="left")

@@ -6,9 +6,12 @@ from collections.abc import Iterator
 
 import polars as pl
 
-from pipeline.line.classes import passes_needed
+from pipeline.line.trials import trials_needed
 from schemas.enums import TRUTH
 from schemas.line import LineCriteria, LineDirection
+
+# So many net elements are named; the table has the rest.
+_NAMED = 8
 
 
 def remarks(
@@ -34,7 +37,10 @@ def _evidence(runs: pl.DataFrame) -> Iterator[str]:
 
 
 def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
-    needed, most = passes_needed(0, 0, criteria), max(table["passes"].to_list(), default=0)
+    needed, most = (
+        trials_needed(0, 0, criteria.loss_limit, criteria.confidence),
+        max(table["passes"].to_list(), default=0),
+    )
     if needed is None or most < needed:
         yield (
             f"Too few passes: a piece has {most} at most, and {needed or 'more than can be'} without a loss are needed "
@@ -45,10 +51,16 @@ def _numbers(table: pl.DataFrame, criteria: LineCriteria) -> Iterator[str]:
 
 
 def _sides(table: pl.DataFrame) -> Iterator[str]:
-    passed = table.filter(pl.col("passes") > 0)
-    for side in LineDirection:
-        if passed.height and passed.filter(pl.col("direction") == side.value).is_empty():
-            yield f"No run in the direction of {side.value} measure: that direction is unknown everywhere."
+    """Net elements that runs passed in one direction only; a wrong track condemns both, whichever was run."""
+    run = table.filter(pl.col("passes") > pl.col("lost_wrong_track"))
+    sides = run.group_by("netelement_id", maintain_order=True).agg(pl.col("direction").unique())
+    for side, other in (tuple(LineDirection), tuple(reversed(LineDirection))):
+        lone = sides.filter(pl.col("direction") == [other.value])["netelement_id"].to_list()
+        if lone:
+            yield (
+                f"No run in the direction of {side.value} measure on {', '.join(lone[:_NAMED])}"
+                f"{f' and {len(lone) - _NAMED} more' if len(lone) > _NAMED else ''}: that direction is unknown there."
+            )
 
 
 def _trains(runs: pl.DataFrame) -> Iterator[str]:
@@ -58,12 +70,14 @@ def _trains(runs: pl.DataFrame) -> Iterator[str]:
             f"The runs were replayed with {kinds} settings or vehicle files; their passes are counted together. "
             "Positions are those of the balise antenna: how a piece looks to the rest of a longer train is not known."
         )
-    yield "The tables hold neither train lengths nor C/N0 nor satellites in view: no cause is derived from them."
+    yield "The tables hold neither train lengths nor C/N0: no cause is derived from them."
 
 
 def _rest(passes: pl.DataFrame, table: pl.DataFrame, figures: pl.DataFrame) -> Iterator[str]:
     if passes.is_empty():
         yield "No run has a place that the evidence knows on this site."
+    elif passes["satellites"].is_null().all():
+        yield "The runs do not tell how many satellites were used: no cause is derived from that."
     if figures.is_empty():
         yield "No piece is suitable: there is nothing to propose."
     elif figures["points"].max() and (figures["points_served"] < figures["points"]).any():

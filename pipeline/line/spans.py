@@ -32,7 +32,7 @@ class State(IntEnum):
 FIRST_LOSS = State.ALARM
 EPOCH_COLUMNS = (
     *("t", "solution", "netelement_id", "measure_m", "path_m", "error_low_m", "error_high_m", "direction"),
-    *("judgement", "in_use", "on_track", "gate_probability", "confidence_m"),
+    *("judgement", "in_use", "on_track", "gate_probability", "confidence_m", "satellites"),
 )
 
 
@@ -59,31 +59,25 @@ def _is(epochs: pl.DataFrame, judgement: str) -> Bools:
     return (epochs["judgement"].cast(pl.String) == judgement).fill_null(value=False).to_numpy()
 
 
-def directions_of(epochs: pl.DataFrame) -> Floats:
-    """Direction of travel on growing path, kept through stops; NaN where it was never known."""
-    travel = epochs["direction"].cast(pl.Float64)
-    return floats(travel.replace(0.0, None).forward_fill().backward_fill().to_frame("d"), "d")
-
-
-def true_path_m(epochs: pl.DataFrame, direction: Floats) -> tuple[Floats, Floats]:
+def true_path_m(epochs: pl.DataFrame) -> tuple[Floats, Floats]:
     """Least and largest path position of the train: position less the judged error; NaN where nobody knows."""
-    path, low, high = (floats(epochs, name) for name in ("path_m", "error_low_m", "error_high_m"))
+    columns = ("path_m", "error_low_m", "error_high_m", "direction")
+    path, low, high, direction = (floats(epochs, name) for name in columns)
     one, other = path - direction * low, path - direction * high
     return np.minimum(one, other), np.maximum(one, other)
 
 
 def spans_of(epochs: pl.DataFrame, states: Ints, config: Configuration) -> pl.DataFrame:
     """One row per pair of epochs: `low_m, high_m` where the train may have been, `from_m, to_m` where it was most
-    likely, `direction, state, t, one, other` (net elements of the two positions).
+    likely, `direction, state, t, one, other` (net elements of the two positions), `satellites` (the fewer of the two).
 
     Between two places that are known nothing but a pure outage is told of what lies between: the rest is unknown, for
     nobody knows on which piece it was. So is a place known less closely than the failure limit on both sides. What
     was wrong at an end of such a way, or of an outage, was wrong there and not along it: a row of its own.
     """
-    direction = directions_of(epochs)
-    low, high = true_path_m(epochs, direction)
+    low, high = true_path_m(epochs)
     placed = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
-    t_ns, names = times_ns(epochs), epochs["netelement_id"]
+    t_ns, names, satellites = times_ns(epochs), epochs["netelement_id"], floats(epochs, "satellites")
     here, there = placed[:-1], placed[1:]
     state = np.maximum(states[here], states[there])
     silent = (t_ns[there] - t_ns[here] > crossing_gap_ns(t_ns, config.lds)) & (there == here + 1)
@@ -103,11 +97,12 @@ def spans_of(epochs: pl.DataFrame, states: Ints, config: Configuration) -> pl.Da
             "high_m": np.maximum(high[here], high[there]),
             "from_m": np.minimum(middle[here], middle[there]),
             "to_m": np.maximum(middle[here], middle[there]),
-            "direction": direction[there],
+            "direction": epochs["direction"].gather(there),
             "state": state,
             "t": epochs["t"].gather(here),
             "one": names.gather(here),
             "other": names.gather(there),
+            "satellites": pl.Series(np.fmin(satellites[here], satellites[there]), nan_to_null=True),
         }
     )
 

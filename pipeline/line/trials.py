@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import polars as pl
 
+from pipeline.figures.bounds import CONFIDENCE, clopper_pearson
 from schemas.enums import RunVerdict
 
 
@@ -31,8 +30,16 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     ]
 
 
-def fewest(enough: Callable[[int], bool]) -> int | None:
-    """The least number, from 0 on, that is enough; whatever is more must be enough too. None beyond 2^40."""
+def trials_needed(bad: int, number: int, limit: float, confidence: float = CONFIDENCE) -> int | None:
+    """Further good trials until the upper bound of the share of bad ones keeps the limit; None beyond 2^40.
+
+    `bad` of `number` trials so far; the bound is Clopper and Pearson's.
+    """
+
+    def enough(more: int) -> bool:
+        high = clopper_pearson(bad, number + more, confidence).high
+        return high is not None and high <= limit
+
     most = next((1 << power for power in range(41) if enough(1 << power)), None)
     if most is None:
         return None

@@ -45,6 +45,7 @@ def gap_m(a: pl.DataFrame, b: pl.DataFrame) -> float:
         ({"kind": "step", "target": "G20", "start_s": 50.0, "size_m": 40.0, "duration_s": 10.0}, 1e-5),
         ({"kind": "outage", "target": "galileo", "start_s": 60.0, "duration_s": 20.0}, 1e-5),
         ({"kind": "outage", "target": "G20", "start_s": 60.0, "duration_s": 20.0}, 1e-5),
+        ({"kind": "outage", "target": "satellites", "below_deg": 15.0, "start_s": 60.0, "duration_s": 20.0}, 1e-5),
         ({"kind": "bias", "target": "satellites", "below_deg": 25.0, "size_m": 8.0, "start_s": 30.0}, 1e-5),
         # The way that positions show is known to noise and to the chord of 10 m.
         ({"kind": "step", "target": "along", "start_s": 60.0, "size_m": 30.0, "duration_s": 20.0}, 1.0),
@@ -60,6 +61,7 @@ def test_injected_is_simulated(clean: RunLog, values: dict[str, Any], tolerance_
     assert gap_m(afterwards.gnss, clean.gnss) > 0.1 if values["kind"] != "outage" else True
     for column in ("cov_ee_m2", "cov_nu_m2", "hpl_m", "vpl_m"):
         assert (afterwards.gnss[column] - at_once.gnss[column]).abs().max() < 1e-9  # type: ignore[operator]
+    assert afterwards.gnss["satellites"].equals(at_once.gnss["satellites"])
     if "target" in values and values["target"] not in ("along", "cross", "up"):
         assert afterwards.satellites is not None
         assert at_once.satellites is not None

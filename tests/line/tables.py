@@ -24,7 +24,7 @@ CRITERIA = LineCriteria()
 CONFIG = Configuration()
 # From, to, and the causes that the place may be known by.
 PLACES = {
-    "cutting": (500.0, 700.0, {"confidence"}),
+    "cutting": (500.0, 700.0, {"few_satellites"}),
     "tunnel": (1500.0, 1800.0, {"outage"}),
     "roof": (3000.0, 3040.0, {"alarm"}),
     "facade": (4000.0, 4100.0, {"wrong", "claimed_wrongly"}),
@@ -89,6 +89,7 @@ def _epoch(at_m: float, number: int, back: bool, places: Sequence[str]) -> dict[
         "on_track": True,
         "gate_probability": 1.0,
         "confidence_m": 5.0,
+        "satellites": 12,
         "alarm": False,
     }
     since_roof_m = (PLACES["roof"][1] - at_m) if back else at_m - PLACES["roof"][0]
@@ -96,7 +97,7 @@ def _epoch(at_m: float, number: int, back: bool, places: Sequence[str]) -> dict[
         nothing = dict.fromkeys(("path_m", "netelement_id", "measure_m", "error_low_m", "error_high_m", "confidence_m"))
         return row | nothing | {"judgement": "unknown", "in_use": False, "on_track": False}
     if inside("cutting", at_m, places):
-        return row | {"confidence_m": 25.0, "in_use": False}
+        return row | {"confidence_m": 25.0, "in_use": False, "satellites": 5}
     if "roof" in places and 0.0 <= since_roof_m < BLOCKED_M:
         return row | {"alarm": True, "in_use": False}
     if inside("neighbour", at_m, places):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.line import distinct
-from pipeline.line.classes import passes_needed, piece_classes
+from pipeline.line import distinct, trials_needed
+from pipeline.line.classes import piece_classes
 from pipeline.line.spans import State
 from schemas.line import LineCriteria
 from schemas.run import Site
@@ -202,6 +202,20 @@ def test_the_place_is_the_trains_not_the_positions(site: Site) -> None:
     assert set(table.filter(pl.col("chainage").is_between(1400.0, 1700.0))["word"]) == {"suitable"}
 
 
+def test_few_satellites_are_named_where_a_run_tells_them(passes: pl.DataFrame, site: Site) -> None:
+    """Every other run tells none: more than half of the lost passes must have few, of days one that tells is enough."""
+    number = pl.col("run_id").str.slice(1).cast(pl.Int64) // 2
+    cutting = pl.col("chainage").is_between(525.0, 675.0)
+    for told, cause in ((number % 3 < 2, "few_satellites"), (number % 3 < 1, "confidence")):
+        some = passes.with_columns(satellites=pl.when(told).then("satellites"))
+        assert set(classes(some, site).filter(cutting)["why"]) == {cause}
+        by_day = classes(some, site, LineCriteria(independent="day", loss_limit=0.01)).filter(cutting)
+        assert set(by_day["why"]) == {"few_satellites"}
+    # As many as ever: the interval was too wide for another reason.
+    usual = passes.with_columns(satellites=pl.lit(12.0))
+    assert set(classes(usual, site).filter(cutting)["why"]) == {"confidence"}
+
+
 def test_passes_of_one_day_count_as_one_by_option(passes: pl.DataFrame, site: Site) -> None:
     table = classes(passes, site, LineCriteria(independent="day"))
     # 84 runs an hour apart lie on four days; hours of the day are those of all passes.
@@ -211,9 +225,9 @@ def test_passes_of_one_day_count_as_one_by_option(passes: pl.DataFrame, site: Si
 
 
 @pytest.mark.parametrize(("bad", "number", "needed"), [(0, 0, 36), (0, 30, 6), (0, 50, 0), (1, 0, 54)])
-def test_passes_needed(bad: int, number: int, needed: int) -> None:
+def test_trials_needed(bad: int, number: int, needed: int) -> None:
     """1 - 0.025^(1/36) = 0.0974 keeps 10 %, 1 - 0.025^(1/35) = 0.10003 does not."""
-    assert passes_needed(bad, number, CRITERIA) == needed
+    assert trials_needed(bad, number, CRITERIA.loss_limit) == needed
 
 
 def test_hours_may_be_asked_for(passes: pl.DataFrame, site: Site) -> None:

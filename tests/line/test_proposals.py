@@ -167,6 +167,8 @@ def test_runs_of_one_direction_without_truth(tmp_path: Path, site: Site) -> None
     write_tables(tmp_path, 1, epochs_of(2, (), falling=False).filter(pl.col("path_m") < SPLIT_M - 100.0))
     remarks = write_line(tmp_path, site, CRITERIA).remarks
     assert any(text.startswith("1 of 2 runs have neither") for text in remarks)
+    assert any("growing measure on B:" in text for text in remarks)
+    assert any("falling measure on A:" in text for text in remarks)
     write_tables(tmp_path, 0, epochs_of(0, falling=False).filter(pl.col("path_m") < SPLIT_M - 100.0))
     assert any("direction of falling measure" in text for text in write_line(tmp_path, site, CRITERIA).remarks)
 
@@ -192,8 +194,9 @@ def test_the_page_of_criteria_names_every_key_with_its_default() -> None:
 def test_an_unsafe_acceptance_and_an_undetected_error_count_at_their_place(tmp_path: Path, site: Site) -> None:
     offered = {"balise_id": "VB1", "kind": "virtual", "netelement_id": "A", "measure_m": 1025.0, "direction": "growing"}
     row = {"solution": "primary", "status": "accepted", "judgement": "wrong", "undetected_ahead_m": 12.5}
-    unsafe = filled(pl.DataFrame([{**offered, **row}]), Passages)
-    write_tables(tmp_path, 0, epochs_of(0, ()), passages=unsafe)
+    run = epochs_of(0, ())
+    unsafe = filled(pl.DataFrame([{**offered, **row, "t_offered": run["t"][40]}]), Passages)
+    write_tables(tmp_path, 0, run, passages=unsafe)
     table = write_line(tmp_path, site, LineCriteria(loss_limit=0.99)).pieces.filter(pl.col("netelement_id") == "A")
     bad = table.filter((pl.col("piece_class") == "unsuitable") & (pl.col("from_m") < 2000.0))
     assert bad.select("from_m", "direction", "cause").rows() == [(1000.0, "growing", "unsafe_acceptance")]
