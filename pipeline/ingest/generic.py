@@ -75,7 +75,7 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    definitions, name = _made(_ros_definitions, channel)
+    definitions, name = ros_definitions(channel)
 
     def checked(payload: bytes) -> Value:
         try:
@@ -138,9 +138,15 @@ def protobuf_descriptor(channel: Channel) -> Any:
     return _made(_protobuf_class, channel).DESCRIPTOR
 
 
+def ros_definitions(channel: Channel) -> tuple[Mapping[str, Definition], str]:
+    """The definitions that a channel's messages are made of, and the name of theirs."""
+    found: tuple[Mapping[str, Definition], str] = _made(_ros_definitions, channel)
+    return found
+
+
 def decode_columns(
     channel: Channel, messages: Messages, types: Mapping[str, pl.DataType], rows: str = ""
-) -> tuple[pl.DataFrame, list[int]]:
+) -> tuple[dict[str, pl.Series], list[int]]:
     """One column per field path, decoded message by message; with `rows` one row per element of that array.
 
     Also returns, for each row, the number of its message.
@@ -160,14 +166,13 @@ def decode_columns(
                     values[path].append(coerce(take(message) if value is None and rows else value))
         except UndecodableError as error:
             raise undecodable(channel, messages, number, error) from None
-    series = [pl.Series(path, column, dtype=types[path]) for path, column in values.items()]
-    return pl.DataFrame(series), numbers
+    return {path: pl.Series(path, column, dtype=types[path]) for path, column in values.items()}, numbers
 
 
 def undecodable(channel: Channel, messages: Messages, row: int, error: UndecodableError) -> InputError:
     """The error for one message, named by the time at which it was recorded."""
     return InputError(
-        f"the message recorded at log time {messages.times('log_time')[row]} ns cannot be decoded: {error}",
+        f"the message recorded at log time {messages.log_time[row]} ns cannot be decoded: {error}",
         place=channel.place,
         remedy="Record the log again, or map other fields.",
     )

@@ -8,12 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 import pytest
 import zstandard
 
-from pipeline.ingest import mcap_chunk, read_run
+from pipeline.ingest import mcap_block, read_run
 from pipeline.ingest.clean import clean, of_the_journey
 from pipeline.ingest.describe import describe_log
 from pipeline.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
@@ -98,13 +97,12 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
 
 
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
-    spent = mcap_chunk.Allowance(3)
-    data = np.frombuffer(definitions() + some_messages(1), dtype="uint8")
-    placed = [mcap_chunk.Placed(0, len(data), 0, ())]
-    mcap_chunk.messages_in(data, placed, 0, lambda *_: None, spent)
+    spent = mcap_block.Allowance(3)
+    records = definitions() + some_messages(1)
+    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
     assert spent.left == 0
-    with pytest.raises(mcap_chunk.DamageError, match="more records"):
-        mcap_chunk.messages_in(data, placed, 0, lambda *_: None, spent)
+    with pytest.raises(mcap_block.DamageError, match="more records"):
+        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
 
 
 LETTERS = "A" * 26
