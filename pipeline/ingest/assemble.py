@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.breaches import Breach
 from pipeline.ingest.conform import conform
 from pipeline.ingest.plan import Source, missing_field
 from pipeline.ingest.reader import ORDINAL
@@ -25,7 +24,7 @@ class Decoded:
 
 
 def stream_frames(
-    decoded: Sequence[Decoded], breaches: list[Breach], few: float, remarks: list[str]
+    decoded: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
 ) -> dict[str, pl.DataFrame]:
     """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out.
 
@@ -40,7 +39,7 @@ def stream_frames(
 
 
 def _stream(
-    stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], few: float, remarks: list[str]
+    stream: Stream, parts: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
 ) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [

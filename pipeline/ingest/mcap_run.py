@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.assemble import Decoded, stream_frames
-from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.generic import UndecodableError, decoder_for, undecodable
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
@@ -156,7 +156,7 @@ def _frames(
     used = {source.channel.topic for source in settled}
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
-    breaches: list[Breach] = []
+    breaches: list[InputError] = []
     remarks: list[str] = []
     frames = stream_frames(decoded, breaches, config.wrong_dates_share, remarks)
     if "gnss" not in frames:
@@ -165,16 +165,16 @@ def _frames(
     return frames, slow_messages, (*left_over, *remarks)
 
 
-def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:
+def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> InputError:
     if walk.cut_at is not None and not walk.met.message_counts:
-        return Breach(
-            str(path),
+        return InputError(
             f"is cut off at byte {walk.cut_at}, before any complete message",
+            place=str(path),
             remedy="Record or copy the log again.",
         )
-    return Breach(
-        str(path),
+    return InputError(
         "holds no GNSS stream",
+        place=str(path),
         found=", ".join(left_over[:40]) or "no messages",
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",
