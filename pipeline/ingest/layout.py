@@ -17,7 +17,6 @@ from pipeline.ingest.mcap_block import Bytes, Messages, stretches_of
 from schemas.arrays import Bools, Ints
 
 _MOST_LAYOUTS = 256  # of one channel; beyond, messages are decoded one by one
-_MOST_PER_LENGTH = 16
 _MOST_ASIDE = 8  # messages without layout that may come before one that has a layout
 _LARGEST_LEARNT = 1 << 16  # bytes of a message that is walked to learn its layout
 
@@ -125,17 +124,18 @@ class LayoutDecoder:
         parts: list[tuple[Messages, Columns]] = []
         left: list[Messages] = []
         for length in np.unique(messages.length).tolist():
-            for layout, group in self._by_layout(length, messages.chosen(messages.length == length), left):
+            for layout, group, rows in self._by_layout(length, messages.chosen(messages.length == length), left):
                 try:
-                    rows = stretches_of(group.data, group.start, layout.end)
                     values = {path: field.take(rows) for path, field in layout.fields.items()}
                     parts.append((group, {path: values[path].cast(dtype) for path, dtype in self._types.items()}))
                 except (UnfitError, pl.exceptions.PolarsError):  # the ordinary decoder says why
                     left.append(group)
         return parts, left
 
-    def _by_layout(self, length: int, messages: Messages, aside: list[Messages]) -> Iterator[tuple[Layout, Messages]]:
-        """Messages of one length by their layouts; those without one into `aside`."""
+    def _by_layout(
+        self, length: int, messages: Messages, aside: list[Messages]
+    ) -> Iterator[tuple[Layout, Messages, Bytes]]:
+        """Messages of one length by their layouts, and their bytes; those without one into `aside`."""
         known = self._layouts.setdefault(length, [])
         tried = 0
         while len(messages):
@@ -148,13 +148,17 @@ class LayoutDecoder:
                 continue
             layout = known[tried]
             tried += 1
-            agree = layout.of(stretches_of(messages.data, messages.start, layout.end))
+            rows = stretches_of(messages.data, messages.start, layout.end)
+            agree = layout.of(rows)
+            if agree.all():
+                yield layout, messages, rows
+                return
             if agree.any():
-                yield layout, messages if agree.all() else messages.chosen(agree)
+                yield layout, messages.chosen(agree), rows[agree]
             messages = messages.chosen(~agree)
 
     def _learn(self, payload: bytes, known: list[Layout]) -> bool:
-        if self._count >= _MOST_LAYOUTS or len(known) >= _MOST_PER_LENGTH or len(payload) > _LARGEST_LEARNT:
+        if self._count >= _MOST_LAYOUTS or len(payload) > _LARGEST_LEARNT:
             return False
         try:
             known.append(self._walk(payload))

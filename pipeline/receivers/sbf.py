@@ -16,7 +16,6 @@ from schemas.enums import Fix
 _NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
 _DO_NOT_USE = -2e10
 _SBAS_PRNS = range(120, 159)
-_NOT_KNOWN_U16 = 65535
 
 
 def parse(raw: bytes) -> Any:
@@ -46,7 +45,7 @@ def _solution(epoch: Epoch, m: Any) -> bool:
     # Base stations are numbered too: only an SBAS solution refers to a satellite.
     if fix is Fix.SBAS and m.ReferenceID in _SBAS_PRNS:
         epoch.gnss["sbas_prn"] = m.ReferenceID
-        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if round(m.MeanCorrAge * 100) != _NOT_KNOWN_U16 else None
+        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if round(m.MeanCorrAge * 100) != _NO_WEEK else None
     return fix is not Fix.NONE
 
 
