@@ -10,16 +10,17 @@ import polars as pl
 import polars.selectors as cs
 from dataframely import Schema
 
-from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.conform import conform
 from schemas.enums import BaliseKind, Reaction
+from schemas.errors import InputError
 from schemas.inputs import Balises
 from schemas.run import Stream
 
 
 def conformed(frame: pl.DataFrame, stream: Stream, place: Path) -> pl.DataFrame:
     """The stream as the contract has it; NaN is not known."""
-    breaches: list[Breach] = []
+    breaches: list[InputError] = []
     found = conform(frame.with_columns(cs.float().fill_nan(None)), stream, str(place), breaches)
     refuse(breaches)
     return found

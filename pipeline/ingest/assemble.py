@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.breaches import Breach
 from pipeline.ingest.conform import conform
 from pipeline.ingest.plan import Source, missing_field
 from pipeline.ingest.reader import ORDINAL
@@ -25,7 +24,7 @@ class Decoded:
 
 
 def stream_frames(
-    decoded: Sequence[Decoded], breaches: list[Breach], few: float, remarks: list[str]
+    decoded: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
 ) -> dict[str, pl.DataFrame]:
     """One frame per stream that has a source, rows in order of the file; `remarks` tells what was left out.
 
@@ -40,7 +39,7 @@ def stream_frames(
 
 
 def _stream(
-    stream: Stream, parts: Sequence[Decoded], breaches: list[Breach], few: float, remarks: list[str]
+    stream: Stream, parts: Sequence[Decoded], breaches: list[InputError], few: float, remarks: list[str]
 ) -> pl.DataFrame:
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [
@@ -76,7 +75,7 @@ def _same_receiver(part: Decoded, other: Decoded) -> bool:
 
 def _rows(part: Decoded, supplements: Sequence[Decoded], few: float, remarks: list[str]) -> pl.DataFrame:
     source = part.source
-    columns = _columns(part.frame, {ORDINAL: pl.col(ORDINAL), **source.columns})
+    columns = part.frame.select(ORDINAL, **source.columns)
     try:
         times = [time.instants(part.frame, name) for name, time in source.times.items()]
     except (ValueError, pl.exceptions.PolarsError) as error:
@@ -161,13 +160,6 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
         )
     remarks.append(f"{source.channel.topic}: {count} messages with a stamp of 0")
     return frame.filter(~unset.fill_null(False))
-
-
-def _columns(frame: pl.DataFrame, wanted: Mapping[str, pl.Expr]) -> pl.DataFrame:
-    """The columns asked for; those that are only fields under another name need no query."""
-    if all(expression.meta.is_column() for expression in wanted.values()):
-        return pl.DataFrame([frame[expression.meta.output_name()].alias(name) for name, expression in wanted.items()])
-    return frame.select(expression.alias(name) for name, expression in wanted.items())
 
 
 def _named(frame: pl.DataFrame, source: Source) -> pl.DataFrame:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.ingest.placeholders import without_placeholders
-from schemas.arrays import Bools
+from schemas.arrays import NS_PER_S, Bools
 from schemas.config import IngestConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
@@ -21,7 +21,7 @@ _KEYS: dict[Stream, list[str]] = {
     "balise_reads": ["t", "balise_id"],
 }
 _PLACE = ("latitude_deg", "longitude_deg")
-_DAY_NS = 86_400_000_000_000
+_DAY_NS = 86_400 * NS_PER_S
 # Streams that say something only of positions: without them a run is replayed all the same.
 _OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
 

@@ -170,7 +170,7 @@ class _Census:
                 fields = _fields(channels[channel_id], messages) if len(self.met) < _MOST_SAMPLES else {}
                 self.met[channel_id] = _Met(channels[channel_id], fields)
             met = self.met[channel_id]
-            times = messages.times("log_time")
+            times = messages.log_time
             met.messages += len(messages)
             met.span_ns += [int(times.min()), int(times.max())]
 
@@ -189,7 +189,7 @@ def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
     """All topics as far as the log can be read; damage is a problem that reading reports."""
     census = _Census()
     try:
-        walk_log(path, config, census, lambda _: None)
+        walk_log(path, config, census)
     except InputError:
         if not census.met:
             return ()

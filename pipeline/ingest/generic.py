@@ -75,7 +75,7 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    definitions, name = _made(_ros_definitions, channel)
+    definitions, name = ros_definitions(channel)
 
     def checked(payload: bytes) -> Value:
         try:
@@ -138,15 +138,21 @@ def protobuf_descriptor(channel: Channel) -> Any:
     return _made(_protobuf_class, channel).DESCRIPTOR
 
 
+def ros_definitions(channel: Channel) -> tuple[Mapping[str, Definition], str]:
+    """The definitions that a channel's messages are made of, and the name of theirs."""
+    found: tuple[Mapping[str, Definition], str] = _made(_ros_definitions, channel)
+    return found
+
+
 def decode_columns(
     channel: Channel, messages: Messages, types: Mapping[str, pl.DataType], rows: str = ""
-) -> tuple[pl.DataFrame, list[int]]:
+) -> tuple[dict[str, pl.Series], list[int]]:
     """One column per field path, decoded message by message; with `rows` one row per element of that array.
 
     Also returns, for each row, the number of its message.
     """
     decode = decoder_for(channel)
-    takers = [(path, _taker(path), _COERCIONS[type(dtype)]) for path, dtype in types.items()]
+    takers = [(path, _taker(path), dtype) for path, dtype in types.items()]
     array = _taker(rows)
     values: dict[str, list[Value]] = {path: [] for path in types}
     numbers: list[int] = []
@@ -155,19 +161,18 @@ def decode_columns(
             message = decode(messages.payload(number))
             for element in array(message) or [] if rows else [message]:
                 numbers.append(number)
-                for path, take, coerce in takers:
+                for path, take, dtype in takers:
                     value = take(element)
-                    values[path].append(coerce(take(message) if value is None and rows else value))
+                    values[path].append(_fitting(take(message) if value is None and rows else value, dtype))
         except UndecodableError as error:
             raise undecodable(channel, messages, number, error) from None
-    series = [pl.Series(path, column, dtype=types[path]) for path, column in values.items()]
-    return pl.DataFrame(series), numbers
+    return {path: pl.Series(path, column, dtype=types[path]) for path, column in values.items()}, numbers
 
 
 def undecodable(channel: Channel, messages: Messages, row: int, error: UndecodableError) -> InputError:
     """The error for one message, named by the time at which it was recorded."""
     return InputError(
-        f"the message recorded at log time {messages.times('log_time')[row]} ns cannot be decoded: {error}",
+        f"the message recorded at log time {messages.log_time[row]} ns cannot be decoded: {error}",
         place=channel.place,
         remedy="Record the log again, or map other fields.",
     )
@@ -216,39 +221,23 @@ def _shown(value: Value) -> str:
     return f"an integer of {value.bit_length()} bits" if long else repr(value)[:80]
 
 
-def _as_float(value: Value) -> float | None:
-    if value is None or (isinstance(value, float)):
-        return value
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**1023:
-        return float(value)
-    raise UndecodableError(f"{_shown(value)} is not a number")
-
-
-def _as_int(value: Value) -> int | None:
-    if value is None or (isinstance(value, int) and not isinstance(value, bool)):
-        if value is not None and not -(2**63) <= value < 2**63:
-            raise UndecodableError(f"{_shown(value)} is not a 64-bit integer")
-        return value
-    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
-        return int(value)
-    raise UndecodableError(f"{_shown(value)} is not an integer")
-
-
-def _as_text(value: Value) -> str | None:
-    if value is None or isinstance(value, str):
-        return value
-    raise UndecodableError(f"{_shown(value)} is not text")
-
-
-def _as_flag(value: Value) -> bool | None:
-    if value is None or isinstance(value, bool):
-        return value
-    raise UndecodableError(f"{_shown(value)} is not true or false")
-
-
-_COERCIONS: dict[type[pl.DataType], Callable[[Value], Value]] = {
-    pl.Float64: _as_float,
-    pl.Int64: _as_int,
-    pl.String: _as_text,
-    pl.Boolean: _as_flag,
+# What values of a type may be, and how the type is called.
+_KINDS: dict[type[pl.DataType], tuple[type, str]] = {
+    pl.Float64: (float, "a number"),
+    pl.Int64: (int, "a 64-bit integer"),
+    pl.String: (str, "text"),
+    pl.Boolean: (bool, "true or false"),
 }
+
+
+def _fitting(value: Value, dtype: pl.DataType) -> Value:
+    """The value in the type asked for: whole numbers also serve as floats, and floats that are whole as integers."""
+    kind, name = _KINDS[type(dtype)]
+    fits = value is None or type(value) is kind
+    if fits and (kind is not int or value is None or -(2**63) <= value < 2**63):
+        return value
+    if kind is float and type(value) is int and abs(value) < 2**1023:
+        return float(value)
+    if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    raise UndecodableError(f"{_shown(value)} is not {name}")

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import polars as pl
 import pyarrow as pa
 import pyarrow.json
 
 from pipeline.ingest.generic import parse_path
+from pipeline.ingest.layout import Columns
 from pipeline.ingest.mcap_block import Messages
-from pipeline.ingest.template import Part
 
 _ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
 # Literals that pyarrow takes and JSON does not know, and `null` after an object, which pyarrow does not survive.
-_LITERALS, _AS_VALUE = ["NaN", "Inf"], r"[:,\[]\s*-?(?:NaN|Inf)"
-_NULL_AFTER = r"\}\s*null"
+_LITERALS, _AS_VALUE = (b"NaN", b"Inf"), re.compile(rb"[:,\[]\s*-?(?:NaN|Inf)")
+_NULL_AFTER = re.compile(rb"\}\s*null")
 
 
 class JsonDecoder:
@@ -34,7 +34,7 @@ class JsonDecoder:
             node["[]" if isinstance(last, int) else last] = _ARROW[type(dtype)]
         self._schema = pa.schema(list(_struct(tree)))
 
-    def decode(self, messages: Messages) -> tuple[list[Part], list[Messages]]:
+    def decode(self, messages: Messages) -> tuple[list[tuple[Messages, Columns]], list[Messages]]:
         """All messages as columns, or all of them left over."""
         content = _joined(messages)
         if content is None:
@@ -51,8 +51,7 @@ class JsonDecoder:
         if table.num_rows != len(messages):
             return [], [messages]
         frame = pl.DataFrame(pl.from_arrow(table))
-        values = frame.select(_value(path).alias(path) for path in self._types).to_dict()
-        return [Part(messages, values=values)], []
+        return [(messages, frame.select(_value(path).alias(path) for path in self._types).to_dict())], []
 
 
 def _struct(tree: Mapping[str, Any]) -> list[pa.Field]:
@@ -75,20 +74,16 @@ def _value(path: str) -> pl.Expr:
 
 def _joined(messages: Messages) -> bytes | None:
     """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
-    bounds = np.empty(2 * len(messages) + 1, dtype=np.int64)
-    bounds[0:-1:2] = messages.start
-    bounds[1::2] = messages.start + messages.length
-    bounds[-1] = bounds[-2]
-    # The texts between payloads are record heads: every other one is taken.
-    pieces = pa.LargeBinaryArray.from_buffers(
-        pa.large_binary(), 2 * len(messages), [None, pa.py_buffer(bounds), pa.py_buffer(messages.data)]
-    )
+    texts = [messages.payload(row).strip(b" \t\r\n") for row in range(len(messages))]
+    content = b"\n".join(texts)
+    strange = any(word in content for word in _LITERALS) and _AS_VALUE.search(content)
+    whole = all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
+    return content if whole and not strange and not _NULL_AFTER.search(content) and _is_utf8(content) else None
+
+
+def _is_utf8(content: bytes) -> bool:
     try:
-        binary = pl.Series(pl.from_arrow(pieces.take(pa.array(np.arange(0, 2 * len(messages), 2)))))
-        texts = binary.cast(pl.String).str.strip_chars(" \t\r\n")
-    except pl.exceptions.PolarsError:
-        return None
-    fits = texts.str.starts_with("{") & texts.str.ends_with("}") & ~texts.str.contains(_NULL_AFTER)
-    if texts.str.contains_any(_LITERALS).any():
-        fits &= ~texts.str.contains(_AS_VALUE)
-    return texts.str.join("\n").item().encode() if fits.all() else None
+        content.decode()
+    except UnicodeDecodeError:
+        return False
+    return True

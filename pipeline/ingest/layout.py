@@ -1,200 +1,168 @@
-"""Fields at fixed places of messages of one layout, and how their values are taken from many at once."""
+"""Messages of one layout decoded at once: fields gathered at fixed offsets, the rest of the layout proved.
+
+A layout is made by walking one message. It holds for another message of the same length if all bytes
+that shaped the walk (length prefixes, tags) are the same there; that is checked on every message.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from pipeline.ingest.mcap_block import Bytes
-from schemas.arrays import Bools
+from pipeline.ingest.mcap_block import Bytes, Messages, stretches_of
+from schemas.arrays import Bools, Ints
 
-Words = npt.NDArray[np.uint64]
-
-
-@dataclass(frozen=True)
-class Repeated:
-    """One value for many messages."""
-
-    value: float | str | bool | None
-    count: int
-    dtype: pl.DataType
-
-    def series(self) -> pl.Series:
-        return pl.Series([self.value], dtype=self.dtype).new_from_index(0, self.count)
-
-
-Values = npt.NDArray[Any] | pl.Series | Repeated
+_MOST_LAYOUTS = 256  # of one channel; beyond, messages are decoded one by one
+_MOST_ASIDE = 8  # messages without layout that may come before one that has a layout
+_LARGEST_LEARNT = 1 << 16  # bytes of a message that is walked to learn its layout
 
 
 class UnfitError(Exception):
     """A message or field that has no fixed layout, or not the type asked for."""
 
 
-class Rows:
-    """What a layout needs of messages of one length, side by side: stretches of bytes of each."""
-
-    def __init__(self, count: int, stretches: Sequence[tuple[int, Bytes]]) -> None:
-        self.count = count  # each stretch: its offset in the message, and one row of bytes per message
-        self.stretches = stretches
-
-    def at(self, offset: int, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """The values of `dtype` at this offset of every message."""
-        for first, content in self.stretches:
-            width = content.shape[1]
-            if first <= offset < first + width:
-                return np.ndarray((self.count,), dtype, content.data, offset=offset - first, strides=(width,))
-        raise AssertionError("a layout asks for bytes that it did not name")
-
-    def word(self, offset: int, width: int) -> Words:
-        """The `width` bytes (at most 8) from this offset on as a little-endian number."""
-        first, content = next(pair for pair in self.stretches if pair[0] <= offset < pair[0] + pair[1].shape[1])
-        if content.shape[1] < 8:
-            content = np.pad(content, ((0, 0), (8 - content.shape[1], 0)))
-            first = offset + width - 8
-        start = min(offset, first + content.shape[1] - 8)
-        words: Words = Rows(self.count, [(first, content)]).at(start, "<u8") >> np.uint64(8 * (offset - start))
-        return words & np.uint64(2 ** (8 * width) - 1)
-
-    def chosen(self, rows: Bools) -> Rows:
-        return Rows(int(rows.sum()), [(first, content[rows]) for first, content in self.stretches])
-
-
-def joined_rows(parts: Sequence[Rows]) -> Rows:
-    """Messages of one layout together."""
-    if len(parts) == 1:
-        return parts[0]
-    stretches = [
-        (first, np.concatenate([part.stretches[number][1] for part in parts]))
-        for number, (first, _) in enumerate(parts[0].stretches)
-    ]
-    return Rows(sum(part.count for part in parts), stretches)
-
-
 @dataclass(frozen=True)
-class Fixed:
-    """A number of fixed width."""
+class Field:
+    """Where a value lies in each message (up to `end`), and how it is taken from rows of their bytes."""
 
-    offset: int
-    dtype: str
+    kind: type[pl.DataType]
+    end: int
+    take: Callable[[Bytes], pl.Series]
 
-    @property
-    def end(self) -> int:
-        return self.offset + int(self.dtype[2:])
+    def as_type(self, dtype: pl.DataType) -> Field:
+        """The field, if its values are of the kind asked for (whole numbers also serve as floats)."""
+        if isinstance(dtype, self.kind) or (self.kind is pl.Int64 and isinstance(dtype, pl.Float64)):
+            return self
+        raise UnfitError(f"not of type {dtype}")
 
-    def values(self, rows: Rows) -> Values:
-        return rows.at(self.offset, self.dtype)
+
+def fixed(offset: int, dtype: str) -> Field:
+    """A number of fixed width, as numpy names it (`<f8`)."""
+    end = offset + int(dtype[2:])
+
+    def take(rows: Bytes) -> pl.Series:
+        values = np.ascontiguousarray(rows[:, offset:end]).view(dtype)[:, 0]
+        return pl.Series(values.astype(values.dtype.newbyteorder("=")))
+
+    return Field(pl.Float64 if dtype[1] == "f" else pl.Int64, end, take)
 
 
-@dataclass(frozen=True)
-class Flag:
+def flag(offset: int) -> Field:
     """A boolean in one byte."""
-
-    offset: int
-
-    @property
-    def end(self) -> int:
-        return self.offset + 1
-
-    def values(self, rows: Rows) -> Values:
-        flags: Bools = rows.at(self.offset, "u1") != 0
-        return flags
+    return Field(pl.Boolean, offset + 1, lambda rows: pl.Series(rows[:, offset] != 0))
 
 
-@dataclass(frozen=True)
-class Varint:
-    """A protobuf varint of known width; `zigzag` for sint32 and sint64."""
-
-    offset: int
-    width: int
-    bits: int
-    signed: bool
-    zigzag: bool = False
-
-    @property
-    def end(self) -> int:
-        return self.offset + self.width
-
-    def values(self, rows: Rows) -> Values:
-        total = _septets(rows.word(self.offset, min(self.width, 8)))
-        for place in range(8, self.width):
-            total |= (rows.at(self.offset + place, "u1") & 0x7F).astype(np.uint64) << np.uint64(7 * place)
-        if self.zigzag:
-            return (total >> np.uint64(1)).astype(np.int64) ^ -(total & np.uint64(1)).astype(np.int64)
-        if self.bits == 32:
-            return total.astype(np.uint32).astype(np.int32 if self.signed else np.uint32)
-        return total.astype(np.int64) if self.signed else total
-
-
-def _septets(words: Words) -> Words:
-    """The lower seven bits of each of eight bytes, closed up."""
-    words &= np.uint64(0x7F7F7F7F7F7F7F7F)
-    for bits, low in ((1, 0x007F007F007F007F), (2, 0x00003FFF00003FFF), (4, 0x000000000FFFFFFF)):
-        high = np.uint64(low << (8 * bits))
-        words = (words & np.uint64(low)) | ((words & high) >> np.uint64(bits))
-    return words
-
-
-@dataclass(frozen=True)
-class Text:
+def text(offset: int, length: int) -> Field:
     """A text of known length."""
 
-    offset: int
-    length: int
-
-    @property
-    def end(self) -> int:
-        return self.offset + self.length
-
-    def values(self, rows: Rows) -> Values:
-        if self.length == 0:
-            return pl.Series([""], dtype=pl.String).new_from_index(0, rows.count)
-        content = np.ascontiguousarray(rows.at(self.offset, f"V{self.length}"))
-        offsets = np.arange(rows.count + 1, dtype=np.int64) * self.length
-        texts = pa.LargeStringArray.from_buffers(rows.count, pa.py_buffer(offsets), pa.py_buffer(content))
+    def take(rows: Bytes) -> pl.Series:
+        content = pa.py_buffer(np.ascontiguousarray(rows[:, offset : offset + length]))
+        ends = pa.py_buffer(np.arange(len(rows) + 1, dtype=np.int64) * length)
+        texts = pa.LargeStringArray.from_buffers(len(rows), ends, content)
         try:
             texts.validate(full=True)  # refuses what is not UTF-8
         except pa.ArrowInvalid:
             raise UnfitError("a text is not UTF-8") from None
         return pl.Series(pl.from_arrow(texts))
 
+    return Field(pl.String, offset + length, take)
+
+
+def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
+    """A field that messages of this layout leave out: its default, or null."""
+    return Field(
+        type(dtype), 0, lambda rows: pl.Series([value], dtype=dtype, strict=False).new_from_index(0, len(rows))
+    )
+
 
 @dataclass(frozen=True)
-class Constant:
-    """A field that messages of this layout leave out: its default, or null."""
+class Layout:
+    """Of messages of one length: the fields, and the bytes `at` which messages must agree under a mask."""
 
-    value: float | str | bool | None
-    dtype: pl.DataType
-
-    @property
-    def offset(self) -> int:
-        return 0
+    fields: Mapping[str, Field]
+    at: Ints
+    mask: Bytes
+    expected: Bytes
 
     @property
     def end(self) -> int:
-        return 0  # takes no bytes of the message
+        """Behind the last byte that is looked at."""
+        ends = [field.end for field in self.fields.values()]
+        return max(1, *ends, int(self.at.max(initial=0)) + 1)
 
-    def values(self, rows: Rows) -> Values:
-        return Repeated(self.value, rows.count, self.dtype)
+    def of(self, rows: Bytes) -> Bools:
+        """Whether each message has this layout."""
+        agree: Bools = (rows[:, self.at] & self.mask == self.expected).all(axis=1)
+        return agree
 
 
-Field = Fixed | Flag | Varint | Text | Constant
+def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) -> Layout:
+    """From one message; `static` masks the bits that shape the layout."""
+    mask = np.frombuffer(static, dtype=np.uint8)
+    at = np.flatnonzero(mask)
+    return Layout(fields, at, mask[at], np.frombuffer(payload, dtype=np.uint8)[at] & mask[at])
 
 
-def check_type(field: Field, dtype: pl.DataType) -> Field:
-    """The field, if its values are of the kind asked for (whole numbers also serve as floats)."""
-    number = isinstance(field, Varint) or (isinstance(field, Fixed) and field.dtype[1] in "iu")
-    fits = {
-        pl.Float64: isinstance(field, Fixed) or number,
-        pl.Int64: number,
-        pl.Boolean: isinstance(field, Flag),
-        pl.String: isinstance(field, Text),
-    }
-    if isinstance(field, Constant) or fits[type(dtype)]:
-        return field
-    raise UnfitError(f"not of type {dtype}")
+Columns = Mapping[str, pl.Series]
+
+
+class LayoutDecoder:
+    """Decodes the messages of a channel by their layouts, which it learns as they come."""
+
+    def __init__(self, walk: Callable[[bytes], Layout], types: Mapping[str, pl.DataType]) -> None:
+        self._walk = walk
+        self._types = types
+        self._layouts: dict[int, list[Layout]] = {}
+        self._count = 0
+
+    def decode(self, messages: Messages) -> tuple[list[tuple[Messages, Columns]], list[Messages]]:
+        """Messages whose layout is known with their fields, and those that no layout fits."""
+        parts: list[tuple[Messages, Columns]] = []
+        left: list[Messages] = []
+        for length in np.unique(messages.length).tolist():
+            for layout, group, rows in self._by_layout(length, messages.chosen(messages.length == length), left):
+                try:
+                    values = {path: field.take(rows) for path, field in layout.fields.items()}
+                    parts.append((group, {path: values[path].cast(dtype) for path, dtype in self._types.items()}))
+                except (UnfitError, pl.exceptions.PolarsError):  # the ordinary decoder says why
+                    left.append(group)
+        return parts, left
+
+    def _by_layout(
+        self, length: int, messages: Messages, aside: list[Messages]
+    ) -> Iterator[tuple[Layout, Messages, Bytes]]:
+        """Messages of one length by their layouts, and their bytes; those without one into `aside`."""
+        known = self._layouts.setdefault(length, [])
+        tried = 0
+        while len(messages):
+            if tried == len(known) and not self._learn(messages.payload(0), known):
+                if len(aside) >= _MOST_ASIDE:
+                    aside.append(messages)
+                    return
+                aside.append(messages.chosen(slice(1)))
+                messages = messages.chosen(slice(1, None))
+                continue
+            layout = known[tried]
+            tried += 1
+            rows = stretches_of(messages.data, messages.start, layout.end)
+            agree = layout.of(rows)
+            if agree.all():
+                yield layout, messages, rows
+                return
+            if agree.any():
+                yield layout, messages.chosen(agree), rows[agree]
+            messages = messages.chosen(~agree)
+
+    def _learn(self, payload: bytes, known: list[Layout]) -> bool:
+        if self._count >= _MOST_LAYOUTS or len(payload) > _LARGEST_LEARNT:
+            return False
+        try:
+            known.append(self._walk(payload))
+        except UnfitError:
+            return False
+        self._count += 1
+        return True

@@ -2,109 +2,178 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from mcap.opcode import Opcode
 
-from pipeline.ingest.mcap_records import HEAD_SIZE, DamageError, Op
-from schemas.arrays import Ints
+from pipeline.ingest.mcap_records import HEAD, HEAD_SIZE, DamageError
+from schemas.arrays import Bools, Ints
 
 Bytes = npt.NDArray[np.uint8]
+OnRecord = Callable[[int, bytes, int], None]  # opcode, content, offset of its chunk in the file
 
 # A message record: opcode, length, channel, sequence, log time, publish time, then the payload.
 MESSAGE_HEAD = np.dtype(
     {
-        "names": ["opcode", "length", "channel", "log_time", "publish_time"],
-        "formats": ["u1", "<u8", "<u2", "<i8", "<i8"],
-        "offsets": [0, 1, 9, 15, 23],
+        "names": ["length", "channel", "log_time", "publish_time"],
+        "formats": ["<u8", "<u2", "<i8", "<i8"],
+        "offsets": [1, 9, 15, 23],
         "itemsize": 31,
     }
 )
-MESSAGE_HEAD_SIZE = MESSAGE_HEAD.itemsize
-_MESSAGE = int(Op.MESSAGE)
-_FIXED_FIELDS = MESSAGE_HEAD_SIZE - HEAD_SIZE
-Locate = Callable[[int], int]  # place in a block to place in the file
+_FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
 
 
 @dataclass(frozen=True)
 class Messages:
     """Messages of one channel in a block, in order of the file: where their payloads lie in `data`.
 
-    `ordinal` orders messages of all channels of the log as they stand in the file.
+    `ordinal` orders messages of all channels of the log as they stand in the file; times are in nanoseconds.
     """
 
     data: Bytes
     start: Ints
     length: Ints
     ordinal: Ints
-    heads: npt.NDArray[Any]  # of more messages than these, where `picked` tells which
-    picked: Ints | None = None
+    log_time: Ints
+    publish_time: Ints
 
     def __len__(self) -> int:
         return len(self.start)
-
-    def times(self, name: str) -> Ints:
-        """`log_time` or `publish_time` [ns]."""
-        times: Ints = self.heads[name].astype(np.int64)
-        if self.picked is not None:
-            times = times[self.picked]
-        return times
 
     def payload(self, row: int) -> bytes:
         first = int(self.start[row])
         return self.data[first : first + int(self.length[row])].tobytes()
 
-    def chosen(self, rows: npt.NDArray[Any]) -> Messages:
-        """Some of them, by mask or number."""
-        if rows.dtype == np.bool_:
-            rows = np.flatnonzero(rows)
-        picked = rows if self.picked is None else self.picked[rows]
-        return Messages(self.data, self.start[rows], self.length[rows], self.ordinal[rows], self.heads, picked)
+    def chosen(self, rows: Ints | Bools | slice) -> Messages:
+        """Some of them."""
+        columns = (self.start, self.length, self.ordinal, self.log_time, self.publish_time)
+        return Messages(self.data, *(column[rows] for column in columns))
 
 
 Block = dict[int, Messages]  # by channel
 
 
-def gathered(data: Bytes, starts: Ints, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """Values of `dtype` that stand at arbitrary byte offsets; the offsets must have been checked."""
-    kind = np.dtype(dtype)
-    return stretches_of(data, starts, kind.itemsize).reshape(-1).view(kind)
-
-
 def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
-    """`width` bytes from each of these offsets on, one row each."""
+    """`width` bytes from each of these offsets on, one row each; the offsets must have been checked."""
     # As plain bytes: numpy gathers structured values five times slower, field by field.
     every_offset = np.ndarray((len(data) - width + 1,), f"V{width}", data.data, strides=(1,))
     return every_offset[starts].view(np.uint8).reshape(-1, width)
 
 
-def block_of(data: Bytes, starts: Ints, locate: Locate, first_ordinal: int) -> Block:
-    """The messages at these record offsets, by channel."""
+@dataclass(frozen=True)
+class Piece:
+    """Records side by side, as of one chunk, and where messages begin among them; `offset`: its place in the file."""
+
+    data: Bytes
+    starts: Ints
+    offset: int
+
+    @cached_property
+    def entries(self) -> tuple[npt.NDArray[np.uint16], Ints]:
+        """What message indexes must say: channel, and pairs of log time and offset, by channel."""
+        heads = _heads(self.data, self.starts)
+        order = np.argsort(heads["channel"], kind="stable")
+        return heads["channel"][order], np.column_stack([heads["log_time"], self.starts])[order]
+
+    def check_index(self, channel: int, entries: bytes) -> None:
+        """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
+        channels, found = self.entries
+        first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
+        told = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
+        if not np.array_equal(told[np.argsort(told[:, 1], kind="stable")], found[first:end]):
+            raise DamageError(self.offset, "a message index disagrees with its chunk")
+
+
+@dataclass
+class Allowance:
+    """How many records more the chunks of a log may hold.
+
+    Every record that a recorder writes takes bytes of the file even when it is compressed, for its time differs; so
+    the work stays in proportion to the file, whatever a few bytes unpack to.
+    """
+
+    left: int
+
+
+def piece_of_chunk(content: Any, offset: int, on_record: OnRecord, allowance: Allowance) -> Piece:
+    """The messages of a chunk, which its records must fill exactly; other records go to `on_record`."""
+    view, unpack, message = memoryview(content), HEAD.unpack_from, int(Opcode.MESSAGE)
+    starts = array("q")
+    at, room, keep = 0, len(view) - HEAD_SIZE, starts.append
+    for left in range(allowance.left, -1, -1):
+        if at > room:
+            allowance.left = left
+            break
+        opcode, length = unpack(view, at)
+        if opcode == message:
+            keep(at)
+        elif at + length <= room:
+            on_record(opcode, bytes(view[at + HEAD_SIZE :][:length]), offset)
+        at += HEAD_SIZE + length
+    else:
+        raise DamageError(offset, "a chunk unpacks to more records than the file has bytes")
+    if at != len(view):
+        how = "is cut off by" if at < len(view) else "runs past"
+        raise DamageError(offset, f"a record {how} the end of its chunk")
+    return _piece(content, starts, offset)
+
+
+def piece_of_messages(content: bytes, offset: int) -> Piece:
+    """The whole messages outside of chunks that this part of the file begins with."""
+    unpack, message = HEAD.unpack_from, int(Opcode.MESSAGE)
+    starts = array("q")
+    at, room = 0, len(content) - HEAD_SIZE
+    while at <= room:
+        opcode, length = unpack(content, at)
+        if opcode != message or at + length > room:
+            break
+        starts.append(at)
+        at += HEAD_SIZE + length
+    return _piece(memoryview(content)[:at], starts, offset)
+
+
+def _piece(content: Any, starts: array[int], offset: int) -> Piece:
+    data = np.frombuffer(content, dtype=np.uint8)
+    found = np.frombuffer(starts, dtype=np.int64) if starts else np.empty(0, dtype=np.int64)
+    lengths = stretches_of(data, found + 1, 8).view("<u8") if starts else found
+    if (lengths < _FIXED_FIELDS).any():
+        raise DamageError(offset, "a message is shorter than its header")
+    return Piece(data, found, offset)
+
+
+def _heads(data: Bytes, starts: Ints) -> npt.NDArray[Any]:
+    if not len(starts):
+        return np.empty(0, dtype=MESSAGE_HEAD)
+    return stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
+
+
+def block_of(pieces: list[Piece], first_ordinal: int) -> Block:
+    """The messages of neighbouring pieces, by channel."""
+    sizes = [len(piece.data) for piece in pieces]
+    data = pieces[0].data if len(pieces) == 1 else np.concatenate([piece.data for piece in pieces])
+    bases = np.cumsum([0, *sizes[:-1]])
+    starts = np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)])
     if not len(starts):
         return {}
-    if starts.max() > len(data) - MESSAGE_HEAD_SIZE:
-        raise DamageError(locate(int(starts.max())), "a message is shorter than its header")
-    heads = gathered(data, starts, MESSAGE_HEAD)
+    heads = _heads(data, starts)
     order = np.argsort(heads["channel"], kind="stable")
     starts, heads = starts[order], heads[order]
-    lengths = heads["length"].astype(np.int64)
     firsts = np.flatnonzero(np.diff(heads["channel"].astype(np.int64), prepend=-1)).tolist()
     return {
-        int(heads["channel"][first]): messages_of(
-            data, starts[first:end], lengths[first:end], heads[first:end], locate, first_ordinal
+        int(heads["channel"][first]): Messages(
+            data,
+            starts[first:end] + MESSAGE_HEAD.itemsize,
+            heads["length"][first:end].astype(np.int64) - _FIXED_FIELDS,
+            starts[first:end] + first_ordinal,
+            heads["log_time"][first:end].astype(np.int64),
+            heads["publish_time"][first:end].astype(np.int64),
         )
         for first, end in zip(firsts, [*firsts[1:], len(starts)], strict=True)
     }
-
-
-def messages_of(
-    data: Bytes, starts: Ints, lengths: Ints, heads: npt.NDArray[Any], locate: Locate, first_ordinal: int
-) -> Messages:
-    """Messages of one channel, whose heads were gathered; `lengths` are those of the records."""
-    lengths = lengths - _FIXED_FIELDS
-    if lengths.min() < 0:
-        raise DamageError(locate(int(starts[lengths.argmin()])), "a message is shorter than its header")
-    return Messages(data, starts + MESSAGE_HEAD_SIZE, lengths, starts + first_ordinal, heads)

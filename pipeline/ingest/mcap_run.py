@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+import hashlib
+import io
+from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
 import polars as pl
-from isal.isal_zlib import crc32
 
 from pipeline.ingest.assemble import Decoded, stream_frames
-from pipeline.ingest.breaches import Breach, refuse
-from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.digest import BackgroundDigest
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.generic import UndecodableError, decoder_for, undecodable
 from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
@@ -97,16 +95,8 @@ def sample_of(messages: Messages, channel: Channel) -> Sample:
 
 def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> RunLog:
     """All streams of a log, read strictly from front to back in pieces."""
-    if not with_digest:
-        return _read(path, config, lambda _: None)
-    with BackgroundDigest() as digest:
-        run = _read(path, config, digest.update)
-        return replace(run, input_digest=digest.hexdigest())
-
-
-def _read(path: Address, config: IngestConfig, on_bytes: Callable[[memoryview], object]) -> RunLog:
     streams = McapStreams(config)
-    walk = walk_log(path, config, streams, on_bytes)
+    walk, digest = walk_log(path, config, streams, with_digest)
     frames, slow_messages, left_over = _frames(path, config, walk, streams)
     return RunLog(
         run_id=stem_of(path),
@@ -117,7 +107,7 @@ def _read(path: Address, config: IngestConfig, on_bytes: Callable[[memoryview], 
             chunks_without_crc=walk.without_crc,
             skipped_topics=left_over,
         ),
-        input_digest="",
+        input_digest=digest,
         **frames,
     )
 
@@ -127,50 +117,26 @@ class BlockSink(Protocol):
 
 
 def walk_log(
-    path: Address, config: IngestConfig, streams: BlockSink, on_bytes: Callable[[memoryview], object]
-) -> McapWalk:
-    """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind."""
-    limit = int(config.chunk_limit_mib * _MIB)
+    path: Address, config: IngestConfig, streams: BlockSink, with_digest: bool = False
+) -> tuple[McapWalk, str]:
+    """Walk the whole log into `streams`; damage becomes one error that names file, byte and kind.
+
+    `with_digest`: also the SHA-256 of the file, else an empty text.
+    """
     try:
-        with files.open_binary(path) as stream:
-            window = ByteWindow(stream, files.size_of(path), on_bytes)
-            walk = McapWalk(window, str(path), limit)
+        with files.open_binary(path) as raw, io.BufferedReader(raw, _MIB) as stream:  # type: ignore[type-var]
+            size = stream.seek(0, io.SEEK_END)
+            walk = McapWalk(stream, size, str(path), int(config.chunk_limit_mib * _MIB))
             for block in walk.blocks():
                 streams.add(block, walk.channels)
-            window.drain()
-        _check_data_crc(path, walk)
+            stream.seek(0)
+            return walk, hashlib.file_digest(stream, "sha256").hexdigest() if with_digest else ""
     except DamageError as damage:
         raise InputError(
             str(damage), place=str(path), remedy="Record or copy the log again, or try `mcap recover`."
         ) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error}", place=str(path)) from None
-    return walk
-
-
-def _check_data_crc(path: Address, walk: McapWalk) -> None:
-    """The checksum over the whole data section, which few recorders write.
-
-    The Rust writer leaves the contents of chunks out of it when it is told to give chunks no checksums.
-    """
-    expected, end = walk.data_crc
-    if not expected or _crc_of(path, end, []) == expected:
-        return
-    if not walk.without_own_crc or _crc_of(path, end, walk.without_own_crc) != expected:
-        raise DamageError(end, "the checksum of the data section does not match")
-    walk.crc_covers_chunks = False
-
-
-def _crc_of(path: Address, end: int, left_out: Sequence[int]) -> int:
-    """CRC-32 of the file up to `end`, without some parts (each from and to)."""
-    crc, at = 0, 0
-    with files.open_binary(path) as stream:
-        for stop, resume in zip([*left_out[::2], end], [*left_out[1::2], end], strict=True):
-            while at < stop and (piece := stream.read(min(stop - at, 4 * _MIB))):
-                crc = crc32(piece, crc)
-                at += len(piece)
-            at = stream.seek(resume)
-    return crc
 
 
 def _frames(
@@ -190,7 +156,7 @@ def _frames(
     used = {source.channel.topic for source in settled}
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
-    breaches: list[Breach] = []
+    breaches: list[InputError] = []
     remarks: list[str] = []
     frames = stream_frames(decoded, breaches, config.wrong_dates_share, remarks)
     if "gnss" not in frames:
@@ -199,16 +165,16 @@ def _frames(
     return frames, slow_messages, (*left_over, *remarks)
 
 
-def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Breach:
+def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> InputError:
     if walk.cut_at is not None and not walk.met.message_counts:
-        return Breach(
-            str(path),
+        return InputError(
             f"is cut off at byte {walk.cut_at}, before any complete message",
+            place=str(path),
             remedy="Record or copy the log again.",
         )
-    return Breach(
-        str(path),
+    return InputError(
         "holds no GNSS stream",
+        place=str(path),
         found=", ".join(left_over[:40]) or "no messages",
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",

@@ -4,32 +4,35 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from struct import Struct
 
-import numpy as np
 from isal.isal_zlib import crc32
-from mcap.records import ChunkIndex, Footer, Statistics
+from mcap.opcode import Opcode
+from mcap.records import Chunk, ChunkIndex, Footer, Statistics
 
-from pipeline.ingest.byte_window import ByteWindow
-from pipeline.ingest.mcap_records import HEAD_SIZE, MAGIC, DamageError, Op, parse
-
-# Of a chunk: first and last time, offset, length, compressed size, size, compression. Packed, for a log may have a
-# million.
-CHUNK_ENTRY = np.dtype(
-    [(name, "<u8") for name in ("start", "end", "offset", "length", "compressed", "size")] + [("compression", "S16")]
-)
-_ENTRY = Struct("<6Q16s")
+from pipeline.ingest.mcap_records import HEAD_SIZE, DamageError, parse
 
 
 @dataclass
 class Met:
-    """What the walk counted on its way."""
+    """What the walk counted on its way.
+
+    `chunk_sum` adds up what a chunk index must say of each chunk, in any order: a log may have a million of them.
+    """
 
     message_counts: Counter[int] = field(default_factory=Counter)
-    chunks: bytearray = field(default_factory=bytearray)  # entries of `CHUNK_ENTRY`
+    chunks: int = 0
+    chunk_sum: int = 0
     attachments: int = 0
     metadata: int = 0
     span_ns: tuple[int, int] | None = None
+
+    def add_chunk(self, chunk: Chunk, offset: int, length: int) -> None:
+        """A chunk whose record has this offset and length."""
+        start_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+        self.chunks += 1
+        self.chunk_sum += hash(
+            (start_ns, end_ns, offset, length, len(chunk.data), chunk.uncompressed_size, chunk.compression)
+        )
 
     def add_times(self, low_ns: int, high_ns: int) -> None:
         old = self.span_ns or (low_ns, high_ns)
@@ -43,22 +46,28 @@ class Summary:
         self._start = start
         self._met = met
         self._crc = 0
-        self._indexed = bytearray()
+        self._indexed = 0
+        self._index_sum = 0
 
-    def add(self, opcode: int, whole: memoryview, position: int) -> None:
+    def add(self, opcode: int, whole: bytes, position: int) -> None:
         """A record before the footer."""
         self._crc = crc32(whole, self._crc)
-        if opcode == Op.CHUNK_INDEX:
-            self._indexed += _entry_of(parse(ChunkIndex, whole[HEAD_SIZE:], position))
-        elif opcode == Op.STATISTICS:
+        if opcode == Opcode.CHUNK_INDEX:
+            told = parse(ChunkIndex, whole[HEAD_SIZE:], position)
+            span_ns = (told.message_start_time, told.message_end_time)
+            place = (told.chunk_start_offset, told.chunk_length)
+            content = (told.compressed_size, told.uncompressed_size, told.compression)
+            self._indexed += 1
+            self._index_sum += hash((*span_ns, *place, *content))
+        elif opcode == Opcode.STATISTICS:
             self._check_statistics(parse(Statistics, whole[HEAD_SIZE:], position), position)
 
     def _check_statistics(self, told: Statistics, position: int) -> None:
         met = self._met
         per_channel = {channel: count for channel, count in told.channel_message_counts.items() if count}
-        pairs = [
+        pairs: list[tuple[str, object, object]] = [
             ("messages", told.message_count, met.message_counts.total()),
-            ("chunks", told.chunk_count, len(met.chunks) // CHUNK_ENTRY.itemsize),
+            ("chunks", told.chunk_count, met.chunks),
             ("attachments", told.attachment_count, met.attachments),
             ("metadata records", told.metadata_count, met.metadata),
             ("messages per channel", per_channel or dict(met.message_counts), dict(met.message_counts)),
@@ -71,57 +80,13 @@ class Summary:
             if expected != found:
                 raise DamageError(position, f"the statistics record gives {expected} {name}, the file holds {found}")
 
-    def finish(self, footer: memoryview, position: int, window: ByteWindow) -> int | None:
-        """The footer and the end of the file; the offset of a cut through the closing magic, if there is one."""
+    def finish(self, footer: bytes, position: int) -> None:
+        """The footer. A chunk index lists every chunk once, or there is none."""
         told = parse(Footer, footer[HEAD_SIZE:], position)
-        start, crc = told.summary_start, told.summary_crc
-        met = self._start if position != self._start else 0
-        if start != met:
-            raise DamageError(position, f"the footer places the summary at {start}, it is at {met}")
-        if crc and crc32(footer[:-4], self._crc) != crc:
+        start = self._start if position != self._start else 0
+        if told.summary_start != start:
+            raise DamageError(position, f"the footer places the summary at {told.summary_start}, it is at {start}")
+        if told.summary_crc and crc32(footer[:-4], self._crc) != told.summary_crc:
             raise DamageError(position, "the checksum of the summary does not match")
-        cut_at = _check_end(position + len(footer), window)
-        self._check_chunk_index(position)
-        return cut_at
-
-    def _check_chunk_index(self, position: int) -> None:
-        """A chunk index lists every chunk once, or there is none."""
-        if not self._indexed:
-            return
-        told, chunks = (np.frombuffer(entries, dtype=CHUNK_ENTRY) for entries in (self._indexed, self._met.chunks))
-        told = told[np.argsort(told["offset"], kind="stable")]
-        if not np.array_equal(told["offset"], chunks["offset"]):
-            kind = f"the chunk index names {len(told)} chunks, but the file has {len(chunks)}"
-            raise DamageError(position, kind)
-        if (told != chunks).any():
+        if self._indexed and (self._indexed, self._index_sum) != (self._met.chunks, self._met.chunk_sum):
             raise DamageError(position, "the chunk index disagrees with the chunks")
-
-
-def chunk_entry(start: int, end: int, offset: int, length: int, compressed: int, size: int, compression: str) -> bytes:
-    """What a chunk index says of a chunk, to be compared."""
-    return _ENTRY.pack(start, end, offset, length, compressed, size, compression.encode())
-
-
-def _entry_of(index: ChunkIndex) -> bytes:
-    return chunk_entry(
-        index.message_start_time,
-        index.message_end_time,
-        index.chunk_start_offset,
-        index.chunk_length,
-        index.compressed_size,
-        index.uncompressed_size,
-        index.compression,
-    )
-
-
-def _check_end(end: int, window: ByteWindow) -> int | None:
-    """The closing magic and nothing after it; the offset of a cut through it."""
-    left = min(len(MAGIC), window.size - end)
-    closing = bytes(window.at(end, left)) if left else b""
-    if not MAGIC.startswith(closing):
-        raise DamageError(end, "the magic bytes at the end are wrong")
-    if closing != MAGIC:
-        return end
-    if end + len(MAGIC) != window.size:
-        raise DamageError(end + len(MAGIC), "there is data after the end of the file: two files may have been joined")
-    return None

@@ -7,11 +7,12 @@ from collections.abc import Iterable
 
 import polars as pl
 
-from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.conform import conform
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
 from pipeline.storage.parquet import ParquetError, Schema, read_parquet, without_checksums
+from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
@@ -19,7 +20,7 @@ from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 def read_folder(path: Address, with_digest: bool = True) -> RunLog:
     """A folder `RUN/` of `gnss.parquet`, `odometer.parquet`, ...; every breach of every file in one error."""
     present = set(files.list_dir(path))
-    breaches: list[Breach] = []
+    breaches: list[InputError] = []
     if "gnss.parquet" not in present:
         breaches.append(_no_gnss(path, present))
     digest = hashlib.sha256()
@@ -49,19 +50,19 @@ def read_folder(path: Address, with_digest: bool = True) -> RunLog:
     )
 
 
-def _no_gnss(path: Address, present: set[str]) -> Breach:
-    return Breach(
-        str(path),
+def _no_gnss(path: Address, present: set[str]) -> InputError:
+    return InputError(
         "holds no GNSS stream",
+        place=str(path),
         found=", ".join(sorted(present)[:10]) or "an empty folder",
         expected="gnss.parquet",
         remedy="Give a run folder or an MCAP file; `balise convert` makes runs of receiver logs.",
     )
 
 
-def _read(content: bytes, stream: Stream, place: str, breaches: list[Breach]) -> pl.DataFrame | None:
+def _read(content: bytes, stream: Stream, place: str, breaches: list[InputError]) -> pl.DataFrame | None:
     if not content:
-        breaches.append(Breach(place, "is empty", found="0 bytes", expected="a Parquet file"))
+        breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
     contract = STREAM_SCHEMAS[stream].columns()
     met: Schema = {}
@@ -73,7 +74,9 @@ def _read(content: bytes, stream: Stream, place: str, breaches: list[Breach]) ->
     try:
         frame = read_parquet(content, known)
     except ParquetError as error:
-        breaches.append(Breach(place, f"cannot be read as Parquet ({error})", remedy="Record or copy the file again."))
+        breaches.append(
+            InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
+        )
         return None
     return frame.with_columns(pl.lit(None).alias(name) for name in _others(met, stream))
 

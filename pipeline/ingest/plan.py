@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from pipeline.ingest.breaches import Breach
 from pipeline.ingest.generic import protobuf_descriptor
 from pipeline.ingest.inventory import stamp_parts
 from pipeline.ingest.mapping import mapped_recipe, mappings_of
@@ -16,6 +15,7 @@ from pipeline.ingest.recipe import Recipe
 from pipeline.ingest.recipes import recipes_for
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, time_source
 from schemas.config import IngestConfig, StreamMapping
+from schemas.errors import InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
@@ -45,7 +45,7 @@ class Source:
     times: Mapping[str, TimeSource | CivilTime]
     types: Mapping[str, pl.DataType]
     solution: str | None = None
-    breaches: tuple[Breach, ...] = ()
+    breaches: tuple[InputError, ...] = ()
     mapped: bool = False
     doubtful: Mapping[str, str] = field(default_factory=dict)
     implicit: tuple[str, ...] = ()
@@ -107,7 +107,7 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
     contract = STREAM_SCHEMAS[recipe.stream].columns()
     closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
     columns: dict[str, pl.Expr] = {}
-    breaches: list[Breach] = []
+    breaches: list[InputError] = []
     doubtful: dict[str, str] = {}
     for name, expression in recipe.columns.items():
         absent = [path for path in recipe.fields_of(name) if not _is_there(sample, recipe, path)]
@@ -155,17 +155,17 @@ def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
     )
 
 
-def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> Breach:
-    return Breach(
-        channel.place,
+def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> InputError:
+    return InputError(
         f"has no field {', '.join(absent)} for column {column}",
+        place=channel.place,
         found=", ".join(list(fields)[:40]) or None,
         remedy="Name the field of this column in `fields` of [ingest] in the configuration.",
     )
 
 
 def _times(
-    sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[Breach]
+    sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[InputError]
 ) -> dict[str, TimeSource | CivilTime]:
     """The time of validity, and further times (end of a fault), which look like it and may be absent."""
     if recipe.time is not None and (mapping is None or mapping.time == "auto"):
@@ -176,7 +176,7 @@ def _times(
     return {column: first, **extra}
 
 
-def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[Breach]) -> TimeSource:
+def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[InputError]) -> TimeSource:
     """The time of validity: as configured, else the payload's stamp, else the log time."""
     wanted = mapping.time if mapping else "auto"
     log_time = time_source((LOG_TIME,), {LOG_TIME: "int"}, mapping)
@@ -192,7 +192,7 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
             return time_source(parts, sample.fields, mapping)
         if unfit and named:
             place = f"{sample.channel.place}: field {candidate}"
-            breaches.append(Breach(place, "is not a time", found=unfit[0], expected="numbers or text"))
+            breaches.append(InputError("is not a time", place=place, found=unfit[0], expected="numbers or text"))
             return log_time
     if named:
         breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))

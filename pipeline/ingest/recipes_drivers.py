@@ -143,12 +143,12 @@ def _nav_pvt(h_acc: str, v_acc: str, velocity: tuple[str, str, str], satellites:
 
 
 # RINEX letters of u-blox gnssId (interface description, "GNSS identifiers").
-_UBX_SYSTEMS = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
+UBX_SYSTEMS = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
 
 
 def _nav_sat(stamps: dict[str, str], rows: str, used: pl.Expr, types: dict[str, pl.DataType]) -> Recipe:
     """UBX-NAV-SAT: one row per satellite; SBAS numbers are PRN, of which RINEX takes 100 off."""
-    system = pl.col("gnss_id").replace_strict(_UBX_SYSTEMS, default=None, return_dtype=pl.String)
+    system = pl.col("gnss_id").replace_strict(UBX_SYSTEMS, default=None, return_dtype=pl.String)
     number = pl.when(pl.col("gnss_id") == 1).then(pl.col("sv_id") - 100).otherwise(pl.col("sv_id"))
     return Recipe(
         stream="satellites",

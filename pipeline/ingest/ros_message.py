@@ -8,7 +8,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 PRIMITIVES = {
     "bool": "u1", "byte": "u1", "char": "i1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
@@ -87,38 +87,30 @@ def _member(line: str, package: str) -> Member | None:
     return Member(match["name"], kind, int(size[1:-1]) if size[1:-1].isdigit() else 0)
 
 
+class Place(NamedTuple):
+    """Where a field lies: a number or flag, `size` of them in an array, or the bytes of a text."""
+
+    kind: str
+    offset: int
+    size: int | None
+
+
 class RosWalk:
     """One message of CDR, front to back, as a dict; numbers are aligned to their size, counted from behind the header.
 
-    What it meets on its way goes to `on_number`, `on_length` and `on_text`, with their places in the message. Raises
-    `DefinitionError` where the message does not follow its definition.
+    `places` and `lengths` tell where its fields and the lengths that shape it were met. Raises `DefinitionError` where
+    the message does not follow its definition.
     """
-
-    most_elements: int | None = None  # of an array of messages
 
     def __init__(self, payload: bytes, definitions: Mapping[str, Definition]) -> None:
         if len(payload) < HEADER_SIZE or payload[0] != 0 or payload[1] not in (0, 1):
             raise DefinitionError(f"encapsulation 0x{payload[:2].hex()} is not plain CDR")
-        self.payload = payload
         self.little = bool(payload[1])
+        self.places: dict[str, Place] = {}
+        self.lengths: list[int] = []
+        self._payload = payload
         self._definitions = definitions
         self._at = HEADER_SIZE
-
-    def on_number(self, path: str, kind: str, offset: int, count: int | None) -> None:
-        """A number or flag, or an array of `count` of them."""
-
-    def on_length(self, offset: int) -> None:
-        """A length, which shapes what follows."""
-
-    def on_text(self, path: str, offset: int, length: int) -> str:
-        """A text with its closing zero, which programs leave out where there is no text."""
-        content = self.payload[offset : offset + length]
-        if content and content[-1]:
-            raise DefinitionError("a text has no closing zero")
-        try:
-            return content[:-1].decode()
-        except UnicodeDecodeError:
-            raise DefinitionError("a text is not UTF-8") from None
 
     def message(self, name: str, path: str = "", depth: int = 0) -> dict[str, Any]:
         if name not in self._definitions or depth > DEEPEST:
@@ -134,16 +126,13 @@ class RosWalk:
         count = member.count or self._length()
         if member.type in PRIMITIVES:
             return self._numbers(member.type, path, count) if count else []
-        if self.most_elements is not None and count > self.most_elements:
-            raise DefinitionError("too many elements")
         return [self._value(member.type, f"{path}[{index}]", depth) for index in range(count)]
 
     def _value(self, kind: str, path: str, depth: int) -> Any:
         if kind in PRIMITIVES:
             return self._numbers(kind, path, None)[0]
         if kind == "string":
-            length = self._length()
-            return self.on_text(path, self._take(length, 1), length)
+            return self._text(path)
         if kind == "wstring":
             raise DefinitionError("wide text is not read")
         return self.message(kind, path, depth + 1)
@@ -152,20 +141,33 @@ class RosWalk:
         code = PRIMITIVES[kind]
         size = int(code[1])
         offset = self._take(size * (1 if count is None else count), size)
-        self.on_number(path, kind, offset, count)
-        values = array(_CODES[code], self.payload[offset : self._at])
+        self.places[path] = Place(kind, offset, count)
+        values = array(_CODES[code], self._payload[offset : self._at])
         if self.little != (sys.byteorder == "little"):
             values.byteswap()
         return [bool(value) for value in values] if kind == "bool" else values
 
+    def _text(self, path: str) -> str:
+        """A text with its closing zero, which programs leave out where there is no text."""
+        length = self._length()
+        offset = self._take(length, 1)
+        self.places[path] = Place("string", offset, length)
+        content = self._payload[offset : self._at]
+        if content and content[-1]:
+            raise DefinitionError("a text has no closing zero")
+        try:
+            return content[:-1].decode()
+        except UnicodeDecodeError:
+            raise DefinitionError("a text is not UTF-8") from None
+
     def _length(self) -> int:
         offset = self._take(4, 4)
-        self.on_length(offset)
-        return int.from_bytes(self.payload[offset : self._at], "little" if self.little else "big")
+        self.lengths.append(offset)
+        return int.from_bytes(self._payload[offset : self._at], "little" if self.little else "big")
 
     def _take(self, size: int, alignment: int) -> int:
         start = self._at + -(self._at - HEADER_SIZE) % alignment
-        if start + size > len(self.payload):
+        if start + size > len(self._payload):
             raise DefinitionError("the message ends too early")
         self._at = start + size
         return start

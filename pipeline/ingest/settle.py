@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.mapping import mappings_of
 from pipeline.ingest.plan import Source
 from schemas.config import IngestConfig
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, InputError
 from schemas.run import STREAMS, Stream
 
 
@@ -27,11 +27,11 @@ def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfi
     return _with_solutions(kept)
 
 
-def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[Breach]:
+def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[InputError]:
     return [
-        Breach(
-            f"{file}: topic {mapping.topic}",
+        InputError(
             f"is configured for {stream} but has no messages",
+            place=f"{file}: topic {mapping.topic}",
             found=", ".join(sorted(set(topics))) or "no topics",
             remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
         )
@@ -68,15 +68,15 @@ def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
             )
 
 
-def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Breach]:
+def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
     """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
     topics = list(dict.fromkeys(source.channel.topic for source in sources))
     if stream in ("gnss", "satellites") or len(topics) < 2:
         return []
     return [
-        Breach(
-            file,
+        InputError(
             f"several topics could be the {stream}",
+            place=file,
             found=", ".join(topics),
             expected="one",
             remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration.",

@@ -12,7 +12,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.ingest.breaches import Breach, refuse
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.conform import conform
 from pipeline.ingest.mapping import mappings_of
 from pipeline.receivers import nmea, novatel, sbf, ubx
@@ -126,7 +126,7 @@ def _reasons(dropped: Mapping[str, int]) -> str:
 
 def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
     """The streams of all logs, one after the other, as the contract has them."""
-    breaches: list[Breach] = []
+    breaches: list[InputError] = []
     collected: dict[Stream, list[pl.DataFrame]] = {}
     for log, streams in parts:
         for name, frame in streams.items():

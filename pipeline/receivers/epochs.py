@@ -124,6 +124,17 @@ def frame_of(rows: list[dict[str, Any]], schema: type[dy.Schema]) -> pl.DataFram
     return frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
 
 
+def velocity(east: float, north: float, up: float) -> dict[str, float]:
+    """The `gnss` columns of a velocity [m/s]."""
+    return {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
+
+
+def covariance(ee: float, en: float, eu: float, nn: float, nu: float, uu: float) -> dict[str, float]:
+    """The `gnss` columns of a covariance [m2]."""
+    names = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
+    return {name: float(value) for name, value in zip(names, (ee, en, eu, nn, nu, uu), strict=True)}
+
+
 def satellite_name(system: str, number: int) -> str:
     """`G08`, `E11`, `S23`: SBAS satellites by PRN - 100, as in RINEX."""
     return f"{system}{number - 100 if system == 'S' and number >= 100 else number:02d}"

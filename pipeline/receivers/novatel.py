@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.ingest.novatel import FIX_BY_CODE
 from pipeline.ingest.timescale import utc_of_week
-from pipeline.receivers.epochs import Epoch, Gathered
+from pipeline.receivers.epochs import Epoch, Gathered, covariance, velocity
 from schemas.enums import Fix
 
 # Messages with a position, by rank: that of the receiver before those of the inertial solution.
@@ -101,7 +101,7 @@ def _inertial(epoch: Epoch, m: Any, rank: int) -> None:
     solved = int(m.ins_solution_status) in _SOLVED
     kind = FIX_BY_CODE.get(int(m.position_type), Fix.NONE) if hasattr(m, "position_type") else Fix.ESTIMATED
     _place(epoch, m, rank, kind if solved else Fix.NONE)
-    epoch.tell("velocity", rank, dict(zip(_VELOCITY, (m.east_vel, m.north_vel, m.up_vel), strict=True)))
+    epoch.tell("velocity", rank, velocity(m.east_vel, m.north_vel, m.up_vel))
 
 
 def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
@@ -113,16 +113,14 @@ def _place(epoch: Epoch, m: Any, rank: int, fix: Fix) -> None:
     epoch.tell("fix", rank, {"fix": fix.value})
     epoch.tell("place", rank, {"latitude_deg": m.latitude, "longitude_deg": m.longitude, "height_m": height})
     if hasattr(m, "latitude_std_dev"):
-        deviations = {"nn": m.latitude_std_dev, "ee": m.longitude_std_dev, "uu": m.height_std_dev}
-        variances = {f"cov_{axes}_m2": value**2 for axes, value in deviations.items()}
-        epoch.tell("accuracy", rank, variances | {"cov_en_m2": 0.0, "cov_eu_m2": 0.0, "cov_nu_m2": 0.0})
+        east, north, up = m.longitude_std_dev**2, m.latitude_std_dev**2, m.height_std_dev**2
+        epoch.tell("accuracy", rank, covariance(east, 0.0, 0.0, north, 0.0, up))
 
 
 def _velocity(m: Any) -> dict[str, float]:
     """BESTVEL: speed over ground, its direction, and the vertical speed."""
     course = np.radians(m.ground_track)
-    east, north = m.horizontal_speed * np.sin(course), m.horizontal_speed * np.cos(course)
-    return dict(zip(_VELOCITY, (float(east), float(north), float(m.z)), strict=True))
+    return velocity(m.horizontal_speed * np.sin(course), m.horizontal_speed * np.cos(course), m.z)
 
 
 def _give(velocities: list[Epoch], epochs: list[Epoch]) -> None:
@@ -136,4 +134,4 @@ def _give(velocities: list[Epoch], epochs: list[Epoch]) -> None:
     near = (before <= wanted) & (wanted <= after) & (after - before <= _LONGEST_BETWEEN_NS)
     between = [np.interp((wanted - at[0]) * 1e-9, (at - at[0]) * 1e-9, [row[i] for row in told]) for i in (1, 2, 3)]
     for number in np.flatnonzero(near):
-        epochs[number].gnss |= {name: float(v[number]) for name, v in zip(_VELOCITY, between, strict=True)}
+        epochs[number].gnss |= velocity(*(v[number] for v in between))

@@ -10,13 +10,12 @@ import numpy as np
 from pipeline.ingest.recipes_drivers import SBF_FIXES
 from pipeline.ingest.timescale import utc_of_week
 from pipeline.receivers.earth_fixed import east_north_up, geodetic, local_velocity
-from pipeline.receivers.epochs import Epoch, Gathered
+from pipeline.receivers.epochs import Epoch, Gathered, covariance
 from schemas.enums import Fix
 
 _NO_TOW, _NO_WEEK = 0xFFFFFFFF, 0xFFFF
 _DO_NOT_USE = -2e10
 _SBAS_PRNS = range(120, 159)
-_NOT_KNOWN_U16 = 65535
 
 
 def parse(raw: bytes) -> Any:
@@ -46,7 +45,7 @@ def _solution(epoch: Epoch, m: Any) -> bool:
     # Base stations are numbered too: only an SBAS solution refers to a satellite.
     if fix is Fix.SBAS and m.ReferenceID in _SBAS_PRNS:
         epoch.gnss["sbas_prn"] = m.ReferenceID
-        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if round(m.MeanCorrAge * 100) != _NOT_KNOWN_U16 else None
+        epoch.gnss["sbas_age_s"] = m.MeanCorrAge if round(m.MeanCorrAge * 100) != _NO_WEEK else None
     return fix is not Fix.NONE
 
 
@@ -66,8 +65,7 @@ def _cartesian(epoch: Epoch, m: Any) -> None:
 
 
 def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
-    values = (m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt)
-    _put_covariance(epoch, values)
+    epoch.gnss |= _known(covariance(m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt))
 
 
 def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
@@ -78,12 +76,7 @@ def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
     turn = east_north_up(latitude, longitude)
     xx, yy, zz, xy, xz, yz = m.Cov_xx, m.Cov_yy, m.Cov_zz, m.Cov_xy, m.Cov_xz, m.Cov_yz
     local = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    _put_covariance(epoch, (local[0, 0], local[0, 1], local[0, 2], local[1, 1], local[1, 2], local[2, 2]))
-
-
-def _put_covariance(epoch: Epoch, values: tuple[float, ...]) -> None:
-    names = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
-    epoch.gnss |= _known({name: float(value) for name, value in zip(names, values, strict=True)})
+    epoch.gnss |= _known(covariance(*local[np.triu_indices(3)]))
 
 
 def _protection(epoch: Epoch, m: Any) -> None:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import dataframely as dy
 import polars as pl
 
-from pipeline.ingest.breaches import Breach, line_of
+from pipeline.ingest.breaches import line_of
 from pipeline.ingest.conform import Defaults, conform_to, rows_text, type_name
 from pipeline.ingest.csv_text import comments_of, epsg_in, read_table
 from pipeline.storage.parquet import metadata_of, read_parquet
 from schemas.enums import Reaction
+from schemas.errors import InputError
 from schemas.inputs import SITE_SCHEMAS
 
 EPSG_WGS84 = 4326
@@ -61,7 +62,7 @@ def load_table(file: str, data: bytes, breaches: list[str]) -> RawTable | None:
 def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame | None:
     """The contract's columns with the contract's types (words as text), or breaches and none."""
     columns = SITE_SCHEMAS[table].columns() | _RECORDED.get(table, {})
-    found: list[Breach] = []
+    found: list[InputError] = []
     read = {name: _read(raw, name, column, found) for name, column in columns.items() if name in raw.frame.columns}
     known = {name: column for name, column in columns.items() if name not in read or read[name] is not None}
     recorded = raw.frame.with_columns(series for series in read.values() if series is not None)
@@ -85,7 +86,7 @@ def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:
     return RawTable(file, frame, int(digits))
 
 
-def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[Breach]) -> pl.Series | None:
+def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[InputError]) -> pl.Series | None:
     """What stands as text in the type that it spells, identities that are numbers as text; none with a breach."""
     found = raw.frame[name]
     if isinstance(column, dy.String) and found.dtype.is_integer():
@@ -102,5 +103,5 @@ def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[Breach]) -
         return series
     place, value = f"{raw.file}: column {name}", found.filter(unreadable)[0]
     where = f"{value!r} in {rows_text(unreadable)}"
-    breaches.append(Breach(place, "cannot be read", found=where, expected=type_name(column)))
+    breaches.append(InputError("cannot be read", place=place, found=where, expected=type_name(column)))
     return None

@@ -101,7 +101,7 @@ def test_lengths_past_their_parent(tmp_path):
     huge = record(0x03, struct.pack("<H", 1) + struct.pack("<I", 2**31) + b"abc")
     assert "past the end of its Schema" in refused(tmp_path, whole(huge))
     attachment = record(0x09, struct.pack("<QQ", 0, 0) + text("a") + text("b") + struct.pack("<Q", 2**62) + b"xyz1234")
-    assert "Attachment" in refused(tmp_path, whole(definitions(), attachment, some_messages()))
+    assert read(tmp_path, whole(definitions(), attachment, some_messages())).gnss.height == 3  # it is passed by
     terabyte = whole(definitions(), struct.pack("<BQ", 0x06, 2**40), some_messages())
     assert "past the end of the file" in refused(tmp_path, terabyte)
 
@@ -156,13 +156,13 @@ def test_message_indexes(tmp_path):
     for index in (entries, [], entries[::-1]):
         log = read(tmp_path, whole(chunk(good), message_index(1, index)))
         assert_frame_equal(log.gnss, expected, check_exact=True)
-    assert "lacks messages" in refused(tmp_path, whole(chunk(good), message_index(1, entries[:2])))
-    assert "twice" in refused(tmp_path, whole(chunk(good), message_index(1, [*entries, entries[0]])))
+    assert "disagrees" in refused(tmp_path, whole(chunk(good), message_index(1, entries[:2])))
+    assert "disagrees" in refused(tmp_path, whole(chunk(good), message_index(1, [*entries, entries[0]])))
     assert "disagrees" in refused(tmp_path, whole(chunk(good), message_index(1, [(5, offsets[0])])))
     assert "disagrees" in refused(tmp_path, whole(chunk(good), message_index(2, entries)))
     assert "disagrees" in refused(tmp_path, whole(chunk(good), message_index(1, [(START_NS, start + 1)])))
     for outside in (len(good), 2**40, 2**63, 2**64 - 1):
-        assert "outside" in refused(tmp_path, whole(chunk(good), message_index(1, [(START_NS, outside)])))
+        assert "disagrees" in refused(tmp_path, whole(chunk(good), message_index(1, [(START_NS, outside)])))
 
 
 def test_unknown_opcodes_are_skipped(tmp_path):

@@ -8,12 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 import pytest
 import zstandard
 
-from pipeline.ingest import mcap_chunk, read_run
+from pipeline.ingest import mcap_block, read_run
 from pipeline.ingest.clean import clean, of_the_journey
 from pipeline.ingest.describe import describe_log
 from pipeline.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
@@ -21,7 +20,7 @@ from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from tests.ingest import samples
-from tests.ingest.samples import channel, chunk, definitions, message, position, schema, some_messages, whole
+from tests.ingest.samples import channel, chunk, definitions, message, position, record, schema, some_messages, whole
 
 SECOND_NS = 1_000_000_000
 
@@ -48,6 +47,7 @@ def bombs() -> dict[str, bytes]:
         "positions of 100 MB": whole(definitions(), packed(message(position(0) + b" " * 1_000_000) * 100)),
         "empty chunks": whole(definitions(), chunk(b"") * 20_000, some_messages()),
         "chunks without index": whole(definitions(), chunk(message(position(0))) * 10_000),
+        "messages apart": whole(definitions(), (message(position(0)) + record(0x90, b"")) * 40_000),
         "channels": numbered(60_000, schema(name="x.Y")),
         "topics of positions": numbered(2000, schema()),
         "solutions": whole(
@@ -92,19 +92,19 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
     for name in ("repeated definitions", "records of no kind", "messages of nothing"):
         assert "a chunk unpacks to more records than the file has bytes" in outcomes[name]
     assert outcomes["empty chunks"] == "whole"
+    assert outcomes["messages apart"] == "whole"
     assert outcomes["chunks without index"] == "whole"
     assert "more than 256 topics" in outcomes["topics of positions"]
     assert "found 60000; expected at most 256" in outcomes["solutions"]
 
 
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
-    spent = mcap_chunk.Allowance(3)
-    data = np.frombuffer(definitions() + some_messages(1), dtype="uint8")
-    placed = [mcap_chunk.Placed(0, len(data), 0, ())]
-    mcap_chunk.messages_in(data, placed, 0, lambda *_: None, spent)
+    spent = mcap_block.Allowance(3)
+    records = definitions() + some_messages(1)
+    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
     assert spent.left == 0
-    with pytest.raises(mcap_chunk.DamageError, match="more records"):
-        mcap_chunk.messages_in(data, placed, 0, lambda *_: None, spent)
+    with pytest.raises(mcap_block.DamageError, match="more records"):
+        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
 
 
 LETTERS = "A" * 26

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.ingest.generic import UndecodableError, decode_columns, parse_json
 from pipeline.ingest.json_columns import JsonDecoder
-from pipeline.ingest.mcap_block import MESSAGE_HEAD, Messages
+from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from schemas.errors import InputError
 
@@ -49,7 +49,7 @@ def messages_of(contents: list[bytes]) -> Messages:
     lengths = np.array([len(content) for content in contents], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths[:-1])]).astype(np.int64)
     data = np.frombuffer(b"".join(contents) + b" ", dtype=np.uint8)
-    return Messages(data, starts, lengths, starts, np.zeros(len(contents), MESSAGE_HEAD))
+    return Messages(data, starts, lengths, starts, starts, starts)
 
 
 def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
@@ -66,10 +66,10 @@ def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
     contents = [written(*one) for one in drawn]
     for some in ([content] for content in contents):
         parts, left = JsonDecoder(TYPES).decode(messages_of(some))
-        assert sum(len(part.messages) for part in parts) + sum(map(len, left)) == len(some)
-        for part in parts:
-            expected, _ = decode_columns(CHANNEL, part.messages, TYPES)
-            for path, values in part.values.items():
+        assert sum(len(found) for found, _ in parts) + sum(map(len, left)) == len(some)
+        for found, columns in parts:
+            expected, _ = decode_columns(CHANNEL, found, TYPES)
+            for path, values in columns.items():
                 assert values.to_list() == expected[path].to_list()
 
 
@@ -79,8 +79,8 @@ def test_good_messages_are_taken_at_once():
     ]
     parts, left = JsonDecoder(TYPES).decode(messages_of(contents))
     assert (len(parts), left) == (1, [])
-    assert parts[0].values["a"].to_list() == [number / 7 for number in range(50)]
-    assert parts[0].values["t.sec"].to_list() == list(range(50))
+    assert parts[0][1]["a"].to_list() == [number / 7 for number in range(50)]
+    assert parts[0][1]["t.sec"].to_list() == list(range(50))
 
 
 @pytest.mark.parametrize(
