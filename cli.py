@@ -283,7 +283,7 @@ def inspect(
     from pipeline.results.terminal import show_tables
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
+    tables = inspect_path(path, settings, result, settings.matching, site, _vehicle(vehicle))
     if as_json:
         _print_json(tables)
     else:
@@ -390,7 +390,7 @@ def convert(
     print(f"{converted.run.gnss.height} epochs in {to}")
     for reason, count in converted.dropped.items():
         print(f"not used: {count} x {visible(reason)}")
-    for line in fit_report(converted.run, settings.ingest).lines():
+    for line in fit_report(converted.run, settings).lines():
         print(line)
 
 
