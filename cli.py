@@ -408,7 +408,9 @@ def make_a_site(
         str | None, Option(help="`every 1000` (metres), or a table with coordinates or line kilometres.")
     ] = None,
     epsg: Annotated[int | None, Option(help="Of x and y in tables that do not say.")] = None,
-    join: Annotated[float, Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    join: Annotated[
+        float | None, Option(help="Ends of lines within so many metres meet (`survey.same_place_m`).")
+    ] = None,
     flat: Annotated[bool, Option("--flat", help="Leave heights out.")] = False,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,

@@ -456,6 +456,41 @@ class UndetectedConfig(Settings):
     spacing_step_s: Positive = 60.0
 
 
+class SurveyConfig(Settings):
+    """A site from a survey of the line (`balise site`)."""
+
+    # Two places that are nearer are one; maps write seven decimals of a degree, 1 cm.
+    same_place_m: Positive = 0.05
+    # Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.
+    same_track_m: Positive = 1.5
+    # Lines and their lengths keep to this.
+    shape_m: Positive = 0.1
+    # A stop shrinks to one point: the next counts that is as far away, and farther than the noise reaches.
+    stop_m: Positive = 1.0
+    stop_sigmas: Positive = 6.0
+    # Farther than any train gets in a second or two, and than so many usual steps: nothing was recorded in between.
+    gap_m: Positive = 100.0
+    gap_steps: Positive = 10.0
+    # Behind a switch of 300 m radius the branch is 1.5 m aside after 30 m: there the toe is looked for. What is shorter
+    # is the noise of a pass that was left out.
+    toe_m: Positive = 30.0
+    # At a switch the branches lie within some 12 degrees (1:4.5); maps draw it up to 45.
+    switch_deg: Positive = 45.0
+    # No track turns by so much at a point; a sideways step of so much on a curve of so small a radius is none either.
+    kink_deg: Positive = 20.0
+    kink_radius_m: Positive = 60.0
+    kink_aside_m: Positive = 0.3
+    # The branches of the longest switches (radius 1,200 m) part as far as `same_track_m` within 60 m.
+    doubled_m: Positive = 100.0
+    # Scatter makes a line longer: told from this share of its length on, that of the best odometer scale.
+    longer_share: Probability = 1e-4
+    # Kilometres are posts, not lengths: so far they stray from the track between two points, in metres or by share.
+    kilometre_m: Positive = 20.0
+    kilometre_share: Probability = 0.05
+    # Lists of balises give the track's axis or the marker beside it; farther is another line, or system of coordinates.
+    balise_beside_m: Positive = 10.0
+
+
 class ServiceLevel(Settings):
     """Hazard rate of a signal-in-space service: `integrity_risk` per `exposure_s`."""
 
@@ -503,6 +538,7 @@ class Configuration(Settings):
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
     undetected: UndetectedConfig = UndetectedConfig()
+    survey: SurveyConfig = SurveyConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:
