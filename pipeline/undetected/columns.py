@@ -58,13 +58,12 @@ class Undetected:
 
 @dataclass(frozen=True)
 class _Both:
-    """Errors along growing path and against it at each row [m], NaN at the first row.
+    """Errors along growing path and against it at each row [m] (2, rows), NaN at the first row.
 
     `since_ns`: when they began at the earliest, else -1. `paid_m`, `outright`: what holds the larger (`error.Errors`).
     """
 
-    up_m: Floats
-    down_m: Floats
+    error_m: Floats
     since_ns: Ints
     paid_m: Floats
     outright: Bools
@@ -89,7 +88,10 @@ def undetected_of(
     parts = windows(rows, t_ns, diagnosis.fixes_ns)
     found = _both(rows, parts)
     ranges = diagnosis.satellites
-    of_range = None if ranges is None else _both(_with_ranges(rows, epochs, ranges, config), parts)
+    of_range = None
+    if ranges is not None:
+        low_m, high_m = range_bounds(epochs, ranges, config)
+        of_range = _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts)
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
@@ -111,22 +113,17 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
 
 
 def _both(rows: Watched, parts: list[Window]) -> _Both:
-    up, down = np.full(rows.rows, np.nan), np.full(rows.rows, np.nan)
+    error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
     paid, outright = np.zeros((rows.rows, 1 + rows.weight.shape[1])), np.zeros(rows.rows, dtype=np.bool_)
     for window in parts:
         seen = rows.since(window.start, window.end, window.since_s)
         ahead, behind = largest_errors(seen), largest_errors(seen.mirrored())
         part, worse = slice(window.start + 1, window.end + 1), ahead.most_m >= behind.most_m
-        up[part], down[part], since_ns[part] = ahead.most_m, behind.most_m, window.since_ns
+        error[:, part], since_ns[part] = (ahead.most_m, behind.most_m), window.since_ns
         paid[part] = np.where(worse[:, None], ahead.paid_m, behind.paid_m)
         outright[part] = np.where(worse, ahead.outright, behind.outright)
-    return _Both(up, down, since_ns, paid, outright)
-
-
-def _with_ranges(rows: Watched, epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Watched:
-    low_m, high_m = range_bounds(epochs, satellites, config)
-    return bounded(rows, low_m[rows.epoch], high_m[rows.epoch])
+    return _Both(error, since_ns, paid, outright)
 
 
 def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
@@ -153,7 +150,7 @@ def _at_epochs(rows: Watched, found: _Both, facing: Ints) -> pl.DataFrame:
 
 def _faced(found: _Both, facing: Ints) -> Floats:
     """Ahead and behind, shape (2, rows), for these directions of travel along growing path."""
-    return np.where(facing > 0, [found.up_m, found.down_m], [found.down_m, found.up_m])
+    return np.where(facing > 0, found.error_m, found.error_m[::-1])
 
 
 def rows_of_passages(

@@ -77,6 +77,13 @@ class Watched:
             held_high_m=-self.held_low_m,
         )
 
+    @property
+    def longest(self) -> tuple[int, int]:
+        """First and last row of the longest stretch that the bank saw."""
+        edges = np.append(np.flatnonzero(self.fresh | (np.arange(self.rows) == 0)), self.rows)
+        which = int(np.argmax(np.diff(edges)))
+        return int(edges[which]), int(edges[which + 1]) - 1
+
     def between(self, low: int, high: int) -> Watched:
         """Rows [low, high); anchors before them are lost."""
         part = {item.name: getattr(self, item.name)[low:high] for item in fields(self)}
