@@ -6,15 +6,12 @@ evaluated on every row (`paid_m`), so blocks cost closeness, never validity.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.undetected.stretch import Stretch
 from schemas.arrays import Floats, Ints
-
-if TYPE_CHECKING:
-    from scipy import sparse
 
 # Blocks are so much longer than the stretch before them; so much farther on lies the next row with a split of its own.
 GROWTH = 0.3
@@ -37,32 +34,30 @@ class _Blocks(NamedTuple):
         first, end = np.array(edges[:-1]), np.array(edges[1:])
         return cls(first, end - 1, np.repeat(np.arange(first.size), end - first))
 
-    def lines(self, row: Ints) -> sparse.csr_matrix:
+    def lines(self, row: Ints) -> Floats:
         """What the shares at both ends of the blocks, two columns each, are at these rows: straight lines between."""
-        from scipy import sparse
-
-        block = self.of_row[row]
+        block, each = self.of_row[row], np.arange(row.size)
         along = (row - self.first[block]) / np.maximum(self.last[block] - self.first[block], 1)
-        place = np.tile(np.arange(row.size), 2), np.append(2 * block, 2 * block + 1)
-        return sparse.csr_matrix((np.append(1.0 - along, along), place), shape=(row.size, 2 * self.first.size))
+        found = np.zeros((row.size, 2 * self.first.size))
+        found[each, 2 * block], found[each, 2 * block + 1] = 1.0 - along, along
+        return found
 
 
 def best_shares(stretch: Stretch) -> Floats:
     """Shares of raw and averages in each row, shape (rows, 1 + averages), that give the least bound at the last row."""
-    from scipy import sparse  # most replays solve nothing
+    from scipy.linalg import block_diag  # most replays solve nothing
     from scipy.optimize import linprog
 
     blocks, monitors = _Blocks.over(stretch.rows), 1 + stretch.seen.weight.shape[1]
     ends = 2 * blocks.first.size
     parts = [_raw(stretch, blocks), *(_average(stretch, blocks, one) for one in range(monitors - 1))]
-    terms = sparse.block_diag([part.term for part in parts])
-    costs, linear = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
-    gauge, each = max(float(costs.max()), 1e-12), sparse.identity(costs.size)
+    costs, linear = np.concatenate([part.cost for part in parts]), np.concatenate([part.linear for part in parts])
+    gauge, each = max(float(costs.max()), 1e-12), np.eye(costs.size)
     # Each term is what it has above zero less what it has below; shares add up to one at both ends of each block.
-    whole = sparse.hstack([sparse.identity(ends)] * monitors)
+    whole, nothing = np.tile(np.eye(ends), monitors), np.zeros((ends, 2 * costs.size))
     found = linprog(
         np.concatenate([linear, costs, costs]) / gauge,
-        A_eq=sparse.bmat([[terms, -each, each], [whole, None, None]], format="csr"),
+        A_eq=np.block([[block_diag(*(part.terms for part in parts)), -each, each], [whole, nothing]]),
         b_eq=np.concatenate([np.zeros(costs.size), np.ones(ends)]),
         bounds=np.array([(-np.inf, np.inf)] * (monitors * ends) + [(0.0, np.inf)] * (2 * costs.size)),
         method="highs-ds",
@@ -75,41 +70,34 @@ def best_shares(stretch: Stretch) -> Floats:
 
 
 class _Part(NamedTuple):
-    """Of one monitor: what is paid for, as terms over its shares at both ends of the blocks; what each of them costs;
-    and what the start gives.
-    """
+    """Of one monitor: what is paid for, over its shares at both ends of the blocks; the cost of each; the start's."""
 
-    term: sparse.csr_matrix
+    terms: Floats
     cost: Floats
     linear: Floats
 
 
 def _raw(stretch: Stretch, blocks: _Blocks) -> _Part:
-    from scipy import sparse
-
     raw_mps = np.maximum(np.abs(stretch.seen.most_mps), np.abs(stretch.seen.least_mps))
     raw_m = np.add.reduceat(stretch.seen.way_s * _tested(raw_mps), blocks.first)
     single = blocks.first == blocks.last
     cost = np.column_stack([np.where(single, raw_m, 0.5 * raw_m), np.where(single, 0.0, 0.5 * raw_m)]).ravel()
-    return _Part(sparse.identity(cost.size, format="csr"), cost, np.zeros(cost.size))
+    return _Part(np.eye(cost.size), cost, np.zeros(cost.size))
 
 
 def _average(stretch: Stretch, blocks: _Blocks, average: int) -> _Part:
-    from scipy import sparse
-
     weight = stretch.seen.weight[:, average]
     part = stretch.seen.way_s / weight
     # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
     after = np.append((part * (1.0 - weight))[1:], 0.0)
     at, cost = _paid_at(blocks, _tested(stretch.seen.threshold_mps[:, average]))
     following = np.minimum(at + 1, stretch.rows - 1)
-    term = sparse.diags(part[at]) @ blocks.lines(at) - sparse.diags(after[at]) @ blocks.lines(following)
-    start, linear = part[0] * (1.0 - weight[0]), np.zeros(term.shape[1])
-    linear[0] -= start * stretch.start_mps[average]
+    terms = part[at, None] * blocks.lines(at) - after[at, None] * blocks.lines(following)
+    start, linear = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0]), np.zeros(terms.shape[1])
+    linear -= start[0] * stretch.start_mps[average]
     if (free := stretch.start_free_mps[average]) > 0.0:
-        term = sparse.vstack([term, sparse.csr_matrix(([start], ([0], [0])), shape=(1, linear.size))])
-        cost = np.append(cost, free)
-    return _Part(term, cost, linear)
+        terms, cost = np.vstack([terms, start]), np.append(cost, free)
+    return _Part(terms, cost, linear)
 
 
 def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
