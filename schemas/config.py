@@ -454,6 +454,10 @@ class UndetectedConfig(Settings):
     solutions_at_fault: Literal["all", "one"] = "all"
     # Physical balises are thought of at epochs so far apart, to find their largest spacing.
     spacing_step_s: Positive = 60.0
+    # A monitor holds a bound if it pays for this share of it at least.
+    holding_share: Probability = 0.01
+    # A curve hides this share of a fault at most: of positions farther beside it nothing could be said any more.
+    hidden_share: Probability = 0.5
 
 
 class SurveyConfig(Settings):

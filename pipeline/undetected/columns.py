@@ -24,8 +24,6 @@ from schemas.conform import dtypes
 from schemas.enums import BaliseKind
 from schemas.tables import SCALES, Epochs, Passages
 
-# What pays for less than this share of a bound does not hold it.
-_LEAST_SHARE = 0.01
 EPOCH_COLUMNS = ("undetected_ahead_m", "undetected_behind_m")
 RANGE_COLUMNS = ("undetected_range_ahead_m", "undetected_range_behind_m")
 
@@ -95,11 +93,12 @@ def undetected_of(
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
+    names, least = _names(diagnosis.bank, config), config.undetected.holding_share
+    before = np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan)
+    of_passages = _at_passages(at, rows, found, of_range, facing, names, least)
     return Undetected(
         _at_epochs(rows, found, facing),
-        _at_passages(at, rows, found, of_range, facing, _names(diagnosis.bank, config)).with_columns(
-            physical_before_m=pl.Series(np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan), nan_to_null=True)
-        ),
+        of_passages.with_columns(physical_before_m=pl.Series(before, nan_to_null=True)),
         spacing,
     )
 
@@ -175,7 +174,7 @@ def rows_of_passages(
 
 
 def _at_passages(
-    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, names: list[str]
+    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, names: list[str], least: float
 ) -> pl.DataFrame:
     known = (at >= 0) & (found.since_ns[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
     at = np.where(known, at, 0)
@@ -184,7 +183,7 @@ def _at_passages(
     ranges = nothing if of_range is None else _taken(of_range, at, known, rows, facing)
     values |= dict(zip(RANGE_COLUMNS, ranges, strict=True))
     since = [int(found.since_ns[row]) if yes else None for row, yes in zip(at, known, strict=True)]
-    holding = [_holding(found, row, names) if yes else None for row, yes in zip(at.tolist(), known, strict=True)]
+    holding = [_holding(found, row, names, least) if yes else None for row, yes in zip(at.tolist(), known, strict=True)]
     return pl.DataFrame([pl.Series(name, one, nan_to_null=True) for name, one in values.items()]).with_columns(
         undetected_since=pl.Series(since, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
         undetected_monitors=pl.Series(holding, dtype=pl.List(pl.String)),
@@ -197,10 +196,10 @@ def _taken(found: _Both, at: Ints, known: Bools, rows: Watched, facing: Ints) ->
     return np.where(known, _faced(found, facing[rows.epoch])[:, at], np.nan)
 
 
-def _holding(found: _Both, row: int, names: list[str]) -> list[str]:
+def _holding(found: _Both, row: int, names: list[str], least: float) -> list[str]:
     """Monitors that hold the larger error at a row, first what holds most of it; none where the bank was blind."""
     if found.outright[row]:
         return [names[-1]]
     paid = found.paid_m[row]
     order = np.argsort(-paid, kind="stable")
-    return [names[which] for which in order.tolist() if paid[which] > _LEAST_SHARE * paid.sum()]
+    return [names[which] for which in order.tolist() if paid[which] > least * paid.sum()]
