@@ -226,6 +226,17 @@ def test_a_shifted_survey_moves_positions_and_reference(trips: list[Trip]) -> No
     assert _fit(_fixed(drawn.run, found), moved).misfits == ()
 
 
+def test_what_is_told_is_configuration(trips: list[Trip]) -> None:
+    run, moved = trips[0].run, moved_site(24.0, 18.0)(trips[0].site)
+    late = shifted(10.0, "odometer")(run)
+    wide = PlausibilityConfig(shift_told_m=60.0, lag_limit_s=12.0)
+    assert [check.what for check in _fit(run, moved).misfits] == ["positions against the survey"]
+    assert fit_run(run, "primary", Vehicle(), wide, moved).misfits == ()
+    (clock,) = _fit(late, trips[0].site).impossible
+    assert clock.what == "clock of the odometer against the GNSS"
+    assert fit_run(late, "primary", Vehicle(), wide, trips[0].site).impossible == ()
+
+
 def test_a_unit_is_mended_once(trips: list[Trip]) -> None:
     vehicle = Vehicle(odometer_scale=1.0 / trips[0].scale, odometer_scale_sigma=2e-4)
     found = _fit(scaled("odometer", distance_m=0.001)(trips[0].run), trips[0].site, vehicle)

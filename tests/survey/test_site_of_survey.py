@@ -54,8 +54,8 @@ def written(folder: Path, name: str, *features: dict[str, Any]) -> Path:
 
 
 def site_of(*surveys: Path, balises: str | None = None, **wishes: Any) -> Site:
-    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m", 0.05), wishes.get("flat", False))
-    return make_site(wish, Vehicle(), Configuration())
+    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False))
+    return make_site(wish, Vehicle(), Configuration(survey=SurveyConfig(**wishes.get("config", {}))))
 
 
 def navigable(site: Site) -> set[frozenset[tuple[str, int]]]:
@@ -333,3 +333,14 @@ def test_what_is_no_survey_is_one_message(tmp_path: Path, name: str) -> None:
         site_of(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert name in str(caught.value)
+
+
+def test_what_a_survey_is_taken_for_is_configuration(tmp_path: Path) -> None:
+    bent = written(tmp_path, "bent.geojson", way("bent", (0, 0), (100, 0), (200, 15)))
+    assert "kinks" not in told(site_of(bent))
+    assert "track: bent: 1 kinks" in told(site_of(bent, config={"kink_deg": 5.0}))
+    apart = written(tmp_path, "apart.geojson", way("a", (0, 0), (100, 0)), way("b", (100.5, 0), (200, 0)))
+    assert navigable(site_of(apart)) == set()
+    joined = {frozenset([("a", 1), ("b", 0)])}
+    assert navigable(site_of(apart, config={"same_place_m": 1.0})) == joined
+    assert navigable(site_of(apart, join_m=1.0)) == joined
