@@ -258,7 +258,7 @@ def inspect(
     from pipeline.results.inspection import inspect_path, show
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings.ingest, result, settings.matching, site, _vehicle(vehicle))
+    tables = inspect_path(path, settings, result, settings.matching, site, _vehicle(vehicle))
     _print_json(tables) if as_json else show(tables)
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
@@ -333,7 +333,9 @@ def make_a_site(
     out: OutFolder,
     balises: Annotated[str | None, Option(help="`every 1000` (m), or a table of places or kilometres.")] = None,
     epsg: Annotated[int | None, Option(help="Of x and y in tables that do not say.")] = None,
-    join: Annotated[float, Option(help="Ends of lines within so many metres meet.")] = 0.05,
+    join: Annotated[
+        float | None, Option(help="Ends of lines within so many metres meet (`survey.same_place_m`).")
+    ] = None,
     flat: Annotated[bool, Option("--flat", help="Leave heights out.")] = False,
     vehicle: VehicleFile = None,
     config: ConfigFile = None,

@@ -20,20 +20,20 @@ from benchmarks.results import Figure
 from pipeline.ingest.clean import clean
 from pipeline.plausibility.check import Check, State
 from pipeline.plausibility.fit import Fit, fit_run
-from schemas.config import IngestConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
-_CONFIG = IngestConfig()
+_CONFIG = Configuration()
 
 
 def fit_of(run: RunLog, site: Site, vehicle: Vehicle | None = None) -> Fit | str:
     """The fit of a run as a replay makes it, or the error of one that has no time in common."""
     try:
-        cleaned, _ = clean(run, _CONFIG)
+        cleaned, _ = clean(run, _CONFIG.ingest)
     except InputError as error:
         return str(error)
-    return fit_run(cleaned, "primary", vehicle or Vehicle(), _CONFIG, site)
+    return fit_run(cleaned, "primary", vehicle or Vehicle(), _CONFIG.plausibility, site)
 
 
 def applies(wrong: Wrong, drawn: Trip) -> bool:

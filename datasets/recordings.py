@@ -32,7 +32,7 @@ def convert_logs(
         converted = as_run(found, to.name.removesuffix(".mcap"), purpose, settings.fix_sigma)
     write_run_as(converted.run, to)
     unused = [f"not used: {count} x {visible(reason)}" for reason, count in converted.dropped.items()]
-    fit = fit_report(converted.run, settings.ingest).lines()
+    fit = fit_report(converted.run, settings).lines()
     return [f"{converted.run.gnss.height} epochs in {to}", *unused, *fit]
 
 

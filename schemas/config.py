@@ -86,15 +86,6 @@ class IngestConfig(Settings):
     correct: tuple[StreamCorrection, ...] = ()
     # Impossible values of a known cause fail a run (`fail`), or are reported and leave it unproven (`warn`).
     plausibility: Literal["fail", "warn"] = "fail"
-    # Worn wheels count 4 % too much, bad radars 6 %; the nearest wrong unit (yards) 9 %.
-    fit_scale_limit: Probability = 0.08
-    fit_scale_told: Probability = 0.03
-    # Receivers and buses are late by 2 s at most; the nearest wrong clock (leap seconds) is 18 s off.
-    fit_lag_limit_s: Positive = 5.0
-    # 0.3 s at 40 m/s is more than half the failure limit of 20 m.
-    fit_lag_told_s: Positive = 0.3
-    # Positions without corrections are within 5 m of the track, 95 %; a shift above half of `ci_limit_m` is reported.
-    fit_shift_told_m: Positive = 8.0
     # A nearer wrong position may be a fault; a default place or 0/0 is thousands of kilometres away.
     placeholder_far_m: Positive = 10_000.0
 
@@ -104,6 +95,60 @@ class IngestConfig(Settings):
         if not isinstance(data, Mapping):
             return data
         return {key: [value] if isinstance(value, Mapping) else value for key, value in data.items()}
+
+
+class PlausibilityConfig(Settings):
+    """Whether the streams of a run can be of one journey: what is told, and what no train can have."""
+
+    # Worn wheels count 4 % too much, bad radars 6 %; the nearest wrong unit (yards) 9 %.
+    scale_limit: Probability = 0.08
+    scale_told: Probability = 0.03
+    # Receivers and buses are late by 2 s at most; the nearest wrong clock (leap seconds) is 18 s off.
+    lag_limit_s: Positive = 5.0
+    # 0.3 s at 40 m/s is more than half the failure limit of 20 m.
+    lag_told_s: Positive = 0.3
+    # Positions without corrections are within 5 m of the track, 95 %; a shift above half of `ci_limit_m` is reported.
+    shift_told_m: Positive = 8.0
+    # Slower, positions that scatter by some metres may be of a train that stands.
+    moving_mps: Positive = 1.0
+    # With less in common, of all and of the shorter record, any two journeys look alike.
+    overlap_s: Positive = 90.0
+    overlap_share: Probability = 0.6
+    # Constant speed tells no lag: its scatter over its mean.
+    speed_change: Probability = 0.08
+    # Nobody looks for another lag where speeds agree in so much of the moving time; a journey that repeats itself
+    # agrees nearly as well at another one.
+    speeds_agree: Probability = 0.93
+    lag_rival: Probability = 0.05
+    # Ways are compared over windows of this length: positions that scatter by 2 m tell them to 2 %.
+    window_m: Positive = 150.0
+    # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
+    unit_share: Probability = 0.045
+    # So many windows agree on the factor of a unit. Pulses, which no unit explains, have to be clearer, and far from 1.
+    unit_windows: Probability = 0.6
+    pulses_windows: Probability = 0.8
+    pulses_factor: Positive = 1.5
+    # Streams are late by so much beside what explains the lag of a clock; two lags so near are of one clock.
+    clock_near_s: Positive = 2.2
+    same_clock_s: Positive = 1.5
+    # A vehicle file may differ from the run by so many of its own sigmas, and by this scale at least.
+    file_sigmas: Positive = 4.0
+    file_scale: Probability = 0.005
+    # Two records are of one place within so much, a read of the balise that it names, and positions of the same line.
+    same_place_m: Positive = 400.0
+    read_m: Positive = 60.0
+    same_line_m: Positive = 2_000.0
+    # Velocities fit if they differ from the displacement by a smaller share of it; slower, scatter turns that.
+    velocity_share: Probability = 0.3
+    velocity_mps: Positive = 3.0
+    # A survey is in a national datum if its shift is so near to the datum's.
+    datum_near_m: Positive = 12.0
+    datum_near_share: Probability = 0.12
+    # Of a copy so many places are equal to the last digit, and at most so often would an independent record's be.
+    copy_share: Probability = 0.8
+    copy_chance: Probability = 0.01
+    # Positions as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
+    without_error: Probability = 0.2
 
 
 class FixSigma(Settings):
@@ -409,6 +454,45 @@ class UndetectedConfig(Settings):
     solutions_at_fault: Literal["all", "one"] = "all"
     # Physical balises are thought of at epochs so far apart, to find their largest spacing.
     spacing_step_s: Positive = 60.0
+    # A monitor holds a bound if it pays for this share of it at least.
+    holding_share: Probability = 0.01
+    # A curve hides this share of a fault at most: of positions farther beside it nothing could be said any more.
+    hidden_share: Probability = 0.5
+
+
+class SurveyConfig(Settings):
+    """A site from a survey of the line (`balise site`)."""
+
+    # Two places that are nearer are one; maps write seven decimals of a degree, 1 cm.
+    same_place_m: Positive = 0.05
+    # Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.
+    same_track_m: Positive = 1.5
+    # Lines and their lengths keep to this.
+    shape_m: Positive = 0.1
+    # A stop shrinks to one point: the next counts that is as far away, and farther than the noise reaches.
+    stop_m: Positive = 1.0
+    stop_sigmas: Positive = 6.0
+    # Farther than any train gets in a second or two, and than so many usual steps: nothing was recorded in between.
+    gap_m: Positive = 100.0
+    gap_steps: Positive = 10.0
+    # Behind a switch of 300 m radius the branch is 1.5 m aside after 30 m: there the toe is looked for. What is shorter
+    # is the noise of a pass that was left out.
+    toe_m: Positive = 30.0
+    # At a switch the branches lie within some 12 degrees (1:4.5); maps draw it up to 45.
+    switch_deg: Positive = 45.0
+    # No track turns by so much at a point; a sideways step of so much on a curve of so small a radius is none either.
+    kink_deg: Positive = 20.0
+    kink_radius_m: Positive = 60.0
+    kink_aside_m: Positive = 0.3
+    # The branches of the longest switches (radius 1,200 m) part as far as `same_track_m` within 60 m.
+    doubled_m: Positive = 100.0
+    # Scatter makes a line longer: told from this share of its length on, that of the best odometer scale.
+    longer_share: Probability = 1e-4
+    # Kilometres are posts, not lengths: so far they stray from the track between two points, in metres or by share.
+    kilometre_m: Positive = 20.0
+    kilometre_share: Probability = 0.05
+    # Lists of balises give the track's axis or the marker beside it; farther is another line, or system of coordinates.
+    balise_beside_m: Positive = 10.0
 
 
 class ServiceLevel(Settings):
@@ -449,6 +533,7 @@ class Configuration(Settings):
     """The whole of a replay's configuration."""
 
     ingest: IngestConfig = IngestConfig()
+    plausibility: PlausibilityConfig = PlausibilityConfig()
     fix_sigma: FixSigma = FixSigma()
     matching: MatchingConfig = MatchingConfig()
     align: AlignConfig = AlignConfig()
@@ -457,6 +542,7 @@ class Configuration(Settings):
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
     undetected: UndetectedConfig = UndetectedConfig()
+    survey: SurveyConfig = SurveyConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:

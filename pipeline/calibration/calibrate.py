@@ -140,14 +140,14 @@ def _refuse_what_does_not_fit(log: RunLog, site: Site, vehicle: Vehicle, config:
     """A run with a wrong unit or clock would teach its error to every other run."""
     run, _ = clean(log, config.ingest)
     if solution in run.solutions():
-        fit = fit_run(run, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m), config.ingest, site)
+        fit = fit_run(run, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m), config.plausibility, site)
         refuse_impossible(fit, log.run_id, config.ingest)
 
 
 def _refuse_figures_of_no_train(vehicle: Vehicle, logs: Sequence[RunLog], config: Configuration) -> None:
     """Figures beyond what wheels and receivers can be off are another error, and a vehicle file would hide it."""
     scale, latency_s = vehicle.odometer_scale or 1.0, vehicle.gnss_latency_s or 0.0
-    most, most_s = config.ingest.fit_scale_limit, config.ingest.fit_lag_limit_s
+    most, most_s = config.plausibility.scale_limit, config.plausibility.lag_limit_s
     if abs(scale - 1.0) <= most and abs(latency_s) <= most_s:
         return
     raise InputError(

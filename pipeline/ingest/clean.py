@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.ingest.placeholders import without_placeholders
 from schemas.arrays import NS_PER_S, Bools
-from schemas.config import IngestConfig, Vehicle
+from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
@@ -252,5 +252,5 @@ def _clock_remedy(run: RunLog) -> str:
     known = "Check date and time scale (UTC or GPS) of both recorders, or leave the odometer out."
     if not {"fix", *_PLACE} <= set(run.gnss.columns):
         return known
-    found = fit_run(run, run.solutions()[0], Vehicle(), IngestConfig()).impossible
+    found = fit_run(run, run.solutions()[0], Vehicle(), PlausibilityConfig()).impossible
     return " ".join([known, *(f"{check.sentence}." for check in found), remedy_of(found)]).rstrip(" ")

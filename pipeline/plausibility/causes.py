@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from schemas.config import PlausibilityConfig
+
 # How many of the unit make a metre, or of the speed a metre per second.
 SPEED_UNITS = {
     "km/h": 3.6,
@@ -44,10 +46,6 @@ WAY_UNITS = {
 _SUMMED = {
     f"speeds summed up in {unit}": factor for unit, factor in SPEED_UNITS.items() if unit in ("km/h", "mph", "knots")
 }
-# Worn wheels, slip and curves: so far may a factor be off the unit that explains it; above the 3 % of bad odometers.
-_NEAR = 0.045
-# Streams are late by so much besides [s].
-_LATENCY_S = 2.2
 # GPS time is ahead of UTC by so many seconds since (IERS Bulletin C); TAI by 19 s more.
 _LEAPS = {2017.0: 18, 2015.5: 17, 2012.5: 16, 2009.0: 15, 2006.0: 14, 1999.0: 13}
 TAI_OVER_GPS_S = 19
@@ -64,20 +62,20 @@ class Explained:
     exact: float
 
 
-def explain_factor(factor: float, speed: bool) -> Explained | None:
+def explain_factor(factor: float, speed: bool, config: PlausibilityConfig) -> Explained | None:
     """The unit that makes recorded values `factor` times what they should be; the nearest one."""
     units = SPEED_UNITS if speed else WAY_UNITS | _SUMMED
     name, exact = min(units.items(), key=lambda item: abs(factor / item[1] - 1.0))
     # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
-    near = min(_NEAR, abs(exact - 1.0) / 3.0)
+    near = min(config.unit_share, abs(exact - 1.0) / 3.0)
     return Explained(f"in {name}", exact) if abs(factor / exact - 1.0) <= near else None
 
 
-def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> Explained | None:
+def explain_lag(lag_s: float, t_ns: int, precision_s: float, config: PlausibilityConfig) -> Explained | None:
     """What makes two clocks differ by `lag_s`, known to within `precision_s`, at an instant; the simplest cause."""
     size = abs(lag_s)
     for explained in _lags(size, t_ns):
-        if abs(size - explained.exact) <= max(precision_s, _LATENCY_S):
+        if abs(size - explained.exact) <= max(precision_s, config.clock_near_s):
             return Explained(explained.cause, explained.exact if lag_s > 0 else -explained.exact)
     return None
 

@@ -1,4 +1,4 @@
-"""By how much two clocks may differ, from two records of one journey's speed, whatever their units."""
+"""By how much two clocks differ, from two records of one journey's speed, whatever their units."""
 
 from __future__ import annotations
 
@@ -7,28 +7,47 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.plausibility.course import Course, Places
+from pipeline.plausibility.robust import LEAST, explains, usual
 from schemas.arrays import Floats
+from schemas.config import PlausibilityConfig
 
-# Less in common than this, and than this share of the shorter record, and any two journeys look alike.
-_LEAST_S, LEAST_SHARE = 90.0, 0.6
-# Shifts of the clocks that are worth a closer look: so many, so far from each other [s].
-_CANDIDATES, APART_S = 4, 15.0
-# Constant speed tells no lag: its scatter over its mean.
-_LEAST_CHANGE = 0.08
+# Lags that are worth a closer look: so many, so far from each other [s], improved in these steps.
+_CANDIDATES, _APART_S, _CLIMB_S = 4, 15.0, (8.0, 4.0, 2.0, 1.0)
+# To so much a lag is known by speeds alone [s].
+NEAR_S = 2.0
+# Below this share of the usual speed a record tells more of noise than of the scale.
+SLOW_SHARE = 0.2
 
 
-def possible_lags(one: Places, other: Course) -> tuple[list[float], str]:
-    """Lags at which two records of speed look alike, to a second, best correlated first; and why there are none.
+def clock_lag(gnss: Places, counter: Course, config: PlausibilityConfig) -> tuple[float, str]:
+    """The lag of the clocks that makes the speeds agree, 0 where they do as recorded; and why none is told.
 
-    A lag is the second record's stamp of a moment minus the first's.
+    A lag is the counter's stamp of a moment minus the GNSS's. A fault of one of both leaves part of the journey that
+    agrees, and with it the right lag ahead of all others.
     """
-    times = [np.arange(t_s[0], t_s[-1] + 0.5, 1.0) for t_s in (one.t_s, other.t_s)]
-    speeds = _bounded(one.speed(times[0])), _bounded(np.abs(other.speed(times[1])))
-    if any(np.isfinite(speed).sum() < _LEAST_S for speed in speeds):
-        return [], f"less than {_LEAST_S:.0f} s of movement are known"
-    if any(np.nanstd(speed) < _LEAST_CHANGE * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
+    as_recorded = _agreement(gnss, counter, 0.0, 0.0)
+    if as_recorded >= config.speeds_agree:
+        return 0.0, ""
+    possible_s, reason = _possible_lags(gnss, counter, config)
+    if reason:
+        return 0.0, reason
+    rated = _rated(gnss, counter, possible_s, config.overlap_share)
+    if not rated or not explains(rated[0][0], as_recorded):
+        return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
+    if len(rated) > 1 and rated[0][0] - rated[1][0] < config.lag_rival:
+        return 0.0, "several shifts of the clocks make the speeds agree"
+    return rated[0][1], ""
+
+
+def _possible_lags(gnss: Places, counter: Course, config: PlausibilityConfig) -> tuple[list[float], str]:
+    """Lags at which both speeds look alike, to a second, best correlated first; and why there are none."""
+    times = [np.arange(t_s[0], t_s[-1] + 0.5, 1.0) for t_s in (gnss.t_s, counter.t_s)]
+    speeds = _bounded(gnss.speed(times[0])), _bounded(np.abs(counter.speed(times[1])))
+    if any(np.isfinite(speed).sum() < config.overlap_s for speed in speeds):
+        return [], f"less than {config.overlap_s:.0f} s of movement are known"
+    if any(np.nanstd(speed) < config.speed_change * max(float(np.nanmean(speed)), 1e-9) for speed in speeds):
         return [], "the speed hardly changes"
-    rho = _correlations(*speeds)
+    rho = _correlations(*speeds, config)
     lags_s = times[1][0] - times[0][0] + times[1].size - 1.0 - np.arange(rho.size)
     return list(_peaks(lags_s, rho)), ""
 
@@ -38,19 +57,17 @@ def _peaks(lags_s: Floats, rho: Floats) -> Iterator[float]:
     left = rho.copy()
     for _ in range(_CANDIDATES):
         best = int(np.argmax(left))
-        if left[best] <= 0.0:
-            return
-        yield float(lags_s[best])
-        left[np.abs(lags_s - lags_s[best]) < APART_S] = 0.0
+        if left[best] > 0.0:
+            yield float(lags_s[best])
+        left[np.abs(lags_s - lags_s[best]) < _APART_S] = 0.0
 
 
 def _bounded(speed: Floats) -> Floats:
     """Without speeds that only a jump of the position has."""
-    known = speed[np.isfinite(speed)]
-    return np.where(speed > 1.5 * np.quantile(known, 0.95) + 1e-9, np.nan, speed) if known.size else speed
+    return np.where(speed > 1.5 * usual(speed, 0.95) + 1e-9, np.nan, speed)
 
 
-def _correlations(one: Floats, other: Floats) -> Floats:
+def _correlations(one: Floats, other: Floats, config: PlausibilityConfig) -> Floats:
     """Correlation at every shift over what both know; 0 where that is too little.
 
     Element k pairs `one[i]` with `other[i - k + n - 1]`, n the length of `other` (Padfield 2012, masked FFT).
@@ -67,7 +84,46 @@ def _correlations(one: Floats, other: Floats) -> Floats:
     def sums(left: int, right: int) -> Floats:
         return np.asarray(np.fft.irfft(first[left] * second[right], size)[: one.size + other.size - 1])
 
-    least = max(_LEAST_S, LEAST_SHARE * min(np.isfinite(values).sum() for values in (one, other)))
+    least = max(config.overlap_s, config.overlap_share * min(np.isfinite(values).sum() for values in (one, other)))
     spread = sums(2, 0) * sums(0, 2)
-    told = (np.round(sums(0, 0)) >= least) & (spread > _LEAST_CHANGE**4)
+    told = (np.round(sums(0, 0)) >= least) & (spread > config.speed_change**4)
     return np.where(told, sums(1, 1) / np.sqrt(np.where(told, spread, 1.0)), 0.0)
+
+
+def _rated(gnss: Places, counter: Course, possible_s: list[float], least: float) -> list[tuple[float, float]]:
+    """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
+    found: list[tuple[float, float]] = []
+    for lag_s in possible_s:
+        best = _agreement(gnss, counter, lag_s, least), lag_s
+        for step_s in _CLIMB_S:
+            near = [best[1] - step_s, best[1] + step_s]
+            best = max(best, *((_agreement(gnss, counter, lag_s, least), lag_s) for lag_s in near))
+        found.append(best)
+    found.sort(reverse=True)
+    apart = found[:1] + [one for one in found[1:] if abs(one[1] - found[0][1]) > _APART_S]
+    return [one for one in apart if abs(one[1]) > NEAR_S]
+
+
+def common(gnss: Places, counter: Course, lag_s: float) -> tuple[float, float]:
+    """Begin and end of what both records have in common at this lag, by the stamps of the GNSS [s]."""
+    return max(gnss.t_s[0], counter.t_s[0] - lag_s), min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
+
+
+def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float) -> float:
+    """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
+    common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
+    """
+    begin_s, end_s = common(gnss, counter, lag_s)
+    shorter_s = min(np.ptp(gnss.t_s), np.ptp(counter.t_s))
+    if end_s - begin_s < max(least_overlap * shorter_s, 20.0):
+        return 0.0
+    grid = np.linspace(begin_s, end_s, int(np.clip(end_s - begin_s, 20, 800)))
+    speeds = np.stack([gnss.speed(grid), np.abs(counter.speed(grid + lag_s))])
+    one, other = speeds[:, np.isfinite(speeds).all(axis=0)]
+    moves = [speed > SLOW_SHARE * usual(speed, 0.9) for speed in (one, other)]
+    both, either = moves[0] & moves[1], moves[0] | moves[1]
+    if both.sum() < LEAST:
+        return 0.0
+    factor = float(np.median(other[both] / one[both]))
+    alike = np.abs(other / factor - one) < 0.07 * one + 0.04 * usual(one, 0.9)
+    return float(np.mean(alike[either])) * float(end_s - begin_s) / float(shorter_s)

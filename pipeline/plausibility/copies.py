@@ -10,25 +10,21 @@ lie on the track far nearer than their sigma. There a copy and the truth are the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
 from pipeline.plausibility.check import Check, State
 from pipeline.plausibility.course import Places, seconds_since
-from pipeline.plausibility.robust import LEAST, MOVES_MPS
+from pipeline.plausibility.robust import LEAST
 from pipeline.plausibility.survey import Line, fit_survey
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
-from schemas.arrays import Bools, Floats, Ints, floats
-from schemas.config import FixSigma
+from schemas.arrays import Bools, Floats, floats
+from schemas.config import FixSigma, PlausibilityConfig
 from schemas.enums import Fix
 
 _WHAT = "reference against the positions"
-# So many of the common places have to be equal, and at most so often may an independent record's be by chance.
-_MOST, _CHANCE = 0.8, 0.01
-# Positions usually as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
-_WITHOUT_ERROR = 0.2
 # Fewer moving places in common tell nothing.
 _FEWEST = 3 * LEAST
 # Stamps are equal within this: recorders round them to milliseconds [s].
@@ -39,8 +35,7 @@ _UNITS_DEG, _DECIMALS, _LEAST_DEG = (1.0, 1.0 / 60.0, 1.0 / 3600.0), range(2, 10
 _ROWS = 4_000
 
 
-@dataclass(frozen=True)
-class _Track:
+class _Track(NamedTuple):
     """Stamps [s], and latitude and longitude [deg] in rows."""
 
     t_s: Floats
@@ -51,7 +46,13 @@ class _Track:
 
 
 def copy_check(
-    fixes: pl.DataFrame, gnss: Places, reference: pl.DataFrame, record: Places, epoch_ns: int, line: Line | None
+    fixes: pl.DataFrame,
+    gnss: Places,
+    reference: pl.DataFrame,
+    record: Places,
+    epoch_ns: int,
+    line: Line | None,
+    config: PlausibilityConfig,
 ) -> Check | None:
     """`impossible` where the reference is a copy of the solution `fixes`; None where it is none, or nothing tells.
 
@@ -59,7 +60,7 @@ def copy_check(
     with other stamps.
     """
     own, other = _track(fixes, epoch_ns), _track(reference, epoch_ns)
-    other = other.take(np.nan_to_num(record.speed(other.t_s)) > MOVES_MPS)
+    other = other.take(np.nan_to_num(record.speed(other.t_s)) > config.moving_mps)
     other = other.take(np.arange(other.t_s.size) % max(1, other.t_s.size // _ROWS) == 0)
     if min(own.t_s.size, other.t_s.size) < _FEWEST:
         return None
@@ -68,15 +69,17 @@ def copy_check(
     digit_m, sigma_m = digit_deg * to_m, _sigma_m(fixes)
     # Of a normal error, so much lies within a digit on either side.
     chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
-    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0])) if chance <= _CHANCE else None
+    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0])) if chance <= config.copy_chance else None
     if lag_s is None:
         return None
-    row = _nearest(own.t_s, other.t_s - lag_s)
+    row = np.clip(np.searchsorted(own.t_s, other.t_s - lag_s), 1, own.t_s.size - 1)
+    row -= other.t_s - lag_s - own.t_s[row - 1] < own.t_s[row] - (other.t_s - lag_s)
     common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= _SAME_STAMP_S
     equal = np.all(np.abs(own.degrees[row] - other.degrees) <= 1.001 * digit_deg, axis=1)[common]
-    if equal.size < _FEWEST or equal.mean() < _MOST:
+    if equal.size < _FEWEST or equal.mean() < config.copy_share:
         return None
-    if line is not None and fit_survey(gnss, line).aside_m < _WITHOUT_ERROR * float(sigma_m.min()):
+    exact_m = config.without_error * float(sigma_m.min())
+    if line is not None and fit_survey(gnss, line, config.moving_mps).aside_m < exact_m:
         return None
     stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > _SAME_STAMP_S else ""
     found = (
@@ -107,12 +110,6 @@ def _lag_s(own: _Track, other: _Track, reach_m: float) -> float | None:
     alike = np.searchsorted(lags_s, lags_s + _SAME_STAMP_S, "right") - np.arange(lags_s.size)
     first = int(alike.argmax())
     return float(np.median(lags_s[first : first + alike[first]]))
-
-
-def _nearest(t_s: Floats, at_s: Floats) -> Ints:
-    """Rows whose stamps are nearest to some instants."""
-    after = np.clip(np.searchsorted(t_s, at_s), 1, t_s.size - 1)
-    return np.asarray(after - (at_s - t_s[after - 1] < t_s[after] - at_s), dtype=np.int64)
 
 
 def _digit_deg(degrees: Floats) -> float:

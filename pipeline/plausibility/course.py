@@ -9,14 +9,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.track.geodesy import Points, earth_centred_m, points_of
-from schemas.arrays import Bools, Floats, floats, times_ns
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Fix
 
-# Two rows a second tell all that is asked here.
-_THIN_S = 0.45
-# A pause of so many periods is not bridged, nor is one of SPEED_S.
-_GAP_PERIODS = 3.5
-# Speed over this time: positions that scatter by 2 m give it to 0.7 m/s.
+# Speed over this time: positions that scatter by 2 m give it to 0.7 m/s. A shorter pause is bridged.
 SPEED_S = 4.0
 
 
@@ -29,7 +25,7 @@ class _Record:
     @cached_property
     def limit_s(self) -> float:
         """A longer pause is not bridged."""
-        return max(SPEED_S, _GAP_PERIODS * float(np.median(np.diff(self.t_s))))
+        return max(SPEED_S, 3.5 * float(np.median(np.diff(self.t_s))))
 
     def known(self, t_s: Floats) -> Bools:
         """Whether instants lie between two rows that are no farther apart than the limit."""
@@ -55,22 +51,24 @@ class Places(_Record):
 
     def at(self, t_s: Floats) -> Floats:
         """Places by straight lines [m], shape (n, 3)."""
-        return np.column_stack([np.interp(t_s, self.t_s, self.ecef_m[:, axis]) for axis in range(3)])
+        return np.column_stack([np.interp(t_s, self.t_s, axis) for axis in self.ecef_m.T])
+
+    def moved(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Displacement from some instants to others [m], shape (n, 3); NaN where it is not known."""
+        known = self.known(begin_s) & self.known(end_s)
+        return np.where(known[:, None], self.at(end_s) - self.at(begin_s), np.nan)
 
     def speed(self, t_s: Floats) -> Floats:
         """Speed over ground [m/s], never negative; NaN where it is not known."""
-        begin, end = t_s - SPEED_S / 2, t_s + SPEED_S / 2
-        chord = np.linalg.norm(self.at(end) - self.at(begin), axis=1)
-        return np.where(self.known(begin) & self.known(end) & self.known(t_s), chord / SPEED_S, np.nan)
+        chord = np.linalg.norm(self.moved(t_s - SPEED_S / 2, t_s + SPEED_S / 2), axis=1)
+        return np.where(self.known(t_s), chord / SPEED_S, np.nan)
 
     def way(self, begin_s: Floats, end_s: Floats) -> Floats:
         """Way from some instants to others [m]: the chord, and by half of it what a curve adds; NaN where unknown."""
         middle_s = (begin_s + end_s) / 2
-        known = self.known(begin_s) & self.known(middle_s) & self.known(end_s)
-        begin, middle, end = self.at(begin_s), self.at(middle_s), self.at(end_s)
-        chord = np.linalg.norm(end - begin, axis=1)
-        halves = np.linalg.norm(middle - begin, axis=1) + np.linalg.norm(end - middle, axis=1)
-        return np.where(known, halves + (halves - chord) / 3.0, np.nan)
+        parts = (begin_s, end_s), (begin_s, middle_s), (middle_s, end_s)
+        chord, first, second = (np.linalg.norm(self.moved(*part), axis=1) for part in parts)
+        return np.asarray(first + second + (first + second - chord) / 3.0)
 
 
 @dataclass(frozen=True)
@@ -79,9 +77,9 @@ class Course(_Record):
 
     way: Floats
 
-    def speed(self, t_s: Floats) -> Floats:
+    def speed(self, t_s: Floats, over_s: float = SPEED_S) -> Floats:
         """Signed speed in units per second; NaN where it is not known."""
-        return self.gained(t_s - SPEED_S / 2, t_s + SPEED_S / 2) / SPEED_S
+        return self.gained(t_s - over_s / 2, t_s + over_s / 2) / over_s
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
         """Signed way from some instants to others; NaN where it is not known."""
@@ -96,16 +94,15 @@ def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     if "fix" in frame.columns:
         valid &= (frame["fix"].cast(pl.String) != Fix.NONE.value).fill_null(False).to_numpy()
     t_s = seconds_since(epoch_ns, frame)
-    rows = np.flatnonzero(valid)
-    rows = rows[_thinned(t_s[rows])]
+    rows = _thinned(t_s, np.flatnonzero(valid))
     if rows.size < 10:
         return None
     height = floats(frame, "height_m")[rows] if "height_m" in frame.columns else np.full(rows.size, np.nan)
     level_m = float(np.nanmedian(height)) if np.isfinite(height).any() else 0.0
-    level_m = level_m if abs(level_m) < 9000.0 else 0.0
-    flat = np.full(rows.size, level_m)
-    ecef = earth_centred_m(latitude[rows], longitude[rows], flat)
-    return Places(t_s[rows], latitude[rows], longitude[rows], height, ecef)
+    flat = np.full(rows.size, level_m if abs(level_m) < 9000.0 else 0.0)
+    return Places(
+        t_s[rows], latitude[rows], longitude[rows], height, earth_centred_m(latitude[rows], longitude[rows], flat)
+    )
 
 
 def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
@@ -113,30 +110,28 @@ def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
     return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
 
 
-def distance_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
-    """The recorded distance; None where hardly any row has one."""
-    t_s, distance = seconds_since(epoch_ns, odometer), floats(odometer, "distance_m")
-    rows = np.flatnonzero(np.isfinite(distance))
-    rows = rows[_thinned(t_s[rows])]
-    return Course(t_s[rows], distance[rows]) if rows.size >= 10 else None
+def courses_of(odometer: pl.DataFrame | None, epoch_ns: int) -> dict[str, Course]:
+    """`distance`, and `speed` summed up, of an odometer, each where enough rows have it."""
+    found: dict[str, Course] = {}
+    if odometer is None:
+        return found
+    for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
+        t_s, values = seconds_since(epoch_ns, odometer), floats(odometer, column)
+        rows = np.flatnonzero(np.isfinite(values))
+        t_s, way = t_s[rows], values[rows]
+        if name == "speed" and rows.size:
+            way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
+        kept = _thinned(t_s, np.arange(rows.size))
+        if kept.size >= 10:
+            found[name] = Course(t_s[kept], way[kept])
+    return found
 
 
-def speed_course(odometer: pl.DataFrame, epoch_ns: int) -> Course | None:
-    """The recorded speed, summed up; None where hardly any row has one."""
-    t_s, speed = seconds_since(epoch_ns, odometer), floats(odometer, "speed_mps")
-    rows = np.flatnonzero(np.isfinite(speed))
-    if rows.size < 10:
-        return None
-    t_s, speed = t_s[rows], speed[rows]
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t_s))])
-    kept = _thinned(t_s)
-    return Course(t_s[kept], way[kept])
-
-
-def _thinned(t_s: Floats) -> Bools:
-    """Rows that are at least some 0.45 s after the kept one before."""
-    if t_s.size < 2 or np.median(np.diff(t_s)) >= _THIN_S:
-        return np.ones(t_s.size, dtype=np.bool_)
+def _thinned(t_s: Floats, rows: Ints) -> Ints:
+    """Of these rows some two a second, which tell all that is asked here."""
+    t_s = t_s[rows]
+    if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.45:
+        return rows
     slot = np.floor((t_s - t_s[0]) / 0.5 + 1e-6)
-    kept: Bools = np.diff(slot, prepend=-1.0) > 0
+    kept: Ints = rows[np.diff(slot, prepend=-1.0) > 0]
     return kept

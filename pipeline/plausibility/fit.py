@@ -16,7 +16,7 @@ from pipeline.plausibility.survey import line_of
 from pipeline.plausibility.witnesses import Clocks, Lag
 from pipeline.plausibility.written import reference_elsewhere, written_checks
 from schemas.arrays import times_ns
-from schemas.config import IngestConfig, Vehicle
+from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
@@ -38,7 +38,7 @@ class Fit:
         return (*self.impossible, *(check for check in self.checks if check.state is State.MISFIT))
 
 
-def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, site: Site | None = None) -> Fit:
+def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityConfig, site: Site | None = None) -> Fit:
     """Compare the streams of a cleaned run with one solution, the site and the vehicle file where there are any."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     epoch_ns = int(times_ns(run.gnss)[0])
@@ -54,7 +54,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
     of_reference: Lag | None = None
     beside_reference = False
     if run.reference is not None and run.reference.height:
-        checks += reference_elsewhere(gnss, run.reference, epoch_ns)
+        checks += reference_elsewhere(gnss, run.reference, epoch_ns, config)
         if not checks:
             of_reference, checks, beside_reference = reference_checks(
                 fixes, gnss, run.reference, epoch_ns, config, line
@@ -66,7 +66,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: IngestConfig, 
         lags.append(reads_lag(gnss, run.balise_reads, site, epoch_ns, config))
     if line is not None:
         checks = survey_checks(gnss, line, vehicle, config, beside_reference) + checks
-    checks += velocity_checks(fixes, gnss, epoch_ns, config.fit_scale_limit)
+    checks += velocity_checks(fixes, gnss, epoch_ns, config)
     streams = [name for name in ("gnss", "satellites") if run.stream(name) is not None]
     several = solution if len(run.solutions()) > 1 else None
     believed = all(check.state is not State.MISFIT for check in checks if check.what == LATENCY)

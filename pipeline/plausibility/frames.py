@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from schemas.arrays import Floats
+from schemas.config import PlausibilityConfig
 
 _RADIAN_DEG = float(np.degrees(1.0))
 
@@ -69,7 +70,6 @@ DATUMS = {
     "Tokyo (Japan)": 4301,
     "MGI 1901 (former Yugoslavia)": 3906,
 }
-_NEAR_M, _NEAR_SHARE = 12.0, 0.12
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,12 @@ class Datum:
         """How far a shift is from this one."""
         return float(np.hypot(self.east_m - east_m, self.north_m - north_m))
 
-    def explains(self, east_m: float, north_m: float, one_heading: bool) -> bool:
+    def explains(self, east_m: float, north_m: float, one_heading: bool, config: PlausibilityConfig) -> bool:
         """Whether it is this shift; of a single heading only the part across it is known."""
         size_m = float(np.hypot(east_m, north_m))
         across_m = abs((self.east_m - east_m) * east_m + (self.north_m - north_m) * north_m) / size_m
-        return (across_m if one_heading else self.off_m(east_m, north_m)) < max(_NEAR_M, _NEAR_SHARE * size_m)
+        off_m = across_m if one_heading else self.off_m(east_m, north_m)
+        return off_m < max(config.datum_near_m, config.datum_near_share * size_m)
 
 
 def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:
@@ -101,7 +102,8 @@ def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:
     geod = pyproj.Geod(ellps="WGS84")
     for name, code in DATUMS.items():
         area = pyproj.CRS.from_epsg(code).area_of_use
-        if area is None or not _inside(area.bounds, latitude_deg, longitude_deg):
+        west, south, east, north = (181.0, 0.0, 0.0, 0.0) if area is None else area.bounds
+        if not (south <= latitude_deg <= north and west <= longitude_deg <= east):
             continue
         turn = pyproj.Transformer.from_crs(code, 4326, always_xy=True)
         longitude, latitude = turn.transform(longitude_deg, latitude_deg)
@@ -109,8 +111,3 @@ def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:
         azimuth = np.radians(azimuth_deg)
         found.append(Datum(name, code, float(distance_m * np.sin(azimuth)), float(distance_m * np.cos(azimuth))))
     return found
-
-
-def _inside(bounds: tuple[float, float, float, float], latitude_deg: float, longitude_deg: float) -> bool:
-    west, south, east, north = bounds
-    return south <= latitude_deg <= north and west <= longitude_deg <= east

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.plausibility.course import Places
-from pipeline.plausibility.robust import LEAST, MOVES_MPS, explains, regressed, sampled
+from pipeline.plausibility.robust import LEAST, explains, regressed, sampled
 from schemas.arrays import Floats, Ints
-from schemas.config import IngestConfig
+from schemas.config import PlausibilityConfig
 
-# Two records are of the same place within so much, and a read of the balise that it names [m].
-_SAME_PLACE_M = 400.0
-READ_M = 60.0
 # Lags found place by place agree within so much [s].
 _BIN_S = 2.0
 
@@ -41,11 +38,11 @@ class PlaceFit:
         return float(np.hypot(self.east_m, self.north_m))
 
 
-def fit_places(gnss: Places, record: Places, config: IngestConfig) -> PlaceFit:
+def fit_places(gnss: Places, record: Places, config: PlausibilityConfig) -> PlaceFit:
     """Lag and shift of another record of the same journey; a shift of its clock has to explain more than none."""
     as_recorded = _refined(gnss, record, 0.0, config)
-    moving = sampled(np.nan_to_num(gnss.speed(gnss.t_s)) > MOVES_MPS, 100)
-    number, passed_s = passes(record, gnss.points.surface[moving], _SAME_PLACE_M)
+    moving = sampled(np.nan_to_num(gnss.speed(gnss.t_s)) > config.moving_mps, 100)
+    number, passed_s = passes(record, gnss.points.surface[moving], config.same_place_m, config)
     lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()))
     if lag_s is None or abs(lag_s) <= _BIN_S:
         return as_recorded
@@ -55,7 +52,7 @@ def fit_places(gnss: Places, record: Places, config: IngestConfig) -> PlaceFit:
     return replace(shifted, as_recorded=0.0 if as_recorded.reason else as_recorded.as_recorded)
 
 
-def passes(track: Places, places_m: Floats, within_m: float) -> tuple[Ints, Floats]:
+def passes(track: Places, places_m: Floats, within_m: float, config: PlausibilityConfig) -> tuple[Ints, Floats]:
     """Which places at height zero a moving record passes, and when [s]; a place as often as it is passed."""
     surface = track.points.surface
     centre = surface.mean(axis=0)
@@ -75,7 +72,7 @@ def passes(track: Places, places_m: Floats, within_m: float) -> tuple[Ints, Floa
         better = (left_m < away_m) & (period_s <= track.limit_s)
         at_s = np.where(better, track.t_s[begin] + part * period_s, at_s)
         away_m = np.where(better, left_m, away_m)
-    kept = (away_m < within_m) & (np.nan_to_num(track.speed(at_s)) > MOVES_MPS)
+    kept = (away_m < within_m) & (np.nan_to_num(track.speed(at_s)) > config.moving_mps)
     return place[kept], at_s[kept]
 
 
@@ -92,7 +89,7 @@ def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
     return float(np.median(agreeing)), float(np.std(agreeing) / np.sqrt(agreeing.size))
 
 
-def _refined(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -> PlaceFit:
+def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityConfig) -> PlaceFit:
     """Shift and the rest of the lag by robust regression of what both are apart on the velocity."""
     t_s = gnss.t_s
     known = record.known(t_s + lag_s) & record.known(t_s + lag_s + 1.0) & record.known(t_s + lag_s - 1.0)
@@ -101,7 +98,7 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -
     axes = np.stack([gnss.points.east[rows], gnss.points.north[rows]], axis=1)
     velocity = np.einsum("ijk,ik->ij", axes, (record.at(t_s + 1.0) - record.at(t_s - 1.0)) / 2.0)
     apart = np.einsum("ijk,ik->ij", axes, record.at(t_s) - gnss.ecef_m[rows])
-    moves = np.linalg.norm(velocity, axis=1) > MOVES_MPS
+    moves = np.linalg.norm(velocity, axis=1) > config.moving_mps
     if moves.sum() < 3 * LEAST:
         return PlaceFit(reason="hardly any movement in common")
     velocity, apart = velocity[moves], apart[moves]
@@ -109,7 +106,7 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -
     # Along one heading at constant speed a lag and a shift look alike: it is taken for a lag.
     fit = regressed(design, apart, floor=0.2, told=1e-4)
     # What is told besides is no disagreement, nor what positions scatter beyond it.
-    bound = 1.5 * config.fit_shift_told_m + config.fit_lag_told_s * np.linalg.norm(velocity, axis=1)
+    bound = 1.5 * config.shift_told_m + config.lag_told_s * np.linalg.norm(velocity, axis=1)
     agreeing = float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound))
     before = float(np.mean(np.linalg.norm(apart, axis=1) < bound))
     # The record is ahead by so much way at its stamp: it stamps a place so much too early.

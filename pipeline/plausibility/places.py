@@ -10,13 +10,13 @@ from pipeline.plausibility.check import Check, State, correction, fits, not_chec
 from pipeline.plausibility.copies import copy_check
 from pipeline.plausibility.course import Places, places_of, seconds_since
 from pipeline.plausibility.frames import Datum, datums_at
-from pipeline.plausibility.passing import READ_M, PlaceFit, common_lag, fit_places, passes
+from pipeline.plausibility.passing import PlaceFit, common_lag, fit_places, passes
 from pipeline.plausibility.robust import explains
 from pipeline.plausibility.survey import Line, SurveyFit, fit_survey, steady_median
 from pipeline.plausibility.witnesses import Lag
 from pipeline.track.geodesy import points_of
 from schemas.arrays import Floats
-from schemas.config import IngestConfig, Vehicle
+from schemas.config import PlausibilityConfig, Vehicle
 from schemas.run import Site
 
 _REFERENCE = "places of the reference against the positions"
@@ -31,27 +31,27 @@ def reference_checks(
     gnss: Places,
     reference: pl.DataFrame,
     epoch_ns: int,
-    config: IngestConfig,
+    config: PlausibilityConfig,
     line: Line | None,
 ) -> tuple[Lag, list[Check], bool]:
     """Clock, place and heights of the reference; and whether it lies where the positions do. A copy tells nothing."""
     record = places_of(reference, epoch_ns)
     if record is None:
         return Lag("reference", reason="hardly any place"), [], False
-    if copied := copy_check(fixes, gnss, reference, record, epoch_ns, line):
+    if copied := copy_check(fixes, gnss, reference, record, epoch_ns, line, config):
         return Lag("reference", reason="a copy of the positions"), [copied], False
     found = fit_places(gnss, record, config)
     if found.reason:
         return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
-    told = abs(found.lag_s) > max(config.fit_lag_told_s, 5.0 * found.lag_sigma_s)
+    told = abs(found.lag_s) > max(config.lag_told_s, 5.0 * found.lag_sigma_s)
     agrees = explains(found.agreeing, 0.0)
-    small = abs(found.lag_s) <= config.fit_lag_limit_s and agrees
+    small = abs(found.lag_s) <= config.lag_limit_s and agrees
     sure = told and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
     lag = Lag("reference", found.lag_s, found.lag_sigma_s, sure=sure)
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
-    near = found.shift_m <= config.fit_shift_told_m
+    near = found.shift_m <= config.shift_told_m
     beside = _beside_reference(found, near or not found.shift_is_steady)
     return lag, [beside, *_reference_heights(gnss, record, found.lag_s, config)], near
 
@@ -65,7 +65,7 @@ def _beside_reference(found: PlaceFit, fit: bool) -> Check:
     return Check(_REFERENCE, State.MISFIT, words, cause, advice=advice)
 
 
-def _reference_heights(gnss: Places, record: Places, lag_s: float, config: IngestConfig) -> list[Check]:
+def _reference_heights(gnss: Places, record: Places, lag_s: float, config: PlausibilityConfig) -> list[Check]:
     known = np.isfinite(record.height_m)
     if known.sum() < 2 or not np.isfinite(gnss.height_m).any():
         return []
@@ -76,20 +76,20 @@ def _reference_heights(gnss: Places, record: Places, lag_s: float, config: Inges
     return _heights("reference", up_m, gnss.height_m, 0.0, config)
 
 
-def reads_lag(gnss: Places, reads: pl.DataFrame, site: Site, epoch_ns: int, config: IngestConfig) -> Lag:
+def reads_lag(gnss: Places, reads: pl.DataFrame, site: Site, epoch_ns: int, config: PlausibilityConfig) -> Lag:
     """The clock of the balise reads: where the positions pass a balise that was read."""
     places = _balise_places(site)
     names = reads["balise_id"].to_list()
     known = np.array([name in places for name in names], dtype=np.bool_)
     if known.sum() < 3:
         return Lag("balise_reads", reason="fewer than three reads of balises of the site")
-    number, passed_s = passes(gnss, np.array([places[name] for name in names if name in places]), READ_M)
+    number, passed_s = passes(gnss, np.array([places[name] for name in names if name in places]), config.read_m, config)
     t_s = seconds_since(epoch_ns, reads)[known]
     lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()))
     if lag_s is None:
         return Lag("balise_reads", reason="no one lag explains the reads")
     # Antennas far from each other pass a balise at other times: what a train can have may be theirs.
-    return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.fit_lag_limit_s)
+    return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.lag_limit_s)
 
 
 def _balise_places(site: Site) -> dict[str, Floats]:
@@ -106,36 +106,35 @@ def _balise_places(site: Site) -> dict[str, Floats]:
 
 
 def survey_checks(
-    gnss: Places, line: Line, vehicle: Vehicle, config: IngestConfig, beside_reference: bool
+    gnss: Places, line: Line, vehicle: Vehicle, config: PlausibilityConfig, beside_reference: bool
 ) -> list[Check]:
     """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
-    found, datum = _by_datum(fit_survey(gnss, line), gnss, line, config)
+    found, datum = _by_datum(fit_survey(gnss, line, config.moving_mps), gnss, line, config)
     heights = _heights("survey", found.up_m, found.height_m, vehicle.antenna_height_m, config)
     return [_beside(found, datum, config, ("gnss", "reference") if beside_reference else ("gnss",)), *heights]
 
 
-def _by_datum(found: SurveyFit, gnss: Places, line: Line, config: IngestConfig) -> tuple[SurveyFit, Datum | None]:
+def _by_datum(found: SurveyFit, gnss: Places, line: Line, config: PlausibilityConfig) -> tuple[SurveyFit, Datum | None]:
     """The datum that the survey may be in; between curves a large shift is found only from near it."""
-    if found.aside_m < config.fit_shift_told_m:
+    if found.aside_m < config.shift_told_m:
         return found, None
     datums = datums_at(float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg)))
-    tried = [
-        (found if found.constant else fit_survey(gnss, line, (datum.east_m, datum.north_m)), datum) for datum in datums
-    ]
     named = [
         (fit, datum)
-        for fit, datum in tried
-        if fit.constant and datum.explains(fit.east_m, fit.north_m, fit.one_heading)
+        for datum in datums
+        for start_m in [(datum.east_m, datum.north_m)]
+        for fit in [found if found.constant else fit_survey(gnss, line, config.moving_mps, start_m)]
+        if fit.constant and datum.explains(fit.east_m, fit.north_m, fit.one_heading, config)
     ]
     return min(named, key=lambda item: item[1].off_m(item[0].east_m, item[0].north_m), default=(found, None))
 
 
-def _beside(found: SurveyFit, datum: Datum | None, config: IngestConfig, streams: tuple[str, ...]) -> Check:
+def _beside(found: SurveyFit, datum: Datum | None, config: PlausibilityConfig, streams: tuple[str, ...]) -> Check:
     unknown = " (along the track not known: one heading)" if found.one_heading else ""
     words = f"the survey lies {towards(found.east_m, found.north_m)} of them{unknown}"
-    told = found.shift_m > config.fit_shift_told_m and found.aside_m > 0.4 * config.fit_shift_told_m
+    told = found.shift_m > config.shift_told_m and found.aside_m > 0.4 * config.shift_told_m
     if not told or not found.constant:
-        if found.aside_m > config.fit_shift_told_m:
+        if found.aside_m > config.shift_told_m:
             return Check(_SURVEY, State.MISFIT, f"they lie {found.aside_m:.0f} m beside the track, not by one shift")
         return fits(_SURVEY, f"{found.aside_m:.1f} m beside the track usually")
     if datum is not None:
@@ -159,18 +158,18 @@ def towards(east_m: float, north_m: float) -> str:
     return f"{abs(east_m):.0f} m {east}, {abs(north_m):.0f} m {north}"
 
 
-def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: IngestConfig) -> list[Check]:
+def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: PlausibilityConfig) -> list[Check]:
     """Heights of the survey or reference, which lie `up_m` above those of the positions; `offset_m`: as they should."""
     what = f"heights against the {other}"
     apart_m, is_steady = steady_median(up_m + offset_m)
     if not np.isfinite(apart_m):
         return []
     words = f"the {other} lies {apart_m:.0f} m above them"
-    if abs(apart_m) <= 1.5 * config.fit_shift_told_m or not is_steady:
+    if abs(apart_m) <= 1.5 * config.shift_told_m or not is_steady:
         return [fits(what, words)]
     ratio, _ = steady_median(height_m / (height_m + up_m + offset_m))
     for stream, factor in (("gnss", ratio), (other, 1.0 / ratio)):
-        unit = explain_factor(factor, speed=False)
+        unit = explain_factor(factor, False, config)
         if unit is not None and unit.cause.removeprefix("in ") in _HEIGHT_UNITS:
             whose = "heights of the positions are" if stream == "gnss" else f"heights of the {other} are"
             lines = "" if stream == "survey" else correction(stream, {"height_m": 1.0 / unit.exact})

@@ -9,12 +9,9 @@ import numpy as np
 from schemas.arrays import Bools, Floats
 
 # Tukey's biweight, 95 % efficient on Gaussian noise (Huber and Ronchetti 2009), after least absolute deviations.
-_BIWEIGHT = 4.685
-_ROUNDS = 12
+_BIWEIGHT, _ROUNDS = 4.685, 12
 # Fewer observations tell nothing, and so do two rivals that agree nearly as well.
 LEAST = 6
-# Slower than this, positions that scatter by some metres may be of a train that stands [m/s].
-MOVES_MPS = 1.0
 
 
 @dataclass(frozen=True)

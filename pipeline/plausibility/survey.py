@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.plausibility.course import Places
-from pipeline.plausibility.robust import MOVES_MPS, regressed, sampled, steady, usual
+from pipeline.plausibility.robust import regressed, sampled, steady, usual
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import track_of
 from schemas.arrays import Floats
@@ -17,9 +17,8 @@ from schemas.arrays import Floats
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_SPACING_M = 20.0
-# Each round finds the nearest track anew.
-_ROUNDS = 8
+# Points of the track lie so far apart [m]; each round finds the nearest of them anew.
+_SPACING_M, _ROUNDS = 20.0, 8
 # A heading only: below this share of the information across it, the shift along the track is not known.
 _ONE_HEADING = 0.04
 
@@ -92,12 +91,12 @@ def line_of(frame: pl.DataFrame) -> Line:
     return Line(places, along, heights, cKDTree(places))
 
 
-def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
+def fit_survey(gnss: Places, line: Line, moving_mps: float, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
     """The constant shift that brings moving positions onto the track, by repeated projection and robust regression.
 
     `start_m`: a shift to begin with.
     """
-    moving = np.nan_to_num(gnss.speed(gnss.t_s)) > MOVES_MPS
+    moving = np.nan_to_num(gnss.speed(gnss.t_s)) > moving_mps
     rows = np.flatnonzero(sampled(moving if moving.sum() >= 20 else np.ones_like(moving), 400))
     points = gnss.points.take(rows)
     axes = np.stack([points.east, points.north], axis=1)

@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 from pipeline.plausibility.causes import explain_lag, leap_seconds
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
-from schemas.config import IngestConfig
+from schemas.config import PlausibilityConfig
 
-# Two lags are of one clock if they are so near to each other [s].
-_SAME_S = 1.5
 NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "balise reads"}
 
 
@@ -39,7 +37,7 @@ class Clocks:
     streams: list[str]
     solution: str | None
     t_ns: int
-    config: IngestConfig
+    config: PlausibilityConfig
     latency_s: float = 0.0
 
     def checks(self, lags: list[Lag]) -> list[Check]:
@@ -48,35 +46,37 @@ class Clocks:
         sure = [lag.lag_s for lag in lags if lag.sure]
         # Two recorders that show the same lag are surer than each.
         lags = [lag if lag.reason else replace(lag, sure=self._as_sure(lag, sure)) for lag in lags]
-        wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > self.config.fit_lag_limit_s]
-        others = [lag for lag in lags if not lag.reason and abs(lag.lag_s) <= self.config.fit_lag_limit_s]
-        alike = all(abs(one.lag_s - wrong[0].lag_s) < _SAME_S for one in wrong)
+        wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > self.config.lag_limit_s]
+        others = [lag for lag in lags if not lag.reason and abs(lag.lag_s) <= self.config.lag_limit_s]
+        alike = all(abs(one.lag_s - wrong[0].lag_s) < self.config.same_clock_s for one in wrong)
         # One clock has one lag, and one line that mends it.
         of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
         return [self._check(lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
 
     def _as_sure(self, lag: Lag, sure_s: list[float]) -> bool:
-        beyond = abs(lag.lag_s) > self.config.fit_lag_limit_s
-        return lag.sure or (beyond and any(abs(lag.lag_s - one_s) < _SAME_S for one_s in sure_s))
+        beyond = abs(lag.lag_s) > self.config.lag_limit_s
+        return lag.sure or (beyond and any(abs(lag.lag_s - one_s) < self.config.same_clock_s for one_s in sure_s))
 
     def _check(self, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
         what, size_s = f"clock of the {NAMES[lag.stream]} against the GNSS", abs(lag.lag_s)
         if lag.reason:
             return not_checked(what, lag.reason)
-        if not lag.sure and size_s > max(self.config.fit_lag_told_s, 5.0 * lag.sigma_s):
+        if not lag.sure and size_s > max(self.config.lag_told_s, 5.0 * lag.sigma_s):
             return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
-        if not lag.sure or size_s <= self.config.fit_lag_told_s:
+        if not lag.sure or size_s <= self.config.lag_told_s:
             sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
             return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
         later = "later" if lag.lag_s > 0 else "earlier"
         found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {NAMES[lag.stream]} are {later}"
-        if size_s <= self.config.fit_lag_limit_s:
+        if size_s <= self.config.lag_limit_s:
             return _small(what, found, lag)
         told = of_gnss or lag
-        explained = explain_lag(told.lag_s, self.t_ns, min(3.0 * told.sigma_s, 3.0))
+        explained = explain_lag(told.lag_s, self.t_ns, min(3.0 * told.sigma_s, 3.0), self.config)
         exact_s = round(told.lag_s if explained is None else explained.exact, 2)
         cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
-        at_gnss = of_gnss is not None or (not known and _rather_gnss(lag.lag_s, cause, self.t_ns))
+        at_gnss = of_gnss is not None or (
+            not known and _rather_gnss(lag.lag_s, cause, self.t_ns, self.config.same_clock_s)
+        )
         pair = ("GNSS", NAMES[lag.stream]) if at_gnss else (NAMES[lag.stream], "GNSS")
         cause += f", in the {pair[0]}" if known else f", rather in the {pair[0]} than in the {pair[1]}"
         if not at_gnss:
@@ -86,12 +86,12 @@ class Clocks:
         return Check(what, State.IMPOSSIBLE, found, cause, lines)
 
 
-def _rather_gnss(lag_s: float, cause: str, t_ns: int) -> bool:
+def _rather_gnss(lag_s: float, cause: str, t_ns: int, same_s: float) -> bool:
     """Which of two clocks it is, where nobody else tells.
 
     GPS time is ahead of UTC, so the stream with the later stamps holds it; a week rolls over in GNSS receivers.
     """
-    if abs(abs(lag_s) - leap_seconds(t_ns)) < _SAME_S:
+    if abs(abs(lag_s) - leap_seconds(t_ns)) < same_s:
         return lag_s < 0
     return "roll-over of the GPS week" in cause and lag_s > 0
 

@@ -11,27 +11,24 @@ import polars as pl
 
 from pipeline.plausibility.axes import fit_velocity
 from pipeline.plausibility.check import Check, State, correction, not_checked
-from pipeline.plausibility.course import Places, places_of
+from pipeline.plausibility.course import Places, courses_of, places_of
 from pipeline.plausibility.frames import SLIPS, Slip
-from pipeline.plausibility.odometer import courses_of
 from pipeline.plausibility.pairs import fit_pair
 from pipeline.plausibility.survey import Line
 from pipeline.track.geodesy import points_of
 from schemas.arrays import Floats
-from schemas.config import IngestConfig
+from schemas.config import PlausibilityConfig
 from schemas.run import RunLog
 
 _WHAT = "positions as written"
-# Positions so far from track or reference are not of the same line [m].
-_FAR_M = 2_000.0
 
 
 def written_checks(
-    run: RunLog, fixes: pl.DataFrame, gnss: Places, line: Line | None, epoch_ns: int, config: IngestConfig
+    run: RunLog, fixes: pl.DataFrame, gnss: Places, line: Line | None, epoch_ns: int, config: PlausibilityConfig
 ) -> list[Check]:
     """What keeps positions from being compared at all, empty where nothing does."""
     far_m = 0.0 if line is None else line.far_m(gnss.latitude_deg, gnss.longitude_deg)
-    if line is not None and far_m <= _FAR_M:
+    if line is not None and far_m <= config.same_line_m:
         return []
     recorded = _witnesses(run, fixes, gnss, epoch_ns, config)
     if line is None:
@@ -39,7 +36,7 @@ def written_checks(
     words = f"they lie {far_m / 1000.0:.0f} km from every track"
     for slip in SLIPS:
         mended = _mended(fixes, slip, epoch_ns)
-        if mended is None or line.far_m(mended.latitude_deg, mended.longitude_deg) > _FAR_M:
+        if mended is None or line.far_m(mended.latitude_deg, mended.longitude_deg) > config.same_line_m:
             continue
         if sum(_witnesses(run, fixes, mended, epoch_ns, config).values()) >= sum(recorded.values()):
             return [_slipped(slip, words)]
@@ -50,7 +47,7 @@ def written_checks(
 
 
 def _without_survey(
-    run: RunLog, fixes: pl.DataFrame, recorded: dict[str, bool], epoch_ns: int, config: IngestConfig
+    run: RunLog, fixes: pl.DataFrame, recorded: dict[str, bool], epoch_ns: int, config: PlausibilityConfig
 ) -> list[Check]:
     """The slip that makes every other stream fit, if there is one."""
     words = "no other stream fits them"
@@ -79,19 +76,21 @@ def _lines(stream: str, slip: Slip) -> str:
     return correction(stream, slip.factors, exchange=exchange)
 
 
-def _witnesses(run: RunLog, fixes: pl.DataFrame, gnss: Places, epoch_ns: int, config: IngestConfig) -> dict[str, bool]:
+def _witnesses(
+    run: RunLog, fixes: pl.DataFrame, gnss: Places, epoch_ns: int, config: PlausibilityConfig
+) -> dict[str, bool]:
     """What of the run's other streams fits positions, by name; without those that tell nothing."""
     found: dict[str, bool] = {}
-    for course in courses_of(run, epoch_ns).values():
-        pair = fit_pair(gnss, course)
+    for course in courses_of(run.odometer, epoch_ns).values():
+        pair = fit_pair(gnss, course, config)
         if pair.told:
-            fits = pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= config.fit_scale_limit
+            fits = pair.constant > 0.5 and abs(abs(pair.factor) - 1.0) <= config.scale_limit
             found["odometer"] = found.get("odometer", False) or fits
-    velocity = fit_velocity(fixes, gnss, epoch_ns)
+    velocity = fit_velocity(fixes, gnss, epoch_ns, config)
     if velocity is not None:
-        found["velocity"] = velocity.best == 0 and abs(velocity.ratio - 1.0) <= config.fit_scale_limit
+        found["velocity"] = velocity.best == 0 and abs(velocity.ratio - 1.0) <= config.scale_limit
     if run.reference is not None and (record := places_of(run.reference, epoch_ns)) is not None:
-        found["reference"] = apart_m(gnss, record.latitude_deg, record.longitude_deg) < _FAR_M
+        found["reference"] = apart_m(gnss, record.latitude_deg, record.longitude_deg) < config.same_line_m
     return found
 
 
@@ -111,15 +110,20 @@ def apart_m(gnss: Places, latitude_deg: Floats, longitude_deg: Floats) -> float:
     return float(np.min(tree.query(gnss.points.surface[:: max(1, len(gnss.t_s) // 200)])[0]))
 
 
-def reference_elsewhere(gnss: Places, reference: pl.DataFrame, epoch_ns: int) -> list[Check]:
+def reference_elsewhere(
+    gnss: Places, reference: pl.DataFrame, epoch_ns: int, config: PlausibilityConfig
+) -> list[Check]:
     """A reference far away: perhaps its axes or signs are wrong; empty where it is near."""
     record = places_of(reference, epoch_ns)
-    if record is None or (far_m := apart_m(gnss, record.latitude_deg, record.longitude_deg)) < 10.0 * _FAR_M:
+    if (
+        record is None
+        or (far_m := apart_m(gnss, record.latitude_deg, record.longitude_deg)) < 10.0 * config.same_line_m
+    ):
         return []
     what, words = "places of the reference against the positions", f"it is {far_m / 1000:.0f} km from the positions"
     for slip in SLIPS:
         latitude, longitude = slip.mended(record.latitude_deg, record.longitude_deg)
-        if np.max(np.abs(latitude)) <= 90.0 and apart_m(gnss, latitude, longitude) < 10.0 * _FAR_M:
+        if np.max(np.abs(latitude)) <= 90.0 and apart_m(gnss, latitude, longitude) < 10.0 * config.same_line_m:
             cause, advice = f"in the reference {slip.cause}", "Convert its positions." if slip.minutes else ""
             lines = "" if slip.minutes else _lines("reference", slip)
             return [Check(what, State.IMPOSSIBLE, words, cause, lines, advice=advice)]

@@ -9,7 +9,7 @@ import polars as pl
 from pipeline.ingest.clean import CleanCounts, clean
 from pipeline.plausibility.check import State
 from pipeline.plausibility.fit import Fit, fit_run, lines_of
-from schemas.config import IngestConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site, Stream
 
@@ -36,18 +36,20 @@ class FitReport:
 
 
 def fit_report(
-    run: RunLog, config: IngestConfig, site: Site | None = None, vehicle: Vehicle | None = None
+    run: RunLog, config: Configuration, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> FitReport:
     """Every check of every solution; a run that cannot be cleaned has its error as problem."""
     problems: tuple[str, ...] = ()
     try:
-        cleaned, counts = clean(run, config)
+        cleaned, counts = clean(run, config.ingest)
     except InputError as error:
         # Recorders of different times: what moves one to the other is told all the same.
         cleaned, counts, problems = _in_order(run), CleanCounts(), (str(error),)
         if cleaned.gnss.height < 2:
             return FitReport({}, problems)
-    found = {name: fit_run(cleaned, name, vehicle or Vehicle(), config, site) for name in cleaned.solutions()}
+    found = {
+        name: fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site) for name in cleaned.solutions()
+    }
     tables = {"Fit": _checks(found, counts)}
     mending: dict[str, str] = {}
     for fit in found.values():
@@ -57,7 +59,7 @@ def fit_report(
     text = "\n".join(f"# {into}\n{lines}" for into, lines in mending.items())
     if text:
         tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
-    failing = found.values() if config.plausibility == "fail" and not problems else ()
+    failing = found.values() if config.ingest.plausibility == "fail" and not problems else ()
     impossible = dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)
     return FitReport(tables, problems + tuple(impossible))
 

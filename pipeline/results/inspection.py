@@ -20,7 +20,7 @@ from pipeline.results.terminal import show_tables
 from pipeline.site.read import is_geojson, read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
-from schemas.config import IngestConfig, MatchingConfig, Vehicle
+from schemas.config import Configuration, MatchingConfig, Vehicle
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding, Site
 
@@ -36,7 +36,7 @@ _RUN_COLUMNS: tuple[str | pl.Expr, ...] = (
 
 def inspect_path(
     path: Address,
-    config: IngestConfig | None = None,
+    config: Configuration | None = None,
     result: Address | None = None,
     matching: MatchingConfig | None = None,
     site: Address | None = None,
@@ -56,7 +56,7 @@ def inspect_path(
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
-        return inspect_log(path, config or IngestConfig(), None if site is None else read_site(site), vehicle)
+        return inspect_log(path, config or Configuration(), None if site is None else read_site(site), vehicle)
     if name_of(path).lower().endswith(".csv"):
         return inspect_csv(Path(path))
     raise UsageError(
@@ -80,10 +80,10 @@ def show(tables: Mapping[str, pl.DataFrame]) -> None:
 
 
 def inspect_log(
-    path: Address, config: IngestConfig, site: Site | None = None, vehicle: Vehicle | None = None
+    path: Address, config: Configuration, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> dict[str, pl.DataFrame]:
     """Streams, topics, what is mapped to what, what does not fit, and what keeps the log from being replayed."""
-    found = describe_log(path, config)
+    found = describe_log(path, config.ingest)
     figures = {
         "kind": found.kind,
         "size_bytes": found.size_bytes,

@@ -14,17 +14,15 @@ from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.site.tables import RawTable, typed_table
 from pipeline.survey.kilometres import measures_at
 from pipeline.survey.network import Network
-from pipeline.survey.pieces import SAME_TRACK_M, Survey
+from pipeline.survey.pieces import Survey
 from pipeline.survey.sources import content_of_survey
 from pipeline.survey.tables import placed_table
 from pipeline.track.geodesy import points_of
 from pipeline.track.network import network_of
 from pipeline.track.survey import Track, track_of
+from schemas.config import SurveyConfig
 from schemas.errors import SiteError
 from schemas.inputs import Balises
-
-# Lists give the track's axis or the marker beside it; farther is another line, or another system of coordinates.
-_FAR_M = 10.0
 
 
 def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
@@ -43,10 +41,7 @@ def balises_every(network: Network, spacing_m: float) -> pl.DataFrame:
         measures = way - begins if at_start <= at_end else length - (way - begins)
         rows += [{"netelement_id": name, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
     ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
-    return _validated(pl.DataFrame(rows, schema={"netelement_id": pl.String, "measure_m": pl.Float64}), ids)
-
-
-def _validated(table: pl.DataFrame, ids: list[str]) -> pl.DataFrame:
+    table = pl.DataFrame(rows, schema={"netelement_id": pl.String, "measure_m": pl.Float64})
     return _typed("balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual")))
 
 
@@ -75,7 +70,9 @@ def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
     return found
 
 
-def balises_of_list(path: Path, network: Network, epsg: int | None, survey: Survey) -> pl.DataFrame:
+def balises_of_list(
+    path: Path, network: Network, epsg: int | None, survey: Survey, config: SurveyConfig
+) -> pl.DataFrame:
     """The balises of a table, each at its net element and measure, its coordinates, or its line kilometre.
 
     Raises `SiteError` for a balise that no track, or more than one, can be meant for.
@@ -87,20 +84,18 @@ def balises_of_list(path: Path, network: Network, epsg: int | None, survey: Surv
         table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
     kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
     table = table.with_columns(kind=kind)
-    placer = _Placer(place, network, track, survey)
+    placer = _Placer(place, network, track, survey, config)
     found = [placer.placed(row) for row in table.iter_rows(named=True)]
-    ids, measures = [one[0] for one in found], [one[1] for one in found]
-    placed = table.with_columns(
-        pl.Series("netelement_id", ids, dtype=pl.String), pl.Series("measure_m", measures, dtype=pl.Float64)
-    )
-    return _typed(place, placed)
+    columns = {"netelement_id": pl.String, "measure_m": pl.Float64}
+    placed = pl.DataFrame(found, schema=columns, orient="row")
+    return _typed(place, table.with_columns(placed))
 
 
 class _Placer:
     """Where on the track a row of a list is."""
 
-    def __init__(self, place: str, network: Network, track: Track, survey: Survey) -> None:
-        self.place, self.network, self.track, self.survey = place, network, track, survey
+    def __init__(self, place: str, network: Network, track: Track, survey: Survey, config: SurveyConfig) -> None:
+        self.place, self.network, self.track, self.survey, self.config = place, network, track, survey, config
         self.ground, self.segments = network_of(track, network.links), segments_of(track)
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
@@ -119,19 +114,20 @@ class _Placer:
 
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
-        near = candidates_of(point, self.ground, self.segments, 2 * _FAR_M)
+        far_m = self.config.balise_beside_m
+        near = candidates_of(point, self.ground, self.segments, 2 * far_m)
         ranked = sorted(zip(near.distance_m.tolist(), near.element.tolist(), near.along_m.tolist(), strict=True))
         wanted = row.get("netelement_id")
         if wanted is not None:
             ranked = [one for one in ranked if self.track.ids[one[1]] == wanted]
-        if not ranked or ranked[0][0] > _FAR_M:
-            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * _FAR_M:g} m"
-            raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {_FAR_M:g} m")
+        if not ranked or ranked[0][0] > far_m:
+            found = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
+            raise self._refusal(row, "lies beside the track", found=found, expected=f"at most {far_m:g} m")
         self._tell_rival(row, ranked)
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
     def _tell_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
-        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + SAME_TRACK_M]
+        near = [one for one in ranked[1:] if one[0] < ranked[0][0] + self.config.same_track_m]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
         for _, other, _ in near:
             if not nodes & set(self.network.ends[other].tolist()):
@@ -144,7 +140,9 @@ class _Placer:
             (element.name, measure)
             for number, element in enumerate(self.network.elements)
             if wanted in (None, element.name)
-            for measure in measures_at(element.line_km, self.track.measure_m[self.track.vertices(number)], km)
+            for measure in measures_at(
+                element.line_km, self.track.measure_m[self.track.vertices(number)], km, self.config
+            )
         ]
         if not found:
             expected = "a line kilometre of the survey, not one that it jumps over"

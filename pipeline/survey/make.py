@@ -15,10 +15,10 @@ from pipeline.storage.writing import replace_files
 from pipeline.survey.balises import balises_every, balises_of_list
 from pipeline.survey.doubts import doubts
 from pipeline.survey.network import Network, make_network
-from pipeline.survey.pieces import SAME_PLACE_M, Survey
+from pipeline.survey.pieces import Survey
 from pipeline.survey.sources import read_surveys
 from pipeline.survey.trace import clean_traces
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.errors import SiteError, UsageError
 from schemas.run import Finding, Site
 
@@ -33,11 +33,11 @@ class Wish:
     spacing_m: float | None = None
     balise_list: Path | None = None
     epsg: int | None = None
-    join_m: float = SAME_PLACE_M
+    join_m: float | None = None
     flat: bool = False
 
 
-def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: float, flat: bool) -> Wish:
+def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: float | None, flat: bool) -> Wish:
     """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
     words = [str(path) for path in surveys]
     spacing: float | None = None
@@ -49,7 +49,7 @@ def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: 
         spacing = _number(text.removesuffix("m"))
         if spacing is None or not 1.0 <= spacing <= 1e6:
             raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
-    if not 0.0 <= join_m <= LIMITS.gap_m:
+    if join_m is not None and not 0.0 <= join_m <= LIMITS.gap_m:
         raise UsageError("is no reach", place=f"--join {join_m:g}", expected=f"0 to {LIMITS.gap_m:g} m")
     if not surveys:
         raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
@@ -61,26 +61,26 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
 
     Raises `SiteError`.
     """
-    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config))
+    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config), config.survey)
     if wish.flat:
         survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
-    network = make_network(survey, wish.join_m)
+    network = make_network(survey, wish.join_m, config.survey)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
-    balises = _balises(wish, network, survey)
+    balises = _balises(wish, network, survey, config.survey)
     track = network.track
     found = remarks(track, network.links, balises, None, {})
     if found.breaches:
         raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))
-    findings = (*survey.findings, *doubts(network), *found.findings, *without_balises(balises))
+    findings = (*survey.findings, *doubts(network, config.survey), *found.findings, *without_balises(balises))
     return Site(track, found.links, balises, None, findings)
 
 
-def _balises(wish: Wish, network: Network, survey: Survey) -> pl.DataFrame | None:
+def _balises(wish: Wish, network: Network, survey: Survey, config: SurveyConfig) -> pl.DataFrame | None:
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m)
         return table if table.height else None
-    return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey)
+    return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey, config)
 
 
 def write_made(site: Site, page: str, out: Path, force: bool) -> None:

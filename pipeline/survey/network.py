@@ -14,18 +14,16 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pipeline.site.checks import outward
-from pipeline.survey.pieces import COLUMNS, SAME_PLACE_M, Piece, Survey
+from pipeline.survey.pieces import COLUMNS, Piece, Survey
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import geometric_measures_m, track_of
 from schemas.arrays import Floats, Ints, spans_of
+from schemas.config import SurveyConfig
 from schemas.enums import Navigability
 from schemas.inputs import Links
 
 # OpenStreetMap writes seven decimals of a degree: equal positions are the same node.
 _NODE_DEG = 1e-7
-# A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
-# tram curve of 20 m. At a switch the branches lie within some 12 degrees (1:4.5); maps draw it up to 45.
-_MOST_AT_SWITCH_DEG = 45.0
 
 
 @dataclass(frozen=True)
@@ -41,23 +39,23 @@ class Network:
     track: pl.DataFrame
 
 
-def make_network(survey: Survey, join_m: float) -> Network:
-    """Net elements of all pieces; ends within `join_m` of a vertex of another piece meet it.
+def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> Network:
+    """Net elements of all pieces; ends within `join_m` (else: in one place) of a vertex of another piece meet it.
 
     What is doubtful about it is added to the survey's findings.
     """
     pieces = [piece for piece in survey.pieces if len(piece) > 1]
     if (short := len(survey.pieces) - len(pieces)) > 0:
         survey.told("note", "survey", f"{short} lines with fewer than two points are left out")
-    nodes = _nodes(pieces, join_m)
+    if not pieces:
+        return Network([], np.zeros((0, 2), dtype=np.int64), Links.create_empty(), pl.DataFrame())
+    nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m)
     pieces, nodes = _without_doubles(pieces, nodes, survey)
-    switches = _nodes_at(pieces, nodes, survey.switches_deg)
-    crossings = _crossings(pieces, nodes, switches, survey)
+    switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
+    crossings = _crossings(pieces, nodes, switches, survey, config)
     elements, ends = _cut(pieces, nodes, crossings)
-    if not elements:
-        return Network([], ends, Links.create_empty(), pl.DataFrame())
     track = _track_table(elements)
-    return Network(elements, ends, _links(track, ends, crossings, switches, survey), track)
+    return Network(elements, ends, _links(track, ends, crossings, switches, survey, config), track)
 
 
 def _track_table(elements: list[Piece]) -> pl.DataFrame:
@@ -70,17 +68,14 @@ def _track_table(elements: list[Piece]) -> pl.DataFrame:
 
 def _nodes(pieces: list[Piece], join_m: float) -> list[Ints]:
     """A number per point; points that are one node have the same."""
-    if not pieces:
-        return []
     latitude = np.concatenate([piece.latitude_deg for piece in pieces])
     longitude = np.concatenate([piece.longitude_deg for piece in pieces])
     last = np.cumsum([len(piece) for piece in pieces])
     keys = np.rint(np.column_stack([latitude, longitude]) / _NODE_DEG).astype(np.int64)
     node = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
     piece_of = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
-    surface = points_of(latitude, longitude).surface
     ends = np.unique(np.concatenate([last - [len(piece) for piece in pieces], last - 1]))
-    pairs = list(_near_ends(surface, piece_of, ends, join_m))
+    pairs = list(_near_ends(points_of(latitude, longitude).surface, piece_of, ends, join_m))
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     count = int(node.max()) + 1
     same = coo_array((np.ones(len(rows)), (node[rows], node[columns])), shape=(count, count))
@@ -118,17 +113,17 @@ def _without_doubles(pieces: list[Piece], nodes: list[Ints], survey: Survey) -> 
     return kept, kept_nodes
 
 
-def _crossings(pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey) -> set[int]:
+def _crossings(
+    pieces: list[Piece], nodes: list[Ints], switches: set[int], survey: Survey, config: SurveyConfig
+) -> set[int]:
     """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
 
     Nobody can take such a node of two lines for a slip by its geometry; a survey that names it a switch is believed.
     """
-    if not pieces:
-        return set()
     inner = np.concatenate([own[1:-1] for own in nodes])
     at_ends = np.unique(np.concatenate([own[[0, -1]] for own in nodes]))
     through, count = np.unique(inner, return_counts=True)
-    told = _nodes_at(pieces, nodes, survey.crossings_deg)
+    told = _nodes_at(pieces, nodes, survey.crossings_deg, config)
     by_form = set(np.setdiff1d(through[count == 2], at_ends).tolist()) - switches
     _tell_of_crossings(pieces, nodes, by_form - told, survey)
     return told | by_form
@@ -147,15 +142,16 @@ def _tell_of_crossings(pieces: list[Piece], nodes: list[Ints], unnamed: set[int]
         survey.told("note", f"track: {', '.join(pair)}", text, remedy)
 
 
-def _nodes_at(pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[float, float]]) -> set[int]:
+def _nodes_at(
+    pieces: list[Piece], nodes: list[Ints], places_deg: list[tuple[float, float]], config: SurveyConfig
+) -> set[int]:
     """The nodes at places (latitude, longitude)."""
     if not places_deg:
         return set()
-    latitude = np.concatenate([piece.latitude_deg for piece in pieces])
-    longitude = np.concatenate([piece.longitude_deg for piece in pieces])
+    tree = cKDTree(np.concatenate([piece.surface for piece in pieces]))
     wanted = points_of(*np.array(places_deg).T).surface
-    row = cKDTree(points_of(latitude, longitude).surface).query(wanted, distance_upper_bound=SAME_PLACE_M)[1]
-    return set(np.concatenate(nodes)[row[row < len(latitude)]].tolist())
+    row = tree.query(wanted, distance_upper_bound=config.same_place_m)[1]
+    return set(np.concatenate(nodes)[row[row < tree.n]].tolist())
 
 
 def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[list[Piece], Ints]:
@@ -179,18 +175,24 @@ def _cut(pieces: list[Piece], nodes: list[Ints], crossings: set[int]) -> tuple[l
     return elements, np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
-def _links(table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey) -> pl.DataFrame:
-    """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
+def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
+    """Elements and their ends at each node."""
     arms: dict[int, list[tuple[int, int]]] = {}
-    for element, pair in enumerate(ends.tolist()):
-        for position, node in enumerate(pair):
-            arms.setdefault(node, []).append((element, position))
+    for (element, position), node in np.ndenumerate(ends):
+        arms.setdefault(int(node), []).append((element, position))
+    return arms
+
+
+def _links(
+    table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
+) -> pl.DataFrame:
+    """Every pair of ends at a node: navigable in both directions where a train can go that way, else not."""
     track = track_of(table)
     directions, names = outward(track), track.ids
     rows: list[tuple[str, int, str, int, str]] = []
-    for node, meeting in arms.items():
+    for node, meeting in arms_of(ends).items():
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
-        pairs = _navigable(units, node in crossings, node in switches)
+        pairs = _navigable(units, node in crossings, node in switches, config.switch_deg)
         for one, other in itertools.combinations(range(len(meeting)), 2):
             way = Navigability.BOTH if (one, other) in pairs else Navigability.NONE
             (a, a_end), (b, b_end) = meeting[one], meeting[other]
@@ -200,7 +202,7 @@ def _links(table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[i
     return Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
 
 
-def _navigable(units: list[Floats], crossing: bool, switch: bool) -> set[tuple[int, int]]:
+def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:
     """Pairs of arms that a train can take; at a crossing each arm goes on straight only.
 
     Two arms that meet two are a crossing, unless the survey names a switch (a slip) there.
@@ -209,7 +211,9 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool) -> set[tuple[i
         (one, other): float(np.degrees(np.arccos(np.clip(-units[one] @ units[other], -1.0, 1.0))))
         for one, other in itertools.combinations(range(len(units)), 2)
     }
-    most = 90.0 if len(units) == 2 else _MOST_AT_SWITCH_DEG
+    # A train bends by its curve alone, 57 degrees over the 20 m that an end's direction is taken from and the sharpest
+    # tram curve of 20 m.
+    most = 90.0 if len(units) == 2 else switch_deg
     possible = {pair for pair, turn in turns.items() if turn <= most}
     ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
     two_by_two = ways == [2, 2, 2, 2]

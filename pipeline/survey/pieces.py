@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from pipeline.track.geodesy import earth_centred_m, points_of
 from schemas.arrays import Floats, Ints
 from schemas.errors import SiteError
 from schemas.run import Finding
 
-# Tracks lie 3.5 m and more apart, RTK scatters by centimetres: lines that are nearer are one track.
-SAME_TRACK_M = 1.5
-# Lines and their lengths keep to this.
-SHAPE_M = 0.1
-# Two places that are nearer are one.
-SAME_PLACE_M = 0.05
 # A survey of 100 MB holds some two million points: more is no line that a person checks.
 MOST_BYTES = 100_000_000
 
@@ -39,9 +35,29 @@ class Piece:
     def __len__(self) -> int:
         return len(self.latitude_deg)
 
-    def take(self, rows: Ints) -> Piece:
+    @property
+    def surface(self) -> Floats:
+        """The points at height zero, earth-centred [m]."""
+        return points_of(self.latitude_deg, self.longitude_deg).surface
+
+    @property
+    def solid(self) -> Floats:
+        """The points at their heights, at height zero where one of them has none, earth-centred [m]."""
+        height = np.zeros(len(self)) if np.isnan(self.height_m).any() else self.height_m
+        return earth_centred_m(self.latitude_deg, self.longitude_deg, height)
+
+    def place(self, row: int) -> str:
+        """A point in words."""
+        return f"{self.latitude_deg[row]:.6f}, {self.longitude_deg[row]:.6f}"
+
+    def take(self, rows: Ints | list[int]) -> Piece:
         """Some of the points."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+
+    def followed_by(self, other: Piece) -> Piece:
+        """Its points and those of another."""
+        both: dict[str, Any] = {name: np.append(getattr(self, name), getattr(other, name)) for name in COLUMNS}
+        return replace(self, **both)
 
 
 COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")

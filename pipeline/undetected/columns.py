@@ -24,8 +24,6 @@ from schemas.conform import dtypes
 from schemas.enums import BaliseKind
 from schemas.tables import SCALES, Epochs, Passages
 
-# What pays for less than this share of a bound does not hold it.
-_LEAST_SHARE = 0.01
 EPOCH_COLUMNS = ("undetected_ahead_m", "undetected_behind_m")
 RANGE_COLUMNS = ("undetected_range_ahead_m", "undetected_range_behind_m")
 
@@ -58,13 +56,12 @@ class Undetected:
 
 @dataclass(frozen=True)
 class _Both:
-    """Errors along growing path and against it at each row [m], NaN at the first row.
+    """Errors along growing path and against it at each row [m] (2, rows), NaN at the first row.
 
     `since_ns`: when they began at the earliest, else -1. `paid_m`, `outright`: what holds the larger (`error.Errors`).
     """
 
-    up_m: Floats
-    down_m: Floats
+    error_m: Floats
     since_ns: Ints
     paid_m: Floats
     outright: Bools
@@ -89,15 +86,19 @@ def undetected_of(
     parts = windows(rows, t_ns, diagnosis.fixes_ns)
     found = _both(rows, parts)
     ranges = diagnosis.satellites
-    of_range = None if ranges is None else _both(_with_ranges(rows, epochs, ranges, config), parts)
+    of_range = None
+    if ranges is not None:
+        low_m, high_m = range_bounds(epochs, ranges, config)
+        of_range = _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts)
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
+    names, least = _names(diagnosis.bank, config), config.undetected.holding_share
+    before = np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan)
+    of_passages = _at_passages(at, rows, found, of_range, facing, names, least)
     return Undetected(
         _at_epochs(rows, found, facing),
-        _at_passages(at, rows, found, of_range, facing, _names(diagnosis.bank, config)).with_columns(
-            physical_before_m=pl.Series(np.where(at >= 0, np.append(before_m, np.nan)[at], np.nan), nan_to_null=True)
-        ),
+        of_passages.with_columns(physical_before_m=pl.Series(before, nan_to_null=True)),
         spacing,
     )
 
@@ -111,22 +112,17 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
 
 
 def _both(rows: Watched, parts: list[Window]) -> _Both:
-    up, down = np.full(rows.rows, np.nan), np.full(rows.rows, np.nan)
+    error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
     paid, outright = np.zeros((rows.rows, 1 + rows.weight.shape[1])), np.zeros(rows.rows, dtype=np.bool_)
     for window in parts:
         seen = rows.since(window.start, window.end, window.since_s)
         ahead, behind = largest_errors(seen), largest_errors(seen.mirrored())
         part, worse = slice(window.start + 1, window.end + 1), ahead.most_m >= behind.most_m
-        up[part], down[part], since_ns[part] = ahead.most_m, behind.most_m, window.since_ns
+        error[:, part], since_ns[part] = (ahead.most_m, behind.most_m), window.since_ns
         paid[part] = np.where(worse[:, None], ahead.paid_m, behind.paid_m)
         outright[part] = np.where(worse, ahead.outright, behind.outright)
-    return _Both(up, down, since_ns, paid, outright)
-
-
-def _with_ranges(rows: Watched, epochs: pl.DataFrame, satellites: pl.DataFrame, config: Configuration) -> Watched:
-    low_m, high_m = range_bounds(epochs, satellites, config)
-    return bounded(rows, low_m[rows.epoch], high_m[rows.epoch])
+    return _Both(error, since_ns, paid, outright)
 
 
 def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
@@ -153,7 +149,7 @@ def _at_epochs(rows: Watched, found: _Both, facing: Ints) -> pl.DataFrame:
 
 def _faced(found: _Both, facing: Ints) -> Floats:
     """Ahead and behind, shape (2, rows), for these directions of travel along growing path."""
-    return np.where(facing > 0, [found.up_m, found.down_m], [found.down_m, found.up_m])
+    return np.where(facing > 0, found.error_m, found.error_m[::-1])
 
 
 def rows_of_passages(
@@ -178,7 +174,7 @@ def rows_of_passages(
 
 
 def _at_passages(
-    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, names: list[str]
+    at: Ints, rows: Watched, found: _Both, of_range: _Both | None, facing: Ints, names: list[str], least: float
 ) -> pl.DataFrame:
     known = (at >= 0) & (found.since_ns[at] >= 0) if rows.rows else np.zeros(at.size, dtype=np.bool_)
     at = np.where(known, at, 0)
@@ -187,7 +183,7 @@ def _at_passages(
     ranges = nothing if of_range is None else _taken(of_range, at, known, rows, facing)
     values |= dict(zip(RANGE_COLUMNS, ranges, strict=True))
     since = [int(found.since_ns[row]) if yes else None for row, yes in zip(at, known, strict=True)]
-    holding = [_holding(found, row, names) if yes else None for row, yes in zip(at.tolist(), known, strict=True)]
+    holding = [_holding(found, row, names, least) if yes else None for row, yes in zip(at.tolist(), known, strict=True)]
     return pl.DataFrame([pl.Series(name, one, nan_to_null=True) for name, one in values.items()]).with_columns(
         undetected_since=pl.Series(since, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
         undetected_monitors=pl.Series(holding, dtype=pl.List(pl.String)),
@@ -200,10 +196,10 @@ def _taken(found: _Both, at: Ints, known: Bools, rows: Watched, facing: Ints) ->
     return np.where(known, _faced(found, facing[rows.epoch])[:, at], np.nan)
 
 
-def _holding(found: _Both, row: int, names: list[str]) -> list[str]:
+def _holding(found: _Both, row: int, names: list[str], least: float) -> list[str]:
     """Monitors that hold the larger error at a row, first what holds most of it; none where the bank was blind."""
     if found.outright[row]:
         return [names[-1]]
     paid = found.paid_m[row]
     order = np.argsort(-paid, kind="stable")
-    return [names[which] for which in order.tolist() if paid[which] > _LEAST_SHARE * paid.sum()]
+    return [names[which] for which in order.tolist() if paid[which] > least * paid.sum()]

@@ -100,9 +100,7 @@ def splits_after(window: Watched) -> After:
     """Splits for stretches whose averages at the start are not known, as a longest stretch in the middle has them."""
     if not np.isfinite(window.high_m[1:]).any():
         return []
-    edges = np.append(np.flatnonzero(window.fresh | (np.arange(window.rows) == 0)), window.rows)
-    longest = int(np.argmax(np.diff(edges)))
-    first, last = int(edges[longest]), int(edges[longest + 1]) - 1
+    first, last = window.longest
     period_s = max(float(np.median(np.diff(window.t_s[first : last + 1]))) if last > first else 1.0, 1e-3)
     most = min(last - first - 1, int(_LOOK_BACK_S / period_s))
     middle = (first + last - most) // 2

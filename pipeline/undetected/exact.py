@@ -7,7 +7,7 @@ equations, and every quantity is counted in its own bound, so that tolerances ar
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -45,9 +45,9 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
     """
     from scipy.optimize import linprog  # only who asks for a profile solves the whole
 
-    program = _Program(window, margin)
-    goal = np.zeros(program.width)
-    goal[program.fault(program.window.rows - 1)] = -1.0
+    program = _program(window, margin)
+    goal = np.zeros(program.low.size)
+    goal[program.fault[-1]] = -1.0
     found = linprog(
         goal,
         A_eq=program.equations,
@@ -60,102 +60,101 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
     )
     if found.status != 0:
         raise BaliseError("the linear program of the largest error has no solution", found=str(found.message))
-    fault = np.concatenate([[0.0], found.x[program.fault(np.arange(1, program.window.rows))]])
-    return Optimum(float(fault[-1]), fault, program.binding(found.x))
+    fault = np.concatenate([[0.0], found.x[program.fault]])
+    return Optimum(float(fault[-1]), fault, _binding(window, program, found.x))
 
 
-class _Program:
-    """The linear program of one window; unknowns stand row by row: y, averages, fault, unseen growth."""
+class _Program(NamedTuple):
+    """The linear program of one window; unknowns stand row by row: y, averages, fault, unseen growth.
 
-    def __init__(self, window: Watched, margin: float) -> None:
-        self.window = window
-        self._averages = window.weight.shape[1]
-        self._per_row = self._averages + 3
-        self.width = self._per_row * (window.rows - 1)
-        self._scale = np.maximum(np.maximum(np.abs(window.most_mps), np.abs(window.least_mps)), 1e-9)
-        self._limits = np.where(np.isfinite(window.threshold_mps), window.threshold_mps, 1e6) * (1.0 - margin)
-        self._margin = margin
-        self.low, self.high = self._bounds()
-        self.equations, self.right = self._recursions()
-        self.relinks, self.relink_bounds = self._relinks()
+    `fault`: the places of the fault; `relinks`: fault at a re-link minus fault at its anchor, both ways.
+    """
 
-    def _at(self, row: Ints | int, which: int) -> Ints:
-        place: Ints = (np.asarray(row) - 1) * self._per_row + which
-        return place
+    equations: sparse.csr_matrix
+    right: Floats
+    relinks: sparse.csr_matrix | None
+    relink_bounds: Floats | None
+    low: Floats
+    high: Floats
+    fault: Ints
 
-    def fault(self, row: Ints | int) -> Ints:
-        return self._at(row, self._averages + 1)
 
-    def _bounds(self) -> tuple[Floats, Floats]:
-        window, part = self.window, slice(1, None)
-        most = window.learned_m + np.where(window.fresh, window.fastest_m, 0.0)
-        inside = 1.0 - self._margin
-        watched = (~window.fresh)[part]
-        columns_low = [np.where(watched, inside * window.least_mps[part] / self._scale[part], 0.0)]
-        columns_high = [np.where(watched, inside * window.most_mps[part] / self._scale[part], 0.0)]
-        for _ in range(self._averages):
-            columns_low.append(np.full(window.rows - 1, -1.0))
-            columns_high.append(np.full(window.rows - 1, 1.0))
-        columns_low += [window.low_m[part], -most[part]]
-        columns_high += [window.high_m[part], most[part]]
-        return np.column_stack(columns_low).ravel(), np.column_stack(columns_high).ravel()
+def _program(window: Watched, margin: float) -> _Program:
+    """A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - way (y_i - u_i) - unseen_i = 0."""
+    from scipy import sparse
 
-    def _recursions(self) -> tuple[sparse.csr_matrix, Floats]:
-        """A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - way (y_i - u_i) - unseen_i = 0."""
-        window, rows = self.window, np.arange(1, self.window.rows)
-        seen = ~window.fresh[rows]
-        entries, right = [], []
-        count = rows.size
-        for average in range(self._averages):
-            here = average * count + np.arange(count)
-            limit = self._limits[:, average]
-            weight = np.where(seen, window.weight[rows, average], 0.0)
-            keep = np.where(seen, 1.0 - window.weight[rows, average], 0.0)
-            entries.append((here, self._at(rows, 1 + average), np.ones(count)))
-            entries.append((here, self._at(rows, 0), -weight * self._scale[rows] / limit[rows]))
-            carried = keep[1:] * limit[rows[:-1]] / limit[rows[1:]]
-            entries.append((here[1:], self._at(rows[:-1], 1 + average), -carried))
-            begin = np.zeros(count)
-            begin[0] = keep[0] * window.average_mps[0, average] / limit[rows[0]]
-            right.append(begin)
-        here = self._averages * count + np.arange(count)
-        entries.append((here, self.fault(rows), np.ones(count)))
-        entries.append((here[1:], self.fault(rows[:-1]), -np.ones(count - 1)))
-        entries.append((here, self._at(rows, 0), np.where(seen, -window.way_s[rows] * self._scale[rows], 0.0)))
-        entries.append((here, self._at(rows, self._averages + 2), -np.ones(count)))
-        right.append(np.where(seen, -window.way_s[rows] * window.rate_mps[rows], 0.0))
-        return self._matrix(entries, (self._averages + 1) * count), np.concatenate(right)
+    count, averages = window.rows - 1, window.weight.shape[1]
+    seen, one = ~window.fresh[1:], sparse.identity(count)
+    scale = np.maximum(np.maximum(np.abs(window.most_mps), np.abs(window.least_mps)), 1e-9)[1:]
+    limits = np.where(np.isfinite(window.threshold_mps), window.threshold_mps, 1e6) * (1.0 - margin)
+    # Blocks of the matrix: an equation each, over y, each average, the fault and the unseen growth.
+    blocks: list[list[sparse.spmatrix | None]] = []
+    right: list[Floats] = []
+    for average in range(averages):
+        limit, weight = limits[:, average], np.where(seen, window.weight[1:, average], 0.0)
+        keep = np.where(seen, 1.0 - window.weight[1:, average], 0.0)
+        carried = sparse.diags(keep[1:] * limit[1:-1] / limit[2:], -1, shape=(count, count))
+        row: list[sparse.spmatrix | None] = [None] * (averages + 3)
+        row[0], row[1 + average] = sparse.diags(-weight * scale / limit[1:]), one - carried
+        blocks.append(row)
+        begin = np.zeros(count)
+        begin[0] = keep[0] * window.average_mps[0, average] / limit[1]
+        right.append(begin)
+    way_s = np.where(seen, -window.way_s[1:], 0.0)
+    grown = one - sparse.diags(np.ones(count - 1), -1, shape=(count, count))
+    blocks.append([sparse.diags(way_s * scale), *[None] * averages, grown, -one])
+    right.append(way_s * window.rate_mps[1:])
+    order = np.arange((averages + 3) * count).reshape(-1, count).T.ravel()
+    relinks, relink_bounds = _relinks(window, averages + 1)
+    inside, most = 1.0 - margin, (window.learned_m + np.where(window.fresh, window.fastest_m, 0.0))[1:]
+    ones = [np.ones(count)] * averages
+    low, high = (
+        np.array(
+            [np.where(seen, inside * raw_mps[1:] / scale, 0.0), *(side * one for one in ones), fault_m[1:], grown_m]
+        )
+        for side, raw_mps, fault_m, grown_m in (
+            (-1.0, window.least_mps, window.low_m, -most),
+            (1.0, window.most_mps, window.high_m, most),
+        )
+    )
+    return _Program(
+        equations=sparse.bmat(blocks, format="csc")[:, order].tocsr(),
+        right=np.concatenate(right),
+        relinks=None if relinks is None else relinks[:, order].tocsr(),
+        relink_bounds=relink_bounds,
+        low=low.T.ravel(),
+        high=high.T.ravel(),
+        fault=np.arange(count) * (averages + 3) + averages + 1,
+    )
 
-    def _relinks(self) -> tuple[sparse.csr_matrix | None, Floats | None]:
-        """Fault at a re-link minus fault at its anchor within the recorded bounds; before the window it is zero."""
-        window = self.window
-        rows = np.flatnonzero(np.isfinite(window.held_high_m))
-        rows = rows[rows > 0]
-        if not rows.size:
-            return None, None
-        anchored = np.flatnonzero(window.anchor[rows] > 0)
-        here = np.arange(rows.size)
-        entries = [(here, self.fault(rows), np.ones(rows.size))]
-        entries.append((anchored, self.fault(window.anchor[rows][anchored]), -np.ones(anchored.size)))
-        difference = self._matrix(entries, rows.size)
-        bounds = np.concatenate([window.held_high_m[rows], -window.held_low_m[rows]])
-        from scipy import sparse
 
-        return sparse.vstack([difference, -difference]).tocsr(), bounds
+def _relinks(window: Watched, before: int) -> tuple[sparse.csc_matrix | None, Floats | None]:
+    """Fault at a re-link minus fault at its anchor within the recorded bounds; before the window it is zero.
 
-    def _matrix(self, entries: list[tuple[Ints, Ints, Floats]], height: int) -> sparse.csr_matrix:
-        from scipy import sparse
+    `before`: how many unknowns of each row stand before the fault; one stands after it.
+    """
+    from scipy import sparse
 
-        row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
-        return sparse.csr_matrix((value, (row, column)), shape=(height, self.width))
+    rows = np.flatnonzero(np.isfinite(window.held_high_m))
+    rows = rows[rows > 0]
+    if not rows.size:
+        return None, None
+    # The first row, at which there is no fault yet, has no unknown.
+    faults = sparse.identity(window.rows, format="csr")[:, 1:]
+    difference = faults[rows] - faults[np.maximum(window.anchor[rows], 0)]
+    empty = [sparse.csr_matrix((rows.size, parts * (window.rows - 1))) for parts in (before, 1)]
+    difference = sparse.hstack([empty[0], difference, empty[1]])
+    return (
+        sparse.vstack([difference, -difference], format="csc"),
+        np.concatenate([window.held_high_m[rows], -window.held_low_m[rows]]),
+    )
 
-    def binding(self, solution: Floats) -> tuple[int, ...]:
-        """Which bounds the profile reaches, by how many rows do."""
-        inside = np.isfinite(self.low) & np.isfinite(self.high)
-        margin = MARGIN * np.maximum(1.0, np.abs(np.where(inside, self.high, 1.0)))
-        reached = (solution >= self.high - margin) | (solution <= self.low + margin)
-        rows = reached.reshape(-1, self._per_row)
-        watched = ~self.window.fresh[1:]
-        counts = {which: int((rows[:, which] & watched).sum()) for which in range(self._averages + 1)}
-        counts[-1] = int(rows[:, self._averages + 1].sum())
-        return tuple(sorted((which for which, rows in counts.items() if rows), key=lambda which: -counts[which]))
+
+def _binding(window: Watched, program: _Program, solution: Floats) -> tuple[int, ...]:
+    """Which bounds the profile reaches, by how many rows do."""
+    low, high, averages = program.low, program.high, window.weight.shape[1]
+    margin = MARGIN * np.maximum(1.0, np.abs(np.where(np.isfinite(low) & np.isfinite(high), high, 1.0)))
+    reached = ((solution >= high - margin) | (solution <= low + margin)).reshape(window.rows - 1, -1)
+    counts = {which: int((reached[:, which] & ~window.fresh[1:]).sum()) for which in range(averages + 1)}
+    counts[-1] = int(reached[:, averages + 1].sum())
+    return tuple(sorted((which for which, rows in counts.items() if rows), key=lambda which: -counts[which]))

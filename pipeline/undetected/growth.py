@@ -22,14 +22,16 @@ class Growth:
 
 def growth_of(stretch: Stretch) -> Growth:
     """The growth that no monitor would have noticed, from above, at every row of a stretch."""
-    return growth_with(stretch, _splits(stretch))
+    return growth_with(stretch, splits_of(stretch))
 
 
 def growth_with(stretch: Stretch, splits: Iterable[Floats]) -> Growth:
     """The same with given splits, each of shape (some rows, 1 + averages); any of them bounds the growth."""
     most = np.full(stretch.rows, np.inf)
-    paid = np.zeros((stretch.rows, 1 + stretch.weight.shape[1]))
-    for shares in (*_alone(stretch), *splits):
+    monitors = 1 + stretch.seen.weight.shape[1]
+    paid = np.zeros((stretch.rows, monitors))
+    # All to one monitor, and the splits.
+    for shares in (*(np.tile(one, (stretch.rows, 1)) for one in np.eye(monitors)), *splits):
         part = stretch.first(len(shares))
         bills = paid_m(part, shares[: part.rows])
         total = bills.sum(axis=1)
@@ -38,13 +40,7 @@ def growth_with(stretch: Stretch, splits: Iterable[Floats]) -> Growth:
     return Growth(most - stretch.recorded_m, paid)
 
 
-def _alone(stretch: Stretch) -> Iterator[Floats]:
-    """All to one monitor."""
-    for one in np.eye(1 + stretch.weight.shape[1]):
-        yield np.tile(one, (stretch.rows, 1))
-
-
-def _splits(stretch: Stretch) -> Iterator[Floats]:
+def splits_of(stretch: Stretch) -> Iterator[Floats]:
     """The best up to rows that lie farther and farther on."""
     for rows in horizons(stretch.rows):
         yield best_shares(stretch.first(rows))

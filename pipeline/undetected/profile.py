@@ -11,9 +11,8 @@ from pipeline.undetected.columns import Diagnosis, rows_of, rows_of_passages
 from pipeline.undetected.error import largest_errors
 from pipeline.undetected.exact import MARGIN, largest_profile
 from pipeline.undetected.shapes import largest_of_shape
-from pipeline.undetected.watched import Watched
 from pipeline.undetected.windows import windows
-from schemas.arrays import NS_PER_S, Ints, ints, times_ns
+from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.tables import SCALES
@@ -77,17 +76,11 @@ def epoch_of(
 ) -> int:
     """The epoch that is asked for: of the first passage of a balise, the last one up to a time, or the last one."""
     rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(diagnosis.epochs)
-    if balise is not None:
-        return _epoch_of_balise(balise, passages, crossings, rows, t_ns, config)
-    stamps = t_ns[rows.epoch]
-    latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
-    row = int(np.searchsorted(stamps, latest, side="right")) - 1
-    return int(rows.epoch[row]) if row >= 0 else 0
-
-
-def _epoch_of_balise(
-    balise: str, passages: pl.DataFrame, crossings: pl.DataFrame, rows: Watched, t_ns: Ints, config: Configuration
-) -> int:
+    if balise is None:
+        stamps = t_ns[rows.epoch]
+        latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
+        row = int(np.searchsorted(stamps, latest, side="right")) - 1
+        return int(rows.epoch[row]) if row >= 0 else 0
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     own = (passages["balise_id"] == balise).to_numpy() & (at >= 0)
     if not own.any():

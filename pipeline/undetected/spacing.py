@@ -13,8 +13,7 @@ import numpy as np
 
 from pipeline.figures.undetected import Spacing
 from pipeline.undetected.error import Errors, largest_errors, splits_after
-from pipeline.undetected.growth import growth_with, horizons
-from pipeline.undetected.shares import best_shares
+from pipeline.undetected.growth import growth_with, splits_of
 from pipeline.undetected.stretch import stretch_after
 from pipeline.undetected.watched import Watched
 from schemas.arrays import Floats
@@ -91,10 +90,5 @@ def _first_beyond(
 
 def splits_anywhere(rows: Watched) -> list[Floats]:
     """Best splits of a long stretch, for any start: what is best hangs on thresholds, and these change little."""
-    edges = np.append(np.flatnonzero(rows.fresh | (np.arange(rows.rows) == 0)), rows.rows)
-    longest = int(np.argmax(np.diff(edges)))
-    first, last = int(edges[longest]), int(edges[longest + 1]) - 1
-    if last - first < 2:
-        return []
-    stretch = stretch_after(rows, first + (last - first) // 8, last, known=True)
-    return [best_shares(stretch.first(count)) for count in horizons(stretch.rows)]
+    first, last = rows.longest
+    return list(splits_of(stretch_after(rows, first + (last - first) // 8, last, known=True)))

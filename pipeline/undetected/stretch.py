@@ -12,7 +12,7 @@ With q_i the part of row i that falls to an average A_i = (1 - w_i) A_(i-1) + w_
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,54 +22,35 @@ from schemas.arrays import Floats
 
 @dataclass(frozen=True)
 class Stretch:
-    """Rows after a start, to be bounded one by one; shapes (n,) and (n, averages), as in `Watched`.
+    """`seen`: the rows after a start, to be bounded one by one.
 
     `start_mps` (averages,): the averages at the start; `start_free_mps`: how far they may be from that.
     """
 
-    way_s: Floats
-    rate_mps: Floats
-    least_mps: Floats
-    most_mps: Floats
-    weight: Floats
-    threshold_mps: Floats
+    seen: Watched
     start_mps: Floats
     start_free_mps: Floats
 
     @property
     def rows(self) -> int:
-        return self.way_s.size
+        return self.seen.rows
 
     def first(self, rows: int) -> Stretch:
-        whole = ("start_mps", "start_free_mps")
-        return Stretch(
-            **{
-                item.name: getattr(self, item.name)[slice(None) if item.name in whole else slice(rows)]
-                for item in fields(self)
-            }
-        )
+        return replace(self, seen=self.seen.between(0, rows))
 
     @property
     def recorded_m(self) -> Floats:
         """What the increments recorded have gathered up to each row."""
-        return np.cumsum(self.way_s * self.rate_mps)
+        return np.cumsum(self.seen.way_s * self.seen.rate_mps)
 
 
 def stretch_after(rows: Watched, start: int, end: int, known: bool) -> Stretch:
     """The rows (start, end]; without `known` the averages at the start are only known to have been silent."""
-    part = slice(start + 1, end + 1)
-    averages = rows.average_mps[start]
-    known = known or bool(rows.fresh[start])
-    return Stretch(
-        way_s=rows.way_s[part],
-        rate_mps=rows.rate_mps[part],
-        least_mps=rows.least_mps[part],
-        most_mps=rows.most_mps[part],
-        weight=rows.weight[part],
-        threshold_mps=rows.threshold_mps[part],
-        start_mps=averages if known else np.zeros_like(averages),
-        start_free_mps=np.zeros_like(averages) if known else rows.threshold_mps[start],
-    )
+    averages, silent = rows.average_mps[start], rows.threshold_mps[start]
+    nothing, seen = np.zeros_like(averages), rows.between(start + 1, end + 1)
+    if known or rows.fresh[start]:
+        return Stretch(seen, averages, nothing)
+    return Stretch(seen, nothing, silent)
 
 
 def paid_m(stretch: Stretch, shares: Floats) -> Floats:
@@ -78,13 +59,14 @@ def paid_m(stretch: Stretch, shares: Floats) -> Floats:
     `shares`: of each row, raw first; they add up to one. The sum up to a row ends there: what the last row gives to an
     average is paid by its value there.
     """
-    raw = stretch.way_s * np.where(shares[:, 0] > 0.0, stretch.most_mps, stretch.least_mps) * shares[:, 0]
-    part = shares[:, 1:] * (stretch.way_s[:, None] / stretch.weight)
-    before = part * (1.0 - stretch.weight)
+    seen = stretch.seen
+    raw = seen.way_s * np.where(shares[:, 0] > 0.0, seen.most_mps, seen.least_mps) * shares[:, 0]
+    part = shares[:, 1:] * (seen.way_s[:, None] / seen.weight)
+    before = part * (1.0 - seen.weight)
     inside = part.copy()
     inside[:-1] -= before[1:]
-    inner = _cost(inside, stretch.threshold_mps)
-    paid = _cost(part, stretch.threshold_mps)
+    inner = _cost(inside, seen.threshold_mps)
+    paid = _cost(part, seen.threshold_mps)
     paid[1:] += np.cumsum(inner[:-1], axis=0)
     paid += np.abs(before[0]) * stretch.start_free_mps - before[0] * stretch.start_mps
     return np.column_stack([np.cumsum(raw), paid])

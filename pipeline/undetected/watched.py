@@ -20,8 +20,6 @@ from schemas.config import Configuration, Vehicle
 
 NO_ROW = -1
 _BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
-# Of positions so far beside a curve, nothing along it could be said any more.
-_MOST_HIDDEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -77,6 +75,13 @@ class Watched:
             held_high_m=-self.held_low_m,
         )
 
+    @property
+    def longest(self) -> tuple[int, int]:
+        """First and last row of the longest stretch that the bank saw."""
+        edges = np.append(np.flatnonzero(self.fresh | (np.arange(self.rows) == 0)), self.rows)
+        which = int(np.argmax(np.diff(edges)))
+        return int(edges[which]), int(edges[which + 1]) - 1
+
     def between(self, low: int, high: int) -> Watched:
         """Rows [low, high); anchors before them are lost."""
         part = {item.name: getattr(self, item.name)[low:high] for item in fields(self)}
@@ -111,7 +116,7 @@ def watched(
     t_s = (t_ns[epoch] - t_ns[0]) * 1e-9
     fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
     fastest_m = config.undetected.max_rate_mps * np.diff(t_s, prepend=t_s[:1])
-    way_s = series.dt_s[kept] / _share_seen(epochs, epoch)
+    way_s = series.dt_s[kept] / _share_seen(epochs, epoch, config.undetected.hidden_share)
     rate, threshold = series.rate_mps[kept], _thresholds(bank, epoch)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
     learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
@@ -145,7 +150,7 @@ def _thresholds(bank: AxisRecord, epoch: Ints) -> Floats:
     return np.where(np.isfinite(threshold), threshold, np.inf)
 
 
-def _share_seen(epochs: pl.DataFrame, epoch: Ints) -> float:
+def _share_seen(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
     """How much of a fault the increments show, at least; one on straight track.
 
     `along_m` leaves out the way that a curve adds to a position y beside it (`pipeline.alignment.align.unrolled`). A
@@ -153,7 +158,7 @@ def _share_seen(epochs: pl.DataFrame, epoch: Ints) -> float:
     times the sharpest curvature times the fault.
     """
     curvature, beside = (np.abs(np.nan_to_num(floats(epochs, name)[epoch])) for name in _BESIDE_CURVES)
-    return 1.0 - min(float(curvature.max(initial=0.0) * beside.max(initial=0.0)), _MOST_HIDDEN)
+    return 1.0 - min(float(curvature.max(initial=0.0) * beside.max(initial=0.0)), most)
 
 
 def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Configuration) -> tuple[Floats, Floats]:

@@ -14,7 +14,7 @@ from pipeline.plausibility.course import places_of
 from pipeline.plausibility.survey import Line, line_of
 from pipeline.stages import replay as replayed
 from schemas.arrays import times_ns
-from schemas.config import Configuration
+from schemas.config import Configuration, PlausibilityConfig
 from schemas.errors import InputError
 from schemas.run import RunLog
 
@@ -58,7 +58,7 @@ def _copies(gnss: pl.DataFrame, reference: pl.DataFrame, line: Line | None = Non
     places, record = places_of(gnss, epoch_ns), places_of(reference, epoch_ns)
     assert places is not None
     assert record is not None
-    check = copy_check(gnss, places, reference, record, epoch_ns, line)
+    check = copy_check(gnss, places, reference, record, epoch_ns, line, PlausibilityConfig())
     return [] if check is None else [check.found]
 
 

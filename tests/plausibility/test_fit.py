@@ -22,7 +22,7 @@ from pipeline.plausibility.check import CONFIGURATION, State
 from pipeline.plausibility.fit import Fit, fit_run, lines_of
 from pipeline.results.fit_report import fit_report
 from pipeline.stages import replay as replayed
-from schemas.config import Configuration, IngestConfig, Vehicle, settings_from
+from schemas.config import Configuration, IngestConfig, PlausibilityConfig, Vehicle, settings_from
 from schemas.errors import ConfigError, InputError
 from schemas.run import RunLog, Site
 
@@ -47,7 +47,7 @@ def test_what_is_wrong_is_told_and_its_lines_mend_it(wrong: Wrong, trips: list[T
     if wrong.vehicle or wrong.site:
         return
     changed = wrong.change(drawn.run)
-    found = fit_run(changed, "primary", Vehicle(), IngestConfig(), drawn.site)
+    found = fit_run(changed, "primary", Vehicle(), PlausibilityConfig(), drawn.site)
     lines = lines_of(found.impossible).get(CONFIGURATION)
     if lines is None:
         return
@@ -82,7 +82,8 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
     odometer = pl.DataFrame({"t": gnss["t"], "distance_m": way}).with_columns(later, speed_mps=pl.lit(None, pl.Float64))
     run = random_trial(0).run.with_streams(gnss=gnss, odometer=odometer, reference=None)
     states = {
-        check.what: (check.state, check.found) for check in fit_run(run, "primary", Vehicle(), IngestConfig()).checks
+        check.what: (check.state, check.found)
+        for check in fit_run(run, "primary", Vehicle(), PlausibilityConfig()).checks
     }
     assert states["clock of the odometer against the GNSS"] == (State.NOT_CHECKED, "the speed changes too little")
     assert states["odometer distance against the positions"][0] is State.FITS
@@ -104,14 +105,14 @@ def test_a_run_at_constant_speed_tells_no_clock() -> None:
     ],
 )
 def test_causes_of_lags(lag_s: float, cause: str) -> None:
-    explained = explain_lag(lag_s, NOON_NS, 0.5)
+    explained = explain_lag(lag_s, NOON_NS, 0.5, PlausibilityConfig())
     assert explained is not None
     assert cause in explained.cause
     assert abs(explained.exact - lag_s) < 2.0
 
 
 def test_leap_seconds_are_those_of_the_day() -> None:
-    in_2014 = explain_lag(16.0, 1_400_000_000 * 10**9, 0.1)
+    in_2014 = explain_lag(16.0, 1_400_000_000 * 10**9, 0.1, PlausibilityConfig())
     assert in_2014 is not None
     assert in_2014.exact == 16
 
@@ -120,14 +121,14 @@ def test_leap_seconds_are_those_of_the_day() -> None:
     ("factor", "speed", "cause"), [(3.5, True, "km/h"), (1.95, True, "knots"), (0.00101, False, "km")]
 )
 def test_causes_of_factors(factor: float, speed: bool, cause: str) -> None:
-    explained = explain_factor(factor, speed)
+    explained = explain_factor(factor, speed, PlausibilityConfig())
     assert explained is not None
     assert explained.cause == f"in {cause}"
 
 
 @pytest.mark.parametrize("factor", [1.03, 0.95, 1.3, 2.6])
 def test_no_unit_makes_these_factors(factor: float) -> None:
-    assert explain_factor(factor, speed=True) is None
+    assert explain_factor(factor, True, PlausibilityConfig()) is None
 
 
 def test_a_replay_of_an_impossible_run_fails_or_is_unproven() -> None:
@@ -193,7 +194,7 @@ def _fixed(run: RunLog, fit: Fit) -> RunLog:
 
 
 def _fit(run: RunLog, site: Site | None = None, vehicle: Vehicle | None = None) -> Fit:
-    return fit_run(run, "primary", vehicle or Vehicle(), IngestConfig(), site)
+    return fit_run(run, "primary", vehicle or Vehicle(), PlausibilityConfig(), site)
 
 
 def test_positions_written_wrongly_are_told_without_a_site(trips: list[Trip]) -> None:
@@ -225,6 +226,17 @@ def test_a_shifted_survey_moves_positions_and_reference(trips: list[Trip]) -> No
     assert _fit(_fixed(drawn.run, found), moved).misfits == ()
 
 
+def test_what_is_told_is_configuration(trips: list[Trip]) -> None:
+    run, moved = trips[0].run, moved_site(24.0, 18.0)(trips[0].site)
+    late = shifted(10.0, "odometer")(run)
+    wide = PlausibilityConfig(shift_told_m=60.0, lag_limit_s=12.0)
+    assert [check.what for check in _fit(run, moved).misfits] == ["positions against the survey"]
+    assert fit_run(run, "primary", Vehicle(), wide, moved).misfits == ()
+    (clock,) = _fit(late, trips[0].site).impossible
+    assert clock.what == "clock of the odometer against the GNSS"
+    assert fit_run(late, "primary", Vehicle(), wide, trips[0].site).impossible == ()
+
+
 def test_a_unit_is_mended_once(trips: list[Trip]) -> None:
     vehicle = Vehicle(odometer_scale=1.0 / trips[0].scale, odometer_scale_sigma=2e-4)
     found = _fit(scaled("odometer", distance_m=0.001)(trips[0].run), trips[0].site, vehicle)
@@ -246,7 +258,7 @@ def test_a_counter_that_is_reset_is_no_wrong_sign(trips: list[Trip]) -> None:
 
 def test_recorders_of_different_hours_are_told_with_lines(trips: list[Trip]) -> None:
     run = shifted(7200.0, "odometer")(trips[0].run)
-    report = fit_report(run, IngestConfig())
+    report = fit_report(run, Configuration())
     assert "does not overlap" in report.problems[0]
     assert "shift_s = -7200.0" in report.lines()
     (inline,) = re.findall(r"ingest\.correct = .*\]", report.problems[0])

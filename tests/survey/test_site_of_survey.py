@@ -19,7 +19,7 @@ from pipeline.survey.network import make_network
 from pipeline.survey.pieces import Piece, Survey
 from pipeline.survey.trace import clean_traces
 from pipeline.track.geodesy import moved_deg
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, SurveyConfig, Vehicle
 from schemas.errors import BaliseError
 from schemas.run import Site
 
@@ -54,8 +54,8 @@ def written(folder: Path, name: str, *features: dict[str, Any]) -> Path:
 
 
 def site_of(*surveys: Path, balises: str | None = None, **wishes: Any) -> Site:
-    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m", 0.05), wishes.get("flat", False))
-    return make_site(wish, Vehicle(), Configuration())
+    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False))
+    return make_site(wish, Vehicle(), Configuration(survey=SurveyConfig(**wishes.get("config", {}))))
 
 
 def navigable(site: Site) -> set[frozenset[tuple[str, int]]]:
@@ -264,14 +264,14 @@ def test_recorded_passes_make_one_line_and_a_branch_meets_it_at_a_switch() -> No
     aside = np.arange(0.0, 1500.0, 5.0)
     # Radius 500 m from east 800 m on, until 4.5 m aside, then straight on.
     branch = recorded("branch", aside, np.clip((aside - 800.0).clip(0) ** 2 / 1000.0, 0.0, 60.0), rng)
-    survey = clean_traces(Survey([main, branch]))
+    survey = clean_traces(Survey([main, branch]), SurveyConfig())
     assert [piece.name for piece in survey.pieces] == ["main", "branch"]
     kept = survey.pieces[0]
     # The stop is a point or two, the way back nothing, and a straight line needs few points.
     assert len(kept) < 30
     north = (kept.latitude_deg - HOME_DEG[0]) * 111_229.0
     assert np.abs(north).max() < 0.15
-    network = make_network(survey, 0.05)
+    network = make_network(survey, None, SurveyConfig())
     assert sorted(element.name for element in network.elements) == ["branch", "main.1", "main.2"]
     ways = network.links.filter(pl.col("navigability").cast(pl.String) == "both")
     assert ways.height == 2
@@ -283,7 +283,7 @@ def test_a_later_pass_goes_on_from_the_end_of_the_first() -> None:
     rng = np.random.default_rng(4)
     first, second = np.arange(0.0, 1200.0, 4.0), np.arange(1000.0, 2000.0, 4.0)
     passes = [recorded("a", first, 0.0 * first, rng), recorded("b", second, 0.0 * second, rng)]
-    network = make_network(clean_traces(Survey(passes)), 0.05)
+    network = make_network(clean_traces(Survey(passes), SurveyConfig()), None, SurveyConfig())
     assert [element.name for element in network.elements] == ["a", "b"]
     track = network.track.group_by("netelement_id").agg(pl.col("measure_m").max())
     assert track["measure_m"].sum() == pytest.approx(1996.0, abs=0.5)
@@ -333,3 +333,14 @@ def test_what_is_no_survey_is_one_message(tmp_path: Path, name: str) -> None:
         site_of(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert name in str(caught.value)
+
+
+def test_what_a_survey_is_taken_for_is_configuration(tmp_path: Path) -> None:
+    bent = written(tmp_path, "bent.geojson", way("bent", (0, 0), (100, 0), (200, 15)))
+    assert "kinks" not in told(site_of(bent))
+    assert "track: bent: 1 kinks" in told(site_of(bent, config={"kink_deg": 5.0}))
+    apart = written(tmp_path, "apart.geojson", way("a", (0, 0), (100, 0)), way("b", (100.5, 0), (200, 0)))
+    assert navigable(site_of(apart)) == set()
+    joined = {frozenset([("a", 1), ("b", 0)])}
+    assert navigable(site_of(apart, config={"same_place_m": 1.0})) == joined
+    assert navigable(site_of(apart, join_m=1.0)) == joined
