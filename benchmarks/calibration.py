@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from scipy.signal import lfilter
 
 from benchmarks.results import Figure
 from pipeline.matching import match
@@ -80,6 +79,8 @@ def stated(rng: np.random.Generator, sigma_m: float) -> float | None:
 
 def noise(rng: np.random.Generator, count: int, step_s: float, sigma_m: float) -> np.ndarray:
     """Four first-order Gauss-Markov processes, stationary from the start [m]."""
+    from scipy.signal import lfilter  # takes long to load
+
     total = np.zeros(count)
     for share, tau_s in NOISE:
         keep = float(np.exp(-step_s / tau_s))

@@ -14,8 +14,6 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from distributed import Client
-
 ROOT = Path(__file__).parents[1]
 _START_S = 60.0
 
@@ -46,6 +44,8 @@ class Cluster:
         """Until all workers have joined: a nanny gives up where one dies before."""
         if self.nanny.poll() is not None:
             self.nanny = self.start_workers()
+        from distributed import Client  # takes seconds to load
+
         with Client(self.address, set_as_default=False) as client:  # type: ignore[no-untyped-call]
             client.wait_for_workers(self._workers, timeout=_START_S)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
+from pipeline.monitors.recursion import linear_recurrence
 from schemas.arrays import Floats
 
 
@@ -38,8 +38,9 @@ def gauss_markov(
     phi = float(np.exp(-step_s / tau_s))
     drive = rng.standard_normal(shape)
     drive[1:] *= np.sqrt(1.0 - phi * phi)
-    path: Floats = lfilter([1.0], [1.0, -phi], drive, axis=0)
-    return path * sigma
+    columns = drive.reshape(len(drive), -1)
+    path = linear_recurrence(np.broadcast_to(phi, columns.shape), columns, np.zeros(columns.shape[1]))
+    return path.reshape(shape) * sigma
 
 
 def position_errors(

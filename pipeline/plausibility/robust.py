@@ -67,10 +67,12 @@ def _solved(design: Floats, target: Floats, floor: float, told: float, start: tu
             weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
         weighted = design * weight[:, None, None]
         normal = np.einsum("nmk,nml->kl", weighted, design)
-        inverse = np.linalg.pinv(normal, rcond=told, hermitian=True)
+        strengths, axes = np.linalg.eigh(normal)
+        known = strengths > told * strengths[-1]
+        inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
         estimate = inverse @ np.einsum("nmk,nm->k", weighted, target)
         left = np.linalg.norm(target - design @ estimate, axis=1)
-    whole = int(np.linalg.matrix_rank(normal, tol=told * np.linalg.norm(normal, 2), hermitian=True)) == len(estimate)
+    whole = bool(known.all())
     sigma = spread * np.sqrt(np.diag(inverse)) if whole else np.full(len(estimate), np.inf)
     return Regression(estimate, sigma, spread, whole)
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from scipy.signal import lfilter
 
 from pipeline.alignment.align import align
 from pipeline.odometry import odometry_of
@@ -37,6 +36,8 @@ class Straight:
 
 
 def gauss_markov(rng, n, period_s, sigma_m):
+    from scipy.signal import lfilter  # takes long to load
+
     error = np.zeros(n)
     for share, tau in zip(SHARES, TAUS_S, strict=True):
         phi = np.exp(-period_s / tau)

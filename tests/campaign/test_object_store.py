@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, make_server
 
 from pipeline import storage
@@ -35,6 +34,8 @@ class Moody:
     """A store in front of the store: every so often it refuses, or thinks before it answers."""
 
     def __init__(self) -> None:
+        from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app  # takes long to load
+
         self.inner = DomainDispatcherApplication(create_backend_app)
         self.refuse_each = 0
         self.forbidden = ""
@@ -108,19 +109,21 @@ def of_two(result: dict[str, bytes]) -> dict[str, bytes]:
 
 
 def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -> None:
-    plan = make_plan([f"{bucket}/runs"], f"{bucket}/site", f"{bucket}/out")
-    assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 4
-    assert remote_bytes(f"{bucket}/out") == result_bytes(undisturbed)
+    plan = make_plan([f"{bucket}/runs/run0", f"{bucket}/runs/run1"], f"{bucket}/site", f"{bucket}/out")
+    assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 2
+    assert remote_bytes(f"{bucket}/out") == of_two(result_bytes(undisturbed))
     again = run_campaign(plan, jobs=1)
-    assert (again.skipped, again.count(RunStatus.OK)) == (4, 4)
-    remote, on_disk = (read_manifest(out) or {} for out in (f"{bucket}/out", undisturbed))
-    assert remote["runs"].keys() == {"run0", "run1", "run2", "run3"}
-    for part in ("runs", "sites", "files"):
-        assert remote[part] == on_disk[part]
-    local = run_campaign(make_plan([f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
-    assert local.count(RunStatus.OK) == 1
+    assert (again.skipped, again.count(RunStatus.OK)) == (2, 2)
+    local = run_campaign(make_plan([f"{bucket}/runs/run0", f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
+    assert local.count(RunStatus.OK) == 2
+    remote, copied, on_disk = (read_manifest(out) or {} for out in (f"{bucket}/out", tmp_path, undisturbed))
+    assert remote["runs"].keys() == {"run0", "run1"}
+    for run_id, run in remote["runs"].items():
+        assert run == on_disk["runs"][run_id]
+    assert remote["sites"] == on_disk["sites"]
+    assert remote["files"] == copied["files"]
     runs = store.read_table(f"{bucket}/out", "runs").collect()
-    assert runs["run_id"].to_list() == ["run0", "run1", "run2", "run3"]
+    assert runs["run_id"].to_list() == ["run0", "run1"]
 
 
 @pytest.mark.usefixtures("in_process")

@@ -34,6 +34,13 @@ def odometer(scale: float | None) -> Any:
     return SimpleNamespace(scale=scale, between=between)
 
 
+def test_a_gap_has_the_anchors_that_there_are() -> None:
+    begin, end = ANCHORS
+    for given in ((begin, end), (None, end), (begin, None)):
+        gap = Gap(0, 10 * NS_PER_S, *given, ways=[])
+        assert gap.anchors == [anchor for anchor in given if anchor]
+
+
 def test_without_a_vehicle_file_both_anchors_may_be_right() -> None:
     """From the first 40.8 m with variance 1.04, from the second 38.8 m with variance 4.06; three sigmas."""
     low, high = between_anchors(odometer(None), cast(Any, ANCHORS), (0.0, 100.0), AT_4_S, CONFIG)

@@ -60,7 +60,7 @@ def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
     return content.encode("utf-8", "surrogatepass")
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(payloads)
 def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
     contents = [written(*one) for one in drawn]

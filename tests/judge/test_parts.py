@@ -12,7 +12,7 @@ import pytest
 from pipeline.evidence.evidence import KINDS, Alternative, EvidenceSet
 from pipeline.evidence.routes import Place, Route
 from pipeline.judge.alarms import verdict_within
-from pipeline.judge.episodes import Episode, _is_back
+from pipeline.judge.episodes import Episode, _failure, _is_back
 from pipeline.judge.hazards import _instants, drafts_of, within_budget
 from pipeline.judge.judge import errors_across
 from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
@@ -240,3 +240,20 @@ def test_who_is_suspected(
     # What was before the time looked back on does not count.
     late = 70 * NS
     assert suspect_of(cast(Any, bench), 6 * NS + late, 6 * NS + late) is Suspect.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("codes", "step", "failure"),
+    [
+        ([WRONG, WRONG, WRONG, RIGHT, WRONG, WRONG, WRONG, RIGHT], None, 4),  # 2 s at the begin lie before the onset
+        ([RIGHT, RIGHT, RIGHT, WRONG, RIGHT, WRONG, RIGHT, RIGHT], None, None),
+        ([RIGHT, RIGHT, RIGHT, WRONG, RIGHT, WRONG, RIGHT, RIGHT], (5, 5), 5),  # a step counts at once
+    ],
+)
+def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
+    codes: list[int], step: tuple[int, int] | None, failure: int | None
+) -> None:
+    """Positions each 0.5 s, the onset is the third."""
+    series = SimpleNamespace(judged=SimpleNamespace(code=np.array(codes)), t_ns=seconds(*(0.5 * np.arange(8))))
+    jump = None if step is None else SimpleNamespace(first=step[0], last=step[1])
+    assert _failure(cast(Any, series), 2, 8, cast(Any, jump), HazardConfig()) == failure

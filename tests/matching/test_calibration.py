@@ -11,7 +11,7 @@ from tests.matching.builders import line, matched, run, site
 
 @pytest.fixture(scope="module")
 def found() -> list[Claim]:
-    return claims(300, seed=77)
+    return claims(200, seed=77)
 
 
 @pytest.mark.parametrize("name", ["gate", "path"])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import polars as pl
 import pytest
@@ -215,3 +218,11 @@ def test_an_axis_without_any_epoch_hides_no_fail_of_the_others():
     epochs, odometer = steady(count)
     bank = bank_of(epochs.with_columns(path_m=pl.Series(path_m)), odometer)
     assert [bank.failed(k) for k in (0, 8299, 8300)] == [False, False, True]
+
+
+@pytest.mark.parametrize(("epoch", "end", "quiet"), [(1, 9, 4), (4, 9, 4), (5, 9, 8), (5, 7, 7), (1, 3, 3)])
+def test_quiet_until_the_next_fail_or_the_end_of_what_is_known(epoch: int, end: int, quiet: int) -> None:
+    """Fails at the fourth and the ninth epoch; ten are known."""
+    fails = np.isin(np.arange(10), [4, 8])
+    bank = SimpleNamespace(_look=lambda _: None, _any=fails, _known_to=9)
+    assert MonitorBank.quiet_until(cast(Any, bank), epoch, end) == quiet

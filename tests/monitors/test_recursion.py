@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import lfilter
 
 from pipeline.monitors.recursion import (
     AxisState,
@@ -87,6 +86,8 @@ def test_an_accuracy_that_jumps_up_and_creeps_down_for_hours_keeps_its_variance_
 
 def test_variance_stays_true_where_the_accuracy_jumps():
     """Sigma between 0.1 and 5 m every 20 s, against 4,000 sampled paths: within 15 %, and never negative."""
+    from scipy.signal import lfilter  # takes long to load
+
     rng = np.random.default_rng(5)
     paths, n = 4_000, 121
     sigma_m = np.where((np.arange(n) // 20) % 2 == 0, 0.1, 5.0)
@@ -128,6 +129,8 @@ def test_variance_tends_to_the_derived_limit(period_s):
 
 def test_variance_agrees_with_simulation():
     """2,000 seeded paths at 1 Hz, epoch 300 after a restart: within 10 % of the sampled variance."""
+    from scipy.signal import lfilter  # takes long to load
+
     rng = np.random.default_rng(11)
     paths, n = 2_000, 301
     error = np.zeros((paths, n))

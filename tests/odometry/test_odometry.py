@@ -9,10 +9,11 @@ import pytest
 
 from pipeline.odometry.driven import turns_of
 from pipeline.odometry.odometry import Noise
+from pipeline.odometry.odometry import odometry_of as odometry_of_stream
 from pipeline.odometry.polarity import polarity
 from pipeline.odometry.quantisation import QuantisationNoise
 from pipeline.odometry.rows import ways_between
-from schemas.config import AlignConfig
+from schemas.config import AlignConfig, Configuration, Vehicle
 from tests.align.straight import odometer_of, odometry_from
 
 
@@ -260,3 +261,9 @@ def test_a_row_is_a_spike_only_where_a_train_could_have_driven_on_without_it(las
     t, reads = np.array([1000.0, 1001.0, 1002.0]), np.array([0.0, 900.0, last_m])
     found = ways_between(t, reads, np.full(3, np.nan), 5.0, AlignConfig())
     np.testing.assert_array_equal(found.way_m, way_m)
+
+
+def test_one_row_or_none_is_no_odometry() -> None:
+    one_row = odometer_of(np.array([0.0]), np.array([5.0]), np.array([1.0]))
+    assert odometry_of_stream(one_row, Vehicle(), Configuration()) is None
+    assert odometry_of_stream(None, Vehicle(), Configuration()) is None

@@ -457,7 +457,7 @@ def test_shifting_all_times_changes_nothing_else(shift: int) -> None:
     }
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_shares_and_availability_are_shares(data: st.DataObject) -> None:
     t = sorted(data.draw(st.sets(st.integers(0, 400), min_size=0, max_size=30)))

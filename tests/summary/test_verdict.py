@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from pipeline.figures.independent import independent_episodes
-from pipeline.figures.verdict import head_of, run_verdicts, verdict_of, worst_verdict
+from pipeline.figures.verdict import head_of, run_verdicts, verdict_of, verdict_reasons, worst_verdict
 from schemas.enums import RunVerdict
 from schemas.tables import Runs
 from tests.summary.tables import NS, hazards, table
@@ -90,3 +90,18 @@ def test_rows_of_one_fault_are_one_event() -> None:
     assert events["missed"].to_list() == [False, False, True]
     assert events["with_truth"].to_list() == [False, True, True]
     assert events["time_to_detect_s"].to_list() == [13.0, None, None]
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ({"verdict": "safe"}, "every acceptance right, every position failure within the time allowed"),
+        ({"verdict": "unproven"}, "its streams do not fit each other, as the notes say"),
+        (
+            {"verdict": "unsafe", "unsafe_accepted": 1, "unproven_accepted": 5},
+            "VBs accepted despite a wrong position: 1; VBs accepted that nothing can check: 5",
+        ),
+    ],
+)
+def test_the_reasons_are_said_one_after_the_other(found: dict[str, Any], said: str) -> None:
+    assert verdict_reasons({**CLEAN, **found}, 0.01) == said
