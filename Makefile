@@ -3,9 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
-# A third one, for two cores: tests of stores and clusters mostly wait; the quick ones do not, and each process takes
-# seconds to start. Compiled modules are kept, or each of the many processes compiles the program and the tests again.
-TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile
+# One for each of two cores: each takes seconds to start. Compiled modules are kept, or each of the many processes
+# compiles the program and the tests again.
+TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
 .PHONY: install demo test quick check lint types bench mutations dictionary lock clean
@@ -22,10 +22,10 @@ demo: install
 	$(BIN)/balise demo
 
 test: install
-	$(TESTS) -n 3
+	$(TESTS)
 
 quick: install
-	$(TESTS) -n 2 -m "not slow"
+	$(TESTS) -m "not slow"
 
 lint: install
 	$(BIN)/ruff check .

@@ -10,11 +10,12 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from datetime import datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from typer import Argument, Exit, Option, Typer
+from typer.main import get_command
 
 if TYPE_CHECKING:
     import polars as pl
@@ -563,11 +564,17 @@ def main() -> None:
     sys.exit(_guarded(arguments, debug="--debug" in sys.argv[1:]))
 
 
+@cache
+def _commands() -> Callable[..., Any]:
+    """Made once of all signatures; whoever calls the program many times in one process does not wait for it again."""
+    return get_command(app)
+
+
 def _guarded(arguments: list[str], debug: bool) -> int:
     from schemas.errors import BaliseError, InputError
 
     try:
-        app(arguments, prog_name="balise", standalone_mode=True)
+        _commands()(arguments, prog_name="balise", standalone_mode=True)
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else USAGE
     except BaliseError as error:

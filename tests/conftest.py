@@ -74,8 +74,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what `make quick` leaves out."""
     here = Path(__file__).parent
     slow = [here / name for name in _SLOW]
+    left_out = {path for path in {item.path for item in items} if any(path.is_relative_to(place) for place in slow)}
     for item in items:
-        if any(item.path.is_relative_to(place) for place in slow):
+        if item.path in left_out:
             item.add_marker(pytest.mark.slow)
 
 

@@ -12,8 +12,10 @@ import json
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pipeline import storage
@@ -135,7 +137,7 @@ def _frame() -> Manifest:
     """What does not come from runs."""
     return {
         "manifest": FORMAT,
-        "program": {"software": SOFTWARE, "contract": CONTRACT_VERSION, "packages": _packages()},
+        "program": {"software": SOFTWARE, "contract": CONTRACT_VERSION, "packages": dict(_packages())},
         "platform": {
             "python": platform.python_version(),
             "system": platform.system(),
@@ -148,13 +150,14 @@ def _frame() -> Manifest:
     }
 
 
-def _packages() -> dict[str, str]:
+@cache
+def _packages() -> Mapping[str, str]:
     """Versions of the libraries that this program needs."""
     try:
         needed = [re.split(r"[^\w.-]", line)[0] for line in requires("balise") or [] if "extra ==" not in line]
     except PackageNotFoundError:
         needed = []
-    return {name: version(name) for name in sorted(needed, key=str.lower)}
+    return MappingProxyType({name: version(name) for name in sorted(needed, key=str.lower)})
 
 
 def _run(metadata: Mapping[str, str], marker: bytes) -> dict[str, Any]:
