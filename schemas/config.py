@@ -175,6 +175,12 @@ class MatchingConfig(Settings):
 
     # Farther than any sigma that can still tell tracks apart; DOMAIN section 2.
     reach_m: Positive = 50.0
+    # Positions off every track are compared with tracks within so many times the reach: one that drifts away slowly
+    # still shows by its movement which way the train turned.
+    far_reach_factor: Annotated[Number, Field(ge=1)] = 3.0
+    # An element ends where its track goes on; farther past that end, by metres or sigmas, a position is none of it.
+    beyond_end_m: NonNegative = 15.0
+    beyond_end_sigmas: NonNegative = 4.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
     # The bias in that. Not `cross_bias_sigma_m`: an exact reference 0.3 m off the axis is on the track.
@@ -222,6 +228,15 @@ class MatchingConfig(Settings):
     # Positions closer together give the same information on the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
+    # Farther than this from any link steps are so many times longer: a later one shows as much.
+    clear_of_links_m: NonNegative = 100.0
+    clear_step_factor: Annotated[Number, Field(ge=1)] = 4.0
+    # Over a longer step the train may have passed a whole element unseen, and come to another of the same candidates.
+    long_step_m: NonNegative = 60.0
+    # Ways between two steps are looked for up to this share and margin longer than the distance: longer ones are worse
+    # than a break, and the search grows with them.
+    detour_share: NonNegative = 0.5
+    detour_m: Positive = 100.0
     # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
     offset_floor_m: Positive = 0.02
     table_floor_m: Positive = 0.1
@@ -238,6 +253,10 @@ class MatchingConfig(Settings):
     jump_margin_m: NonNegative = 10.0
     jump_speed_mps: Positive = 100.0
     jump_acceleration_mps2: Positive = 5.0
+    # That velocity is told by positions at least and at most so far apart: over less it is mostly noise, over more a
+    # train has changed it.
+    jump_speed_least_s: Positive = 1.0
+    jump_speed_most_s: Positive = 5.0
     # For so long before and after a jump the train may be on a track as far aside as that, and as it was long.
     jump_aside_s: NonNegative = 120.0
     jump_aside_m: NonNegative = 500.0
