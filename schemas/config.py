@@ -196,6 +196,8 @@ class MatchingConfig(Settings):
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     # DOMAIN section 2: a probability of 0.99 has to be right in 99 of 100 runs.
     ambiguity_probability: Probability = 0.99
+    # Where tracks part or cross they are beside each other for less: that is told of no site.
+    parallel_least_m: NonNegative = 100.0
     # Noise of 0.35 m/s across the track at the slowest speed that counts.
     heading_sigma_deg: Positive = 10.0
     # At lower speed the heading is mostly noise of the velocity.
@@ -287,6 +289,8 @@ class AlignConfig(Settings):
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
     # 400 pieces is within 10 % of its mean.
     quantisation_factor: Positive = 2.0
+    # Over so long, or over eight rows where that is longer, the way of a train is a curve of third degree.
+    quantisation_span_s: Positive = 2.0
     # 0.8 % of scale and 83 ms of latency were seen in recorded runs (DOMAIN section 3).
     scale_prior_sigma: Positive = 0.01
     latency_prior_sigma_s: Positive = 0.2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.written_steps import step_of
+from pipeline.odometry.written_steps import step_of
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.config import FixSigma
