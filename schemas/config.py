@@ -88,6 +88,11 @@ class IngestConfig(Settings):
     plausibility: Literal["fail", "warn"] = "fail"
     # A nearer wrong position may be a fault; a default place or 0/0 is thousands of kilometres away.
     placeholder_far_m: Positive = 10_000.0
+    # Nobody runs trains so near to 0/0, in the Gulf of Guinea.
+    placeholder_origin_deg: NonNegative = 0.01
+    # A receiver looks for its first fix over this share of the run at most, or so long.
+    first_fix_share: Probability = 0.2
+    first_fix_s: NonNegative = 900.0
 
     @model_validator(mode="before")
     @classmethod
@@ -483,6 +488,24 @@ class UndetectedConfig(Settings):
     hidden_share: Probability = 0.5
 
 
+class CalibrationConfig(Settings):
+    """What `balise calibrate` measures from."""
+
+    # Epochs used are so far apart: user errors last 100 s, accelerations a few seconds, so that a long run loses little
+    # at 2 s; a short one is used to the full.
+    step_least_s: Positive = 0.1
+    step_most_s: Positive = 2.0
+    # Scale, latency and offset of a stretch of odometry are fitted to so many epochs at least.
+    least_points: Annotated[int, Field(strict=True, ge=3)] = 20
+    # Share of a position's variance without memory, only to keep the covariance well conditioned where epochs repeat.
+    # With `align.white_share`, which makes a replay learn carefully, the misfit of simulated runs is 0.75 instead of 1.
+    white_share: Probability = 0.001
+    # A standard deviation from so many is known to 7 %, if they were independent.
+    least_epochs: Annotated[int, Field(strict=True, gt=0)] = 100
+    # With a sigma that varies by a smaller share, intercept and slope cannot be told apart.
+    sigma_spread_share: Probability = 0.05
+
+
 class SurveyConfig(Settings):
     """A site from a survey of the line (`balise site`)."""
 
@@ -566,6 +589,7 @@ class Configuration(Settings):
     safety: SafetyConfig = SafetyConfig()
     undetected: UndetectedConfig = UndetectedConfig()
     survey: SurveyConfig = SurveyConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:
