@@ -125,6 +125,10 @@ class PlausibilityConfig(Settings):
     # agrees nearly as well at another one.
     speeds_agree: Probability = 0.93
     lag_rival: Probability = 0.05
+    # To so much a lag is known by speeds alone, which are means over 4 s.
+    speed_lag_s: Positive = 2.0
+    # Below this share of the usual speed a record tells more of noise than of the scale.
+    slow_share: Probability = 0.2
     # Ways are compared over windows of this length: positions that scatter by 2 m tell them to 2 %.
     window_m: Positive = 150.0
     # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
@@ -149,9 +153,13 @@ class PlausibilityConfig(Settings):
     # A survey is in a national datum if its shift is so near to the datum's.
     datum_near_m: Positive = 12.0
     datum_near_share: Probability = 0.12
+    # A line of one heading: with less of the information across it, a shift along the track is not known.
+    one_heading: Probability = 0.04
     # Of a copy so many places are equal to the last digit, and at most so often would an independent record's be.
     copy_share: Probability = 0.8
     copy_chance: Probability = 0.01
+    # Stamps are equal within this: recorders round them to milliseconds.
+    same_stamp_s: NonNegative = 0.002
     # Positions as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
     without_error: Probability = 0.2
 
