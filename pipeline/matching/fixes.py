@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.odometry.written_steps import step_of
-from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, Points, points_of
+from pipeline.track.geodesy import MEAN_RADIUS_M, Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.config import FixSigma
 from schemas.enums import Fix
@@ -128,7 +128,7 @@ def digit_noise(fixes: pl.DataFrame, heading_deg: Floats) -> list[pl.Series]:
     """
     latitude = floats(fixes, "latitude_deg")
     known = latitude[np.isfinite(latitude)]
-    north_per_deg = np.radians(1.0) * SEMI_MAJOR_AXIS_M
+    north_per_deg = np.radians(1.0) * MEAN_RADIUS_M
     east_per_deg = north_per_deg * np.cos(np.radians(known.mean())) if known.size else north_per_deg
     north, east, up = (
         step_m(values[np.isfinite(values)], scale) / np.sqrt(12.0)
