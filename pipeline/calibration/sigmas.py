@@ -21,9 +21,10 @@ from schemas.arrays import Floats
 from schemas.config import CalibrationConfig
 from schemas.tables import AXES, BANK_MONITORS, SCALES
 
-# Numerics of the regression: bins of sigma of the same number of epochs, and pieces of which one at a time is left out
-# where runs are fewer. More of either changes a fit by less than its standard error.
+# Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
+# than a fifth of its standard error.
 _BINS = 12
+# Pieces of which one at a time is left out where runs are fewer: standard errors depend on it, fits do not.
 _BLOCKS_OF_ONE_RUN = 8
 
 
