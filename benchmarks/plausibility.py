@@ -30,7 +30,7 @@ _CONFIG = Configuration()
 def fit_of(run: RunLog, site: Site, vehicle: Vehicle | None = None) -> Fit | str:
     """The fit of a run as a replay makes it, or the error of one that has no time in common."""
     try:
-        cleaned, _ = clean(run, _CONFIG.ingest)
+        cleaned, _ = clean(run, _CONFIG)
     except InputError as error:
         return str(error)
     return fit_run(cleaned, "primary", vehicle or Vehicle(), _CONFIG.plausibility, site)

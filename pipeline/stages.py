@@ -85,7 +85,7 @@ def diagnosed(
 
 def _context(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> _Context:
     """The run in order, whether it fits, its odometer, and what is known of where the train was."""
-    cleaned, counts = clean(run, config.ingest)
+    cleaned, counts = clean(run, config)
     fits = {name: fit_run(cleaned, name, vehicle, config.plausibility, site) for name in cleaned.solutions()}
     cleaned = of_the_journey(cleaned)
     odometry = odometry_of(cleaned.odometer, vehicle, config)

@@ -88,6 +88,11 @@ class IngestConfig(Settings):
     plausibility: Literal["fail", "warn"] = "fail"
     # A nearer wrong position may be a fault; a default place or 0/0 is thousands of kilometres away.
     placeholder_far_m: Positive = 10_000.0
+    # Nobody runs trains so near to 0/0, in the Gulf of Guinea.
+    placeholder_origin_deg: NonNegative = 0.01
+    # A receiver looks for its first fix over this share of the run at most, or so long.
+    first_fix_share: Probability = 0.2
+    first_fix_s: NonNegative = 900.0
 
     @model_validator(mode="before")
     @classmethod
@@ -120,6 +125,10 @@ class PlausibilityConfig(Settings):
     # agrees nearly as well at another one.
     speeds_agree: Probability = 0.93
     lag_rival: Probability = 0.05
+    # To so much a lag is known by speeds alone, which are means over 4 s.
+    speed_lag_s: Positive = 2.0
+    # Below this share of the usual speed a record tells more of noise than of the scale.
+    slow_share: Probability = 0.2
     # Ways are compared over windows of this length: positions that scatter by 2 m tell them to 2 %.
     window_m: Positive = 150.0
     # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
@@ -144,9 +153,13 @@ class PlausibilityConfig(Settings):
     # A survey is in a national datum if its shift is so near to the datum's.
     datum_near_m: Positive = 12.0
     datum_near_share: Probability = 0.12
+    # A line of one heading: with less of the information across it, a shift along the track is not known.
+    one_heading: Probability = 0.04
     # Of a copy so many places are equal to the last digit, and at most so often would an independent record's be.
     copy_share: Probability = 0.8
     copy_chance: Probability = 0.01
+    # Stamps are equal within this: recorders round them to milliseconds.
+    same_stamp_s: NonNegative = 0.002
     # Positions as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
     without_error: Probability = 0.2
 
@@ -175,6 +188,12 @@ class MatchingConfig(Settings):
 
     # Farther than any sigma that can still tell tracks apart; DOMAIN section 2.
     reach_m: Positive = 50.0
+    # Positions off every track are compared with tracks within so many times the reach: one that drifts away slowly
+    # still shows by its movement which way the train turned.
+    far_reach_factor: Annotated[Number, Field(ge=1)] = 3.0
+    # An element ends where its track goes on; farther past that end, by metres or sigmas, a position is none of it.
+    beyond_end_m: NonNegative = 15.0
+    beyond_end_sigmas: NonNegative = 4.0
     # A position is on the track within so many standard deviations of position, survey and bias together.
     on_track_sigmas: Positive = 3.0
     # The bias in that. Not `cross_bias_sigma_m`: an exact reference 0.3 m off the axis is on the track.
@@ -190,6 +209,8 @@ class MatchingConfig(Settings):
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     # DOMAIN section 2: a probability of 0.99 has to be right in 99 of 100 runs.
     ambiguity_probability: Probability = 0.99
+    # Where tracks part or cross they are beside each other for less: that is told of no site.
+    parallel_least_m: NonNegative = 100.0
     # Noise of 0.35 m/s across the track at the slowest speed that counts.
     heading_sigma_deg: Positive = 10.0
     # At lower speed the heading is mostly noise of the velocity.
@@ -222,6 +243,15 @@ class MatchingConfig(Settings):
     # Positions closer together give the same information on the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
+    # Farther than this from any link steps are so many times longer: a later one shows as much.
+    clear_of_links_m: NonNegative = 100.0
+    clear_step_factor: Annotated[Number, Field(ge=1)] = 4.0
+    # Over a longer step the train may have passed a whole element unseen, and come to another of the same candidates.
+    long_step_m: NonNegative = 60.0
+    # Ways between two steps are looked for up to this share and margin longer than the distance: longer ones are worse
+    # than a break, and the search grows with them.
+    detour_share: NonNegative = 0.5
+    detour_m: Positive = 100.0
     # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
     offset_floor_m: Positive = 0.02
     table_floor_m: Positive = 0.1
@@ -238,6 +268,10 @@ class MatchingConfig(Settings):
     jump_margin_m: NonNegative = 10.0
     jump_speed_mps: Positive = 100.0
     jump_acceleration_mps2: Positive = 5.0
+    # That velocity is told by positions at least and at most so far apart: over less it is mostly noise, over more a
+    # train has changed it.
+    jump_speed_least_s: Positive = 1.0
+    jump_speed_most_s: Positive = 5.0
     # For so long before and after a jump the train may be on a track as far aside as that, and as it was long.
     jump_aside_s: NonNegative = 120.0
     jump_aside_m: NonNegative = 500.0
@@ -268,6 +302,8 @@ class AlignConfig(Settings):
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
     # 400 pieces is within 10 % of its mean.
     quantisation_factor: Positive = 2.0
+    # Over so long, or over eight rows where that is longer, the way of a train is a curve of third degree.
+    quantisation_span_s: Positive = 2.0
     # 0.8 % of scale and 83 ms of latency were seen in recorded runs (DOMAIN section 3).
     scale_prior_sigma: Positive = 0.01
     latency_prior_sigma_s: Positive = 0.2
@@ -460,6 +496,24 @@ class UndetectedConfig(Settings):
     hidden_share: Probability = 0.5
 
 
+class CalibrationConfig(Settings):
+    """What `balise calibrate` measures from."""
+
+    # Epochs used are so far apart: user errors last 100 s, accelerations a few seconds, so that a long run loses little
+    # at 2 s; a short one is used to the full.
+    step_least_s: Positive = 0.1
+    step_most_s: Positive = 2.0
+    # Scale, latency and offset of a stretch of odometry are fitted to so many epochs at least.
+    least_points: Annotated[int, Field(strict=True, ge=3)] = 20
+    # Share of a position's variance without memory, only to keep the covariance well conditioned where epochs repeat.
+    # With `align.white_share`, which makes a replay learn carefully, the misfit of simulated runs is 0.75 instead of 1.
+    white_share: Probability = 0.001
+    # A standard deviation from so many is known to 7 %, if they were independent.
+    least_epochs: Annotated[int, Field(strict=True, gt=0)] = 100
+    # With a sigma that varies by a smaller share, intercept and slope cannot be told apart.
+    sigma_spread_share: Probability = 0.05
+
+
 class SurveyConfig(Settings):
     """A site from a survey of the line (`balise site`)."""
 
@@ -543,6 +597,7 @@ class Configuration(Settings):
     safety: SafetyConfig = SafetyConfig()
     undetected: UndetectedConfig = UndetectedConfig()
     survey: SurveyConfig = SurveyConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:

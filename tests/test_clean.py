@@ -7,6 +7,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from pipeline.ingest.clean import StreamCounts, clean, require_one_journey
+from schemas.config import AlignConfig, Configuration, IngestConfig
 from schemas.errors import InputError
 from schemas.run import RunLog
 
@@ -99,3 +100,24 @@ def test_two_journeys_in_one_recording_are_refused():
 def test_doubles_of_the_same_place_do_not_contradict():
     run = RunLog("r", gnss([1, 2, 2, 2, 3], latitudes=[50.0, 50.1, 50.1, 50.2, 50.3]))
     assert clean(run)[1].solutions == {"primary": StreamCounts(duplicates=2, contradicting=1)}
+
+
+def test_what_a_placeholder_is_is_configuration():
+    """0.05 degrees from 0/0; and the first places of a run that begins on the other side of the world."""
+    times = [NOW_NS + second * 10**9 for second in range(20)]
+    far = [-30.0, -30.0001, -30.0002] + [50.0] * 17
+    near_origin = RunLog(
+        "r", gnss(times, latitudes=[0.05] * 20).with_columns(fix=pl.lit("rtk_fixed"), longitude_deg=0.05)
+    )
+    far_first = RunLog("r", gnss(times, latitudes=far).with_columns(fix=pl.lit("rtk_fixed")))
+
+    def placeholders(run, **keys):
+        config = Configuration(ingest=IngestConfig(**keys))
+        return clean(run, config)[1].solutions["primary"].placeholders
+
+    assert placeholders(near_origin) == 0
+    assert placeholders(near_origin, placeholder_origin_deg=0.1) == 20
+    assert placeholders(far_first) == 3
+    assert placeholders(far_first, first_fix_share=0.01, first_fix_s=1.0) == 0
+    faster = Configuration(align=AlignConfig(fastest_mps=1e8))
+    assert clean(far_first, faster)[1].solutions["primary"].placeholders == 0

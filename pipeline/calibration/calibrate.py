@@ -80,7 +80,7 @@ def calibrate(
     _refuse_figures_of_no_train(fitted, logs, config)
     epochs = [replay(log, site, fitted, config).epochs.filter(pl.col("solution") == solution) for log in logs]
     factor = config.monitors.threshold_factor
-    fits = regress_sigmas(epochs, factor)
+    fits = regress_sigmas(epochs, factor, config.calibration)
     worst = worst_fit(fits)
     return Calibration(
         vehicle=fitted,
@@ -88,7 +88,7 @@ def calibrate(
         sigmas=sigma_table(fits),
         sigma_intercept_m=None if worst is None else worst.intercept_m,
         sigma_slope=None if worst is None else worst.slope,
-        doppler_sigma_mps=velocity_sigma_mps(epochs, factor, config.monitors.doppler_sigma_mps),
+        doppler_sigma_mps=velocity_sigma_mps(epochs, factor, config.monitors.doppler_sigma_mps, config.calibration),
     )
 
 
@@ -110,7 +110,7 @@ def _check_solution(logs: Sequence[RunLog], solution: str) -> None:
 
 
 def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> RunEstimate | None:
-    run, _ = clean(log, config.ingest)
+    run, _ = clean(log, config)
     fixes = run.gnss.filter(pl.col("solution") == solution)
     odometry = odometry_of(run.odometer, vehicle, config)
     if odometry is None or fixes.is_empty():
@@ -119,7 +119,7 @@ def _estimate(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, 
     epochs = found.epochs.filter("fix_valid", "on_track")
     t_s = odometry.seconds(times_ns(epochs))
     seen = Observations(t_s, floats(epochs, "path_m"), floats(epochs, "sigma_along_m"))
-    return estimate_run(seen, odometry.oriented(found.odometer_sign), *error_model(config.monitors))
+    return estimate_run(seen, odometry.oriented(found.odometer_sign), *error_model(config.monitors), config.calibration)
 
 
 def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: float) -> Vehicle:
@@ -138,7 +138,7 @@ def _vehicle(base: Vehicle, found: Sequence[RunEstimate], latency_unknown_s: flo
 
 def _refuse_what_does_not_fit(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> None:
     """A run with a wrong unit or clock would teach its error to every other run."""
-    run, _ = clean(log, config.ingest)
+    run, _ = clean(log, config)
     if solution in run.solutions():
         fit = fit_run(run, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m), config.plausibility, site)
         refuse_impossible(fit, log.run_id, config.ingest)

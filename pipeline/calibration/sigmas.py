@@ -18,12 +18,13 @@ import polars as pl
 from scipy.optimize import nnls
 
 from schemas.arrays import Floats
+from schemas.config import CalibrationConfig
 from schemas.tables import AXES, BANK_MONITORS, SCALES
 
+# Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
+# than a fifth of its standard error.
 _BINS = 12
-_LEAST_EPOCHS = 100
-# With a sigma that hardly varies, intercept and slope cannot be told apart.
-_LEAST_SPREAD = 0.05
+# Pieces of which one at a time is left out where runs are fewer: standard errors depend on it, fits do not.
 _BLOCKS_OF_ONE_RUN = 8
 
 
@@ -41,7 +42,7 @@ class SigmaFit:
     slope_error: float
 
 
-def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float) -> list[SigmaFit]:
+def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: CalibrationConfig) -> list[SigmaFit]:
     """One fit per monitor of the bank that was evaluated often enough; `runs`: epochs tables of fault-free runs.
 
     `factor` is k_T, by which thresholds exceed sigmas. Errors are jackknifed over runs, or over stretches of a
@@ -52,8 +53,8 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float) -> list[SigmaFit
         axis = next(name for name in AXES if monitor.removeprefix(name + "_") in SCALES)
         pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, len(runs))]
         samples = np.concatenate(pieces) if pieces else np.zeros((0, 2))
-        if len(samples) >= _LEAST_EPOCHS:
-            fits.append(_fit_with_errors(monitor, pieces))
+        if len(samples) >= config.least_epochs:
+            fits.append(_fit_with_errors(monitor, pieces, config))
     return fits
 
 
@@ -68,11 +69,11 @@ def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int
     return [block for block in np.array_split(rows, blocks) if len(block)]
 
 
-def _fit_with_errors(monitor: str, pieces: list[Floats]) -> SigmaFit:
+def _fit_with_errors(monitor: str, pieces: list[Floats], config: CalibrationConfig) -> SigmaFit:
     count = len(pieces)
-    whole, errors = _fit(np.concatenate(pieces)), np.full(3, np.nan)
+    whole, errors = _fit(np.concatenate(pieces), config), np.full(3, np.nan)
     if count > 1:
-        without = np.array([_fit(np.concatenate(pieces[:left] + pieces[left + 1 :])) for left in range(count)])
+        without = np.array([_fit(np.concatenate(pieces[:left] + pieces[left + 1 :]), config) for left in range(count)])
         errors = np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     figures = [figure for pair in zip(whole.tolist(), errors.tolist(), strict=True) for figure in pair]
     return SigmaFit(monitor, sum(len(piece) for piece in pieces), *figures)
@@ -83,11 +84,11 @@ def overall_ratio(ratios: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(ratios))))
 
 
-def _fit(samples: Floats) -> Floats:
+def _fit(samples: Floats, config: CalibrationConfig) -> Floats:
     """Overall ratio, intercept [m] and slope from rows (sigma, ratio): weighted least squares over bins of sigma."""
     sigma, squares = samples[:, 0], samples[:, 1] ** 2
     overall = overall_ratio(samples[:, 1])
-    if sigma.std() < _LEAST_SPREAD * sigma.mean():
+    if sigma.std() < config.sigma_spread_share * sigma.mean():
         return np.array([overall, 0.0, overall])
     edges = np.unique(np.quantile(sigma, np.linspace(0.0, 1.0, _BINS + 1)))
     place = np.clip(np.searchsorted(edges, sigma, side="right") - 1, 0, edges.size - 2)
@@ -101,7 +102,9 @@ def _fit(samples: Floats) -> Floats:
     return np.array([overall, intercept, slope])
 
 
-def velocity_sigma_mps(runs: Sequence[pl.DataFrame], factor: float, assumed_mps: float) -> float | None:
+def velocity_sigma_mps(
+    runs: Sequence[pl.DataFrame], factor: float, assumed_mps: float, config: CalibrationConfig
+) -> float | None:
     """Standard deviation of the GNSS velocity along the track [m/s] as monitor `along_doppler` shows it.
 
     `runs`: epochs tables of fault-free runs, replayed with `assumed_mps` for it; `factor` is k_T. What the odometer's
@@ -110,7 +113,7 @@ def velocity_sigma_mps(runs: Sequence[pl.DataFrame], factor: float, assumed_mps:
     """
     value, threshold = pl.col("along_doppler_value"), pl.col("along_doppler_threshold")
     looks = pl.concat([run.select(value, threshold).drop_nulls() for run in runs])
-    if looks.height < _LEAST_EPOCHS:
+    if looks.height < config.least_epochs:
         return None
     of_others = (threshold / factor) ** 2 - assumed_mps**2
     variance = looks.select((value**2 - of_others).mean()).item()

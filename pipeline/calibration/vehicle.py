@@ -18,16 +18,13 @@ import numpy.typing as npt
 
 from pipeline.odometry import Odometry
 from schemas.arrays import Floats
+from schemas.config import CalibrationConfig
 
-# Points of one dense covariance, and the time between them: user errors last 100 s, accelerations a few seconds, so a
-# long run loses little at 2 s; a short one is used to the full.
+# Numerics: points of one dense covariance, which takes time by their third power.
 _BLOCK_POINTS = 900
-_STEP_S = (0.1, 2.0)
-_LEAST_POINTS = 20
-# Keeps the covariance well conditioned where epochs repeat.
-_WHITE_SHARE = 0.001
 _ITERATIONS = 4
-# Of what a run seems to tell of the latency, at least so much counts: a sigma stays finite.
+# Numerics: of what a run seems to tell of the latency, at least so much counts, so that its sigma stays finite. A sigma
+# a hundred times as large says nothing either way.
 _LEAST_SHARE = 1e-4
 
 
@@ -56,16 +53,21 @@ class Observations:
 
 
 def estimate_run(
-    seen: Observations, odometry: Odometry, shares: Floats, taus_s: Floats, latency_s: float = 0.0
+    seen: Observations,
+    odometry: Odometry,
+    shares: Floats,
+    taus_s: Floats,
+    config: CalibrationConfig,
+    latency_s: float = 0.0,
 ) -> RunEstimate | None:
     """Scale and latency of one run, none where too little of it can be compared.
 
     `odometry` must grow with the path. Solved by Gauss-Newton steps from `latency_s`.
     """
-    blocks = _blocks(seen, odometry)
+    blocks = _blocks(seen, odometry, config)
     if not blocks:
         return None
-    covariances = [_covariance(block, odometry, shares, taus_s) for block in blocks]
+    covariances = [_covariance(block, odometry, shares, taus_s, config) for block in blocks]
     by_chance = sum(_chance_information(block, c, odometry) for block, c in zip(blocks, covariances, strict=True))
     estimate = np.array([1.0, latency_s])
     for _ in range(_ITERATIONS):
@@ -80,7 +82,7 @@ def estimate_run(
     return RunEstimate(float(estimate[0]), float(sigma[0]), float(estimate[1]), float(sigma[1]), misfit, points)
 
 
-def _blocks(seen: Observations, odometry: Odometry) -> list[Observations]:
+def _blocks(seen: Observations, odometry: Odometry, config: CalibrationConfig) -> list[Observations]:
     """Thinned observations in pieces of unbroken odometry, each with an offset of its own."""
     begin_s, end_s = _span(seen.t_s, odometry)
     known = (
@@ -90,32 +92,34 @@ def _blocks(seen: Observations, odometry: Odometry) -> list[Observations]:
         & odometry.known_at_s(end_s)
     )
     rows = np.flatnonzero(known & np.isfinite(seen.path_m) & np.isfinite(seen.sigma_m) & (seen.sigma_m > 0))
-    rows = rows[_thinned(seen.t_s[rows])]
+    rows = rows[_thinned(seen.t_s[rows], config)]
     pieces: list[Observations] = []
     for piece in np.split(rows, np.flatnonzero(np.diff(odometry.segment_at_s(seen.t_s[rows]))) + 1):
         for part in np.array_split(piece, max(1, -(-piece.size // _BLOCK_POINTS))):
-            if part.size >= _LEAST_POINTS:
+            if part.size >= config.least_points:
                 pieces.append(Observations(seen.t_s[part], seen.path_m[part], seen.sigma_m[part]))
     return pieces
 
 
-def _thinned(t_s: Floats) -> npt.NDArray[np.int64]:
+def _thinned(t_s: Floats, config: CalibrationConfig) -> npt.NDArray[np.int64]:
     """Indices a step apart that suits the length of the run."""
     if t_s.size == 0:
         return np.zeros(0, dtype=np.int64)
-    step_s = np.clip((t_s[-1] - t_s[0]) / (_BLOCK_POINTS - 1), *_STEP_S)
+    step_s = np.clip((t_s[-1] - t_s[0]) / (_BLOCK_POINTS - 1), config.step_least_s, config.step_most_s)
     slot = np.floor((t_s - t_s[0]) / step_s + 1e-6).astype(np.int64)
     return np.flatnonzero(np.diff(slot, prepend=-1))
 
 
-def _covariance(block: Observations, odometry: Odometry, shares: Floats, taus_s: Floats) -> Floats:
+def _covariance(
+    block: Observations, odometry: Odometry, shares: Floats, taus_s: Floats, config: CalibrationConfig
+) -> Floats:
     """Covariance of GNSS minus odometer [m^2]: Gauss-Markov sources, a white rest, the odometer's walk and rows."""
     lag = np.abs(block.t_s[:, None] - block.t_s[None, :])
     correlation = sum(share * np.exp(-lag / tau) for share, tau in zip(shares, taus_s, strict=True))
     gnss = np.outer(block.sigma_m, block.sigma_m) * correlation
     since = block.t_s - block.t_s[0]
     walk = odometry.noise.white_m2_per_s * np.minimum(since[:, None], since[None, :])
-    result: Floats = gnss + walk + np.diag(_WHITE_SHARE * block.sigma_m**2)
+    result: Floats = gnss + walk + np.diag(config.white_share * block.sigma_m**2)
     return result + _of_rows(odometry, block.t_s, block.t_s) if odometry.noise.quantisation else result
 
 

@@ -159,7 +159,7 @@ def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     from pipeline.matching.found_route import found_route
     from pipeline.odometry import odometry_of
 
-    cleaned, _ = clean(run, job.config.ingest)
+    cleaned, _ = clean(run, job.config)
     solutions, matching = cleaned.solutions(), job.config.matching
     fixes = cleaned.gnss.filter(pl.col("solution") == ("primary" if "primary" in solutions else solutions[0]))
     odometry = odometry_of(cleaned.odometer, job.vehicle, job.config)

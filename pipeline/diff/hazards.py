@@ -10,6 +10,7 @@ import polars as pl
 from pipeline.diff.tables import Difference, compare_tables
 from schemas.tables import Hazards
 
+# Of the comparison of two results, which have a configuration each: an onset moves by an epoch at 1 Hz either way.
 HAZARD_WINDOW_S = 2.0
 # Columns of a hazard that say what it was, whether it was seen in time and what it hit.
 _DECIDING = {

@@ -12,7 +12,8 @@ from pipeline.track.network import Edge, Network
 from pipeline.track.path import TravelledPath
 from schemas.arrays import Bools, Floats, Ints
 
-# Of two visits of one element the one that holds the measure comes first, however near the other is.
+# Of two visits of one element the one that holds the measure comes first, however near the other is:
+# an order of two costs, not a limit.
 _OUTSIDE_COUNTS = 1e3
 
 

@@ -17,6 +17,8 @@ from schemas.run import RunTables, Site
 
 Feature = dict[str, Any]
 
+# Of the drawing alone: over a longer pause no line is drawn. By `lds.crossing_gap_s` a log at 0.5 Hz would be single
+# points.
 _GAP_S = 10.0
 _DIGITS = 8
 

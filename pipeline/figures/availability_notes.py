@@ -10,7 +10,8 @@ from schemas.arrays import Bools
 from schemas.config import Configuration
 from schemas.enums import LdsMode
 
-# An hour in a thousand is what a healthy run loses at its start; below this share the reader asks why.
+# When and how much a note says, no figure: a healthy run loses some at its start, below this share the reader asks why;
+# so many reasons are named, and none for less than this share.
 _LOW = 0.9
 _SHOWN = 3
 _LEAST_SHARE = 0.02

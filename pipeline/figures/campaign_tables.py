@@ -18,6 +18,7 @@ from schemas.config import Configuration
 from schemas.conform import conform, dtypes
 from schemas.enums import TRUTH, BaliseKind, FailureMode, LinkingError
 
+# How a table is cut: it stands in the names of its rows, and no figure of a run depends on it.
 SPEED_BAND_KMH = 40.0
 
 RUN = ["run_id", "solution"]

@@ -9,6 +9,7 @@ import polars as pl
 
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 
+# The usual time of continuity of GNSS approaches, and part of the column names `continuity_15s`.
 CONTINUITY_S = 15.0
 """Most critical phase of an APV-I/LPV-200 operation (LOC section VI)."""
 

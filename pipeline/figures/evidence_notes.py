@@ -52,7 +52,7 @@ _DIGITS = (
     "thresholds allow for it"
 )
 _UNTOLD = "for {s:.0f} s it is not known whether the train moved: availability counts this time as moving without a TVB"
-# Less than the positions themselves scatter is not worth a word.
+# When a note is made, no figure: less than the positions themselves scatter is not worth a word.
 _WORTH_M = 0.1
 
 

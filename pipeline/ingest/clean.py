@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.ingest.placeholders import without_placeholders
 from schemas.arrays import NS_PER_S, Bools
-from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
+from schemas.config import Configuration, PlausibilityConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
@@ -50,7 +50,7 @@ class CleanCounts:
     streams: dict[str, StreamCounts] = field(default_factory=dict)
 
 
-def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
+def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog, CleanCounts]:  # noqa: B008 - frozen
     """The run with every stream in order and each stamp once (the first recorded one stays), times in nanoseconds.
 
     A few rows more than a day from the others (a receiver that did not know the date yet), all before 1970, and single
@@ -66,7 +66,7 @@ def clean(run: RunLog, config: IngestConfig = IngestConfig()) -> tuple[RunLog, C
         frame = run.stream(name)
         if frame is None or name == "faults":
             continue
-        stray = _strays(frame, config.wrong_dates_share)
+        stray = _strays(frame, config.ingest.wrong_dates_share)
         if name in _OF_POSITIONS:
             elsewhere = _far_from_any(frame["t"], streams["gnss"]["t"])
             # Where no row is near, the clock of the whole recorder is wrong, which the fit of the run tells.
@@ -106,12 +106,14 @@ def of_the_journey(run: RunLog) -> RunLog:
     return replace(run, notes=notes, satellites=satellites, reference=reference, balise_reads=reads)
 
 
-def _with_fixes(gnss: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataFrame, dict[str, int]]:
+def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame, dict[str, int]]:
     """Positions without placeholders, and how many these were, by solution."""
     if not {"fix", *_PLACE} <= set(gnss.columns):
         return gnss, {}
     parts = gnss.with_row_index("_row").partition_by("solution", maintain_order=True)
-    marked = [(part["solution"][0], *without_placeholders(part, config)) for part in parts]
+    marked = [
+        (part["solution"][0], *without_placeholders(part, config.ingest, config.align.fastest_mps)) for part in parts
+    ]
     counts = {name: count for name, _, count in marked}
     if any(counts.values()):
         gnss = pl.concat([part for _, part, _ in marked]).sort("_row").drop("_row")

@@ -15,6 +15,7 @@ from pipeline.lds.windows import Window, window_after_turn_m, window_m
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction
 
+# SUBSET-026 3.16.2.7 (TVB eq. 4): two consecutive expected balise groups that are not found apply the service brake.
 MISSED_IN_A_ROW = 2
 
 

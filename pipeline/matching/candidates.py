@@ -13,7 +13,8 @@ from pipeline.track.segments import Feet, Polyline, downhill
 from pipeline.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 
-# Every place on an element has a search point within this distance along it.
+# Every place on an element has a search point within this distance along it. Numerics: it decides how many points are
+# searched, not which elements are within reach.
 PROBE_SPACING_M = 40.0
 
 

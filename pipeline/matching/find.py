@@ -25,16 +25,9 @@ from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 from schemas.errors import InputError
 
-# An element past whose end a position lies by more is no candidate, unless the track ends there.
-_BEYOND_M = 15.0
-_BEYOND_SIGMAS = 4.0
-# Epochs off every track are compared with tracks within this many times the reach.
-_FAR = 3.0
-# A position this close to a track lies near it whatever else is around [m].
+# Saves time only: what is kept of a step lies within `reach_m` beyond its nearest track, so that one with a track as
+# close as this need not be searched farther [m].
 _CLOSE_M = 10.0
-# Further than this from any link [m], one step in so many is enough.
-_CLEAR_M = 100.0
-_THINNING = 4
 
 
 def find_path(
@@ -80,7 +73,7 @@ def _trellis(
     near = np.flatnonzero(nearest <= config.reach_m)
     if len(near) == 0:
         raise off_the_network(fixes, network.track, config)
-    judged = nearest <= (_FAR - 1.0) * config.reach_m
+    judged = nearest <= (config.far_reach_factor - 1.0) * config.reach_m
     judged[: near[0]] = judged[near[-1] + 1 :] = False
     # A track much further off than the nearest is none of several possible ones; one just out of reach is.
     kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
@@ -95,8 +88,8 @@ def _trellis(
 def _thinned(fixes: Fixes, steps: Steps, network: Network, way: Travelled, config: MatchingConfig) -> Steps:
     """Fewer steps where no link is near, since nothing can be decided there that a later step does not show."""
     ends = end_places(network.track)[network.linked_ends()]
-    apart, _ = cKDTree(ends).query(fixes.points.surface[steps.epoch], distance_upper_bound=_CLEAR_M)
-    moved = np.cumsum(np.nan_to_num(steps.chord_m)) / (_THINNING * config.step_distance_m)
+    apart, _ = cKDTree(ends).query(fixes.points.surface[steps.epoch], distance_upper_bound=config.clear_of_links_m)
+    moved = np.cumsum(np.nan_to_num(steps.chord_m)) / (config.clear_step_factor * config.step_distance_m)
     kept = np.isfinite(apart) | (np.nan_to_num(steps.elapsed_s) >= 0.5 * config.step_time_s)
     kept[1:] |= np.diff(np.floor(moved)) > 0
     kept[[0, -1]] = True
@@ -108,20 +101,22 @@ def _all_candidates(
 ) -> Candidates:
     """Candidates within reach, and for steps that are not close to a track those in a wider circle."""
     close_m = _CLOSE_M + config.reach_m
-    found = _candidates(fixes, steps.epoch, network, segments, close_m)
+    found = _candidates(fixes, steps.epoch, network, segments, close_m, config)
     close = np.zeros(len(steps), dtype=bool)
     close[found.step[found.distance_m <= _CLOSE_M]] = True
     if close.all():
         return found
-    far = _candidates(fixes, steps.epoch[~close], network, segments, _FAR * config.reach_m)
+    far = _candidates(fixes, steps.epoch[~close], network, segments, config.far_reach_factor * config.reach_m, config)
     return merged(found.take(np.flatnonzero(close[found.step]), len(steps)), far, np.flatnonzero(~close))
 
 
-def _candidates(fixes: Fixes, epoch: Ints, network: Network, segments: Segments, reach_m: float) -> Candidates:
+def _candidates(
+    fixes: Fixes, epoch: Ints, network: Network, segments: Segments, reach_m: float, config: MatchingConfig
+) -> Candidates:
     everything = candidates_of(fixes.points.take(epoch), network, segments, reach_m)
     row = epoch[everything.step]
     sigma = np.sqrt(0.5 * (fixes.cov_ee_m2[row] + fixes.cov_nn_m2[row]))
-    near = everything.beyond_m <= np.maximum(_BEYOND_M, _BEYOND_SIGMAS * sigma)
+    near = everything.beyond_m <= np.maximum(config.beyond_end_m, config.beyond_end_sigmas * sigma)
     onward = np.where(everything.past < 0, everything.linked_start, everything.linked_end)
     return everything.take(np.flatnonzero(near | ~onward), len(epoch))
 

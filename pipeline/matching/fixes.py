@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.written_steps import step_of
-from pipeline.track.geodesy import Points, points_of
+from pipeline.odometry.written_steps import step_of
+from pipeline.track.geodesy import MEAN_RADIUS_M, Points, points_of
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.config import FixSigma
 from schemas.enums import Fix
@@ -113,7 +113,6 @@ def _kinds(fix: pl.Series) -> Ints:
     return fix.cast(pl.Enum(_KINDS)).to_physical().cast(pl.Int64).fill_null(len(_KINDS)).to_numpy()
 
 
-_EARTH_RADIUS_M = 6_371_000.0
 # Finer steps drown in the noise of any receiver; less than the other is rounding.
 _LEAST_STEP_M, _ROUNDED_M = 0.02, 1e-4
 
@@ -129,7 +128,7 @@ def digit_noise(fixes: pl.DataFrame, heading_deg: Floats) -> list[pl.Series]:
     """
     latitude = floats(fixes, "latitude_deg")
     known = latitude[np.isfinite(latitude)]
-    north_per_deg = np.radians(1.0) * _EARTH_RADIUS_M
+    north_per_deg = np.radians(1.0) * MEAN_RADIUS_M
     east_per_deg = north_per_deg * np.cos(np.radians(known.mean())) if known.size else north_per_deg
     north, east, up = (
         step_m(values[np.isfinite(values)], scale) / np.sqrt(12.0)

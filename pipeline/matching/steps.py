@@ -15,9 +15,6 @@ from pipeline.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
-# How fast the train was is told by positions this far apart, at least and at most [s].
-_SPEED_SPAN_S = (1.0, 5.0)
-
 
 @dataclass(frozen=True)
 class Steps:
@@ -76,10 +73,10 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
     rows = np.flatnonzero(usable)
     believed = np.ones(len(rows), dtype=bool)
     t_s = fixes.t_s[rows]
-    since = _second_before(t_s)
+    since = _span_before(t_s, config.jump_speed_least_s)
 
     def reachable(before: Ints, after: Ints) -> Bools:
-        velocity = _velocity_mps(fixes, rows, since[before], before)
+        velocity = _velocity_mps(fixes, rows, since[before], before, config.jump_speed_most_s)
         return _reachable(fixes, rows[before], rows[after], velocity, way, config) | (
             t_s[after] - t_s[before] > config.jump_hold_s
         )
@@ -103,16 +100,16 @@ def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConf
     return rows[believed]
 
 
-def _second_before(t_s: Floats) -> Ints:
-    """Per time the number of the last one at least a second before, -1 without one."""
-    return np.searchsorted(t_s, t_s - _SPEED_SPAN_S[0], side="right") - 1
+def _span_before(t_s: Floats, span_s: float) -> Ints:
+    """Per time the number of the last one at least so long before, -1 without one."""
+    return np.searchsorted(t_s, t_s - span_s, side="right") - 1
 
 
-def _velocity_mps(fixes: Fixes, rows: Ints, since: Ints, until: Ints) -> Floats:
+def _velocity_mps(fixes: Fixes, rows: Ints, since: Ints, until: Ints, most_s: float) -> Floats:
     """Mean velocity between numbers of `rows`, one vector each, NaN where they are too far apart to say."""
     begin, end = rows[np.maximum(since, 0)], rows[until]
     elapsed = np.where(since >= 0, fixes.t_s[end] - fixes.t_s[begin], np.nan)
-    elapsed[elapsed > _SPEED_SPAN_S[1]] = np.nan
+    elapsed[elapsed > most_s] = np.nan
     return np.asarray((fixes.points.surface[end] - fixes.points.surface[begin]) / elapsed[:, None])
 
 

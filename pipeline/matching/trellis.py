@@ -17,9 +17,6 @@ from schemas.config import MatchingConfig
 
 # Log-probability of a move that the network does not know: only where nothing else is possible.
 BREAK = -200.0
-# Steps longer than this are judged move by move, since more than one element may lie within them.
-_LONG_STEP_M = 60.0
-_SEARCH_MARGIN_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -90,8 +87,8 @@ def trellis_of(
     polarity = _polarity(steps, first, oriented, place, offset) if network.orientable else 0
     nothing, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     draft = Trellis(
-        network, steps, _ways(steps, polarity), like, config, first, oriented, candidate, place, offset, initial,
-        nothing, none.astype(bool), none, nothing,
+        network, steps, _ways(steps, polarity, config), like, config, first, oriented, candidate, place, offset,
+        initial, nothing, none.astype(bool), none, nothing,
     )  # fmt: skip
     stays = _stays(draft)
     pair_first, pair_move = _pair_moves(draft, np.flatnonzero(~stays)[1:])
@@ -99,12 +96,12 @@ def trellis_of(
     return replace(draft, stay=stay, stays=stays, pair_first=pair_first, pair_move=pair_move)
 
 
-def _ways(steps: Steps, polarity: int) -> Ways:
+def _ways(steps: Steps, polarity: int, config: MatchingConfig) -> Ways:
     """What each step's length is measured against: the odometer, signed once its sign is known, else GNSS."""
     known = np.isfinite(steps.odometer_m)
     chord = np.nan_to_num(steps.chord_m)
     distance = np.where(known, (polarity or 1) * steps.odometer_m, chord)
-    limit = 1.5 * np.maximum(chord, np.abs(distance)) + _SEARCH_MARGIN_M
+    limit = (1.0 + config.detour_share) * np.maximum(chord, np.abs(distance)) + config.detour_m
     return Ways(distance, known & (polarity != 0), limit)
 
 
@@ -152,7 +149,7 @@ def _stays(trellis: Trellis) -> Bools:
     """Steps over which no state can change: the same states as before, none linked to another, no long way."""
     stays = _unchanged(trellis)
     way = np.fmax(np.abs(trellis.steps.odometer_m), trellis.steps.chord_m)
-    stays &= np.nan_to_num(way, nan=np.inf) <= _LONG_STEP_M
+    stays &= np.nan_to_num(way, nan=np.inf) <= trellis.config.long_step_m
     apart: dict[tuple[int, ...], bool] = {}
     oriented, first = trellis.oriented.tolist(), trellis.first.tolist()
     for step in np.flatnonzero(stays).tolist():

@@ -11,17 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.ingest.written_steps import step_of
+from pipeline.odometry.written_steps import step_of
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import AlignConfig
 
-# Over so long, or over so many rows where that is longer, the way of a train is a curve of third degree.
-_SPAN_S = 2.0
+# Numerics of the fit: so many rows of a piece, and the degree of its curve.
 _MOST_ROWS, _FEWEST_ROWS = 16, 8
 _DEGREE = 3
 # Enough for the median, however long the run is; with fewer it is chance.
 _PIECES, _FEWEST_PIECES = 400, 8
-# Less is rounding of decimal numbers.
+# Less is rounding of decimal numbers, which are not whole in binary; far below any `counter_step_m`.
 _ROUNDED_M = 1e-3
 
 
@@ -73,7 +72,7 @@ def _scatter_beyond(
     t_s: Floats, distance_m: Floats, whole: Bools, white_m2_per_s: float, deadband_mps: float, config: AlignConfig
 ) -> QuantisationNoise:
     """What the rows show of their noise."""
-    rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config.straight_s)
+    rows = _moving_pieces(t_s, distance_m, whole, deadband_mps, config)
     if len(rows) < _FEWEST_PIECES:
         return QuantisationNoise()
     since_s, ways = t_s[rows] - t_s[rows[:, :1]], distance_m[rows] - distance_m[rows[:, :1]]
@@ -88,16 +87,16 @@ def _scatter_beyond(
     return QuantisationNoise(max(low_m2 - moving_s2 * low_mps**2, 0.0), moving_s2)
 
 
-def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: float, farthest_s: float) -> Ints:
+def _moving_pieces(t_s: Floats, distance_m: Floats, whole: Bools, deadband_mps: float, config: AlignConfig) -> Ints:
     """Rows of pieces without a gap in which the train moves, spread over the run; shape (pieces, rows).
 
     Rows farther apart tell of a train that drives otherwise than a moment ago, not of their noise.
     """
     period_s = float(np.median(np.diff(t_s)))
-    if period_s > farthest_s or period_s <= 0.0:
+    if period_s > config.straight_s or period_s <= 0.0:
         return np.zeros((0, 1), dtype=np.int64)
-    count = int(np.clip(np.ceil(_SPAN_S / period_s) + 1, _FEWEST_ROWS, _MOST_ROWS))
-    stride = max(1, round(_SPAN_S / period_s / (count - 1)))
+    count = int(np.clip(np.ceil(config.quantisation_span_s / period_s) + 1, _FEWEST_ROWS, _MOST_ROWS))
+    stride = max(1, round(config.quantisation_span_s / period_s / (count - 1)))
     length = (count - 1) * stride
     starts = np.arange(0, t_s.size - length, max(length, (t_s.size - length) // _PIECES))
     broken = np.concatenate([[0], np.cumsum(~whole)])

@@ -13,10 +13,6 @@ from schemas.config import PlausibilityConfig
 
 # Lags that are worth a closer look: so many, so far from each other [s], improved in these steps.
 _CANDIDATES, _APART_S, _CLIMB_S = 4, 15.0, (8.0, 4.0, 2.0, 1.0)
-# To so much a lag is known by speeds alone [s].
-NEAR_S = 2.0
-# Below this share of the usual speed a record tells more of noise than of the scale.
-SLOW_SHARE = 0.2
 
 
 def clock_lag(gnss: Places, counter: Course, config: PlausibilityConfig) -> tuple[float, str]:
@@ -25,13 +21,13 @@ def clock_lag(gnss: Places, counter: Course, config: PlausibilityConfig) -> tupl
     A lag is the counter's stamp of a moment minus the GNSS's. A fault of one of both leaves part of the journey that
     agrees, and with it the right lag ahead of all others.
     """
-    as_recorded = _agreement(gnss, counter, 0.0, 0.0)
+    as_recorded = _agreement(gnss, counter, 0.0, 0.0, config.slow_share)
     if as_recorded >= config.speeds_agree:
         return 0.0, ""
     possible_s, reason = _possible_lags(gnss, counter, config)
     if reason:
         return 0.0, reason
-    rated = _rated(gnss, counter, possible_s, config.overlap_share)
+    rated = _rated(gnss, counter, possible_s, config)
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
     if len(rated) > 1 and rated[0][0] - rated[1][0] < config.lag_rival:
@@ -90,18 +86,21 @@ def _correlations(one: Floats, other: Floats, config: PlausibilityConfig) -> Flo
     return np.where(told, sums(1, 1) / np.sqrt(np.where(told, spread, 1.0)), 0.0)
 
 
-def _rated(gnss: Places, counter: Course, possible_s: list[float], least: float) -> list[tuple[float, float]]:
+def _rated(
+    gnss: Places, counter: Course, possible_s: list[float], config: PlausibilityConfig
+) -> list[tuple[float, float]]:
     """Agreement and lag of the best shifts away from 0, best first; a stuck counter moves a correlation by seconds."""
     found: list[tuple[float, float]] = []
+    least, slow_share = config.overlap_share, config.slow_share
     for lag_s in possible_s:
-        best = _agreement(gnss, counter, lag_s, least), lag_s
+        best = _agreement(gnss, counter, lag_s, least, slow_share), lag_s
         for step_s in _CLIMB_S:
             near = [best[1] - step_s, best[1] + step_s]
-            best = max(best, *((_agreement(gnss, counter, lag_s, least), lag_s) for lag_s in near))
+            best = max(best, *((_agreement(gnss, counter, lag_s, least, slow_share), lag_s) for lag_s in near))
         found.append(best)
     found.sort(reverse=True)
     apart = found[:1] + [one for one in found[1:] if abs(one[1] - found[0][1]) > _APART_S]
-    return [one for one in apart if abs(one[1]) > NEAR_S]
+    return [one for one in apart if abs(one[1]) > config.speed_lag_s]
 
 
 def common(gnss: Places, counter: Course, lag_s: float) -> tuple[float, float]:
@@ -109,7 +108,7 @@ def common(gnss: Places, counter: Course, lag_s: float) -> tuple[float, float]:
     return max(gnss.t_s[0], counter.t_s[0] - lag_s), min(gnss.t_s[-1], counter.t_s[-1] - lag_s)
 
 
-def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float) -> float:
+def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float, slow_share: float) -> float:
     """Share of the moving time in which both speeds agree at this lag, times what of the shorter record they have in
     common then: a shift that cuts a fault off explains nothing. 0 where that is too little.
     """
@@ -120,7 +119,7 @@ def _agreement(gnss: Places, counter: Course, lag_s: float, least_overlap: float
     grid = np.linspace(begin_s, end_s, int(np.clip(end_s - begin_s, 20, 800)))
     speeds = np.stack([gnss.speed(grid), np.abs(counter.speed(grid + lag_s))])
     one, other = speeds[:, np.isfinite(speeds).all(axis=0)]
-    moves = [speed > SLOW_SHARE * usual(speed, 0.9) for speed in (one, other)]
+    moves = [speed > slow_share * usual(speed, 0.9) for speed in (one, other)]
     both, either = moves[0] & moves[1], moves[0] | moves[1]
     if both.sum() < LEAST:
         return 0.0

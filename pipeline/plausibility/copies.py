@@ -27,8 +27,6 @@ from schemas.enums import Fix
 _WHAT = "reference against the positions"
 # Fewer moving places in common tell nothing.
 _FEWEST = 3 * LEAST
-# Stamps are equal within this: recorders round them to milliseconds [s].
-_SAME_STAMP_S = 0.002
 # Degrees, minutes and seconds of an angle are written with so many decimals; finer is rounding of the computer [deg].
 _UNITS_DEG, _DECIMALS, _LEAST_DEG = (1.0, 1.0 / 60.0, 1.0 / 3600.0), range(2, 10), 1e-9
 # Rows of the reference that are looked at.
@@ -69,19 +67,19 @@ def copy_check(
     digit_m, sigma_m = digit_deg * to_m, _sigma_m(fixes)
     # Of a normal error, so much lies within a digit on either side.
     chance = float(np.prod(np.minimum(1.0, 2.0 * digit_m / (np.sqrt(2.0 * np.pi) * sigma_m))))
-    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0])) if chance <= config.copy_chance else None
+    lag_s = _lag_s(own, other, 2.0 * float(digit_m[0]), config.same_stamp_s) if chance <= config.copy_chance else None
     if lag_s is None:
         return None
     row = np.clip(np.searchsorted(own.t_s, other.t_s - lag_s), 1, own.t_s.size - 1)
     row -= other.t_s - lag_s - own.t_s[row - 1] < own.t_s[row] - (other.t_s - lag_s)
-    common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= _SAME_STAMP_S
+    common = np.abs(own.t_s[row] - (other.t_s - lag_s)) <= config.same_stamp_s
     equal = np.all(np.abs(own.degrees[row] - other.degrees) <= 1.001 * digit_deg, axis=1)[common]
     if equal.size < _FEWEST or equal.mean() < config.copy_share:
         return None
     exact_m = config.without_error * float(sigma_m.min())
-    if line is not None and fit_survey(gnss, line, config.moving_mps).aside_m < exact_m:
+    if line is not None and fit_survey(gnss, line, config).aside_m < exact_m:
         return None
-    stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > _SAME_STAMP_S else ""
+    stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > config.same_stamp_s else ""
     found = (
         f"{equal.sum()} of {equal.size} places are those of the positions to the last digit ({digit_m[0]:.1g} m)"
         f"{stamps}; an independent one would be so near in {chance:.1g} of all cases, for the positions have sigma "
@@ -97,7 +95,7 @@ def _track(frame: pl.DataFrame, epoch_ns: int) -> _Track:
     return _Track(seconds_since(epoch_ns, frame), degrees).take(np.all(np.isfinite(degrees), axis=1))
 
 
-def _lag_s(own: _Track, other: _Track, reach_m: float) -> float | None:
+def _lag_s(own: _Track, other: _Track, reach_m: float, same_stamp_s: float) -> float | None:
     """The difference of stamps that most places of the other record have which are in the own one too."""
     from scipy.spatial import cKDTree
 
@@ -107,7 +105,7 @@ def _lag_s(own: _Track, other: _Track, reach_m: float) -> float | None:
     if near.sum() < _FEWEST:
         return None
     lags_s = np.sort(other.t_s[near] - own.t_s[row[near]])
-    alike = np.searchsorted(lags_s, lags_s + _SAME_STAMP_S, "right") - np.arange(lags_s.size)
+    alike = np.searchsorted(lags_s, lags_s + same_stamp_s, "right") - np.arange(lags_s.size)
     first = int(alike.argmax())
     return float(np.median(lags_s[first : first + alike[first]]))
 

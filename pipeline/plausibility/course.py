@@ -12,7 +12,8 @@ from pipeline.track.geodesy import Points, earth_centred_m, points_of
 from schemas.arrays import Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Fix
 
-# Speed over this time: positions that scatter by 2 m give it to 0.7 m/s. A shorter pause is bridged.
+# Speed over this time: positions that scatter by 2 m give it to 0.7 m/s. A shorter pause is bridged. Not yet a key:
+# limits of `[plausibility]` are set for speeds over it.
 SPEED_S = 4.0
 
 

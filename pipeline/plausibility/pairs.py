@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plausibility.clocks import NEAR_S, SLOW_SHARE, clock_lag, common
+from pipeline.plausibility.clocks import clock_lag, common
 from pipeline.plausibility.course import Course, Places
 from pipeline.plausibility.robust import LEAST, regressed, steady, usual
 from schemas.arrays import Floats
@@ -68,12 +68,13 @@ def fit_pair(gnss: Places, counter: Course, config: PlausibilityConfig) -> PairF
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     coarse_s, clock_reason = clock_lag(gnss, counter, config)
     found = _fitted(gnss, counter, coarse_s, config)
-    if found.lag_told and abs(found.lag_s - coarse_s) <= 2.0 * NEAR_S:
+    near_s = config.speed_lag_s
+    if found.lag_told and abs(found.lag_s - coarse_s) <= 2.0 * near_s:
         found = _fitted(gnss, counter, found.lag_s, config)
     # Regressed, a lag is twice as near where both halves agree on it, or faults of the counter have bent it.
-    agreed = found.lag_told and all(abs(half_s - found.lag_s) < NEAR_S / 2.0 for _, half_s in found.halves)
-    if coarse_s and abs(found.lag_s - coarse_s) > (2.0 if agreed else 1.0) * NEAR_S:
-        found = replace(found, lag_s=coarse_s, lag_sigma_s=NEAR_S / 2.0)
+    agreed = found.lag_told and all(abs(half_s - found.lag_s) < near_s / 2.0 for _, half_s in found.halves)
+    if coarse_s and abs(found.lag_s - coarse_s) > (2.0 if agreed else 1.0) * near_s:
+        found = replace(found, lag_s=coarse_s, lag_sigma_s=near_s / 2.0)
     return replace(found, shifted=coarse_s != 0.0, clock_reason=clock_reason)
 
 
@@ -126,8 +127,8 @@ def _windows(
     change = counter.speed(ends + lag_s, 2.0) - counter.speed(starts + lag_s, 2.0)
     found = np.stack([gnss.way(starts, ends), counter.gained(starts + lag_s, ends + lag_s), change])
     found = found[:, np.isfinite(found).all(axis=0)]
-    found = found[:, found[0] > max(SLOW_SHARE * usual(found[0], 0.9), config.moving_mps * length_s)]
+    found = found[:, found[0] > max(config.slow_share * usual(found[0], 0.9), config.moving_mps * length_s)]
     # Neither a counter that stands most of the time nor one that is reset tells what is usual.
     size = np.abs(found[1])
-    counts = size > SLOW_SHARE * usual(size, 0.8)
+    counts = size > config.slow_share * usual(size, 0.8)
     return found[:, counts], float(counts.mean()) if counts.size else 1.0

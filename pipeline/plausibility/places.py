@@ -109,7 +109,7 @@ def survey_checks(
     gnss: Places, line: Line, vehicle: Vehicle, config: PlausibilityConfig, beside_reference: bool
 ) -> list[Check]:
     """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
-    found, datum = _by_datum(fit_survey(gnss, line, config.moving_mps), gnss, line, config)
+    found, datum = _by_datum(fit_survey(gnss, line, config), gnss, line, config)
     heights = _heights("survey", found.up_m, found.height_m, vehicle.antenna_height_m, config)
     return [_beside(found, datum, config, ("gnss", "reference") if beside_reference else ("gnss",)), *heights]
 
@@ -123,7 +123,7 @@ def _by_datum(found: SurveyFit, gnss: Places, line: Line, config: PlausibilityCo
         (fit, datum)
         for datum in datums
         for start_m in [(datum.east_m, datum.north_m)]
-        for fit in [found if found.constant else fit_survey(gnss, line, config.moving_mps, start_m)]
+        for fit in [found if found.constant else fit_survey(gnss, line, config, start_m)]
         if fit.constant and datum.explains(fit.east_m, fit.north_m, fit.one_heading, config)
     ]
     return min(named, key=lambda item: item[1].off_m(item[0].east_m, item[0].north_m), default=(found, None))

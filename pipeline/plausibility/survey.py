@@ -13,14 +13,13 @@ from pipeline.plausibility.robust import regressed, sampled, steady, usual
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import track_of
 from schemas.arrays import Floats
+from schemas.config import PlausibilityConfig
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 # Points of the track lie so far apart [m]; each round finds the nearest of them anew.
 _SPACING_M, _ROUNDS = 20.0, 8
-# A heading only: below this share of the information across it, the shift along the track is not known.
-_ONE_HEADING = 0.04
 
 
 @dataclass(frozen=True)
@@ -91,12 +90,14 @@ def line_of(frame: pl.DataFrame) -> Line:
     return Line(places, along, heights, cKDTree(places))
 
 
-def fit_survey(gnss: Places, line: Line, moving_mps: float, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
+def fit_survey(
+    gnss: Places, line: Line, config: PlausibilityConfig, start_m: tuple[float, float] = (0.0, 0.0)
+) -> SurveyFit:
     """The constant shift that brings moving positions onto the track, by repeated projection and robust regression.
 
     `start_m`: a shift to begin with.
     """
-    moving = np.nan_to_num(gnss.speed(gnss.t_s)) > moving_mps
+    moving = np.nan_to_num(gnss.speed(gnss.t_s)) > config.moving_mps
     rows = np.flatnonzero(sampled(moving if moving.sum() >= 20 else np.ones_like(moving), 400))
     points = gnss.points.take(rows)
     axes = np.stack([points.east, points.north], axis=1)
@@ -113,7 +114,7 @@ def fit_survey(gnss: Places, line: Line, moving_mps: float, start_m: tuple[float
     shift = np.array(start_m)
     for _ in range(_ROUNDS):
         across, apart, height_m = beside(shift)
-        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, told=_ONE_HEADING, halves=False)
+        fit = regressed(across[:, None, :], apart[:, None], floor=1.0, told=config.one_heading, halves=False)
         shift = fit.estimate
     left = np.abs(apart - across @ shift)
     toward, whole = (across @ shift) * apart, (across @ shift) ** 2

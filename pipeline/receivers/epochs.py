@@ -17,7 +17,9 @@ from schemas.enums import Fix
 from schemas.inputs import Gnss, Satellites
 from schemas.run import Stream
 
-# A message may come so many epochs after its own: what a receiver works out for a second at 20 Hz.
+# Numerics of the reading, which has no configuration: a message may come so many epochs after its own, as many as a
+# receiver at 20 Hz makes in over a second. With a later one an epoch of
+# the same key begins.
 _LATEST_MESSAGE = 32
 
 

@@ -33,7 +33,8 @@ _WGS84 = 61
 # "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
 _SOLVED = (2, 3, 6, 7)
 _VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
-_LONGEST_BETWEEN_NS = 1_500_000_000  # between two velocities at 1 Hz, one of them late
+# Of the format: BESTVEL comes at 1 Hz at least, one of two may be late; over more there is no velocity of an epoch.
+_LONGEST_BETWEEN_NS = 1_500_000_000
 
 
 def parse(raw: bytes) -> Any:

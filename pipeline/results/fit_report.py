@@ -41,7 +41,7 @@ def fit_report(
     """Every check of every solution; a run that cannot be cleaned has its error as problem."""
     problems: tuple[str, ...] = ()
     try:
-        cleaned, counts = clean(run, config.ingest)
+        cleaned, counts = clean(run, config)
     except InputError as error:
         # Recorders of different times: what moves one to the other is told all the same.
         cleaned, counts, problems = _in_order(run), CleanCounts(), (str(error),)

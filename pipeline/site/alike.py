@@ -19,7 +19,8 @@ from schemas.config import LdsConfig, MatchingConfig
 from schemas.enums import BaliseKind
 from schemas.run import Finding, Site
 
-# Twice the longest spacing of balises (DOMAIN section 4): nothing is announced from farther back.
+# Twice the longest spacing of balises (DOMAIN section 4): nothing is announced from farther back,
+# so that the search of ways ends there.
 _REACH_M = 6000.0
 
 
@@ -110,10 +111,6 @@ def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Findi
     )
 
 
-# Where tracks part or cross, a shorter stretch is no parallel track [m].
-_SHORTEST_M = 100.0
-
-
 @dataclass(frozen=True)
 class _Stretch:
     """A part of an element beside another one, by measure."""
@@ -137,7 +134,7 @@ def parallel_findings(site: Site, config: MatchingConfig) -> list[Finding]:
     return [
         _finding(site, network, stretch, config)
         for stretch in _stretches(network, config)
-        if stretch.end_m - stretch.begin_m >= _SHORTEST_M
+        if stretch.end_m - stretch.begin_m >= config.parallel_least_m
     ]
 
 

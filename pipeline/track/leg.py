@@ -21,7 +21,8 @@ from pipeline.track.survey import GAP_COUNTS_M, Track
 from schemas.arrays import Bools, Floats, Ints
 
 # A hint further than this from the nearest place may mean another passage of the same place,
-# if the track of that passage lies within the second distance of the first.
+# if the track of that passage lies within the second distance of the first. Geometry of a line: anything between the
+# noise of surveys and positions and the shortest loop of a railway gives the same passage.
 HINT_WINDOW_M = 100.0
 SAME_PLACE_M = 10.0
 

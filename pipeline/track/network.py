@@ -107,7 +107,10 @@ class Network:
             heapq.heappush(queue, (reach.distance_m + barred * BARRED_DETOUR_M, edge.to, reach))
 
 
+# Numerics: searches go at least so far, so that one of them answers for several. What is found farther away than asked
+# competes by its length as every way does.
 MIN_REACH_M = 150.0
+# Only the order of the search: longer than any allowed way between two steps, so that an allowed one is found first.
 BARRED_DETOUR_M = 10_000.0
 
 

@@ -17,11 +17,13 @@ import polars as pl
 from pipeline.track.geodesy import distances_m, points_of
 from schemas.arrays import Floats, Ints, floats
 
+# Both belong to how a site is read, as the limits of its check do: a site is the same for every run and configuration.
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
 GAP_COUNTS_M = 0.5
 # A balise this far beyond its element's end is still on it: surveys and balise lists round [m].
 MEASURE_TOLERANCE_M = 0.5
-# An element's direction is taken over so much of it [m]: single vertices may lie a centimetre apart.
+# An element's direction is taken over so much of it [m]: single vertices may lie a centimetre apart. Numerics: where
+# in a turn of a right angle a piece ends changes no place on it.
 _DIRECTION_OVER_M = 10.0
 
 

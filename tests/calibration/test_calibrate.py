@@ -14,11 +14,12 @@ from datasets.trial import build_run, build_site
 from pipeline.calibration.calibrate import Calibration, calibrate
 from pipeline.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
 from pipeline.stages import replay
-from schemas.config import Configuration, MonitorConfig
+from schemas.config import CalibrationConfig, Configuration, MonitorConfig
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
 
 FACTOR = 5.0
+CONFIG = CalibrationConfig()
 
 
 def monitored(seed: int, intercept: float, slope: float, spread: float = 0.8) -> pl.DataFrame:
@@ -50,7 +51,7 @@ ALL = [
 
 
 def test_intercept_and_slope_are_found() -> None:
-    fits = regress_sigmas([monitored(seed, 0.4, 1.5) for seed in range(3)], FACTOR)
+    fits = regress_sigmas([monitored(seed, 0.4, 1.5) for seed in range(3)], FACTOR, CONFIG)
     assert [fit.monitor for fit in fits] == ["along_raw"]
     assert fits[0].intercept_m == pytest.approx(0.4, abs=4 * fits[0].intercept_error_m)
     assert fits[0].slope == pytest.approx(1.5, abs=4 * fits[0].slope_error)
@@ -58,13 +59,13 @@ def test_intercept_and_slope_are_found() -> None:
 
 
 def test_a_constant_sigma_gives_a_slope_alone() -> None:
-    (fit,) = regress_sigmas([monitored(1, 0.0, 2.0, spread=0.0)], FACTOR)
+    (fit,) = regress_sigmas([monitored(1, 0.0, 2.0, spread=0.0)], FACTOR, CONFIG)
     assert fit.intercept_m == 0.0
     assert fit.slope == pytest.approx(2.0, rel=0.02)
 
 
 def test_the_loudest_proven_monitor_decides() -> None:
-    (fit,) = regress_sigmas([monitored(1, 0.0, 1.2)], FACTOR)
+    (fit,) = regress_sigmas([monitored(1, 0.0, 1.2)], FACTOR, CONFIG)
     lucky = type(fit)("up_raw", 100, 1.4, 0.5, 0.0, 0.0, 1.4, 0.5)
     assert worst_fit([lucky, fit]) is fit
     assert worst_fit([]) is None

@@ -10,9 +10,10 @@ from pipeline.calibration.vehicle import Observations, RunEstimate, estimate_run
 from pipeline.monitors.axis import error_model
 from pipeline.odometry.odometry import Noise, Odometry
 from pipeline.odometry.quantisation import count_step_m, quantisation_noise
-from schemas.config import AlignConfig, Configuration, MonitorConfig
+from schemas.config import AlignConfig, CalibrationConfig, Configuration, MonitorConfig
 
 SHARES, TAUS_S = error_model(MonitorConfig())
+CONFIG = CalibrationConfig()
 SCALE, LATENCY_S, SIGMA_M = 1.004, 0.12, 1.2
 
 
@@ -44,12 +45,12 @@ def simulated_run(seed: int, duration_s: int = 1000, moving: bool = True) -> tup
 @lru_cache(maxsize=8)
 def told_by(seed: int, duration_s: int) -> RunEstimate | None:
     """What a run tells by exact rows."""
-    return estimate_run(*simulated_run(seed, duration_s), SHARES, TAUS_S)
+    return estimate_run(*simulated_run(seed, duration_s), SHARES, TAUS_S, CONFIG)
 
 
 def test_truth_lies_within_the_stated_uncertainty() -> None:
     """12 runs: standardised errors have mean 0 and spread 1, misfit is 1."""
-    results = [estimate_run(*simulated_run(seed), SHARES, TAUS_S) for seed in range(12)]
+    results = [estimate_run(*simulated_run(seed), SHARES, TAUS_S, CONFIG) for seed in range(12)]
     found = [one for one in results if one is not None]
     assert len(found) == 12
     scale = np.array([(one.scale - SCALE) / one.scale_sigma for one in found])
@@ -63,7 +64,7 @@ def test_truth_lies_within_the_stated_uncertainty() -> None:
 
 def test_constant_speed_tells_no_latency() -> None:
     for seed in range(3):
-        one = estimate_run(*simulated_run(seed, 420, moving=False), SHARES, TAUS_S)
+        one = estimate_run(*simulated_run(seed, 420, moving=False), SHARES, TAUS_S, CONFIG)
         assert one is not None
         assert one.latency_sigma_s > 1.0
         assert abs(one.scale - SCALE) < 4.0 * one.scale_sigma
@@ -71,8 +72,8 @@ def test_constant_speed_tells_no_latency() -> None:
 
 def test_start_of_the_search_does_not_matter() -> None:
     seen, track = simulated_run(3)
-    one = estimate_run(seen, track, SHARES, TAUS_S)
-    other = estimate_run(seen, track, SHARES, TAUS_S, latency_s=0.5)
+    one = estimate_run(seen, track, SHARES, TAUS_S, CONFIG)
+    other = estimate_run(seen, track, SHARES, TAUS_S, CONFIG, latency_s=0.5)
     assert one is not None
     assert other is not None
     assert other.latency_s == pytest.approx(one.latency_s, abs=1e-6)
@@ -80,8 +81,8 @@ def test_start_of_the_search_does_not_matter() -> None:
 
 def test_louder_noise_than_stated_widens_the_uncertainty() -> None:
     seen, track = simulated_run(4)
-    honest = estimate_run(seen, track, SHARES, TAUS_S)
-    boastful = estimate_run(Observations(seen.t_s, seen.path_m, seen.sigma_m / 5.0), track, SHARES, TAUS_S)
+    honest = estimate_run(seen, track, SHARES, TAUS_S, CONFIG)
+    boastful = estimate_run(Observations(seen.t_s, seen.path_m, seen.sigma_m / 5.0), track, SHARES, TAUS_S, CONFIG)
     assert honest is not None
     assert boastful is not None
     assert boastful.misfit > 1.5
@@ -92,7 +93,7 @@ def test_lost_distance_is_bridged_by_separate_offsets() -> None:
     seen, track = simulated_run(5)
     jump = (track.t_s >= 700.0).astype(np.int64)
     broken = replace(track, distance_m=track.distance_m + 300.0 * jump, segment=jump)
-    whole, parts = (estimate_run(seen, one, SHARES, TAUS_S) for one in (track, broken))
+    whole, parts = (estimate_run(seen, one, SHARES, TAUS_S, CONFIG) for one in (track, broken))
     assert whole is not None
     assert parts is not None
     assert parts.scale == pytest.approx(whole.scale, abs=4 * whole.scale_sigma)
@@ -102,7 +103,8 @@ def test_lost_distance_is_bridged_by_separate_offsets() -> None:
 def test_too_little_data_gives_nothing() -> None:
     seen, track = simulated_run(6, duration_s=60)
     few = Observations(seen.t_s[:10], seen.path_m[:10], seen.sigma_m[:10])
-    assert estimate_run(few, track, SHARES, TAUS_S) is None
+    assert estimate_run(few, track, SHARES, TAUS_S, CONFIG) is None
+    assert estimate_run(few, track, SHARES, TAUS_S, CalibrationConfig(least_points=5)) is not None
 
 
 def test_pooling_by_hand() -> None:
@@ -136,7 +138,7 @@ ROWS = [("counts", 5.0), ("noise", 0.5)]
 def test_rows_that_scatter_are_no_misfit_of_the_position(kind: str, size_m: float) -> None:
     """They neither widen what a run tells by much nor make it surer than it is."""
     runs = [simulated_run(seed, 600) for seed in range(8)]
-    found = [estimate_run(seen, with_rows(track, kind, size_m, 50), SHARES, TAUS_S) for seen, track in runs]
+    found = [estimate_run(seen, with_rows(track, kind, size_m, 50), SHARES, TAUS_S, CONFIG) for seen, track in runs]
     fine = [told_by(seed, 600) for seed in range(8)]
     results = [(one, other) for one, other in zip(found, fine, strict=True) if one is not None and other is not None]
     assert len(results) == 8
@@ -152,7 +154,7 @@ def test_rows_that_scatter_are_no_misfit_of_the_position(kind: str, size_m: floa
 def test_rows_that_scatter_tell_no_latency_at_constant_speed(kind: str, size_m: float) -> None:
     for seed in range(2):
         seen, track = simulated_run(seed, 420, moving=False)
-        one = estimate_run(seen, with_rows(track, kind, size_m, seed), SHARES, TAUS_S)
+        one = estimate_run(seen, with_rows(track, kind, size_m, seed), SHARES, TAUS_S, CONFIG)
         assert one is not None
         assert one.latency_sigma_s > 0.5
         assert abs(one.scale - SCALE) < 4.0 * one.scale_sigma

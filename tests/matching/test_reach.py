@@ -13,11 +13,18 @@ from pipeline.odometry import odometry_of
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from tests.matching.builders import line, matched, odometer, run, site
 
+DEFAULTS = MatchingConfig()
 
-def disbelieved(x_m: npt.NDArray[np.float64], rate_hz: float, distance: pl.DataFrame | None = None) -> list[int]:
+
+def disbelieved(
+    x_m: npt.NDArray[np.float64],
+    rate_hz: float,
+    distance: pl.DataFrame | None = None,
+    config: MatchingConfig = DEFAULTS,
+) -> list[int]:
     fixes = fixes_of(run(x_m, np.zeros(len(x_m)), rate_hz, sigma_m=0.1), FixSigma())
     way = None if distance is None else odometry_of(distance, Vehicle(), Configuration())
-    believed = believable(fixes, fixes.valid, travelled(fixes, way), MatchingConfig())
+    believed = believable(fixes, fixes.valid, travelled(fixes, way), config)
     return np.setdiff1d(np.arange(len(x_m)), believed).tolist()
 
 
@@ -50,6 +57,15 @@ def test_a_jump_that_stays_is_believed_in_the_end() -> None:
 def test_a_train_that_speeds_up_or_lost_its_position_is_believed() -> None:
     """From standstill at 1.5 m/s²."""
     assert disbelieved(0.75 * np.arange(0.0, 50.0, 0.4) ** 2, 2.5) == []
+
+
+def test_how_far_apart_positions_tell_a_velocity_is_configuration() -> None:
+    """Without a velocity a position that falls back is no farther away than the train can have gone."""
+    x = 200.0 + 50.0 * np.arange(60.0)
+    x[30] -= 60.0
+    assert disbelieved(x, 1.0) == [30]
+    assert disbelieved(x, 1.0, config=MatchingConfig(jump_speed_most_s=0.5)) == []
+    assert disbelieved(x, 1.0, config=MatchingConfig(jump_speed_least_s=10.0)) == []
 
 
 @pytest.mark.parametrize("counts", ["distance_m", "speed_mps"])

@@ -53,12 +53,14 @@ def _moved(frame: pl.DataFrame, sigma_m: float, seed: int = 1) -> pl.DataFrame:
     return frame.with_columns(pl.col("latitude_deg") + noise[0], pl.col("longitude_deg") + noise[1])
 
 
-def _copies(gnss: pl.DataFrame, reference: pl.DataFrame, line: Line | None = None) -> list[str]:
+def _copies(
+    gnss: pl.DataFrame, reference: pl.DataFrame, line: Line | None = None, config: PlausibilityConfig | None = None
+) -> list[str]:
     epoch_ns = int(times_ns(gnss)[0])
     places, record = places_of(gnss, epoch_ns), places_of(reference, epoch_ns)
     assert places is not None
     assert record is not None
-    check = copy_check(gnss, places, reference, record, epoch_ns, line, PlausibilityConfig())
+    check = copy_check(gnss, places, reference, record, epoch_ns, line, config or PlausibilityConfig())
     return [] if check is None else [check.found]
 
 
@@ -87,6 +89,14 @@ def test_a_copy_is_told(run: RunLog, change: Changed, said: str) -> None:
     gnss = _gnss(run)
     (found,) = _copies(gnss, change(_copied(gnss)))
     assert said in found
+
+
+def test_how_near_stamps_are_the_same_is_configuration(run: RunLog) -> None:
+    gnss = _gnss(run)
+    later = _later(0.25)(_copied(gnss))
+    (told,), (same,) = _copies(gnss, later), _copies(gnss, later, config=PlausibilityConfig(same_stamp_s=0.3))
+    assert "at stamps" in told
+    assert "at stamps" not in same
 
 
 def test_an_independent_reference_is_none(run: RunLog) -> None:

@@ -57,6 +57,12 @@ def test_with_a_route_nothing_is_in_doubt() -> None:
     assert parallel_findings(replace(ladder(), route=route), MatchingConfig()) == []
 
 
+def test_how_long_tracks_have_to_be_beside_each_other_is_configuration() -> None:
+    place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
+    assert len(parallel_findings(place, MatchingConfig(parallel_least_m=1900.0))) == 1
+    assert parallel_findings(place, MatchingConfig(parallel_least_m=2100.0)) == []
+
+
 def test_no_run_right_on_its_track_claims_more_than_that() -> None:
     x = np.arange(0.0, 2000.0, 10.0)
     place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})

@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.arrays import Floats
 
-# How far a change may be from a multiple of the step, in steps.
+# Numerics: how far a change may be from a multiple of the step, in steps, since written numbers are rounded.
 _TOLERANCE = 0.02
 # Fewer changes of the change are chance.
 _FEWEST_BENDS = 8
