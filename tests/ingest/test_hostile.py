@@ -101,10 +101,10 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
     spent = mcap_block.Allowance(3)
     records = definitions() + some_messages(1)
-    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
+    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {}).starts.tolist() == [len(definitions())]
     assert spent.left == 0
     with pytest.raises(mcap_block.DamageError, match="more records"):
-        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
+        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {})
 
 
 LETTERS = "A" * 26
