@@ -48,7 +48,7 @@ def fixed(offset: int, dtype: str) -> Field:
 
     def take(rows: Bytes) -> pl.Series:
         values = rows.view(dtype)[:, 0]
-        return pl.Series(values.astype(values.dtype.newbyteorder("="), copy=False))
+        return pl.Series(values.astype(values.dtype.newbyteorder("=")))
 
     return Field(pl.Float64 if dtype[1] == "f" else pl.Int64, offset, offset + int(dtype[2:]), take)
 
@@ -62,7 +62,7 @@ def text(offset: int, length: int) -> Field:
     """A text of known length."""
 
     def take(rows: Bytes) -> pl.Series:
-        content = pa.py_buffer(rows)
+        content = pa.py_buffer(np.ascontiguousarray(rows))
         ends = pa.py_buffer(np.arange(len(rows) + 1, dtype=np.int64) * length)
         texts = pa.LargeStringArray.from_buffers(len(rows), ends, content)
         try:
@@ -116,7 +116,7 @@ class Layout:
         for path, field in self.fields.items():
             number = bisect_right(starts, field.start) - 1
             extent = slice(field.start - starts[number], field.end - starts[number])
-            values[path] = field.take(np.ascontiguousarray(stretches[number][:, extent]))
+            values[path] = field.take(stretches[number][:, extent])
         return values
 
 

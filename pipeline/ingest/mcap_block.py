@@ -150,9 +150,14 @@ def _named(data: Bytes, offset: int, indexes: Mapping[int, bytes]) -> Piece | No
     heads = piece.heads
     lengths = heads["length"].astype(np.int64)
     channels = np.repeat(np.array(list(indexes)), counts)[order]
-    agree = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channels) & (heads["log_time"] == told[order, 0])
-    tiled = starts + HEAD_SIZE + lengths == np.append(starts[1:], len(data))
-    return piece if (agree & tiled & (lengths >= _FIXED_FIELDS)).all() else None
+    ends = starts + HEAD_SIZE + lengths
+    as_told = (
+        (heads["opcode"] == int(Opcode.MESSAGE)).all()
+        and (heads["channel"] == channels).all()
+        and (heads["log_time"] == told[order, 0]).all()
+    )
+    tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and lengths.min() >= _FIXED_FIELDS
+    return piece if as_told and tiled else None
 
 
 def _walk(
