@@ -6,8 +6,7 @@ that shaped the walk (length prefixes, tags) are the same there; that is checked
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,6 @@ from schemas.arrays import Bools, Ints
 _MOST_LAYOUTS = 256  # of one channel; beyond, messages are decoded one by one
 _MOST_ASIDE = 8  # messages without layout that may come before one that has a layout
 _LARGEST_LEARNT = 1 << 16  # bytes of a message that is walked to learn its layout
-_NEAR = 32  # bytes; what lies nearer is taken together
 
 
 class UnfitError(Exception):
@@ -29,10 +27,9 @@ class UnfitError(Exception):
 
 @dataclass(frozen=True)
 class Field:
-    """Where a value lies in each message, and how it is taken from these bytes of each message, in rows."""
+    """Where a value lies in each message (up to `end`), and how it is taken from rows of their bytes."""
 
     kind: type[pl.DataType]
-    start: int
     end: int
     take: Callable[[Bytes], pl.Series]
 
@@ -45,24 +42,25 @@ class Field:
 
 def fixed(offset: int, dtype: str) -> Field:
     """A number of fixed width, as numpy names it (`<f8`)."""
+    end = offset + int(dtype[2:])
 
     def take(rows: Bytes) -> pl.Series:
-        values = rows.view(dtype)[:, 0]
+        values = rows[:, offset:end].view(dtype)[:, 0]
         return pl.Series(values.astype(values.dtype.newbyteorder("=")))
 
-    return Field(pl.Float64 if dtype[1] == "f" else pl.Int64, offset, offset + int(dtype[2:]), take)
+    return Field(pl.Float64 if dtype[1] == "f" else pl.Int64, end, take)
 
 
 def flag(offset: int) -> Field:
     """A boolean in one byte."""
-    return Field(pl.Boolean, offset, offset + 1, lambda rows: pl.Series(rows[:, 0] != 0))
+    return Field(pl.Boolean, offset + 1, lambda rows: pl.Series(rows[:, offset] != 0))
 
 
 def text(offset: int, length: int) -> Field:
     """A text of known length."""
 
     def take(rows: Bytes) -> pl.Series:
-        content = pa.py_buffer(np.ascontiguousarray(rows))
+        content = pa.py_buffer(np.ascontiguousarray(rows[:, offset : offset + length]))
         ends = pa.py_buffer(np.arange(len(rows) + 1, dtype=np.int64) * length)
         texts = pa.LargeStringArray.from_buffers(len(rows), ends, content)
         try:
@@ -71,68 +69,42 @@ def text(offset: int, length: int) -> Field:
             raise UnfitError("a text is not UTF-8") from None
         return pl.Series(pl.from_arrow(texts))
 
-    return Field(pl.String, offset, offset + length, take)
+    return Field(pl.String, offset + length, take)
 
 
 def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
     """A field that messages of this layout leave out: its default, or null."""
-    one = pl.Series([value], dtype=dtype, strict=False)
-    return Field(type(dtype), 0, 0, lambda rows: one.new_from_index(0, len(rows)))
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Bytes of a message that are taken together; those `at` some places among them must agree under a mask."""
-
-    start: int
-    end: int
-    at: Ints
-    mask: Bytes
-    expected: Bytes
+    return Field(
+        type(dtype), 0, lambda rows: pl.Series([value], dtype=dtype, strict=False).new_from_index(0, len(rows))
+    )
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Of messages of one length: the fields, and the stretches that hold them and all that shapes the layout."""
+    """Of messages of one length: the fields, and the bytes `at` which messages must agree under a mask."""
 
     fields: Mapping[str, Field]
-    stretches: Sequence[Stretch]
+    at: Ints
+    mask: Bytes
+    expected: Bytes
 
-    def rows(self, messages: Messages) -> list[Bytes]:
-        """Each stretch of each message."""
-        return [stretches_of(messages.data, messages.start + s.start, s.end - s.start) for s in self.stretches]
+    @property
+    def end(self) -> int:
+        """Behind the last byte that is looked at."""
+        ends = [field.end for field in self.fields.values()]
+        return max(0, *ends, int(self.at.max(initial=-1)) + 1)
 
-    def of(self, stretches: Sequence[Bytes]) -> Bools:
+    def of(self, rows: Bytes) -> Bools:
         """Whether each message has this layout."""
-        agree = np.ones(len(stretches[0]), dtype=np.bool_)
-        for stretch, rows in zip(self.stretches, stretches, strict=True):
-            agree &= (rows[:, stretch.at] & stretch.mask == stretch.expected).all(axis=1)
+        agree: Bools = (rows[:, self.at] & self.mask == self.expected).all(axis=1)
         return agree
-
-    def values(self, stretches: Sequence[Bytes]) -> dict[str, pl.Series]:
-        """The fields of messages that have this layout."""
-        starts = [stretch.start for stretch in self.stretches]
-        values = {}
-        for path, field in self.fields.items():
-            number = bisect_right(starts, field.start) - 1
-            extent = slice(field.start - starts[number], field.end - starts[number])
-            values[path] = field.take(stretches[number][:, extent])
-        return values
 
 
 def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) -> Layout:
     """From one message; `static` masks the bits that shape the layout."""
-    mask, content = np.frombuffer(static, dtype=np.uint8), np.frombuffer(payload, dtype=np.uint8)
-    taken = mask != 0
-    for field in fields.values():
-        taken[field.start : field.end] = True
-    places = np.flatnonzero(taken)
-    stretches = []
-    for part in np.split(places, np.flatnonzero(np.diff(places) > _NEAR) + 1):
-        start, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
-        at = np.flatnonzero(mask[start:end])
-        stretches.append(Stretch(start, end, at, mask[start:end][at], (content & mask)[start:end][at]))
-    return Layout(fields, stretches)
+    mask = np.frombuffer(static, dtype=np.uint8)
+    at = np.flatnonzero(mask)
+    return Layout(fields, at, mask[at], np.frombuffer(payload, dtype=np.uint8)[at] & mask[at])
 
 
 def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
@@ -163,7 +135,7 @@ class LayoutDecoder:
         for length, alike in _by_length(messages):
             for layout, group, rows in self._by_layout(length, alike, left):
                 try:
-                    values = layout.values(rows)
+                    values = {path: field.take(rows) for path, field in layout.fields.items()}
                     parts.append((group, {path: values[path].cast(dtype) for path, dtype in self._types.items()}))
                 except (UnfitError, pl.exceptions.PolarsError):  # the ordinary decoder says why
                     left.append(group)
@@ -171,8 +143,8 @@ class LayoutDecoder:
 
     def _by_layout(
         self, length: int, messages: Messages, aside: list[Messages]
-    ) -> Iterator[tuple[Layout, Messages, list[Bytes]]]:
-        """Messages of one length by their layouts, with the stretches of these; those without one into `aside`."""
+    ) -> Iterator[tuple[Layout, Messages, Bytes]]:
+        """Messages of one length by their layouts, and their bytes; those without one into `aside`."""
         known = self._layouts.setdefault(length, [])
         tried = 0
         while len(messages):
@@ -185,13 +157,13 @@ class LayoutDecoder:
                 continue
             layout = known[tried]
             tried += 1
-            rows = layout.rows(messages)
+            rows = stretches_of(messages.data, messages.start, layout.end)
             agree = layout.of(rows)
             if agree.all():
                 yield layout, messages, rows
                 return
             if agree.any():
-                yield layout, messages.chosen(agree), [stretch[agree] for stretch in rows]
+                yield layout, messages.chosen(agree), rows[agree]
             messages = messages.chosen(~agree)
 
     def _learn(self, payload: bytes, known: list[Layout]) -> bool:
