@@ -6,8 +6,10 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.json
 
 from pipeline.ingest.generic import parse_path
@@ -74,11 +76,26 @@ def _value(path: str) -> pl.Expr:
 
 def _joined(messages: Messages) -> bytes | None:
     """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
-    texts = [messages.payload(row).strip(b" \t\r\n") for row in range(len(messages))]
-    content = b"\n".join(texts)
+    bounds = np.column_stack([messages.start, messages.start + messages.length]).reshape(-1)
+    ends = [pa.py_buffer(np.append(bounds, bounds[-1])), pa.py_buffer(messages.data)]
+    pieces = pa.LargeBinaryArray.from_buffers(pa.large_binary(), len(bounds), [None, *ends])
+    payloads = pieces.take(pa.array(np.arange(0, len(bounds), 2)))  # between them are the heads of records
+    whole = pa.LargeListArray.from_arrays(pa.array([0, len(payloads)], pa.int64()), payloads)
+    content: bytes = pc.binary_join(whole, pa.scalar(b"\n", pa.large_binary()))[0].as_py()
     strange = any(word in content for word in _LITERALS) and _AS_VALUE.search(content)
-    whole = all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
-    return content if whole and not strange and not _NULL_AFTER.search(content) and _is_utf8(content) else None
+    if strange or _NULL_AFTER.search(content) or not _is_utf8(content):
+        return None
+    return content if _all_between_braces(messages) else None
+
+
+def _all_between_braces(messages: Messages) -> bool:
+    """Whether the text of every message is something between braces, but for white space around it."""
+    if not messages.length.all():
+        return False
+    first, last = messages.data[messages.start], messages.data[messages.start + messages.length - 1]
+    bare = (first == ord("{")) & (last == ord("}"))
+    texts = (messages.payload(row).strip(b" \t\r\n") for row in np.flatnonzero(~bare).tolist())
+    return all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
 
 
 def _is_utf8(content: bytes) -> bool:

@@ -45,7 +45,7 @@ def fixed(offset: int, dtype: str) -> Field:
     end = offset + int(dtype[2:])
 
     def take(rows: Bytes) -> pl.Series:
-        values = np.ascontiguousarray(rows[:, offset:end]).view(dtype)[:, 0]
+        values = rows[:, offset:end].view(dtype)[:, 0]
         return pl.Series(values.astype(values.dtype.newbyteorder("=")))
 
     return Field(pl.Float64 if dtype[1] == "f" else pl.Int64, end, take)
@@ -92,7 +92,7 @@ class Layout:
     def end(self) -> int:
         """Behind the last byte that is looked at."""
         ends = [field.end for field in self.fields.values()]
-        return max(1, *ends, int(self.at.max(initial=0)) + 1)
+        return max(0, *ends, int(self.at.max(initial=-1)) + 1)
 
     def of(self, rows: Bytes) -> Bools:
         """Whether each message has this layout."""
@@ -105,6 +105,15 @@ def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Field]) ->
     mask = np.frombuffer(static, dtype=np.uint8)
     at = np.flatnonzero(mask)
     return Layout(fields, at, mask[at], np.frombuffer(payload, dtype=np.uint8)[at] & mask[at])
+
+
+def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
+    first = int(messages.length[0])
+    if (messages.length == first).all():
+        yield first, messages
+        return
+    for length in np.unique(messages.length).tolist():
+        yield length, messages.chosen(messages.length == length)
 
 
 Columns = Mapping[str, pl.Series]
@@ -123,8 +132,8 @@ class LayoutDecoder:
         """Messages whose layout is known with their fields, and those that no layout fits."""
         parts: list[tuple[Messages, Columns]] = []
         left: list[Messages] = []
-        for length in np.unique(messages.length).tolist():
-            for layout, group, rows in self._by_layout(length, messages.chosen(messages.length == length), left):
+        for length, alike in _by_length(messages):
+            for layout, group, rows in self._by_layout(length, alike, left):
                 try:
                     values = {path: field.take(rows) for path, field in layout.fields.items()}
                     parts.append((group, {path: values[path].cast(dtype) for path, dtype in self._types.items()}))

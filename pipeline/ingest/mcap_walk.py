@@ -202,8 +202,25 @@ class McapWalk:
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
-        self._last_chunk = piece_of_chunk(unpacked(chunk, position), position, self._chunk_record, self._allowance)
+        content, indexes = unpacked(chunk, position), self._indexes_behind(end, size)
+        self._last_chunk = piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes)
         self._keep(self._last_chunk)
+
+    def _indexes_behind(self, position: int, room: int) -> dict[int, bytes]:
+        """What the message indexes of a chunk name. They are met like all records, and held against it, later."""
+        indexes: dict[int, bytes] = {}
+        while position + HEAD_SIZE <= self._size:
+            opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
+            body, position = position + HEAD_SIZE, position + HEAD_SIZE + length
+            # A message takes more room in the chunk than its entry in the index.
+            if opcode != Opcode.MESSAGE_INDEX or length > room or position > self._size:
+                break
+            try:
+                channel, indexes[channel] = parse_message_index(self._read(body, length), body)
+            except DamageError:
+                break
+            room -= length
+        return indexes
 
     def _chunk_record(self, opcode: int, body: bytes, position: int) -> None:
         """A record inside a chunk that is no message."""

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 import zstandard
@@ -15,6 +16,7 @@ import zstandard
 from pipeline.ingest import mcap_block, read_run
 from pipeline.ingest.clean import clean, of_the_journey
 from pipeline.ingest.describe import describe_log
+from pipeline.ingest.layout import LayoutDecoder, constant, layout_of
 from pipeline.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig
@@ -101,10 +103,49 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
     spent = mcap_block.Allowance(3)
     records = definitions() + some_messages(1)
-    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
+    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {}).starts.tolist() == [len(definitions())]
     assert spent.left == 0
     with pytest.raises(mcap_block.DamageError, match="more records"):
-        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
+        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {})
+
+
+def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
+    """An index is only believed where all records from its first message to the end are as it tells."""
+    records = definitions() + some_messages(3)
+    allowance = mcap_block.Allowance(1000)
+
+    def piece(entries: bytes) -> mcap_block.Piece:
+        return mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, {1: entries})
+
+    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, {})
+    right = walked.entries[1].tobytes()
+    assert piece(right).proved == {1: right}
+    pairs = np.frombuffer(right, dtype="<i8").reshape(-1, 2)
+    shifted, beyond, late = (pairs + np.array(change) for change in ([0, 1], [0, 1 << 40], [1, 0]))
+    for entries in (
+        right,
+        b"",
+        right[16:],
+        right[:-16],
+        right + right[:16],
+        *(a.tobytes() for a in (shifted, beyond, late)),
+    ):
+        assert piece(entries).starts.tolist() == walked.starts.tolist()
+        if entries not in (right, b""):
+            assert not piece(entries).proved
+            with pytest.raises(mcap_block.DamageError, match="disagrees"):
+                piece(entries).check_index(1, entries)
+
+
+def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
+    """A protobuf message is empty where all its fields have their defaults."""
+    numbers = [np.array([number]) for number in (3, 0, 0, 0, 0)]
+    message = mcap_block.Messages(np.frombuffer(b"abc", dtype=np.uint8), *numbers)
+    fields = {"x": constant(0.0, pl.Float64())}
+    decoder = LayoutDecoder(lambda payload: layout_of(payload, bytearray(payload), fields), {"x": pl.Float64()})
+    ((_, columns),), left = decoder.decode(message)
+    assert columns["x"].to_list() == [0.0]
+    assert left == []
 
 
 LETTERS = "A" * 26
