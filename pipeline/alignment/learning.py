@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.alignment.odometer_filter import Estimates, FilterState, ScaleLatencyFilter, estimates_of, prior_of
-from pipeline.epochs.timeline import gap_limit_s
+from pipeline.epochs.clock import gap_limit_s
 from pipeline.monitors.axis import (
     BLOCK,
     FIRST_BLOCK,

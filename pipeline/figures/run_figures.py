@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import Clock, may_move, met, trusted, usable
-from pipeline.epochs.timeline import availability, outages_s, share_of_time, uptime
+from pipeline.epochs.clock import Clock, availability, may_move, met, outages_s, share_of_time, trusted, uptime, usable
 from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
 from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
 from pipeline.figures.independent import missed_detection

@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import met, unambiguous
-from pipeline.epochs.timeline import crossing_gap_ns
+from pipeline.epochs.clock import crossing_gap_ns, met, unambiguous
 from pipeline.evidence import Evidence as AllEvidence
 from pipeline.evidence.carrying import carried_forward
 from pipeline.evidence.evidence import KINDS, within_spans

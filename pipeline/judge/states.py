@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import met, trusted
-from pipeline.epochs.timeline import crossing_gap_ns, nominal_period_s
+from pipeline.epochs.clock import crossing_gap_ns, met, nominal_period_s, trusted
 from pipeline.judge.judgement import RIGHT, WRONG, Judgements
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, spans_of, times_ns
 from schemas.config import Configuration, LdsConfig

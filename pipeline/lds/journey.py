@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import confident, met, unambiguous
-from pipeline.epochs.timeline import crossing_gap_ns
+from pipeline.epochs.clock import confident, crossing_gap_ns, met, unambiguous
 from pipeline.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig

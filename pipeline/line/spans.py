@@ -7,8 +7,7 @@ from enum import IntEnum
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import confident, met, unambiguous, usable
-from pipeline.epochs.timeline import crossing_gap_ns
+from pipeline.epochs.clock import confident, crossing_gap_ns, met, unambiguous, usable
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from pipeline.epochs.timeline import crossing_gap_ns
+from pipeline.epochs.clock import crossing_gap_ns
 from pipeline.epochs.verdicts import NO_POSITION, first_reason, no_verdicts, verdicts
 from pipeline.monitors.series import FIRST_EPOCH
 from schemas.arrays import Floats, floats, times_ns

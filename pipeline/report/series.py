@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.timeline import gap_limit_s, nominal_period_s
+from pipeline.epochs.clock import gap_limit_s, nominal_period_s
 from pipeline.report.decimate import WHOLE_SERIES, Band, band, detail_rows, kept_rows
 from pipeline.report.markup import Json, packed
 from schemas.arrays import Bools, Floats, Ints, floats

@@ -12,9 +12,8 @@ from itertools import combinations
 
 import polars as pl
 
-from pipeline.epochs.clock import Clock, may_move, met, trusted
+from pipeline.epochs.clock import Clock, held_s, may_move, met, nominal_period_s, trusted, uptime
 from pipeline.epochs.failure_log import FailureLog, failure_log
-from pipeline.epochs.timeline import held_s, nominal_period_s, uptime
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.single import channel_monitor, on_path_of, paired

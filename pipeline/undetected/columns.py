@@ -8,7 +8,7 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.timeline import linking_gap_s, nominal_period_s
+from pipeline.epochs.clock import crossing_gap_ns
 from pipeline.figures.undetected import Spacing
 from pipeline.lds.relink import Held
 from pipeline.monitors.bank import AxisRecord
@@ -18,7 +18,7 @@ from pipeline.undetected.ranges import range_bounds
 from pipeline.undetected.spacing import largest_spacing
 from pipeline.undetected.watched import Watched, watched
 from pipeline.undetected.windows import Window, windows
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, times_ns
+from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
@@ -167,8 +167,9 @@ def rows_of_passages(
     offered = (wanted >= 0) & (rows.epoch[row] == wanted) if rows.rows else np.zeros(wanted.size, dtype=np.bool_)
     read_ns = ints(found["t_offered"].dt.timestamp("ns"))
     before = np.searchsorted(stamps, read_ns, side="right") - 1
-    gap_ns = linking_gap_s(nominal_period_s(t_ns), config.lds.crossing_gap_s) * NS_PER_S
-    near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= gap_ns) if rows.rows else offered
+    near = offered
+    if rows.rows:
+        near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= crossing_gap_ns(t_ns, config.lds))
     physical = (found["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
     return np.where(physical, np.where(near, before, -1), np.where(offered, row, -1))
 
