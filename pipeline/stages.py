@@ -9,8 +9,7 @@ import polars as pl
 from pipeline.alignment.align import align, odometer_at
 from pipeline.evidence import Evidence, evidence_of
 from pipeline.evidence.anchors import ReferencePlaces
-from pipeline.figures.evidence_notes import reading_notes, reference_notes
-from pipeline.figures.run_notes import run_notes
+from pipeline.figures.notes import ride_notes
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.figures.undetected import Spacing
 from pipeline.ingest.clean import CleanCounts, clean, of_the_journey, require_one_journey, require_two_times
@@ -235,19 +234,20 @@ def _reads_on_odometer(
 def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFrame) -> SolutionResults:
     name = ride.solution.name
     counts, fit = context.counts.solutions[name], context.fits[name]
-    notes = run_notes(
+    notes = ride_notes(
         context.run,
         context.site,
         counts,
         ride.solution.fixes,
         ride.found,
+        ride.aligned,
         ride.lds,
         context.vehicle,
         context.odometry,
-        context.config.align.straight_s,
         fit,
+        context.evidence.disputed,
+        context.config,
     )
-    notes = (*notes, *reading_notes(ride.aligned, context.config), *reference_notes(context.evidence.disputed))
     return SolutionResults(
         solution=name,
         epochs=epochs,

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import polars as pl
 
 from pipeline.epochs.clock import Clock
 from pipeline.figures import run_figures as figures
-from pipeline.figures.availability_notes import availability_notes
-from pipeline.figures.evidence_notes import evidence_notes, motion_notes, undiagnosed_notes
+from pipeline.figures.notes import ingest_notes, judged_notes, time_notes, undiagnosed_notes
 from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
@@ -49,7 +48,7 @@ class SolutionResults:
     counts: StreamCounts = field(default_factory=StreamCounts)
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
     spacing: Spacing | None = None
     impossible: int = 0
 
@@ -122,25 +121,13 @@ def _identity(results: SolutionResults) -> Row:
 def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config: Configuration) -> str | None:
     """What the reader should know beside the figures."""
     found = (
-        *_ingest_remarks(results.ingest),
+        *ingest_notes(results.ingest),
         *results.notes,
-        *evidence_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
+        *judged_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
         *undiagnosed_notes(results.epochs, results.passages),
-        *motion_notes(results.epochs, clock),
-        *availability_notes(results.epochs, clock, config),
+        *time_notes(results.epochs, clock, config),
     )
     return "; ".join(found) or None
-
-
-def _ingest_remarks(ingest: IngestNotes) -> list[str]:
-    remarks = list(ingest.corrections)
-    if ingest.chunks_without_crc:
-        remarks.append(f"{ingest.chunks_without_crc} chunks without a checksum")
-    if ingest.files_without_crc:
-        remarks.append(f"without checksums: {', '.join(ingest.files_without_crc)}")
-    if ingest.skipped_topics:
-        remarks.append("topics not used: " + ", ".join(ingest.skipped_topics))
-    return remarks
 
 
 def _extent(epochs: pl.DataFrame, clock: Clock, distance_m: float | None) -> Row:
