@@ -9,10 +9,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.evidence.carrying import Anchor
-from pipeline.evidence.routes import Place, Route, routes_of_path
 from pipeline.odometry import Odometry
-from pipeline.track.path import TravelledPath
-from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
+from pipeline.track.path import Place, Route, TravelledPath
+from pipeline.track.survey import Track
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import AlignConfig, HazardConfig
 from schemas.enums import BaliseKind, Evidence
@@ -55,7 +54,7 @@ class ReferencePlaces:
         placed = np.flatnonzero(flags(epochs, "on_track") & np.isfinite(all_m))
         kept = placed[_reachable(all_ns[placed], all_m[placed], sigma_m[placed], config)]
         leg, path_m = ints(epochs["leg"])[kept], floats(epochs, "path_m")[kept]
-        legs = tuple(routes_of_path(path, track.index))
+        legs = tuple(path.routes(track.index))
         number = np.full(epochs.height, -1)
         number[kept] = np.arange(kept.size)
         sample, element = number[rivals[0]], rivals[1]
@@ -188,25 +187,11 @@ def read_anchors(
     """Reads of physical balises that the site knows, in order of time."""
     if reads is None or balises is None or reads.is_empty():
         return []
-    places = _physical_places(balises, track)
-    known = reads.filter(pl.col("balise_id").is_in(list(places))).sort("t", "balise_id")
-    times, names = times_ns(known).tolist(), known["balise_id"].to_list()
-    return [
-        Anchor(t_ns, places[name], config.balise_read_sigma_m, Evidence.BALISE)
-        for t_ns, name in zip(times, names, strict=True)
-    ]
-
-
-def _physical_places(balises: pl.DataFrame, track: Track) -> dict[str, Place]:
-    """Physical balises on their net elements; one beside its element lies nowhere."""
     physical = balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.PHYSICAL.value)
-    places: dict[str, Place] = {}
-    rows = zip(physical["balise_id"], physical["netelement_id"], floats(physical, "measure_m").tolist(), strict=True)
-    for name, element, measure_m in rows:
-        number = track.index.get(element)
-        if number is None:
-            continue
-        own = track.measure_m[track.vertices(number)]
-        if own[0] - MEASURE_TOLERANCE_M <= measure_m <= own[-1] + MEASURE_TOLERANCE_M:
-            places[name] = Place(number, measure_m)
-    return places
+    rows, elements = track.holding(physical)
+    known = physical[rows].select("balise_id", "measure_m", element=elements)
+    read = reads.select("t", "balise_id").join(known, on="balise_id").sort("t", "balise_id")
+    return [
+        Anchor(t_ns, Place(element, measure_m), config.balise_read_sigma_m, Evidence.BALISE)
+        for t_ns, element, measure_m in zip(times_ns(read).tolist(), read["element"], read["measure_m"], strict=True)
+    ]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.evidence.routes import Place
 from pipeline.odometry import Odometry, Way
+from pipeline.track.path import Place
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence

@@ -19,9 +19,9 @@ from pipeline.evidence.anchors import (
 )
 from pipeline.evidence.carrying import Interval, between_anchors, carried, closes
 from pipeline.evidence.gaps import Gap, Way, gaps_of
-from pipeline.evidence.routes import Route
 from pipeline.odometry import Odometry
 from pipeline.track.network import Network
+from pipeline.track.path import Route
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence as Kind

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.evidence.carrying import Anchor, beside_m, carried, driven_m
-from pipeline.evidence.routes import Chain, along_m, chains_between, extended
+from pipeline.evidence.chains import Chain, chains_between, extended
 from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from schemas.arrays import NS_PER_S, Ints
@@ -92,7 +92,7 @@ def _ways_of_length(
             if found is None:
                 return None
             for chain in found:
-                end_m = chain.entry_m[-1] + along_m(network, chain.oriented[-1], goal.place.measure_m)
+                end_m = chain.entry_m[-1] + network.track.along_m(chain.oriented[-1], goal.place.measure_m)
                 ways.append(Way(chain, (end_m, 0.0) if back else (0.0, end_m)))
     return _distinct(ways)
 
@@ -176,7 +176,7 @@ def _from_one_anchor(gap: Gap, network: Network) -> list[Way]:
     """Both ways round."""
     (anchor,) = gap.anchors
     both = (2 * anchor.place.element, 2 * anchor.place.element + 1)
-    return [Way(Chain((one,), (-along_m(network, one, anchor.place.measure_m),)), (0.0,)) for one in both]
+    return [Way(Chain((one,), (-network.track.along_m(one, anchor.place.measure_m),)), (0.0,)) for one in both]
 
 
 def _reach_m(gap: Gap, way: Way, odometer: Odometry, config: Configuration) -> tuple[float, float]:

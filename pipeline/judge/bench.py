@@ -12,12 +12,11 @@ from pipeline.epochs.clock import crossing_gap_ns, met, unambiguous
 from pipeline.evidence import Evidence as AllEvidence
 from pipeline.evidence.carrying import carried_forward
 from pipeline.evidence.evidence import KINDS, within_spans
-from pipeline.evidence.routes import Route, routes_of_path
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, margins_m, with_own_anchors
 from pipeline.judge.jumps import Jump, find_jumps, steps_of
 from pipeline.judge.states import held_on, in_use_s, odometer_beyond_confidence, stood_spans
 from pipeline.odometry import Odometry
-from pipeline.track.path import TravelledPath
+from pipeline.track.path import Route, TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Evidence, PassageStatus
@@ -112,7 +111,7 @@ class Bench:
 
     @cached_property
     def legs(self) -> list[Route]:
-        return routes_of_path(self.solution.path, self.evidence.network.track.index)
+        return self.solution.path.routes(self.evidence.network.track.index)
 
     @cached_property
     def path_m(self) -> Floats:

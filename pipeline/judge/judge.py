@@ -10,7 +10,6 @@ import polars as pl
 
 from pipeline.epochs.failure_log import failure_log
 from pipeline.evidence.evidence import KINDS, NOTHING, within_spans
-from pipeline.evidence.routes import Place
 from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import find_episodes
@@ -20,6 +19,7 @@ from pipeline.judge.passages import passages_table
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.states import lds_states
 from pipeline.track.geodesy import points_of
+from pipeline.track.path import Place
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
 from schemas.enums import Evidence
 
@@ -63,13 +63,9 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
 def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
     """When the train passed each balise of the path, and how the path runs over its net element."""
     index, balises = bench.evidence.network.track.index, bench.solution.balises.unique("balise_id", keep="first")
-    rows = balises.select("balise_id", "netelement_id", "measure_m", "path_m", "leg").rows()
-    places = {name: Place(index[element], measure) for name, element, measure, _, _ in rows}
-    forward = {}
-    for name, _, measure, path_m, leg in rows:
-        place = places[name]
-        _, sense = bench.legs[leg].coordinate(np.array([place.element]), np.array([measure]), np.array([path_m]))
-        forward[name] = int(sense[0]) or 1
+    rows = balises.select("balise_id", "netelement_id", "measure_m", "sense").rows()
+    places = {name: Place(index[element], measure) for name, element, measure, _ in rows}
+    forward = {name: sense for name, _, _, sense in rows}
     at_ns = _look_at(bench)
     evidence = bench.evidence.at(at_ns, bench.stood)
     hazards = bench.config.hazards

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
-from pipeline.evidence.routes import Route
+from pipeline.track.path import Route
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement

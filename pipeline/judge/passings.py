@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.evidence.evidence import Alternative, EvidenceSet
-from pipeline.evidence.routes import Place, Route
-from pipeline.track.survey import MEASURE_TOLERANCE_M
+from pipeline.evidence.evidence import EvidenceSet
+from pipeline.track.path import Place, Route
 from schemas.arrays import Bools, Floats, Ints
 
 
@@ -32,18 +31,22 @@ def train_passings(
     `rearm_m` from a balise since it passed it has not passed it again.
     """
     alone = _alone(evidence, t_ns.size)
-    places_before = _places_of(evidence, alone, known_to_m)
+    certain: list[tuple[Route, Ints, Floats]] = []
+    element, measure_m = np.full(alone.size, -1), np.full(alone.size, np.nan)
+    for one in evidence.alternatives:
+        close = (one.high_m - one.low_m <= 2.0 * known_to_m) & alone[one.rows]
+        rows, at_m = one.rows[close], (0.5 * (one.low_m + one.high_m))[close]
+        certain.append((one.route, rows, at_m))
+        element[rows], measure_m[rows], _ = one.route.locate(at_m)
     names, spots = list(places), list(places.values())
-    elements = np.array([place.element for place in spots], dtype=np.int64)
-    measures = np.array([place.measure_m for place in spots])
+    balises = np.array([place.element for place in spots]), np.array([place.measure_m for place in spots])
     found: dict[str, list[Passing]] = {name: [] for name in names}
-    for alternative in evidence.alternatives:
-        close = (alternative.high_m - alternative.low_m <= 2.0 * known_to_m) & alone[alternative.rows]
-        rows, at_m = alternative.rows[close], (0.5 * (alternative.low_m + alternative.high_m))[close]
-        rows, at_m = _with_places_before(rows, at_m, alternative.route, places_before)
-        for balise, visit_m, sense in _on_route(alternative, elements, measures, at_m):
-            instants = _crossed(t_ns, rows, at_m - visit_m, rearm_m)
-            found[names[balise]] += [one._replace(sense=one.sense * sense) for one in instants]
+    for route, told, told_m in certain:
+        rows, at_m = _with_places_before(told, told_m, route, element, measure_m)
+        for balise, visit_m, sense in zip(*route.places(*balises), strict=True):
+            if at_m.min(initial=np.inf) <= visit_m <= at_m.max(initial=-np.inf):
+                instants = _crossed(t_ns, rows, at_m - visit_m, rearm_m)
+                found[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in instants]
     return {name: sorted(instants) for name, instants in found.items()}
 
 
@@ -57,44 +60,18 @@ def _alone(evidence: EvidenceSet, size: int) -> Bools:
     return alone
 
 
-Places = tuple[Ints, Floats]
-"""Per instant the net element (-1: not known) and the measure of the train."""
+def _with_places_before(
+    rows: Ints, at_m: Floats, route: Route, element: Ints, measure_m: Floats
+) -> tuple[Ints, Floats]:
+    """The instants just before the route is told of, where the train was on it by what was told before.
 
-
-def _places_of(evidence: EvidenceSet, alone: Bools, known_to_m: float) -> Places:
-    element, measure = np.full(alone.size, -1), np.full(alone.size, np.nan)
-    for one in evidence.alternatives:
-        close = (one.high_m - one.low_m <= 2.0 * known_to_m) & alone[one.rows]
-        rows = one.rows[close]
-        element[rows], measure[rows], _ = one.route.locate((0.5 * (one.low_m + one.high_m))[close])
-    return element, measure
-
-
-def _with_places_before(rows: Ints, at_m: Floats, route: Route, places: Places) -> tuple[Ints, Floats]:
-    """The instants just before the route is told of, where the train was on it by what was told before."""
+    `element`, `measure_m`: per instant the place of the train, -1 and NaN where not known.
+    """
     before = np.setdiff1d(rows[rows > 0] - 1, rows)
-    near_m = at_m[np.searchsorted(rows, before)]
-    there_m, _ = route.coordinate(places[0][before], places[1][before], near_m)
+    there_m, _ = route.coordinate(element[before], measure_m[before], at_m[np.searchsorted(rows, before)])
     known = np.isfinite(there_m)
     order = np.argsort(np.concatenate([rows, before[known]]), kind="stable")
     return np.concatenate([rows, before[known]])[order], np.concatenate([at_m, there_m[known]])[order]
-
-
-def _on_route(alternative: Alternative, elements: Ints, measures: Floats, at_m: Floats) -> list[tuple[int, float, int]]:
-    """Balises on the part of the route that the train covered: number, coordinate [m], sense of the measure."""
-    route, found = alternative.route, []
-    if at_m.size == 0:
-        return []
-    for visit in range(route.element.size):
-        inside = (elements == route.element[visit]) & (measures >= route.low_m[visit] - MEASURE_TOLERANCE_M)
-        inside &= measures <= route.high_m[visit] + MEASURE_TOLERANCE_M
-        for balise in np.flatnonzero(inside).tolist():
-            since = measures[balise] - route.low_m[visit]
-            forward = bool(route.forward[visit])
-            place_m = float(route.entry_m[visit] + (since if forward else route.high_m[visit] - measures[balise]))
-            if at_m.min() <= place_m <= at_m.max():
-                found.append((balise, place_m, 1 if forward else -1))
-    return found
 
 
 def _crossed(t_ns: Ints, rows: Ints, away_m: Floats, rearm_m: float) -> list[Passing]:

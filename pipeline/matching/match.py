@@ -16,7 +16,7 @@ from pipeline.odometry.polarity import polarity
 from pipeline.track.network import network_along, network_of, visits_of
 from pipeline.track.path import TravelledPath
 from pipeline.track.survey import Track, in_pieces, track_of
-from schemas.arrays import Ints, floats, times_ns
+from schemas.arrays import Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import Site
@@ -102,19 +102,12 @@ def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame |
     pinned = np.full(len(fixes), -1, dtype=np.int64)
     if balise_reads is None or site.balises is None:
         return pinned
-    numbers: dict[str, list[int]] = {}
-    for number, name in enumerate(track.ids):
-        numbers.setdefault(name, []).append(number)
-    low, high = track.measure_m[track.first[:-1]], track.measure_m[track.first[1:] - 1]
-    place = {}
-    for balise, name, measure_m in site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows():
-        inside = [number for number in numbers.get(name, ()) if low[number] <= measure_m <= high[number]]
-        # Of an element that is passed twice, or about a cut, a read does not say which it was.
-        if len(inside) == 1:
-            place[balise] = inside[0]
-    times = balise_reads["t"].to_physical().to_list()
-    for t_ns, balise in zip(times, balise_reads["balise_id"].to_list(), strict=True):
-        epoch = int(np.searchsorted(fixes.t_ns, t_ns))
-        if epoch < len(fixes) and balise in place:
-            pinned[epoch] = place[balise]
+    # Of an element that is passed twice, or about a cut, a read does not say which it was.
+    rows, elements = track.holding(site.balises)
+    alone = np.flatnonzero(np.bincount(rows)[rows] == 1)
+    places = site.balises[rows[alone]].select("balise_id", element=elements[alone])
+    read = balise_reads.select("t", "balise_id").join(places, on="balise_id", maintain_order="left")
+    epoch = np.searchsorted(fixes.t_ns, times_ns(read))
+    inside = epoch < len(fixes)
+    pinned[epoch[inside]] = ints(read["element"])[inside]
     return pinned

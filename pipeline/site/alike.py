@@ -63,9 +63,8 @@ def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
         element = network.track.index.get(netelement_id)
         if element is None:
             continue
-        measures = network.track.measure_m[network.track.vertices(element)]
-        along_m, back_m = measure_m - float(measures[0]), float(measures[-1]) - measure_m
-        for oriented, at_m in ((2 * element, along_m), (2 * element + 1, back_m)):
+        for oriented in (2 * element, 2 * element + 1):
+            at_m = network.track.along_m(oriented, measure_m)
             points.setdefault(oriented, []).append(_Point(name, element, accuracy_m, at_m))
     return {
         oriented: sorted(on_it, key=lambda point: (point.at_m, point.balise_id)) for oriented, on_it in points.items()

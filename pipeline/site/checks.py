@@ -275,8 +275,8 @@ def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, s
     """Why no run will pass a balise, and what to mend."""
     if element not in track.index:
         return f"lies on element {element}, which is not in the track: no run will pass it", "Correct netelement_id."
-    part = track.vertices(track.index[element])
-    low, high = float(track.measure_m[part][0]), float(track.measure_m[part][-1])
+    number = track.index[element]
+    low, high = float(track.begin_m[number]), float(track.end_m[number])
     if low - MEASURE_TOLERANCE_M <= measure_m <= high + MEASURE_TOLERANCE_M:
         return None
     text = f"measure {measure_m:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"

@@ -1,9 +1,9 @@
-"""The path that a run travelled: legs of net elements sharing one path position."""
+"""Routes: net elements in order with one coordinate; and the path that a run travelled, legs sharing one of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from pipeline.track.geodesy import Points
 from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.track.segments import Feet, no_feet
 from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, floats
 
 Objects = npt.NDArray[np.object_]
 BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
@@ -23,10 +23,90 @@ BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
     "netelement_id": pl.String,
     "measure_m": pl.Float64,
     "path_m": pl.Float64,
+    "sense": pl.Int64,
     "location_accuracy_m": pl.Float64,
     "linked": pl.Boolean,
     "link_reaction": pl.String,
 }
+
+
+# Of two visits of one element the one that holds the measure comes first, however near the other is:
+# an order of two costs, not a limit.
+_OUTSIDE_COUNTS = 1e3
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place on the network: net element by its number in the survey, and measure [m]."""
+
+    element: int
+    measure_m: float
+
+
+@dataclass(frozen=True)
+class Route:
+    """Net elements in order with one coordinate [m]; arrays per visit.
+
+    `forward`: the measure grows with the coordinate; `entry_m`: coordinate at which the element is entered;
+    `low_m`, `high_m`: the measures that it covers.
+    """
+
+    element: Ints
+    forward: Bools
+    entry_m: Floats
+    low_m: Floats
+    high_m: Floats
+
+    @cached_property
+    def exit_m(self) -> Floats:
+        return self.entry_m + self.high_m - self.low_m
+
+    def coordinate(self, element: Ints, measure_m: Floats, near_m: Floats) -> tuple[Floats, Ints]:
+        """Coordinate [m] of places, NaN where not on the route; +1 where it grows with the measure, else -1.
+
+        Of several visits the one nearest to `near_m` is meant: a lap more is no error of place.
+        """
+        found, sense = np.full(element.size, np.nan), np.zeros(element.size, dtype=np.int64)
+        cost = np.full(element.size, np.inf)
+        order = np.argsort(element, kind="stable")
+        ends = np.searchsorted(element[order], self.element, side="right")
+        begins = np.searchsorted(element[order], self.element, side="left")
+        for visit in np.flatnonzero(ends > begins).tolist():
+            rows = order[begins[visit] : ends[visit]]
+            low, high = self.low_m[visit], self.high_m[visit]
+            measure = measure_m[rows]
+            at_m = self.entry_m[visit] + (measure - low if self.forward[visit] else high - measure)
+            outside = np.maximum(np.maximum(low - measure, measure - high), 0.0)
+            own = outside * _OUTSIDE_COUNTS + np.abs(at_m - near_m[rows])
+            better = own < cost[rows]
+            chosen = rows[better]
+            cost[chosen], found[chosen] = own[better], at_m[better]
+            sense[chosen] = 1 if self.forward[visit] else -1
+        return found, sense
+
+    def locate(self, at_m: Floats) -> tuple[Ints, Floats, Ints]:
+        """Element, measure [m] and its sense (+1: grows with the coordinate); beyond the ends the measure goes on."""
+        visit = np.clip(np.searchsorted(self.entry_m, at_m, side="right") - 1, 0, self.entry_m.size - 1)
+        since = at_m - self.entry_m[visit]
+        forward = self.forward[visit]
+        measure = np.where(forward, self.low_m[visit] + since, self.high_m[visit] - since)
+        return self.element[visit], measure, np.where(forward, 1, -1)
+
+    def places(self, element: Ints, measure_m: Floats) -> tuple[Ints, Floats, Ints]:
+        """All visits of some places, but for what lists round: which place, coordinate [m], sense of the measure."""
+        own = self.element[:, None] == element
+        own &= (self.low_m[:, None] - MEASURE_TOLERANCE_M <= measure_m) & (
+            measure_m <= self.high_m[:, None] + MEASURE_TOLERANCE_M
+        )
+        visit, place = np.nonzero(own)
+        measure = measure_m[place]
+        since = np.where(self.forward[visit], measure - self.low_m[visit], self.high_m[visit] - measure)
+        return place, self.entry_m[visit] + since, np.where(self.forward[visit], 1, -1)
+
+    def covers(self, at_m: Floats) -> Bools:
+        """The coordinate lies on the route, not beyond its ends."""
+        inside: Bools = (at_m >= self.entry_m[0]) & (at_m <= self.exit_m[-1])
+        return inside
 
 
 @dataclass(frozen=True)
@@ -91,39 +171,37 @@ class TravelledPath:
             vertical_m[rows] = height_m[rows] - one.height_start_m[part.segment] - part.fraction * rise
         return path_m, vertical_m
 
+    def routes(self, numbers: dict[str, int]) -> list[Route]:
+        """The legs as routes whose coordinate is `path_m`; `numbers`: net elements as the caller counts them."""
+        routes = []
+        for leg in self.legs:
+            own = np.array([visit.element for visit in leg.visits])
+            routes.append(
+                Route(
+                    element=np.array([numbers[self.track.ids[element]] for element in own.tolist()], dtype=np.int64),
+                    forward=np.array([visit.forward for visit in leg.visits]),
+                    entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
+                    low_m=self.track.begin_m[own],
+                    high_m=self.track.end_m[own],
+                )
+            )
+        return routes
+
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
-        """Balises on the path with their path position, in order of leg and path position.
+        """Balises on the path with path position and `sense` (of the measure along it), in order of leg and position.
 
         A place that two legs share is given on each of them, for a train may pass it on each; an element passed
         twice on one leg gives its balises twice. A balise off its element is on no path (the site's findings
         name it).
         """
-        rows: dict[tuple[int, str, float], tuple[object, ...]] = {}
-        groups: dict[str, list[dict[str, Any]]] = {}
-        for balise in () if balises is None else balises.iter_rows(named=True):
-            groups.setdefault(balise["netelement_id"], []).append(balise)
-        for number, leg in enumerate(self.legs):
-            for row in _balises_on(self.track, number, leg, groups):
-                rows.setdefault((number, str(row[1]), round(float(str(row[5])), 3)), row)
-        frame = pl.DataFrame(list(rows.values()), schema=BALISE_COLUMNS, orient="row")
-        return frame.sort("leg", "path_m", "balise_id")
-
-
-def _balises_on(
-    track: Track, number: int, leg: Leg, groups: dict[str, list[dict[str, Any]]]
-) -> list[tuple[object, ...]]:
-    rows: list[tuple[object, ...]] = []
-    for index, visit in enumerate(leg.visits):
-        name = track.ids[visit.element]
-        if name not in groups:
-            continue
-        measures = track.measure_m[track.vertices(visit.element)]
-        origin = float(measures[0] if visit.forward else measures[-1])
-        start = leg.entry_m(index)
-        for row in groups[name]:
-            if not measures[0] - MEASURE_TOLERANCE_M <= row["measure_m"] <= measures[-1] + MEASURE_TOLERANCE_M:
-                continue
-            path_m = start + abs(row["measure_m"] - origin)
-            values = (row["balise_id"], row["kind"], name, row["measure_m"], path_m)
-            rows.append((number, *values, row["location_accuracy_m"], row["linked"], row["link_reaction"]))
-    return rows
+        if balises is None:
+            return pl.DataFrame(schema=BALISE_COLUMNS)
+        element = balises["netelement_id"].replace_strict(self.track.index, default=-1, return_dtype=pl.Int64)
+        parts = []
+        for leg, route in enumerate(self.routes(self.track.index)):
+            place, path_m, sense = route.places(element.to_numpy(), floats(balises, "measure_m"))
+            parts.append(balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense))
+        whole = pl.concat(parts).select(pl.col(name).cast(kind) for name, kind in BALISE_COLUMNS.items())
+        # Where two pieces of an element meet they share a place.
+        once = whole.unique(["leg", "balise_id", pl.col("path_m").round(3)], keep="first", maintain_order=True)
+        return once.sort("leg", "path_m", "balise_id")

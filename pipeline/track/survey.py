@@ -10,12 +10,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import polars as pl
 
 from pipeline.track.geodesy import distances_m, points_of
-from schemas.arrays import Floats, Ints, floats
+from schemas.arrays import Floats, Ints, floats, ints
 
 # Both belong to how a site is read, as the limits of its check do: a site is the same for every run and configuration.
 # A gap between linked ends that is more than survey noise [m]; it counts as straight track.
@@ -43,6 +44,41 @@ class Track:
     measure_m: Floats
     sigma_m: Floats
     length_m: Floats
+
+    @cached_property
+    def begin_m(self) -> Floats:
+        """Measure at which each element begins [m]."""
+        return self.measure_m[self.first[:-1]]
+
+    @cached_property
+    def end_m(self) -> Floats:
+        """Measure at which each element ends [m]."""
+        return self.measure_m[self.first[1:] - 1]
+
+    def along_m(self, oriented: int, measure_m: float) -> float:
+        """Distance of a measure from where the oriented element (`Network`) is entered [m]."""
+        element, against = divmod(oriented, 2)
+        return float(self.end_m[element] - measure_m if against else measure_m - self.begin_m[element])
+
+    def holding(self, balises: pl.DataFrame) -> tuple[Ints, Ints]:
+        """Pairs of balise (its row) and net element: those that lie on it, or but for what lists round.
+
+        Of an element in pieces each piece that holds the balise.
+        """
+        elements = pl.DataFrame(
+            {
+                "netelement_id": pl.Series(self.ids, dtype=pl.String),
+                "_low": self.begin_m - MEASURE_TOLERANCE_M,
+                "_high": self.end_m + MEASURE_TOLERANCE_M,
+            }
+        )
+        pairs = (
+            balises.select("netelement_id", "measure_m")
+            .with_row_index("_balise")
+            .join(elements.with_row_index("_element"), on="netelement_id", maintain_order="left_right")
+            .filter(pl.col("measure_m").is_between("_low", "_high"))
+        )
+        return ints(pairs["_balise"]), ints(pairs["_element"])
 
     def vertices(self, element: int) -> slice:
         return slice(int(self.first[element]), int(self.first[element + 1]))

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.evidence.carrying import Anchor, between_anchors, closes
+from pipeline.evidence.chains import Chain
 from pipeline.evidence.evidence import _contradicts
 from pipeline.evidence.gaps import Gap, Way
-from pipeline.evidence.routes import Chain, Place
+from pipeline.track.path import Place
 from schemas.arrays import NS_PER_S, Ints
 from schemas.config import Configuration
 from schemas.enums import Evidence

@@ -10,7 +10,6 @@ import polars as pl
 import pytest
 
 from pipeline.evidence.evidence import KINDS, Alternative, EvidenceSet
-from pipeline.evidence.routes import Place, Route
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.episodes import Episode, _failure, _is_back
 from pipeline.judge.hazards import _instants, drafts_of, within_budget
@@ -20,6 +19,7 @@ from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.states import odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
+from pipeline.track.path import Place, Route
 from schemas.config import Configuration, HazardConfig, LdsConfig
 from schemas.enums import Evidence, Hazard, Suspect, Verdict
 

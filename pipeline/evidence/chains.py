@@ -1,0 +1,106 @@
+"""Chains of net elements with one coordinate that lead from one place to another, or on from one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.track.network import Edge, Network
+from pipeline.track.path import Place, Route
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Oriented net elements in order, and the coordinate [m] at which each is entered."""
+
+    oriented: tuple[int, ...]
+    entry_m: tuple[float, ...]
+
+    def route(self, network: Network) -> Route:
+        oriented = np.array(self.oriented, dtype=np.int64)
+        element, track = oriented // 2, network.track
+        return Route(
+            element=element,
+            forward=oriented % 2 == 0,
+            entry_m=np.array(self.entry_m),
+            low_m=track.begin_m[element],
+            high_m=track.end_m[element],
+        )
+
+
+def chains_between(
+    network: Network, start: int, begin: Place, goal: Place, lengths_m: tuple[float, float], back: bool, most: int
+) -> list[Chain] | None:
+    """Chains from `begin` on the oriented element `start` to `goal`, of a length between the two; `begin` is at 0.
+
+    `back`: the train runs them from the goal to the begin. None where there are more than `most`.
+    """
+    shortest_m, longest_m = lengths_m
+    found: list[Chain] = []
+    open_chains = [Chain((start,), (-network.track.along_m(start, begin.measure_m),))]
+    steps = 0
+    while open_chains:
+        chain = open_chains.pop()
+        last, entry_m = chain.oriented[-1], chain.entry_m[-1]
+        if last // 2 == goal.element:
+            at_m = entry_m + network.track.along_m(last, goal.measure_m)
+            if shortest_m <= at_m <= longest_m:
+                found.append(chain)
+        exit_m = entry_m + network.length_m(last)
+        steps += 1
+        if len(found) > most or steps > most**2:
+            return None
+        open_chains += [
+            Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m))
+            for edge in network.successors[last]
+            if exit_m + edge.gap_m <= longest_m and (edge.backward if back else edge.forward)
+        ]
+    return found
+
+
+def extended(network: Network, chain: Chain, least_m: float, most_m: float, most: int) -> list[Chain] | None:
+    """The chain carried on over every branch until it covers the coordinates from `least_m` to `most_m`.
+
+    Where the track ends before, it ends. None where there are more than `most` chains.
+    """
+    ahead = _grown(network, [chain], most_m, _onward, most)
+    return None if ahead is None else _grown(network, ahead, least_m, _before, most)
+
+
+_Step = Callable[[Network, Chain, float], Iterator[Chain]]
+
+
+def _grown(network: Network, chains: list[Chain], until_m: float, step: _Step, most: int) -> list[Chain] | None:
+    done: list[Chain] = []
+    growing = list(chains)
+    while growing:
+        chain = growing.pop()
+        further = list(step(network, chain, until_m))
+        if further:
+            growing += further
+        else:
+            done.append(chain)
+        if len(done) + len(growing) > most:
+            return None
+    return done
+
+
+def _onward(network: Network, chain: Chain, until_m: float) -> Iterator[Chain]:
+    exit_m = chain.entry_m[-1] + network.length_m(chain.oriented[-1])
+    if exit_m < until_m:
+        for edge in _runnable(network.successors[chain.oriented[-1]]):
+            yield Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m))
+
+
+def _before(network: Network, chain: Chain, until_m: float) -> Iterator[Chain]:
+    entry_m = chain.entry_m[0]
+    if entry_m > until_m:
+        for edge in _runnable(network.successors[chain.oriented[0] ^ 1]):
+            here = edge.to ^ 1
+            yield Chain((here, *chain.oriented), (entry_m - edge.gap_m - network.length_m(here), *chain.entry_m))
+
+
+def _runnable(edges: list[Edge]) -> list[Edge]:
+    return [edge for edge in edges if edge.forward or edge.backward]
