@@ -13,21 +13,17 @@ from pipeline.matching.epochs import Assignment
 from pipeline.matching.fixes import Fixes
 from pipeline.matching.likelihood import likelihood_of
 from pipeline.matching.search import search
-from pipeline.matching.steps import Steps, Travelled, believable, resumed, steps_of, travelled
+from pipeline.matching.steps import Steps, Travelled, believable, fewer_where_clear, spaced, steps_of, travelled
 from pipeline.matching.trellis import Trellis, trellis_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import grows_with
 from pipeline.track.geodesy import points_of
 from pipeline.track.network import Network
 from pipeline.track.path import TravelledPath
-from pipeline.track.survey import Track, end_places
+from pipeline.track.survey import Track
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 from schemas.errors import InputError
-
-# Saves time only: what is kept of a step lies within `reach_m` beyond its nearest track, so that one with a track as
-# close as this need not be searched farther [m].
-_CLOSE_M = 10.0
 
 
 def find_path(
@@ -65,10 +61,10 @@ def _trellis(
     Between epochs near a track, epochs further off count too: a position that drifts away slowly still shows
     by its movement which way the train turned.
     """
-    steps = _thinned(fixes, steps_of(fixes, believed, way, config), network, way, config)
+    rows = fewer_where_clear(fixes, spaced(fixes, believed, config), network, config)
     segments = segments_of(network.track)
-    wide = _all_candidates(fixes, steps, network, segments, config)
-    nearest = np.full(len(steps), np.inf)
+    wide = _candidates(fixes, rows, network, segments, config.far_reach_factor * config.reach_m, config)
+    nearest = np.full(len(rows), np.inf)
     np.minimum.at(nearest, wide.step, wide.distance_m)
     near = np.flatnonzero(nearest <= config.reach_m)
     if len(near) == 0:
@@ -77,37 +73,12 @@ def _trellis(
     judged[: near[0]] = judged[near[-1] + 1 :] = False
     # A track much further off than the nearest is none of several possible ones; one just out of reach is.
     kept = judged[wide.step] & (wide.distance_m <= nearest[wide.step] + config.reach_m)
-    candidates = wide.take(np.flatnonzero(kept), len(steps)).renumbered(judged)
-    steps = resumed(fixes, steps.epoch[judged], way)
+    candidates = wide.take(np.flatnonzero(kept), len(rows)).renumbered(judged)
+    steps = steps_of(fixes, rows[judged], way)
     candidates = with_tracks_aside(candidates, fixes, believed, steps, network, segments, config)
     like = likelihood_of(fixes, steps, candidates, config)
     like = like.with_pins(_pins(steps, pinned, candidates))
     return trellis_of(network, steps, candidates, like, config)
-
-
-def _thinned(fixes: Fixes, steps: Steps, network: Network, way: Travelled, config: MatchingConfig) -> Steps:
-    """Fewer steps where no link is near, since nothing can be decided there that a later step does not show."""
-    ends = end_places(network.track)[network.linked_ends()]
-    apart, _ = cKDTree(ends).query(fixes.points.surface[steps.epoch], distance_upper_bound=config.clear_of_links_m)
-    moved = np.cumsum(np.nan_to_num(steps.chord_m)) / (config.clear_step_factor * config.step_distance_m)
-    kept = np.isfinite(apart) | (np.nan_to_num(steps.elapsed_s) >= 0.5 * config.step_time_s)
-    kept[1:] |= np.diff(np.floor(moved)) > 0
-    kept[[0, -1]] = True
-    return resumed(fixes, steps.epoch[kept], way)
-
-
-def _all_candidates(
-    fixes: Fixes, steps: Steps, network: Network, segments: Segments, config: MatchingConfig
-) -> Candidates:
-    """Candidates within reach, and for steps that are not close to a track those in a wider circle."""
-    close_m = _CLOSE_M + config.reach_m
-    found = _candidates(fixes, steps.epoch, network, segments, close_m, config)
-    close = np.zeros(len(steps), dtype=bool)
-    close[found.step[found.distance_m <= _CLOSE_M]] = True
-    if close.all():
-        return found
-    far = _candidates(fixes, steps.epoch[~close], network, segments, config.far_reach_factor * config.reach_m, config)
-    return merged(found.take(np.flatnonzero(close[found.step]), len(steps)), far, np.flatnonzero(~close))
 
 
 def _candidates(

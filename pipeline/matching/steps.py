@@ -9,9 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipeline.matching.fixes import Fixes
 from pipeline.odometry import Odometry
+from pipeline.track.geodesy import way_m
+from pipeline.track.network import Network
+from pipeline.track.survey import end_places
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 
@@ -54,15 +58,24 @@ def travelled(fixes: Fixes, odometry: Odometry | None) -> Travelled:
     return Travelled(odometry.distance_at(fixes.t_ns), odometry.segment_at(fixes.t_ns))
 
 
-def steps_of(fixes: Fixes, rows: Ints, way: Travelled, config: MatchingConfig) -> Steps:
-    """Steps every `step_distance_m` of movement and `step_time_s` of time among the given epochs."""
-    moved = np.linalg.norm(np.diff(fixes.points.surface[rows], axis=0), axis=1)
-    far = np.floor(np.concatenate([[0.0], np.cumsum(moved)]) / config.step_distance_m)
+def spaced(fixes: Fixes, rows: Ints, config: MatchingConfig) -> Ints:
+    """Of the given epochs one every `step_distance_m` of movement and `step_time_s` of time, and the last."""
+    far = np.floor(way_m(fixes.points.surface[rows]) / config.step_distance_m)
     late = np.floor((fixes.t_s[rows] - fixes.t_s[rows[0]]) / config.step_time_s)
-    fresh = np.ones(len(rows), dtype=bool)
-    fresh[1:] = (np.diff(far) > 0) | (np.diff(late) > 0)
+    fresh = (np.diff(far, prepend=-1.0) > 0) | (np.diff(late, prepend=-1.0) > 0)
     fresh[-1] = True
-    return resumed(fixes, rows[fresh], way)
+    return np.asarray(rows[fresh])
+
+
+def fewer_where_clear(fixes: Fixes, rows: Ints, network: Network, config: MatchingConfig) -> Ints:
+    """Fewer of them where no link is near, since nothing can be decided there that a later step does not show."""
+    ends, places = end_places(network.track)[network.linked_ends()], fixes.points.surface[rows]
+    apart, _ = cKDTree(ends).query(places, distance_upper_bound=config.clear_of_links_m)
+    far = np.floor(way_m(places) / (config.clear_step_factor * config.step_distance_m))
+    kept = np.isfinite(apart) | (np.diff(fixes.t_s[rows], prepend=fixes.t_s[rows[:1]]) >= 0.5 * config.step_time_s)
+    kept[1:] |= np.diff(far) > 0
+    kept[[0, -1]] = True
+    return np.asarray(rows[kept])
 
 
 def believable(fixes: Fixes, usable: Bools, way: Travelled, config: MatchingConfig) -> Ints:
@@ -133,7 +146,7 @@ def _reachable(
     return np.asarray(np.where(np.isfinite(by_odometer), counted, heading_there))
 
 
-def resumed(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
+def steps_of(fixes: Fixes, rows: Ints, way: Travelled) -> Steps:
     """Given epochs as steps, each with what happened since the one before."""
     unknown = np.full(1, np.nan)
     elapsed = np.concatenate([unknown, np.diff(fixes.t_s[rows])])
