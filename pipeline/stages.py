@@ -50,6 +50,25 @@ class _Context:
     odometry: Odometry | None
     evidence: Evidence
 
+    def fixes(self, solution: str) -> pl.DataFrame:
+        return self.run.gnss.filter(pl.col("solution") == solution)
+
+    def ranges(self, solution: str) -> pl.DataFrame | None:
+        satellites = self.run.satellites
+        return None if satellites is None else satellites.filter(pl.col("solution") == solution)
+
+    @property
+    def provenance(self) -> Provenance:
+        return provenance(self.run, self.site, self.vehicle, self.config)
+
+    @property
+    def figures_from(self) -> VehicleFigures:
+        """Where scale and latency come from (DOMAIN section 5.4)."""
+        if self.odometry is None:
+            return VehicleFigures.NONE
+        given = self.vehicle.odometer_scale is not None and self.vehicle.gnss_latency_s is not None
+        return VehicleFigures.FILE if given else VehicleFigures.LEARNED
+
 
 _AT_THE_END = ("latency_s", "latency_sigma_s", "odometer_scale")
 Tables = dict[str, pl.DataFrame]
@@ -129,8 +148,7 @@ def _matches(context: _Context) -> tuple[dict[str, Match], dict[str, InputError]
 
 
 def _match(context: _Context, solution: str) -> Match:
-    run = context.run
-    fixes = run.gnss.filter(pl.col("solution") == solution)
+    run, fixes = context.run, context.fixes(solution)
     require_two_times(fixes, "gnss", f" of solution {solution!r}")
     require_one_journey(fixes, f"gnss of solution {solution!r}")
     refuse_impossible(context.fits[solution], f"{run.run_id}: solution {solution!r}", context.config.ingest)
@@ -147,9 +165,8 @@ def _match(context: _Context, solution: str) -> Match:
 
 def _failed(context: _Context, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
-    made = provenance(context.run, context.site, context.vehicle, context.config)
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return nothing | {"runs": failed_row(str(error), made, solution)}
+    return nothing | {"runs": failed_row(str(error), context.provenance, solution)}
 
 
 def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]) -> Tables:
@@ -160,7 +177,7 @@ def _replay_solution(context: _Context, solution: str, matches: dict[str, Match]
     # The direction of travel is the judge's, which the errors are signed by, not the train's own.
     seen, recorded = ride.solution.epochs.drop("direction"), ride.solution.fixes.select("satellites")
     epochs = pl.concat([seen, judged.epochs_columns, recorded], how="horizontal")
-    row = summarise(_results(context, ride, judged, epochs), context.config, _made(context))
+    row = summarise(_results(context, ride, judged, epochs), context.config, context.provenance)
     found = {"hazards": judged.hazards, "passages": judged.passages, "alarms": judged.alarms}
     return {**found, "epochs": epochs, "runs": row}
 
@@ -191,35 +208,20 @@ def _ride(context: _Context, solution: str, matches: dict[str, Match]) -> _Ride:
     scale_sigma = None if odometry is None else odometry.scale_sigma
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)
     seen = pl.concat([aligned, lds.epochs.drop("t")], how="horizontal")
-    diagnosis = _diagnosis(context, solution, seen, bank, lds, singles["channel"], compared)
-    unnoticed = undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
-    monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
-    passages = lds.passages.with_columns(unnoticed.passages)
-    fixes = context.run.gnss.filter(pl.col("solution") == solution)
-    taken = Solution(solution, fixes, monitored, lds.crossings, passages, balises, found.path)
-    return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
-
-
-def _diagnosis(
-    context: _Context,
-    solution: str,
-    seen: pl.DataFrame,
-    bank: MonitorBank,
-    lds: LdsResult,
-    channel: pl.DataFrame,
-    compared: pl.DataFrame | None,
-) -> Diagnosis:
-    """All that watched the solution, for the question what it would not have noticed."""
-    config = context.config
-    return Diagnosis(
+    diagnosis = Diagnosis(
         epochs=seen,
         bank=bank.along(),
         held=lds.held,
-        channel=channel,
+        channel=singles["channel"],
         other=compared,
-        satellites=_ranges(context, solution),
+        satellites=context.ranges(solution),
         fixes_ns=fixes_ns(context.run, lds.crossings, config.lds.starts_of_mission, config.undetected),
     )
+    unnoticed = undetected_of(diagnosis, lds.passages, lds.crossings, context.vehicle, config)
+    monitored = pl.concat([seen, pl.DataFrame(bank.columns()), unnoticed.epochs], how="horizontal")
+    passages = lds.passages.with_columns(unnoticed.passages)
+    taken = Solution(solution, context.fixes(solution), monitored, lds.crossings, passages, balises, found.path)
+    return _Ride(taken, found, aligned, lds, odometry, diagnosis, unnoticed.spacing)
 
 
 def _reads_on_odometer(
@@ -257,7 +259,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         failures=judged.failures,
         distance_m=judged.distance_m,
         evidence=judged.evidence,
-        vehicle=_figures_from(context),
+        vehicle=context.figures_from,
         odometer_contradicted=context.evidence.contradicted,
         alignment=ride.aligned.select(*_AT_THE_END, odometer_scale_sigma="scale_sigma").row(-1, named=True),
         counts=counts,
@@ -269,23 +271,11 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
     )
 
 
-def _made(context: _Context) -> Provenance:
-    return provenance(context.run, context.site, context.vehicle, context.config)
-
-
-def _figures_from(context: _Context) -> VehicleFigures:
-    """Where scale and latency come from (DOMAIN section 5.4)."""
-    if context.odometry is None:
-        return VehicleFigures.NONE
-    given = context.vehicle.odometer_scale is not None and context.vehicle.gnss_latency_s is not None
-    return VehicleFigures.FILE if given else VehicleFigures.LEARNED
-
-
 def _single_monitors(
     context: _Context, solution: str, aligned: pl.DataFrame, compared: pl.DataFrame | None
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
-    ranges = _ranges(context, solution)
+    ranges = context.ranges(solution)
     absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
     return {
         "along_doppler": doppler_monitor(aligned, context.config),
@@ -302,11 +292,6 @@ def _compared(
     if other is None or other == solution or other not in matches:
         return None
     return on_path_of(aligned, matches[other].epochs, context.config.lds)
-
-
-def _ranges(context: _Context, solution: str) -> pl.DataFrame | None:
-    satellites = context.run.satellites
-    return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
 
 def _tables(run_id: str, parts: list[Tables]) -> RunTables:
