@@ -30,14 +30,15 @@ def passages_table(
     its detection.
     """
     stamps = bench.t_ns[np.isfinite(bench.path_m)]
-    passages = _with_unoffered(bench, passings, forward, stamps)
-    t_true = _assigned(passages, passings)
+    known = bench.solution.passages.with_columns(_assigned(bench.solution.passages, passings))
+    passages = _with_unoffered(known, bench, passings, forward, stamps)
+    t_true = passages["t_true"]
     positioned = _within_gap(stamps, ints(t_true), bench.gap_ns) & t_true.is_not_null().to_numpy()
     frame = passages.with_columns(
-        t_true.cast(pl.Datetime("ns", "UTC")).alias("t_true"),
+        pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
         *_of_crossings(passages, bench, drafts),
         pl.Series("_positioned", positioned),
-        pl.Series("_suspect", _inside(passages, spans)),
+        pl.Series("suspect_after_the_fact", _inside(passages, spans)),
         _speeds(passages, t_true, bench),
     )
     return _with_failures(frame).select(Passages.column_names())
@@ -131,35 +132,31 @@ def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
     beyond_window = (pl.col("odometer_distance_m") > pl.col("window_close_m")).fill_null(value=False)
     offered, wrong = pl.col("t_offered").is_not_null(), (pl.col("judgement") == "wrong").fill_null(value=False)
     absent = pl.col("status") == PassageStatus.NOT_AVAILABLE.value
-    insertion = offered & pl.col("_inserted")
-    deletion = absent | ~offered | beyond_window
-    by_position = (insertion | (beyond_window & wrong)) | (~offered & pl.col("_positioned"))
+    insertion, deletion = offered & pl.col("_inserted"), absent | ~offered | beyond_window
+    by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & pl.col("_positioned"))
     without = absent | (~offered & ~pl.col("_positioned"))
-    mode = pl.when(insertion).then(pl.lit(FailureMode.INSERTION.value)).when(deletion)
-    cause = pl.when(by_position & ~(absent & ~insertion)).then(pl.lit(Cause.POSITION.value)).when(without)
     return frame.with_columns(
-        mode.then(pl.lit(FailureMode.DELETION.value))
-        .otherwise(pl.lit(FailureMode.NONE.value))
-        .cast(frame.schema["failure_mode"])
-        .alias("failure_mode"),
-        cause.then(pl.lit(Cause.NO_POSITION.value))
-        .otherwise(pl.lit(Cause.NONE.value))
-        .cast(frame.schema["cause"])
-        .alias("cause"),
-        pl.col("_suspect").alias("suspect_after_the_fact"),
+        failure_mode=_word(frame, "failure_mode", (insertion, FailureMode.INSERTION), (deletion, FailureMode.DELETION)),
+        cause=_word(frame, "cause", (by_position, Cause.POSITION), (without, Cause.NO_POSITION)),
     )
 
 
+def _word(frame: pl.DataFrame, column: str, *rows: tuple[pl.Expr, FailureMode | Cause]) -> pl.Expr:
+    """The word of the first condition that holds, `none` where none does."""
+    applying = [pl.when(condition).then(pl.lit(word.value)) for condition, word in rows]
+    return pl.coalesce(*applying, pl.lit("none")).cast(frame.schema[column])
+
+
 def _with_unoffered(
-    bench: Bench, passings: dict[str, list[Passing]], forward: dict[str, int], stamps: Ints
+    passages: pl.DataFrame, bench: Bench, passings: dict[str, list[Passing]], forward: dict[str, int], stamps: Ints
 ) -> pl.DataFrame:
     """One more passage for each virtual balise that the train passed and the LDS knows nothing of.
 
     The LDS follows the position: before the first one, or where it is wrong at an end of the run, no window has closed
-    yet. `stamps`: of valid positions.
+    yet. `passages`: with their true passing; `stamps`: of valid positions.
     """
-    passages, solution = bench.solution.passages, bench.solution.name
-    given = set(zip(passages["balise_id"].to_list(), _assigned(passages, passings).to_list(), strict=True))
+    solution = bench.solution.name
+    given = set(passages.select("balise_id", "t_true").iter_rows())
     virtual = bench.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     rows = [
         _unoffered(balise, instant, sense * forward[balise["balise_id"]], seen, solution)
@@ -184,8 +181,6 @@ def _unoffered(balise: dict[str, object], instant: int, direction: int, seen: bo
         "status": (PassageStatus.MISSED if seen else PassageStatus.NOT_AVAILABLE).value,
         "linking_error": LinkingError.NONE.value,
         "reaction": Reaction.NONE.value,
-        "failure_mode": FailureMode.DELETION.value,
-        "cause": Cause.NONE.value,
-        "suspect_after_the_fact": False,
         "t_reckoned": instant,
+        "t_true": instant,
     }
