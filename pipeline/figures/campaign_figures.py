@@ -7,11 +7,15 @@ from collections.abc import Callable, Sequence
 import polars as pl
 
 from pipeline.figures.bounds import (
+    Estimator,
     clopper_pearson,
+    continuity_15s,
     hours_still_needed,
     hours_to_substantiate,
+    mtbf,
     poisson_rate,
     poisson_rate_upper,
+    with_estimates,
 )
 from pipeline.figures.campaign_tables import (
     RATES,
@@ -22,17 +26,13 @@ from pipeline.figures.campaign_tables import (
     counted_runs,
     with_truth,
 )
-from pipeline.figures.estimates import Estimator, columns_of, continuity_15s, mtbf, with_estimates
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.map_errors import map_places
 from pipeline.figures.undetected import spacing_of_runs
-from pipeline.figures.verdict import level_counts
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform, dtypes
 from schemas.enums import TRUTH, RunStatus, RunVerdict
-
-Row = dict[str, object]
 
 _STATES = ("p0", "p1", "p2", "p3")
 _ROUNDING = 1e-9
@@ -142,15 +142,29 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: Safety
     Eq. 7 limits how long a hazardous position may be in use, so the hazardous time is compared. The quantiles of T_D
     leave out faults that were not detected.
     """
-    failures = failures_of(runs)
-    episodes = independent_episodes(hazards)
-    solutions = sorted({*failures["solution"].to_list(), *episodes["solution"].to_list()})
-    rows = [
-        row
-        for name in solutions
-        for row in _by_level(name, failures.filter(solution=name), episodes.filter(solution=name), config)
-    ]
-    return conform(pl.DataFrame(rows, schema=dtypes(CampaignDetection)), CampaignDetection)
+    failures, episodes = failures_of(runs), independent_episodes(hazards)
+    spent, may, detected = pl.col("hazardous_s"), pl.col("hazardous_may_s"), pl.col("time_to_detect_s")
+    of_failures = failures.group_by("solution").agg(
+        failures=pl.len(), hazardous_may_max_s=may.max(), **_quantiles(spent, "hazardous")
+    )
+    of_episodes = episodes.group_by("solution").agg(detected=detected.count(), **_quantiles(detected, "time_to_detect"))
+    told = of_failures.join(of_episodes, on="solution", how="full", coalesce=True)
+    levels = [(level, config.allowed_time_to_detect_s(level)) for level in config.service_levels]
+    allowed = pl.DataFrame(levels, {"service_level": pl.String, "allowed_s": pl.Float64}, orient="row")
+    within, exceeded = may <= pl.col("allowed_s"), spent > pl.col("allowed_s")
+    counts = {
+        "within": within.sum(),
+        "exceeded": exceeded.sum(),
+        "failures_judged": ((within | exceeded) & pl.col("by_truth")).sum(),
+        "within_judged": (within & pl.col("by_truth")).sum(),
+    }
+    keys = ["solution", "service_level"]
+    counted = failures.join(allowed, how="cross").group_by(keys).agg(**counts)
+    table = told.sort("solution").join(allowed, how="cross", maintain_order="left_right")
+    table = table.join(counted, on=keys, how="left", maintain_order="left")
+    table = table.with_columns(pl.col("failures", "detected", *counts).fill_null(0).cast(pl.Int64))
+    share: Estimator = ("within_share", "", clopper_pearson, "within_judged", "failures_judged")
+    return conform(with_estimates(table, share), CampaignDetection)
 
 
 def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
@@ -166,40 +180,11 @@ def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
     return listed.explode("hazardous_s", "hazardous_may_s")
 
 
-def _by_level(solution: str, failures: pl.DataFrame, episodes: pl.DataFrame, config: SafetyConfig) -> list[Row]:
-    same = {
-        "solution": solution,
-        "failures": failures.height,
-        **_quantiles(failures["hazardous_s"], "hazardous"),
-        "hazardous_may_max_s": failures["hazardous_may_s"].max(),
-        "detected": episodes["time_to_detect_s"].count(),
-        **_quantiles(episodes["time_to_detect_s"], "time_to_detect"),
-    }
-    return [same | _against(failures, level, config.allowed_time_to_detect_s(level)) for level in config.service_levels]
-
-
-def _against(failures: pl.DataFrame, level: str, allowed_s: float) -> Row:
-    whole, judged = (
-        level_counts(part["hazardous_s"].to_list(), part["hazardous_may_s"].to_list(), allowed_s)
-        for part in (failures, failures.filter("by_truth"))
-    )
+def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
     return {
-        "service_level": level,
-        "allowed_s": allowed_s,
-        "within": whole[0],
-        "exceeded": whole[1],
-        "failures_judged": sum(judged),
-        "within_judged": judged[0],
-        **columns_of("within_share", clopper_pearson(judged[0], sum(judged))),
-    }
-
-
-def _quantiles(values: pl.Series, name: str) -> Row:
-    known = values.drop_nulls()
-    return {
-        f"{name}_median_s": known.median(),
-        f"{name}_p95_s": known.quantile(0.95, interpolation="linear"),
-        f"{name}_max_s": known.max(),
+        f"{name}_median_s": values.median(),
+        f"{name}_p95_s": values.quantile(0.95, interpolation="linear"),
+        f"{name}_max_s": values.max(),
     }
 
 

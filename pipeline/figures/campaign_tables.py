@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.figures.bounds import clopper_pearson, poisson_rate
-from pipeline.figures.estimates import Estimator, with_estimates
+from pipeline.figures.bounds import Estimator, clopper_pearson, poisson_rate, with_estimates
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
 from pipeline.figures.undetected import undetected_spread

@@ -8,8 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.clock import Clock, availability, may_move, met, outages_s, share_of_time, trusted, uptime, usable
-from pipeline.figures.bounds import UNKNOWN, Estimate, poisson_rate
-from pipeline.figures.estimates import CONTINUITY_S, columns_of, continuity
+from pipeline.figures.bounds import CONTINUITY_S, UNKNOWN, Estimate, columns_of, continuity, poisson_rate
 from pipeline.figures.independent import missed_detection
 from pipeline.figures.verdict import LEVEL_LISTS, level_rows
 from schemas.config import Configuration

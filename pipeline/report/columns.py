@@ -8,7 +8,7 @@ from typing import Any
 import dataframely as dy
 import polars as pl
 
-from pipeline.figures.estimates import bounds_of
+from pipeline.figures.bounds import bounds_of
 from pipeline.report.markup import UNKNOWN, Cell, cell, number, table
 from pipeline.report.words import OPINIONS, TITLES, WORDS
 

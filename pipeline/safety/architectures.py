@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.figures.estimates import continuity
+from pipeline.figures.bounds import continuity
 from pipeline.safety.budget import S_PER_H, Figure, each, levels_table
 from pipeline.safety.markov import lds_hazard_rate_per_h
 from schemas.config import SafetyConfig

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 
 from pipeline import storage
-from pipeline.figures.estimates import bounds_of
+from pipeline.figures.bounds import bounds_of
 from pipeline.results.manifest import NAME, read_manifest
 from pipeline.safety.budget import published
 from pipeline.storage.address import Address, join

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import polars as pl
 
-from pipeline.figures.bounds import clopper_pearson, poisson_rate
-from pipeline.figures.estimates import continuity_15s, mtbf, with_estimates
+from pipeline.figures.bounds import clopper_pearson, continuity_15s, mtbf, poisson_rate, with_estimates
 
 REACTIVE, COMPOSITE, REDUNDANT = "reactive 1oo1", "composite 2oo2", "reactive 1oo2"
 

@@ -5,8 +5,7 @@ import math
 import polars as pl
 import pytest
 
-from pipeline.figures.bounds import hours_to_substantiate
-from pipeline.figures.estimates import continuity
+from pipeline.figures.bounds import continuity, hours_to_substantiate
 from pipeline.safety import safety_tables
 from pipeline.safety.architectures import (
     APV_CONTINUITY_RISK,
