@@ -253,12 +253,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
     return SolutionResults(
         solution=name,
         epochs=epochs,
-        passages=judged.passages,
-        hazards=judged.hazards,
-        alarms=judged.alarms,
-        failures=judged.failures,
-        distance_m=judged.distance_m,
-        evidence=judged.evidence,
+        judged=judged,
         vehicle=context.figures_from,
         odometer_contradicted=context.evidence.contradicted,
         alignment=ride.aligned.select(*_AT_THE_END, odometer_scale_sigma="scale_sigma").row(-1, named=True),

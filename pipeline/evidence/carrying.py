@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.odometry import Odometry, Way
+from pipeline.odometry import Odometry
 from pipeline.track.path import Place
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
@@ -34,18 +34,18 @@ def beside_m(driven_m: Floats, sigma_m: float, config: Configuration) -> Floats:
     return half
 
 
-def driven_m(odometer: Odometry, since_ns: Ints, t_ns: Ints) -> Floats:
-    """Way driven from instants to others, turns included [m]."""
-    driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(since_ns))
+def driven_m(odometer: Odometry, since_ns: Ints | int, t_ns: Ints) -> Floats:
+    """Way driven from instants, or from one, to others, turns included [m]."""
+    driven: Floats = np.abs(odometer.travelled_at(t_ns) - odometer.travelled_at(np.atleast_1d(since_ns)))
     return driven
 
 
 def carried(
-    odometer: Odometry, since_ns: Ints, at_m: Floats, sigma_m: float, t_ns: Ints, config: Configuration
+    odometer: Odometry, since_ns: Ints | int, at_m: Floats | float, sigma_m: float, t_ns: Ints, config: Configuration
 ) -> Interval:
     """Least and largest coordinate on one side of anchors of this sigma; NaN where the odometer does not reach.
 
-    Of each instant `t_ns` the anchor: when it was, and its coordinate.
+    Of each instant `t_ns` the anchor, or the one of all: when it was, and its coordinate.
     """
     centre = at_m + odometer.between(since_ns, t_ns).distance_m
     half = beside_m(driven_m(odometer, since_ns, t_ns), sigma_m, config)
@@ -60,7 +60,7 @@ def between_anchors(
     The inverse-variance mean of what both say where a vehicle file's odometer closes, else the hull of both: the
     odometer lost or gained the difference somewhere between.
     """
-    ways = [_from(odometer, anchor, t_ns) for anchor in anchors]
+    ways = [odometer.between(anchor.t_ns, t_ns) for anchor in anchors]
     places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
     variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]
     if odometer.scale is not None and closes(odometer, anchors, at_m[1] - at_m[0], config):
@@ -76,13 +76,9 @@ def between_anchors(
 def closes(odometer: Odometry, anchors: tuple[Anchor, Anchor], apart_m: float, config: Configuration) -> bool:
     """The odometer's way from anchor to anchor is their distance, within k times both roots combined."""
     begin, end = anchors
-    way = _from(odometer, begin, np.array([end.t_ns]))
+    way = odometer.between(begin.t_ns, np.array([end.t_ns]))
     root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + way.variance_m2)
     return bool((np.abs(apart_m - way.distance_m) <= config.hazards.evidence_factor * root)[0])
-
-
-def _from(odometer: Odometry, anchor: Anchor, t_ns: Ints) -> Way:
-    return odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns)
 
 
 def carried_forward(

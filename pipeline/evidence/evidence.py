@@ -144,8 +144,7 @@ class Evidence:
             begin_m, end_m = way.at_m
             return between_anchors(self.odometer, (gap.begin, gap.end), (begin_m, end_m), t_ns, self.config)
         (anchor,), (at_m,) = gap.anchors, way.at_m
-        since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
-        return carried(self.odometer, since_ns, from_m, anchor.sigma_m, t_ns, self.config)
+        return carried(self.odometer, anchor.t_ns, at_m, anchor.sigma_m, t_ns, self.config)
 
 
 def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:

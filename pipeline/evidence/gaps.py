@@ -66,10 +66,10 @@ def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, config:
     """Where the odometer lost distance in a gap, it is two halves that know nothing of each other."""
     if b.t_ns <= a.t_ns:
         return []
-    length_m = float(odometer.between(np.array([a.t_ns]), np.array([b.t_ns])).distance_m[0])
+    length_m = float(odometer.between(a.t_ns, np.array([b.t_ns])).distance_m[0])
     if np.isnan(length_m):
         return [Gap(a.t_ns, b.t_ns, a, None, []), Gap(a.t_ns, b.t_ns, None, b, [])]
-    way_m = float(driven_m(odometer, np.array([a.t_ns]), np.array([b.t_ns]))[0])
+    way_m = float(driven_m(odometer, a.t_ns, np.array([b.t_ns]))[0])
     hazards = config.hazards
     slack_m = float(beside_m(np.array(way_m), 0.0, config)) + hazards.evidence_factor * (a.sigma_m + b.sigma_m)
     ways = _ways_of_length(a, b, length_m, slack_m, network, hazards.routes_limit)
@@ -153,7 +153,7 @@ def _turned(gap: Gap, odometer: Odometry, config: Configuration) -> bool:
     """The train went to and fro in the gap by more than the odometer's own error."""
     t_ns = _looks(gap, odometer)
     for anchor in gap.anchors[:1]:
-        way = odometer.between(np.full(t_ns.size, anchor.t_ns), t_ns).distance_m
+        way = odometer.between(anchor.t_ns, t_ns).distance_m
         known = way[np.isfinite(way)]
         if known.size:
             back = min(float((np.maximum.accumulate(sign * known) - sign * known).max()) for sign in (1.0, -1.0))
@@ -184,8 +184,7 @@ def _reach_m(gap: Gap, way: Way, odometer: Odometry, config: Configuration) -> t
     t_ns = _looks(gap, odometer)
     least, most = min(way.at_m), max(way.at_m)
     for anchor, at_m in zip(gap.anchors, way.at_m, strict=True):
-        since_ns, from_m = np.full(t_ns.size, anchor.t_ns), np.full(t_ns.size, at_m)
-        low, high = carried(odometer, since_ns, from_m, anchor.sigma_m, t_ns, config)
+        low, high = carried(odometer, anchor.t_ns, at_m, anchor.sigma_m, t_ns, config)
         if np.isfinite(low).any():
             least, most = min(least, float(np.nanmin(low))), max(most, float(np.nanmax(high)))
     return least, most

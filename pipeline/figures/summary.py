@@ -14,10 +14,11 @@ from pipeline.figures.notes import ingest_notes, judged_notes, time_notes, undia
 from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import verdict_of
 from pipeline.ingest.clean import StreamCounts
+from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Evidence, RunStatus, RunVerdict, VehicleFigures
+from schemas.enums import RunStatus, RunVerdict, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 
@@ -26,9 +27,9 @@ Row = dict[str, object]
 
 @dataclass(frozen=True)
 class SolutionResults:
-    """All that the stages found out about one solution; tables as in `schemas.tables`, failures as in `schemas.stages`.
+    """All that the stages found out about one solution; `epochs` as in `schemas.tables`.
 
-    `distance_m`: way driven, None where nobody knows; `odometer_contradicted`: gaps between anchors that the odometer
+    `odometer_contradicted`: gaps between anchors that the odometer
     does not close (DOMAIN section 5.1). `alignment`: latency and odometer scale at the end of the run.
     `impossible`: misfits that no train can have, which were let pass. `spacing`: of physical balises, None where not
     computed.
@@ -36,12 +37,7 @@ class SolutionResults:
 
     solution: str
     epochs: pl.DataFrame
-    passages: pl.DataFrame
-    hazards: pl.DataFrame
-    alarms: pl.DataFrame
-    failures: pl.DataFrame
-    distance_m: float | None = None
-    evidence: Evidence | None = None
+    judged: Judged
     vehicle: VehicleFigures = VehicleFigures.NONE
     odometer_contradicted: int = 0
     alignment: Row = field(default_factory=dict)
@@ -55,19 +51,19 @@ class SolutionResults:
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
-    epochs, clock = results.epochs, Clock.of(results.epochs, config)
+    epochs, clock, judged = results.epochs, Clock.of(results.epochs, config), results.judged
     unknown = figures.share_unknown(epochs, clock)
     row = (
         _identity(results)
         | {"share_unknown": unknown, "notes": _notes(results, unknown, clock, config)}
-        | _extent(epochs, clock, results.distance_m)
+        | _extent(epochs, clock, judged.distance_m)
         | figures.positions(epochs, clock, config)
         | figures.accuracy(epochs)
-        | figures.balise_counts(results.passages)
-        | figures.hazard_counts(results.hazards)
-        | figures.failure_counts(results.failures)
-        | figures.service_levels(results.failures, results.evidence, unknown, config)
-        | figures.alarm_counts(results.alarms, epochs, results.evidence, clock)
+        | figures.balise_counts(judged.passages)
+        | figures.hazard_counts(judged.hazards)
+        | figures.failure_counts(judged.failures)
+        | figures.service_levels(judged.failures, judged.evidence, unknown, config)
+        | figures.alarm_counts(judged.alarms, epochs, judged.evidence, clock)
         | figures.exposure(epochs)
         | figures.state_shares(epochs, clock)
         | figures.stanford_counts(epochs, config.lds.ci_limit_m)
@@ -110,7 +106,7 @@ def _identity(results: SolutionResults) -> Row:
         "partial_until": ingest.partial_until_ns,
         "duplicates": results.counts.duplicates,
         "out_of_order": results.counts.out_of_order,
-        "evidence": results.evidence,
+        "evidence": results.judged.evidence,
         "vehicle": results.vehicle,
         "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
@@ -123,8 +119,8 @@ def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config
     found = (
         *ingest_notes(results.ingest),
         *results.notes,
-        *judged_notes(results.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
-        *undiagnosed_notes(results.epochs, results.passages),
+        *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
+        *undiagnosed_notes(results.epochs, results.judged.passages),
         *time_notes(results.epochs, clock, config),
     )
     return "; ".join(found) or None

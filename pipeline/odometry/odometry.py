@@ -117,13 +117,14 @@ class Odometry:
         """
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
-    def between(self, begin_ns: Ints, end_ns: Ints) -> Way:
-        """True distance from some instants to others, and its variance; the one answer to "how far".
+    def between(self, begin_ns: Ints | int, end_ns: Ints) -> Way:
+        """True distance from some instants, or from one, to others, and its variance; the one answer to "how far".
 
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) +
         (sigma_s D)^2 (DOMAIN section 5.1). NaN where either end is not known or the distance was lost in between.
         """
         scale, scale_sigma = self.scale or 1.0, self.scale_sigma or 0.0
+        begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         same = self.segment_at(begin_ns) == self.segment_at(end_ns)
         recorded = np.where(same, self.distance_at(end_ns) - self.distance_at(begin_ns), np.nan)
         moving_s = np.abs(self.moving_s_at(end_ns) - self.moving_s_at(begin_ns))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import StreamCounts
+from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, VehicleFigures
@@ -25,10 +26,9 @@ _TIMES_S = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    empty = SolutionResults(
-        "primary", frame, passages(), hazards(), alarms(), failures(), evidence=Evidence.REFERENCE,
-        vehicle=VehicleFigures.FILE,
-    )  # fmt: skip
+    nothing = Judged(hazards(), alarms(), passages(), failures(), pl.DataFrame(), None, Evidence.REFERENCE)
+    given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
+    empty = SolutionResults("primary", frame, replace(nothing, **given), vehicle=VehicleFigures.FILE)
     return replace(empty, **fields)
 
 
