@@ -209,6 +209,9 @@ class MatchingConfig(Settings):
     table_sigma_doubt: Annotated[Number, Field(ge=1)] = 3.0
     # DOMAIN section 2: a probability of 0.99 has to be right in 99 of 100 runs.
     ambiguity_probability: Probability = 0.99
+    # So many net elements before and after the one in question are the same way, not another: positions about a link
+    # lie on either side of it, and elements may be shorter than positions scatter.
+    same_way_elements: Annotated[int, Field(ge=0)] = 2
     # Where tracks part or cross they are beside each other for less: that is told of no site.
     parallel_least_m: NonNegative = 100.0
     # Noise of 0.35 m/s across the track at the slowest speed that counts.
@@ -240,6 +243,9 @@ class MatchingConfig(Settings):
     # Reflections follow no error model: one of them must not decide the track.
     outlier_probability: Probability = 1e-4
     outlier_scale_m: Positive = 10.0
+    # An error returns towards the bias, as Gauss-Markov errors do; one farther outside its sigma follows no such law,
+    # so that the return from so many sigmas is all that is expected of it.
+    return_sigmas: Positive = 3.0
     # Positions closer together give the same information on the path.
     step_distance_m: Positive = 10.0
     step_time_s: Positive = 10.0
@@ -252,6 +258,8 @@ class MatchingConfig(Settings):
     # than a break, and the search grows with them.
     detour_share: NonNegative = 0.5
     detour_m: Positive = 100.0
+    # Coordinates written down in finer steps add nothing: those drown in the noise of any receiver.
+    digits_least_m: NonNegative = 0.02
     # Rounding of surveys and positions; a table's sigma knows nothing of this receiver's noise.
     offset_floor_m: Positive = 0.02
     table_floor_m: Positive = 0.1

@@ -27,8 +27,6 @@ AMBIGUOUS_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "probability": pl.Float64,
     "told_by": pl.Enum(TOLD_BY),
 }
-# Elements of the path this many before or after the one in question are the same way, not another.
-_NEIGHBOURS = 2
 
 
 @dataclass(frozen=True)
@@ -101,9 +99,9 @@ def _on_path(trellis: Trellis, decoded: Decoded, step: Ints) -> Bools:
     """
     count = trellis.network.count
     keys, key = np.unique(np.column_stack([decoded.leg, decoded.number]), axis=0, return_inverse=True)
-    allowed = np.concatenate(
-        [index * count + _elements_about(decoded, *pair) for index, pair in enumerate(keys.tolist())]
-    )
+    around = trellis.config.same_way_elements
+    about = [elements_about(decoded, leg, number, around) for leg, number in keys.tolist()]
+    allowed = np.concatenate([index * count + elements for index, elements in enumerate(about)])
     element = trellis.oriented // 2
     own = np.isin(key[step] * count + element, allowed)
     for border in np.flatnonzero(np.diff(decoded.leg)).tolist():
@@ -113,10 +111,11 @@ def _on_path(trellis: Trellis, decoded: Decoded, step: Ints) -> Bools:
     return np.asarray(own)
 
 
-def _elements_about(decoded: Decoded, leg: int, number: int) -> Ints:
+def elements_about(decoded: Decoded, leg: int, number: int, around: int) -> Ints:
+    """The element of this number on a leg, and so many before and after it."""
     chain = decoded.chains[leg]
     here = number - chain.low
-    part = chain.oriented[max(0, here - _NEIGHBOURS) : here + _NEIGHBOURS + 1]
+    part = chain.oriented[max(0, here - around) : here + around + 1]
     return np.array(part, dtype=np.int64) // 2
 
 

@@ -113,25 +113,26 @@ def _kinds(fix: pl.Series) -> Ints:
     return fix.cast(pl.Enum(_KINDS)).to_physical().cast(pl.Int64).fill_null(len(_KINDS)).to_numpy()
 
 
-# Finer steps drown in the noise of any receiver; less than the other is rounding.
-_LEAST_STEP_M, _ROUNDED_M = 0.02, 1e-4
+# Numerics: less than this is rounding.
+_ROUNDED_M = 1e-4
 
 
-def digit_noise(fixes: pl.DataFrame, heading_deg: Floats) -> list[pl.Series]:
+def digit_noise(fixes: pl.DataFrame, heading_deg: Floats, least_m: float) -> list[pl.Series]:
     """Columns `digits_along_m`, `digits_cross_m`, `digits_up_m`: deviation by the steps of the recorded coordinates.
 
     Five decimals of a degree, NMEA of four decimals of a minute, or single precision move each position by up to half a
     step, the next one by something else: at 10 Hz metres per second. Only the digits are looked at, so no fault of the
     position can pass for it.
 
-    `fixes`: those of one solution, row for row with `heading_deg`, the direction of growing path.
+    `fixes`: those of one solution, row for row with `heading_deg`, the direction of growing path. `least_m`: finer
+    steps count for nothing.
     """
     latitude = floats(fixes, "latitude_deg")
     known = latitude[np.isfinite(latitude)]
     north_per_deg = np.radians(1.0) * MEAN_RADIUS_M
     east_per_deg = north_per_deg * np.cos(np.radians(known.mean())) if known.size else north_per_deg
     north, east, up = (
-        step_m(values[np.isfinite(values)], scale) / np.sqrt(12.0)
+        step_m(values[np.isfinite(values)], scale, least_m) / np.sqrt(12.0)
         for values, scale in (
             (latitude, north_per_deg),
             (floats(fixes, "longitude_deg"), east_per_deg),
@@ -148,8 +149,8 @@ def digit_noise(fixes: pl.DataFrame, heading_deg: Floats) -> list[pl.Series]:
     ]
 
 
-def step_m(values: Floats, metres: float) -> float:
-    """The step of a recorded coordinate [m], 0 where there is none to speak of; `metres`: of one unit of it."""
+def step_m(values: Floats, metres: float, least_m: float) -> float:
+    """The step of a recorded coordinate [m], 0 where there is none of `least_m`; `metres`: of one unit of it."""
     changes = np.diff(values)
     # At speed the changes themselves are many steps each, but the change of the change is one at times.
-    return metres * step_of(changes, np.diff(changes), _LEAST_STEP_M / metres, _ROUNDED_M / metres)
+    return metres * step_of(changes, np.diff(changes), least_m / metres, _ROUNDED_M / metres)

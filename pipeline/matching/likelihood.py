@@ -106,6 +106,7 @@ class Likelihood:
     direct: Floats
     outlier: float
     outlier_scale_m: float
+    return_sigmas: float
 
     def with_pins(self, ruled_out: Bools) -> Likelihood:
         """As before, and candidates ruled out by a balise read next to impossible."""
@@ -147,6 +148,7 @@ def likelihood_of(fixes: Fixes, steps: Steps, candidates: Candidates, config: Ma
         direct=direct,
         outlier=config.outlier_probability,
         outlier_scale_m=config.outlier_scale_m,
+        return_sigmas=config.return_sigmas,
     )
 
 
@@ -161,11 +163,11 @@ def step_score(before_m: Floats, offset_m: Floats, candidate: Ints, changes: Boo
     """Log-likelihood of states after those of the step before, per hypothesis: `[state, hypothesis]`.
 
     An error returns towards the bias; one far outside its sigma follows no such law, so no more than the return from
-    three sigma is expected of it, and what counts is how it moves.
+    `return_sigmas` is expected of it, and what counts is how it moves.
     """
     bias_m = like.hypotheses.bias_m
     before = before_m[:, None] - bias_m
-    usual = 3.0 * np.sqrt(like.variance_m2[candidate])
+    usual = like.return_sigmas * np.sqrt(like.variance_m2[candidate])
     mean = before - (1.0 - like.keep[candidate]) * np.clip(before, -usual, usual)
     fresh = like.fresh_m2[candidate] + np.where(changes, like.renewed_m2[candidate], 0.0)[:, None]
     density = log_density(offset_m[:, None] - bias_m, mean, fresh, like)

@@ -67,7 +67,7 @@ def match(
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
-    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg")))
+    epochs = epochs.with_columns(digit_noise(fixes, floats(epochs, "heading_deg"), config.digits_least_m))
     return Match(epochs, path, ambiguous, posterior, sign)
 
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.matching import match
+from pipeline.matching.decode import Chain, Decoded
+from pipeline.matching.doubt import elements_about
 from pipeline.matching.epochs import on_track_limit_m
 from pipeline.matching.fixes import contradictory_covariances
-from schemas.config import MatchingConfig
+from pipeline.matching.likelihood import step_score
+from schemas.config import FixSigma, MatchingConfig, Vehicle
+from tests.matching.builders import line, run, site
 
 
 @pytest.mark.parametrize(
@@ -35,3 +43,38 @@ def test_no_covariance_is_larger_than_its_variances_allow(
 ) -> None:
     frame = pl.DataFrame({"cov_ee_m2": [east_m2], "cov_en_m2": [both_m2], "cov_nn_m2": [north_m2]})
     assert contradictory_covariances(frame) == count
+
+
+@pytest.mark.parametrize(("around", "elements"), [(0, [3]), (1, [2, 3, 4]), (2, [1, 2, 3, 4, 5]), (9, [*range(6)])])
+def test_neighbours_on_the_path_are_the_same_way(around: int, elements: list[int]) -> None:
+    """Elements 0 to 5 in their own sense, of which the numbers begin at -2."""
+    chain = Chain(tuple(range(0, 12, 2)), -2)
+    nothing = np.zeros(0)
+    decoded = Decoded((chain,), nothing.astype(int), nothing.astype(int), nothing)
+    assert elements_about(decoded, 0, 1, around).tolist() == elements
+
+
+def test_how_many_neighbours_is_a_setting() -> None:
+    """At the link of two elements a position is on either of them."""
+    place = site({"a": line((0, 0), (500, 0)), "b": line((500, 0), (1000, 0))}, [("a", 1, "b", 0, "both")])
+    fixes = run(np.arange(100.0, 900.0, 10.0), np.zeros(80))
+    for around, sure in ((0, False), (1, True)):
+        config = MatchingConfig(same_way_elements=around)
+        found = match(fixes, None, place, Vehicle(), config, FixSigma())
+        assert (found.epochs["path_probability"].min() > 0.99) is sure
+
+
+@pytest.mark.parametrize(("sigmas", "expected_m"), [(3.0, 8.5), (2.0, 9.0), (20.0, 5.0)])
+def test_an_error_far_outside_its_sigma_returns_no_faster(sigmas: float, expected_m: float) -> None:
+    """10 m aside at a sigma of 1 m, of which a half stays: 1.5 m back from three sigmas, 5 m back from all of it."""
+    one = np.ones((1, 1))
+    like = SimpleNamespace(
+        hypotheses=SimpleNamespace(bias_m=np.zeros(1)), variance_m2=one, fresh_m2=0.1 * one, keep=0.5 * one,
+        renewed_m2=np.zeros(1), fixed=np.zeros(1), outlier=1e-9, outlier_scale_m=10.0, return_sigmas=sigmas,
+    )  # fmt: skip
+    at_m = np.arange(0.0, 12.0, 0.5)
+    score = [
+        step_score(np.array([10.0]), np.array([m]), np.zeros(1, dtype=int), np.zeros(1, bool), cast(Any, like))[0, 0]
+        for m in at_m
+    ]
+    assert at_m[int(np.argmax(score))] == expected_m
