@@ -171,7 +171,7 @@ def _onset_ns(
 
 def _named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
     """Begin of the fault that a `faults` stream names: the last one before the onset as seen, else the first after."""
-    if faults is None or faults.is_empty():
+    if faults is None:
         return None
     of_gnss = ~pl.col("target").str.contains(_ODOMETER)
     begin, end = (pl.col(name).dt.timestamp("ns") for name in ("t_start", "t_end"))

@@ -87,20 +87,24 @@ def _epochs(bench: Bench, spans: Sequence[tuple[int, int]], across: tuple[Floats
     config, judged, (moving, sure) = bench.config, bench.judged, bench.moving
     suspect = within_spans(bench.t_ns, spans) & bench.epochs["tvb"].fill_null(value=False).to_numpy()
     known = np.isfinite(bench.path_m)
-    return pl.DataFrame(
-        [
-            pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
-            pl.Series("error_low_m", np.where(known, judged.low_m, np.nan), nan_to_null=True),
-            pl.Series("error_high_m", np.where(known, judged.high_m, np.nan), nan_to_null=True),
-            pl.Series("error_cross_m", across[0], nan_to_null=True),
-            pl.Series("error_up_m", across[1], nan_to_null=True),
+    errors = {
+        "error_along_m": judged.known_m(config.hazards.known_error_m),
+        "error_low_m": np.where(known, judged.low_m, np.nan),
+        "error_high_m": np.where(known, judged.high_m, np.nan),
+        "error_cross_m": across[0],
+        "error_up_m": across[1],
+    }
+    return (
+        pl.DataFrame(errors)
+        .fill_nan(None)
+        .with_columns(
             judgement_words(judged.code),
             pl.Series("in_use", bench.used_s > 0.0),
             pl.Series("direction", bench.positions.direction, dtype=pl.Int8),
             lds_states(bench.epochs, judged, bench.odometer_wrong),
             pl.Series("suspect_after_the_fact", suspect),
-            pl.select(pl.when(pl.Series(sure)).then(pl.Series(moving)).alias("moving")).to_series(),
-        ]
+            moving=pl.when(pl.Series(sure)).then(pl.Series(moving)),
+        )
     )
 
 

@@ -122,8 +122,6 @@ def judge_positions(
     for alternative in evidence.alternatives:
         kept = positions.known[alternative.rows]
         rows = alternative.rows[kept]
-        if rows.size == 0:
-            continue
         found = _relative(positions, rows, _only(alternative, kept), legs)
         excluded = found.off_track & positions.unambiguous[rows]
         with np.errstate(invalid="ignore"):

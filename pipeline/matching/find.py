@@ -98,9 +98,7 @@ def _pins(steps: Steps, pinned: Ints, candidates: Candidates) -> Bools:
     wanted = np.full(len(steps), -1, dtype=np.int64)
     wanted[np.minimum(index, len(steps) - 1)] = pinned[pinned >= 0]
     proved = wanted[candidates.step]
-    here = np.zeros(len(steps), dtype=bool)
-    here[candidates.step[candidates.element == proved]] = True
-    return np.asarray((proved >= 0) & here[candidates.step] & (candidates.element != proved))
+    return np.asarray((proved >= 0) & (candidates.element != proved))
 
 
 def _assign(fixes: Fixes, steps: Steps, decoded: Decoded, at_m: Floats, doubt: Doubt) -> Assignment:

@@ -9,12 +9,21 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.evidence.evidence import KINDS, Alternative, EvidenceSet
+from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.episodes import Episode, _failure, _is_back
 from pipeline.judge.hazards import _instants, drafts_of, within_budget
 from pipeline.judge.judge import errors_across
-from pipeline.judge.judgement import RIGHT, UNKNOWN, WRONG, Judgements, margins_m
+from pipeline.judge.judgement import (
+    RIGHT,
+    UNKNOWN,
+    WRONG,
+    Judgements,
+    Positions,
+    judge_positions,
+    margins_m,
+    with_own_anchors,
+)
 from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.states import odometer_beyond_confidence
@@ -257,3 +266,45 @@ def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
     series = SimpleNamespace(judged=SimpleNamespace(code=np.array(codes)), t_ns=seconds(*(0.5 * np.arange(8))))
     jump = None if step is None else SimpleNamespace(first=step[0], last=step[1])
     assert _failure(cast(Any, series), 2, 8, cast(Any, jump), HazardConfig()) == failure
+
+
+def placed(path_m: list[float], direction: int = 1, element: int = 0) -> Positions:
+    """Positions on one element, whose measure is the path position."""
+    at_m, size = np.array(path_m), len(path_m)
+    of_element = np.where(np.isnan(at_m), -1, element)
+    leg = np.zeros(size, dtype=np.int64)
+    return Positions(of_element, at_m, leg, at_m, np.full(size, direction), np.ones(size, dtype=bool))
+
+
+def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
+    """On element 0 the train is at 50 m; at 2 s it is there or at 90 m, and at 3 s the position is not known."""
+    route = Route(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
+    told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
+        ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
+    none = np.zeros(0, dtype=np.int64)
+    evidence = EvidenceSet(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told), none, none)
+    found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
+    assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
+    assert found.low_m == pytest.approx([-1.0, 29.0, -41.0, np.nan], nan_ok=True)
+    assert found.high_m == pytest.approx([1.0, 31.0, 1.0, np.nan], nan_ok=True)
+    assert found.kind.tolist() == [KINDS.index(Evidence.BALISE)] * 3 + [NOTHING]
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_the_odometer_since_a_balise_shows_only_what_was_wrong(direction: int) -> None:
+    """20 m is the limit: 15 to 25 m off is unknown, 21 to 31 m wrong; nothing without a position, interval or need."""
+    positions = placed([115.0, 121.0, 121.0, np.nan, 121.0, 79.0], direction)
+    nothing, balise = NOTHING, KINDS.index(Evidence.BALISE)
+    before = np.array([nothing, nothing, balise, nothing, nothing, nothing])
+    unknown = np.full(6, np.nan)
+    judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, np.zeros(6, dtype=bool))
+    low_m = np.array([90.0, 90.0, 90.0, 90.0, np.nan, 100.0])
+    found = with_own_anchors(judged, positions, (low_m, low_m + 10.0), HazardConfig())
+    assert found.code.tolist() == [UNKNOWN, WRONG, UNKNOWN, UNKNOWN, UNKNOWN, WRONG]
+    odometer = KINDS.index(Evidence.ODOMETER)
+    assert found.kind.tolist() == [odometer, odometer, balise, nothing, nothing, odometer]
+    low, high = (15.0, 21.0, -31.0), (25.0, 31.0, -21.0)
+    if direction < 0:
+        low, high = (-25.0, -31.0, 21.0), (-15.0, -21.0, 31.0)
+    assert found.low_m[[0, 1, 5]].tolist() == list(low)
+    assert found.high_m[[0, 1, 5]].tolist() == list(high)

@@ -15,6 +15,8 @@ from pipeline.matching.doubt import elements_about
 from pipeline.matching.epochs import on_track_limit_m
 from pipeline.matching.fixes import contradictory_covariances
 from pipeline.matching.likelihood import step_score
+from pipeline.matching.steps import spaced
+from pipeline.track.geodesy import points_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.matching.builders import line, run, site
 
@@ -78,3 +80,14 @@ def test_an_error_far_outside_its_sigma_returns_no_faster(sigmas: float, expecte
         for m in at_m
     ]
     assert at_m[int(np.argmax(score))] == expected_m
+
+
+def test_steps_are_a_distance_or_a_time_apart() -> None:
+    """4 m each second for 6 s, then a stand to 30 s: every 10 m, every 10 s, and the last; the fifth is left out."""
+    t_s = np.array([*range(7), *range(8, 31, 2)], dtype=float)
+    points = points_of(np.zeros(len(t_s)), np.degrees(np.minimum(4.0 * t_s, 24.0) / 6378137.0))
+    rows = np.delete(np.arange(len(t_s)), 5)
+    fixes = SimpleNamespace(points=points, t_s=t_s)
+    found = spaced(cast(Any, fixes), rows, MatchingConfig(step_distance_m=10.0, step_time_s=10.0))
+    assert t_s[found].tolist() == [0.0, 3.0, 6.0, 10.0, 20.0, 30.0]
+    assert t_s[spaced(cast(Any, fixes), rows[:-1], MatchingConfig(step_time_s=100.0))].tolist() == [0.0, 3.0, 6.0, 28.0]
