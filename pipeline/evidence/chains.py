@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,41 +64,31 @@ def extended(network: Network, chain: Chain, least_m: float, most_m: float, most
 
     Where the track ends before, it ends. None where there are more than `most` chains.
     """
-    ahead = _grown(network, [chain], most_m, _onward, most)
-    return None if ahead is None else _grown(network, ahead, least_m, _before, most)
-
-
-_Step = Callable[[Network, Chain, float], Iterator[Chain]]
-
-
-def _grown(network: Network, chains: list[Chain], until_m: float, step: _Step, most: int) -> list[Chain] | None:
     done: list[Chain] = []
-    growing = list(chains)
+    growing = [chain]
     while growing:
         chain = growing.pop()
-        further = list(step(network, chain, until_m))
-        if further:
-            growing += further
-        else:
-            done.append(chain)
+        further = _onward(network, chain, most_m) or _before(network, chain, least_m)
+        growing += further
+        done += [] if further else [chain]
         if len(done) + len(growing) > most:
             return None
     return done
 
 
-def _onward(network: Network, chain: Chain, until_m: float) -> Iterator[Chain]:
+def _onward(network: Network, chain: Chain, until_m: float) -> list[Chain]:
     exit_m = chain.entry_m[-1] + network.length_m(chain.oriented[-1])
-    if exit_m < until_m:
-        for edge in _runnable(network.successors[chain.oriented[-1]]):
-            yield Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m))
+    edges = _runnable(network.successors[chain.oriented[-1]]) if exit_m < until_m else []
+    return [Chain((*chain.oriented, edge.to), (*chain.entry_m, exit_m + edge.gap_m)) for edge in edges]
 
 
-def _before(network: Network, chain: Chain, until_m: float) -> Iterator[Chain]:
+def _before(network: Network, chain: Chain, until_m: float) -> list[Chain]:
     entry_m = chain.entry_m[0]
-    if entry_m > until_m:
-        for edge in _runnable(network.successors[chain.oriented[0] ^ 1]):
-            here = edge.to ^ 1
-            yield Chain((here, *chain.oriented), (entry_m - edge.gap_m - network.length_m(here), *chain.entry_m))
+    edges = _runnable(network.successors[chain.oriented[0] ^ 1]) if entry_m > until_m else []
+    return [
+        Chain((edge.to ^ 1, *chain.oriented), (entry_m - edge.gap_m - network.length_m(edge.to), *chain.entry_m))
+        for edge in edges
+    ]
 
 
 def _runnable(edges: list[Edge]) -> list[Edge]:

@@ -14,7 +14,7 @@ from pipeline.matching.search import Found
 from pipeline.matching.trellis import Trellis
 from pipeline.track.network import Network
 from pipeline.track.path import TravelledPath
-from schemas.arrays import Bools, Floats, Ints, spans_of
+from schemas.arrays import Bools, Floats, Ints, ints, spans_of
 from schemas.config import MatchingConfig
 
 # What ended a stretch of doubt: a balise read, a switch taken, positions (tracks that part, offsets), or nothing.
@@ -150,29 +150,16 @@ def rivals_of(
     posterior: Posterior, epochs: pl.DataFrame, path: TravelledPath, index: dict[str, int], limit: float
 ) -> tuple[Ints, Ints]:
     """Pairs of epoch and net element (numbers by `index`): of at least `limit` at the steps about it, and its own."""
-    names = epochs["netelement_id"].replace_strict(index, default=None, return_dtype=pl.Int64)
-    rows = np.flatnonzero(names.is_not_null().to_numpy())
-    pairs = [np.column_stack([rows, names.drop_nulls().to_numpy()])]
+    own = epochs["netelement_id"].replace_strict(index, default=None, return_dtype=pl.Int64)
     number = np.array([index[name] for name in path.track.ids], dtype=np.int64)
-    pairs += [_at_steps(posterior, number, side, limit) for side in _sides(posterior, epochs.height)]
-    keys = np.unique(np.concatenate(pairs) @ np.array([len(index), 1]))
-    return keys // len(index), keys % len(index)
-
-
-def _sides(posterior: Posterior, epochs: int) -> tuple[Ints, Ints]:
-    """Per epoch the step at or before it, and the step at or after it."""
-    row, last = np.arange(epochs), len(posterior.epoch) - 1
+    likely = np.flatnonzero(posterior.probability >= limit)
+    step = np.searchsorted(posterior.first, likely, side="right") - 1
+    elements = pl.DataFrame({"step": step, "element": number[posterior.element[likely]]})
+    row = np.arange(epochs.height)
     before = np.searchsorted(posterior.epoch, row, side="right") - 1
     after = np.searchsorted(posterior.epoch, row, side="left")
-    return np.maximum(before, 0), np.minimum(after, last)
-
-
-def _at_steps(posterior: Posterior, number: Ints, step: Ints, limit: float) -> Ints:
-    """Pairs of epoch and element number, of those that reach the limit at each epoch's step."""
-    kept = posterior.probability >= limit
-    first = np.concatenate([[0], np.cumsum(kept)])[posterior.first]
-    element = number[posterior.element[kept]]
-    count = np.diff(first)[step]
-    row = np.repeat(np.arange(len(step)), count)
-    inside = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-    return np.column_stack([row, element[first[step][row] + inside]])
+    about = [np.maximum(before, 0), np.minimum(after, len(posterior.epoch) - 1)]
+    pairs = [pl.DataFrame({"row": row, "step": side}).join(elements, on="step").drop("step") for side in about]
+    pairs.append(pl.DataFrame({"row": row, "element": own}).drop_nulls())
+    found = pl.concat(pairs).unique().sort("row", "element")
+    return ints(found["row"]), ints(found["element"])

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.judge.alarms import verdict_within
+from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, _failure, _is_back
 from pipeline.judge.hazards import _instants, drafts_of, within_budget
 from pipeline.judge.judge import errors_across
@@ -26,7 +27,7 @@ from pipeline.judge.judgement import (
 )
 from pipeline.judge.jumps import Jump
 from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.states import odometer_beyond_confidence
+from pipeline.judge.states import in_use_s, odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
 from pipeline.track.path import Place, Route
 from schemas.config import Configuration, HazardConfig, LdsConfig
@@ -308,3 +309,37 @@ def test_the_odometer_since_a_balise_shows_only_what_was_wrong(direction: int) -
         low, high = (-25.0, -31.0, 21.0), (-15.0, -21.0, 31.0)
     assert found.low_m[[0, 1, 5]].tolist() == list(low)
     assert found.high_m[[0, 1, 5]].tolist() == list(high)
+
+
+def test_a_position_is_in_use_since_the_one_before_it_until_it_is_negated() -> None:
+    """At 1 Hz with a gap of 5 s; the alarm at 9 s takes one epoch to negate, until 12 s; the last is not confident."""
+    t_s = [0, 1, 2, 7, 8, 9, 10, 11, 12, 13]
+    stamps = pl.Series("t", np.array(t_s) * NS, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
+    epochs = pl.DataFrame(
+        {
+            "t": stamps, "path_m": [10.0 * t for t in t_s], "on_track": True, "gate_probability": 1.0,
+            "confidence_m": [5.0] * 9 + [500.0], "negated": [t in (9, 10, 11) for t in t_s],
+        }
+    )  # fmt: skip
+    # Each second counts for the position at its end; of the gap 1.5 s, as long as a movement is interpolated over.
+    expected = [1.0, 1.0, 1.0, 1.5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    assert in_use_s(epochs, Configuration()).tolist() == expected
+    assert in_use_s(epochs.head(1), Configuration()).tolist() == [0.0]
+
+
+def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> None:
+    """Places each 0.5 s, known to 0.1 m: 0.4 m in a second are less than 0.3 m and both noises, 0.6 m are more."""
+    at_m = np.array([0.0, 0.2, 0.4, 0.8, 1.2, 1.6, np.nan, np.nan, np.nan, np.nan])
+    bench = SimpleNamespace(
+        at_ns=seconds(*(0.5 * np.arange(10))),
+        by_reference_m=at_m,
+        judged=SimpleNamespace(half_m=np.full(10, 0.1)),
+        odometer_moves=np.array([True] * 8 + [False] * 2),
+        odometer_told=np.array([False] * 6 + [True] * 3 + [False]),
+        stood=[(round(3.5 * NS), 4 * NS)],
+        config=Configuration(),
+    )
+    moves, sure = cast(Any, Bench.moving).func(bench)
+    # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
+    assert sure.tolist() == [True, True, True, True, False, False, True, False, True, True]
+    assert moves[sure].tolist() == [False, True, True, True, True, False, False]
