@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.matching.moves import Move, best_moves
-from pipeline.matching.trellis import Trellis
+from pipeline.matching.trellis import Move, Trellis, best_moves
 from pipeline.track.leg import Leg, Visit, leg_of, segments_at, shifted
 from pipeline.track.network import Network
 from schemas.arrays import Floats, Ints

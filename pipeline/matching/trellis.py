@@ -1,16 +1,16 @@
-"""Candidates of all steps as states, and the transitions between them."""
+"""Candidates of all steps as states, how a train may get from one to another, and how plausible that is."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.matching.candidates import Candidates
 from pipeline.matching.likelihood import Likelihood, initial_score, step_score
-from pipeline.matching.moves import Ways, distance_scores, move_scores
 from pipeline.matching.steps import Steps
 from pipeline.track.network import Network
 from schemas.arrays import Bools, Floats, Ints
@@ -150,3 +150,90 @@ def _polarity(steps: Steps, first: Ints, oriented: Ints, place_m: Floats, offset
     same = oriented[nearest[1:]] == oriented[nearest[:-1]]
     product = np.diff(place_m[nearest]) * steps.odometer_m[1:]
     return int(np.sign(np.nansum(np.sign(product[same]) * np.abs(steps.odometer_m[1:][same]))))
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How far each step is thought to have led [m]: signed along the path where `signed`, else its size.
+
+    `limit_m` is how far to search the network for it.
+    """
+
+    distance_m: Floats
+    signed: Bools
+    limit_m: Floats
+
+    def take(self, rows: Ints) -> Ways:
+        """Some of the steps, or one of them several times."""
+        return Ways(self.distance_m[rows], self.signed[rows], self.limit_m[rows])
+
+
+class Move(NamedTuple):
+    """The elements between two places, and how the first is left.
+
+    `sense`: +1 ahead, -1 behind, 0 not at all.
+    """
+
+    between: tuple[int, ...]
+    sense: int
+
+
+def move_scores(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, ways: Ways, config: MatchingConfig
+) -> Floats:
+    """Log-probability of each move between pairs of places, -inf where there is none: `[sense, pair]`.
+
+    Rows: on the element, ahead, behind. Places are oriented elements and metres from their entries.
+    """
+    ahead_m, ahead_barred, behind_m, behind_barred = _network_distances(network, one, other, ways.limit_m)
+    length = network.track.length_m
+    left_m, other_left_m = length[one // 2] - one_m, length[other // 2] - other_m
+    stay = np.where(one == other, distance_scores(other_m - one_m, ways, config), -np.inf)
+    ahead = distance_scores(left_m + ahead_m + other_m, ways, config) - config.barred_cost * ahead_barred
+    behind = distance_scores(-(one_m + behind_m + other_left_m), ways, config) - config.barred_cost * behind_barred
+    ahead[~np.isfinite(ahead_m)] = behind[~np.isfinite(behind_m)] = -np.inf
+    return np.stack([stay, ahead, behind])
+
+
+def distance_scores(displacement_m: Floats, ways: Ways, config: MatchingConfig) -> Floats:
+    """Exponential in the difference of distances (Newson & Krumm 2009, eq. 2), limited."""
+    plain = np.abs(np.abs(displacement_m) - np.abs(ways.distance_m))
+    mismatch = np.where(ways.signed, np.abs(displacement_m - ways.distance_m), plain)
+    scale = config.transition_scale_m + config.transition_share * np.abs(ways.distance_m)
+    return np.asarray(-np.minimum(mismatch / scale, config.mismatch_limit))
+
+
+def best_moves(
+    network: Network, one: Ints, one_m: Floats, other: Ints, other_m: Floats, ways: Ways, config: MatchingConfig
+) -> list[Move | None]:
+    """The most plausible move of each pair of places, none where the network has none."""
+    scores = move_scores(network, one, one_m, other, other_m, ways, config)
+    chosen = np.where(np.isfinite(scores.max(axis=0)), scores.argmax(axis=0), -1)
+    rows = zip(chosen.tolist(), one.tolist(), other.tolist(), ways.limit_m.tolist(), strict=True)
+    return [_move(network, *row) for row in rows]
+
+
+def _move(network: Network, chosen: int, one: int, other: int, limit_m: float) -> Move | None:
+    """The move of a row of `move_scores`, -1 for none."""
+    if chosen <= 0:
+        return None if chosen else Move((), 0)
+    if chosen == 1:
+        return Move(network.reach(one, limit_m)[other].between, 1)
+    return Move(network.reach(other, limit_m)[one].between[::-1], -1)
+
+
+def _network_distances(network: Network, one: Ints, other: Ints, limit_m: Floats) -> tuple[Floats, ...]:
+    """From exit to entry, ahead and behind, with the relations not navigable that way; inf where none leads."""
+    pairs, inverse = np.unique(one * len(network.successors) + other, return_inverse=True)
+    limit = np.zeros(len(pairs))
+    np.maximum.at(limit, inverse, limit_m)
+    table = np.full((4, len(pairs)), np.inf)
+    for index, (pair, far) in enumerate(zip(pairs.tolist(), limit.tolist(), strict=True)):
+        here, there = divmod(pair, len(network.successors))
+        ahead = network.reach(here, far).get(there)
+        if ahead is not None:
+            table[:2, index] = ahead.distance_m, ahead.barred_forward
+        behind = network.reach(there, far).get(here)
+        if behind is not None:
+            table[2:, index] = behind.distance_m, behind.barred_backward
+    return tuple(table[:, inverse])
