@@ -247,7 +247,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         context.vehicle,
         context.odometry,
         fit,
-        context.evidence.disputed,
+        context.evidence,
         context.config,
     )
     return SolutionResults(

@@ -246,7 +246,7 @@ class Runs(dy.Schema):
     duration_s = real("s", "last minus first epoch", min=0)
     distance_m = real("m", "distance travelled", min=0)
     epochs = count("GNSS epochs")
-    gnss_rate_hz = real("Hz", "nominal rate of the GNSS", min=0)
+    gnss_rate_hz = real("Hz", "nominal rate of the positions; null for fewer than two", min=0)
     availability = real("1", "share of moving time with a valid TVB", min=0, max=1)
     outages = count("stretches without a usable position")
     longest_outage_s = real("s", "longest of them", min=0)

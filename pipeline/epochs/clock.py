@@ -17,7 +17,7 @@ from schemas.config import Configuration, LdsConfig
 
 @dataclass(frozen=True)
 class Clock:
-    """The epochs' times and how long the state of each holds."""
+    """The epochs' times and how long the state of each holds; `period_s`: from one position to the next."""
 
     t_ns: Ints
     period_s: float | None
@@ -27,7 +27,7 @@ class Clock:
     @classmethod
     def of(cls, epochs: pl.DataFrame, config: Configuration) -> Clock:
         t_ns = times_ns(epochs)
-        period_s = nominal_period_s(t_ns)
+        period_s = nominal_period_s(position_ns(epochs))
         limit_s = gap_limit_s(period_s, config.align.gap_reset_s)
         return cls(t_ns, period_s, limit_s, held_s(t_ns, limit_s))
 
@@ -82,6 +82,11 @@ class Uptime:
 def nominal_period_s(t_ns: Ints) -> float | None:
     """Median distance of consecutive epochs [s]; None for fewer than two."""
     return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else None
+
+
+def position_ns(epochs: pl.DataFrame) -> Ints:
+    """Times of the epochs with a position: a logger may write others between them, which say nothing."""
+    return times_ns(epochs.filter(pl.col("path_m").is_not_null()))
 
 
 def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:

@@ -95,7 +95,8 @@ def _on_own_way(legs: tuple[Route, ...], leg: Ints, sample: Ints, element: Ints)
     """The net element is one that the sample's own leg runs over, sooner or later: no other track."""
     near = np.zeros(sample.size, dtype=np.bool_)
     for number, route in enumerate(legs):
-        rows = np.flatnonzero((sample >= 0) & (leg[sample] == number))
+        rows = np.flatnonzero(sample >= 0)
+        rows = rows[leg[sample[rows]] == number]
         near[rows] = np.isin(element[rows], route.element)
     return near
 

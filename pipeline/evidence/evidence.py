@@ -18,7 +18,7 @@ from pipeline.evidence.anchors import (
     read_anchors,
 )
 from pipeline.evidence.carrying import Interval, between_anchors, carried, closes
-from pipeline.evidence.gaps import Gap, Way, gaps_of
+from pipeline.evidence.gaps import Gap, Way, gaps_of, unreachable
 from pipeline.odometry import Odometry
 from pipeline.track.network import Network
 from pipeline.track.path import Route
@@ -59,7 +59,8 @@ class EvidenceSet:
 class Evidence:
     """All evidence of a run; `contradicted`: gaps that the odometer of a vehicle file does not close.
 
-    `unknown`: times at which nobody knows, because the reference lay nowhere, or reads contradict it (`disputed`).
+    `unknown`: times at which nobody knows, because the reference lay nowhere, or reads contradict it (`disputed`);
+    `unreachable`: gaps between anchors that no train can have passed one after the other.
     """
 
     reference: ReferencePlaces | None
@@ -71,6 +72,7 @@ class Evidence:
     contradicted: int
     unknown: tuple[Span, ...]
     disputed: int
+    unreachable: int
 
     def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
         """Evidence at these instants.
@@ -199,13 +201,22 @@ def evidence_of(
         gaps = gaps_of(borders, facing, odometer, network, config)
     contradicted = sum(_contradicts(gap, odometer, config) for gap in gaps)
     return Evidence(
-        reference, tuple(covered), tuple(gaps), odometer, network, config, contradicted, tuple(unknown), disputed
+        reference,
+        tuple(covered),
+        tuple(gaps),
+        odometer,
+        network,
+        config,
+        contradicted,
+        tuple(unknown),
+        disputed,
+        len(unreachable(gaps)),
     )
 
 
 def _contradicts(gap: Gap, odometer: Odometry | None, config: Configuration) -> bool:
     """An odometer with the scale of a vehicle file that closes on none of the chains between two anchors."""
-    if gap.begin is None or gap.end is None or gap.ways is None or odometer is None or odometer.scale is None:
+    if gap.begin is None or gap.end is None or not gap.ways or odometer is None or odometer.scale is None:
         return False
     anchors = (gap.begin, gap.end)
     return not any(closes(odometer, anchors, way.at_m[1] - way.at_m[0], config) for way in gap.ways)

@@ -58,13 +58,14 @@ def gaps_of(
     for (_, a), (b, _) in pairwise(borders):
         found += _between(a, b, odometer, network, config)
     found.append(Gap(last.t_ns, max(odometer.end_ns, last.t_ns), last, None, []))
+    found = _without_disputed(found)
     sheets = _sheets(found, facing, network)
     return [_reaching(gap, sheets, odometer, network, config) for gap in found]
 
 
 def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, config: Configuration) -> list[Gap]:
     """Where the odometer lost distance in a gap, it is two halves that know nothing of each other."""
-    if b.t_ns <= a.t_ns:
+    if b.t_ns < a.t_ns:
         return []
     length_m = float(odometer.between(a.t_ns, np.array([b.t_ns])).distance_m[0])
     if np.isnan(length_m):
@@ -78,6 +79,22 @@ def _between(a: Anchor, b: Anchor, odometer: Odometry, network: Network, config:
             a, b, length_m, hazards.slip_m + hazards.slip_share * way_m, network, hazards.routes_limit
         )
     return [Gap(a.t_ns, b.t_ns, a, b, ways)]
+
+
+def unreachable(gaps: Sequence[Gap]) -> list[Gap]:
+    """Gaps whose anchors no train can have passed one after the other: one of both is not where it says."""
+    return [gap for gap in gaps if gap.begin is not None and gap.end is not None and gap.ways == []]
+
+
+def _without_disputed(gaps: list[Gap]) -> list[Gap]:
+    """Nothing is said of the gaps on either side of an unreachable one, for nobody knows which anchor is wrong."""
+    disputed = [anchor for gap in unreachable(gaps) for anchor in gap.anchors]
+    return [
+        gap
+        if (gap.ways == [] and len(gap.anchors) == 2) or not any(one in disputed for one in gap.anchors)
+        else replace(gap, ways=None)
+        for gap in gaps
+    ]
 
 
 def _ways_of_length(

@@ -11,6 +11,7 @@ import polars as pl
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED
 from pipeline.epochs.clock import Clock, confident, may_move, met, unambiguous
 from pipeline.epochs.verdicts import NO_ODOMETER
+from pipeline.evidence import Evidence as TrainEvidence
 from pipeline.ingest.clean import StreamCounts
 from pipeline.lds.relink import UNLINKED
 from pipeline.lds.run import LdsResult
@@ -64,12 +65,12 @@ def ride_notes(
     vehicle: Vehicle,
     odometry: Odometry | None,
     fit: Fit,
-    disputed: int,
+    evidence: TrainEvidence,
     config: Configuration,
 ) -> list[str]:
     """What went in, and what matching, alignment and the LDS made of it.
 
-    `counts`, `fixes`: the GNSS of this solution; `disputed`: reads that contradict the reference (DOMAIN section 5.1).
+    `counts`, `fixes`: the GNSS of this solution; `evidence`: what is known of where the train was.
     """
     off_the_track = [item.place.removeprefix(BALISE_PLACE) for item in site.findings if item.severity == "error"]
     telegrams = sorted(set(lds.unknown_reads["balise_id"].to_list()))
@@ -98,7 +99,11 @@ def ride_notes(
             "telegrams read from balises that are not on the train's path: {}": ", ".join(telegrams),
             **_scatter(aligned, config),
             "balise reads contradict the reference {} times: the true position is unknown there. Check both clocks": (
-                disputed
+                evidence.disputed
+            ),
+            "no train can have come from one balise read (or end of the reference) to the next {} times: the true "
+            "position is unknown before, between and after them. Check the reads, and the links of the site": (
+                evidence.unreachable
             ),
         }
     )

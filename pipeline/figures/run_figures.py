@@ -11,6 +11,7 @@ from pipeline.epochs.clock import Clock, availability, may_move, met, outages_s,
 from pipeline.figures.bounds import CONTINUITY_S, UNKNOWN, Estimate, columns_of, continuity, poisson_rate
 from pipeline.figures.independent import missed_detection
 from pipeline.figures.verdict import LEVEL_LISTS, level_rows
+from schemas.arrays import Floats
 from schemas.config import Configuration
 from schemas.enums import (
     TRUTH,
@@ -55,10 +56,13 @@ def judged() -> pl.Expr:
     return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
 
 
-def share_unknown(epochs: pl.DataFrame, clock: Clock) -> float | None:
-    """Share of the moving time in use that the evidence cannot judge; None without any such time."""
-    used = met(epochs, pl.col("in_use") & may_move())
-    return share_of_time(clock.held_s[used], ~met(epochs, judged())[used])
+def share_unknown(epochs: pl.DataFrame, used_s: Floats) -> float | None:
+    """Share of the moving time in use that the evidence cannot judge; None without any such time.
+
+    `used_s`: for how long each epoch stands for a position in use.
+    """
+    moving = met(epochs, may_move())
+    return share_of_time(used_s[moving], ~met(epochs, judged())[moving])
 
 
 def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:

@@ -52,7 +52,7 @@ class SolutionResults:
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
     epochs, clock, judged = results.epochs, Clock.of(results.epochs, config), results.judged
-    unknown = figures.share_unknown(epochs, clock)
+    unknown = figures.share_unknown(epochs, judged.used_s)
     row = (
         _identity(results)
         | {"share_unknown": unknown, "notes": _notes(results, unknown, clock, config)}

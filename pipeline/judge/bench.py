@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.epochs.clock import crossing_gap_ns, met, unambiguous
+from pipeline.epochs.clock import crossing_gap_ns, met, position_ns, unambiguous
 from pipeline.evidence import Evidence as AllEvidence
 from pipeline.evidence.carrying import carried_forward
 from pipeline.evidence.evidence import KINDS, within_spans
@@ -101,6 +101,11 @@ class Bench:
     def t_ns(self) -> Ints:
         return times_ns(self.epochs)
 
+    @cached_property
+    def position_ns(self) -> Ints:
+        """Times of the epochs with a position."""
+        return position_ns(self.epochs)
+
     def instants(self, t_ns: Ints) -> Ints:
         """When positions of these stamps were true: less the latency of the vehicle file, 0 without one."""
         return t_ns - round((self.vehicle.gnss_latency_s or 0.0) * NS_PER_S)
@@ -141,12 +146,11 @@ class Bench:
     def positions(self) -> Positions:
         """The positions of all epochs.
 
-        Without an odometer the direction of travel is that of the train's own place, where the evidence tells it: a
-        position that jumps back does not turn the train.
+        The direction of travel is that of the train's own place where the reference tells it, and without an odometer
+        where any evidence does: a position that jumps back does not turn the train, and some odometers count up while
+        the train reverses.
         """
         told = self._positions(ints(self.epochs["direction"], 1))
-        if self.odometry is not None:
-            return told
         found = judge_positions(told, self.evidence.at(self.at_ns), self.legs, self.config.hazards)
         train_m = self.path_m - found.known_m(self.config.hazards.known_error_m) * told.direction
         ahead = np.searchsorted(self.t_ns, self.t_ns + round(self.config.hazards.turn_s * NS_PER_S)).clip(
@@ -158,7 +162,11 @@ class Bench:
         if sure.size == 0:
             return told
         last = np.maximum(np.searchsorted(sure, np.arange(self.t_ns.size), side="right") - 1, 0)
-        return self._positions(np.sign(came_m[sure]).astype(np.int64)[last])
+        by_evidence = np.sign(came_m[sure]).astype(np.int64)[last]
+        if self.odometry is None:
+            return self._positions(by_evidence)
+        by_reference = found.kind == KINDS.index(Evidence.REFERENCE)
+        return self._positions(np.where(by_reference, by_evidence, told.direction))
 
     def _positions(self, direction: Ints) -> Positions:
         epochs, index = self.epochs, self.evidence.network.track.index
@@ -296,8 +304,8 @@ class Bench:
 
     @cached_property
     def gap_ns(self) -> int:
-        """Longest time between epochs over which a movement is interpolated."""
-        return crossing_gap_ns(self.t_ns, self.config.lds)
+        """Longest time between positions over which a movement is interpolated."""
+        return crossing_gap_ns(self.position_ns, self.config.lds)
 
     @cached_property
     def moving(self) -> tuple[Bools, Bools]:

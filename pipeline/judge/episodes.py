@@ -98,8 +98,9 @@ def _episode(
     detected_ns, monitor, before = _detection(log, onset_ns, end_ns)
     failure = _failure(series, onset, end, step, config)
     known = failure is not None and (failure == 0 or series.judged.code[failure - 1] != UNKNOWN)
-    lasting = slice(onset, end)
-    code, used_s = series.judged.code[lasting], series.used_s[lasting]
+    # A position that takes a second to come back is wrong until then: the jump back belongs to the time in use.
+    back = slice(onset, end if jump_back is None else jump_back.last + 1)
+    code, used_s = series.judged.code[back], series.used_s[back]
     hazardous_s = float(used_s[code == WRONG].sum())
     may_s = hazardous_s + float(used_s[code == UNKNOWN].sum())
     return Episode(

@@ -243,7 +243,7 @@ def _instants(draft: Draft, bench: Bench) -> dict[str, Any]:
     hazard_ns = int(offers.t_ns[draft.hits[0]] if jump is None else series.t_ns[jump.first])
     number = int(offers.number[draft.hits[0]] if jump is None else jump.first)
     failure_ns = None if episode.failure is None else int(series.t_ns[episode.failure])
-    detected_ns, reaction = episode.detected_ns, reaction_s(bench.t_ns, bench.config)
+    detected_ns, reaction = episode.detected_ns, reaction_s(bench.position_ns, bench.config)
     known_failure = failure_ns if episode.failure_known else None
     return {
         "t_onset": episode.onset_ns,

@@ -28,7 +28,8 @@ from schemas.enums import Evidence
 class Judged:
     """Tables of one solution by the contract; `epochs_columns`: those of the judge, row for row with the epochs.
 
-    `failures`: as in `schemas.stages`; `distance_m`: way driven; `evidence`: what most epochs rest on.
+    `used_s`: for how long each epoch stands for a position in use; `failures`: as in `schemas.stages`;
+    `distance_m`: way driven; `evidence`: what most epochs rest on.
     """
 
     hazards: pl.DataFrame
@@ -36,6 +37,7 @@ class Judged:
     passages: pl.DataFrame
     failures: pl.DataFrame
     epochs_columns: pl.DataFrame
+    used_s: Floats
     distance_m: float | None
     evidence: Evidence | None
 
@@ -55,6 +57,7 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
         passages=passages_table(bench, drafts, *_train_passings(bench), spans),
         failures=failures_table(episodes, drafts, bench),
         epochs_columns=_epochs(bench, spans, across),
+        used_s=bench.used_s,
         distance_m=_distance_m(bench),
         evidence=_evidence(bench),
     )

@@ -49,29 +49,32 @@ def odometer_beyond_confidence(
     return beyond
 
 
-def reaction_s(t_ns: Ints, config: Configuration) -> float:
-    """From detection to negation [s]: as configured, else one epoch."""
+def reaction_s(position_ns: Ints, config: Configuration) -> float:
+    """From detection to negation [s]: as configured, else from one position to the next."""
     if config.hazards.reaction_s is not None:
         return config.hazards.reaction_s
-    return nominal_period_s(t_ns) or 0.0
+    return nominal_period_s(position_ns) or 0.0
 
 
 def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
-    """For how long each epoch stands for a position in use [s]: from the epoch before, for a fault may be that old.
+    """For how long each epoch stands for a position in use [s]: from the position before, for a fault may be that old.
 
-    At most max(1.5 periods, `crossing_gap_s`), the first epoch for one period; of a negated time only what comes
-    before the reaction.
+    At most max(1.5 periods, `crossing_gap_s`), the first position for one period; of a negated time only what comes
+    before the reaction. Epochs without a position stand for no time.
     """
-    t_ns = times_ns(epochs)
-    usable = met(epochs, trusted(config))
+    all_ns, known = times_ns(epochs), met(epochs, pl.col("path_m").is_not_null())
+    t_ns = all_ns[known]
     period_s = nominal_period_s(t_ns) or 0.0
-    end_s = (t_ns - t_ns[:1]) / NS_PER_S
-    begin_s = end_s - np.minimum(np.diff(end_s, prepend=-period_s), crossing_gap_ns(t_ns, config.lds) / NS_PER_S)
+    all_s, end_s = ((times - all_ns[:1]) / NS_PER_S for times in (all_ns, t_ns))
+    before_s = np.diff(end_s, prepend=end_s[:1] - period_s)
+    begin_s = end_s - np.minimum(before_s, crossing_gap_ns(t_ns, config.lds) / NS_PER_S)
     blocked = np.zeros(t_ns.size)
-    for from_s, until_s in _negated_spans(end_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
+    for from_s, until_s in _negated_spans(all_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
         blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)
-    held: Floats = np.clip(end_s - begin_s - blocked, 0.0, None)
-    return np.where(usable, held, 0.0)
+    held = np.zeros(all_ns.size)
+    held[known] = np.clip(end_s - begin_s - blocked, 0.0, None)
+    used: Floats = np.where(met(epochs, trusted(config)), held, 0.0)
+    return used
 
 
 def _negated_spans(t_s: Floats, negated: Bools, delay_s: float) -> list[tuple[float, float]]:

@@ -12,14 +12,14 @@ from itertools import combinations
 
 import polars as pl
 
-from pipeline.epochs.clock import Clock, held_s, may_move, met, nominal_period_s, trusted, uptime
+from pipeline.epochs.clock import Clock, held_s, may_move, met, nominal_period_s, position_ns, trusted, uptime
 from pipeline.epochs.failure_log import FailureLog, failure_log
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import judged as judged_epoch
 from pipeline.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.safety.fault_counts import Solution, fault_counts, faults_of_pair, verdict_of_both
 from pipeline.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
-from schemas.arrays import NS_PER_S, Bools, times_ns
+from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.tables import MONITORS, SCALES
@@ -132,7 +132,7 @@ def _composite(first: Solution, second: Solution, config: Configuration) -> Row:
 
 
 def _period_s(one: Solution) -> float:
-    return nominal_period_s(times_ns(one.epochs)) or 0.0
+    return nominal_period_s(position_ns(one.epochs)) or 0.0
 
 
 def _states(one: Solution, position: pl.Expr) -> pl.DataFrame:

@@ -26,7 +26,7 @@ _TIMES_S = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    nothing = Judged(hazards(), alarms(), passages(), failures(), pl.DataFrame(), None, Evidence.REFERENCE)
+    nothing = Judged(hazards(), alarms(), passages(), failures(), pl.DataFrame(), np.zeros(0), None, Evidence.REFERENCE)
     given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
     empty = SolutionResults("primary", frame, replace(nothing, **given), vehicle=VehicleFigures.FILE)
     return replace(empty, **fields)
