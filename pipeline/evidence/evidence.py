@@ -59,8 +59,7 @@ class EvidenceSet:
 class Evidence:
     """All evidence of a run; `contradicted`: gaps that the odometer of a vehicle file does not close.
 
-    `unknown`: times at which nobody knows, because the reference lay nowhere, or reads contradict it (`disputed`);
-    `unreachable`: gaps between anchors that no train can have passed one after the other.
+    `unknown`: times at which nobody knows, because the reference lay nowhere, or reads contradict it (`disputed`).
     """
 
     reference: ReferencePlaces | None
@@ -72,7 +71,11 @@ class Evidence:
     contradicted: int
     unknown: tuple[Span, ...]
     disputed: int
-    unreachable: int
+
+    @property
+    def unreachable(self) -> int:
+        """Pairs of anchors that no train can have passed one after the other."""
+        return len(unreachable(self.gaps))
 
     def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
         """Evidence at these instants.
@@ -201,16 +204,7 @@ def evidence_of(
         gaps = gaps_of(borders, facing, odometer, network, config)
     contradicted = sum(_contradicts(gap, odometer, config) for gap in gaps)
     return Evidence(
-        reference,
-        tuple(covered),
-        tuple(gaps),
-        odometer,
-        network,
-        config,
-        contradicted,
-        tuple(unknown),
-        disputed,
-        len(unreachable(gaps)),
+        reference, tuple(covered), tuple(gaps), odometer, network, config, contradicted, tuple(unknown), disputed
     )
 
 

@@ -102,7 +102,7 @@ def _solution(
 
 def _reactive(one: Solution, config: Configuration) -> _Channel:
     judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
-    epochs = one.epochs.drop("moving").hstack(_states(one, trusted(config)).drop("t"))
+    epochs = one.epochs.drop("moving", "path_m").hstack(_states(one, trusted(config)).drop("t"))
     return _channel(epochs, _DIAGNOSIS, judged, config)
 
 
@@ -141,6 +141,7 @@ def _states(one: Solution, position: pl.Expr) -> pl.DataFrame:
     return one.epochs.select(
         "t",
         "moving",
+        "path_m",
         trusted=position.fill_null(value=False),
         known=known.fill_null(value=False),
         wrong=(known & (pl.col("judgement") == Judgement.WRONG)).fill_null(value=False),

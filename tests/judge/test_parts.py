@@ -196,6 +196,7 @@ def test_the_times_of_a_hazard(known: bool, detected_s: float | None) -> None:
         series=series,
         offers=offers,
         t_ns=t_ns,
+        position_ns=t_ns,
         positions=SimpleNamespace(direction=np.full(10, -1), leg=np.zeros(10, dtype=np.int64)),
         judged=SimpleNamespace(middle_m=np.full(10, 25.0)),
         path_m=500.0 - 10.0 * np.arange(10),

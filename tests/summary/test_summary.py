@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given, settings
@@ -14,6 +15,7 @@ from pipeline.figures.summary import SolutionResults, failed_row, summarise
 from pipeline.ingest.clean import StreamCounts
 from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
+from schemas.arrays import flags, times_ns
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, VehicleFigures
 from schemas.run import IngestNotes
@@ -26,7 +28,8 @@ _TIMES_S = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    nothing = Judged(hazards(), alarms(), passages(), failures(), pl.DataFrame(), np.zeros(0), None, Evidence.REFERENCE)
+    used_s = np.where(flags(frame, "in_use"), np.diff(times_ns(frame), prepend=times_ns(frame)[:1]) / NS, 0.0)
+    nothing = Judged(hazards(), alarms(), passages(), failures(), pl.DataFrame(), used_s, None, Evidence.REFERENCE)
     given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
     empty = SolutionResults("primary", frame, replace(nothing, **given), vehicle=VehicleFigures.FILE)
     return replace(empty, **fields)
@@ -331,7 +334,7 @@ class TestFailures:
         assert row(epochs(seconds(3)))["level_verdict"] == ["no_failure"] * 4
         for evidence in (Evidence.ODOMETER, None):
             assert row(epochs(seconds(3)), evidence=evidence)["level_verdict"] == ["unknown"] * 4
-        judgement = ["unknown"] * 3 + ["right"] * 98
+        judgement = ["unknown"] * 4 + ["right"] * 97
         found = row(epochs(seconds(101), judgement=judgement), evidence=Evidence.BALISE)
         assert (found["share_unknown"], found["level_verdict"]) == (0.03, ["unknown"] * 4)
 
@@ -353,7 +356,7 @@ class TestVerdict:
         frame = epochs(
             seconds(101),
             judgement=judgement,
-            moving=[k >= 30 for k in range(101)],
+            moving=[30 <= k < 100 for k in range(101)],
             in_use=[not 30 <= k < 50 for k in range(101)],
         )
         found = row(frame, passages=passages(1, **ACCEPTED))
@@ -363,7 +366,7 @@ class TestVerdict:
         assert row(frame, lenient, passages=passages(1, **ACCEPTED))["verdict"] == "safe"
 
     def test_unknown_movement_counts_as_moving(self) -> None:
-        frame = epochs(seconds(5), judgement=["unknown", *["right"] * 4], moving=[None, *[True] * 4])
+        frame = epochs(seconds(5), judgement=["right", "unknown", *["right"] * 3], moving=[True, None, *[True] * 3])
         assert row(frame)["share_unknown"] == 0.25
 
 

@@ -1,0 +1,160 @@
+"""Wrong time in use, whatever the log looks like: rows without a position, thinned logs, slow jumps back.
+
+A straight track of 6 km, positions with an exact reference. What may be said follows from the errors put in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.stages import replay
+from schemas.config import Vehicle
+from schemas.inputs import BaliseReads, Balises, Gnss, Odometer, Reference
+from schemas.run import RunLog, RunTables, Site
+from tests.matching import builders
+from tests.matching.builders import line
+from tests.matching.ladder import degrees
+from tests.replay.test_shunting import stream
+
+RATE_HZ = 10.0
+TIME_S = np.arange(0.0, 140.0, 1.0 / RATE_HZ)
+WAY_M = 200.0 + 30.0 * np.clip(TIME_S - 5.0, 0.0, None)
+KNOWN = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.005)
+
+
+def balises(*rows: tuple[str, str, float, str]):
+    frame = pl.DataFrame(rows, schema=["balise_id", "netelement_id", "measure_m", "kind"], orient="row")
+    return Balises.validate(
+        frame.with_columns(location_accuracy_m=12.0, linked=True, link_reaction=pl.lit("service_brake")), cast=True
+    )
+
+
+SITE = Site(
+    builders.site({"a": line((0, 0), (6000, 0))}).track,
+    builders.site({"a": line((0, 0), (6000, 0))}).links,
+    balises=balises(*((f"V{km}", "a", 1000.0 * km, "virtual") for km in range(1, 6))),
+)
+
+
+def gnss(error_m, way_m=WAY_M):
+    noise_m = 0.2 * np.random.default_rng(5).standard_normal(way_m.size)
+    return stream(Gnss, builders.run(way_m + error_m + noise_m, np.zeros(way_m.size), RATE_HZ))
+
+
+def reference(keep=slice(None), aside_m: float = 0.0, way_m=WAY_M, sigma_m: float = 0.05):
+    latitude, longitude = degrees(way_m, np.full(way_m.size, aside_m))
+    frame = pl.DataFrame(
+        {"t": builders.times(way_m.size, RATE_HZ), "latitude_deg": latitude, "longitude_deg": longitude}
+    )
+    kept = np.zeros(way_m.size, dtype=bool)
+    kept[keep] = True
+    return stream(Reference, frame.with_columns(sigma_m=sigma_m).filter(pl.Series(kept)))
+
+
+def counted(distance_m):
+    return stream(Odometer, builders.odometer(distance_m, RATE_HZ))
+
+
+def row(tables: RunTables):
+    return tables.runs.row(0, named=True)
+
+
+def test_a_slow_jump_back_counts_as_time_in_use():
+    """100 m ahead at 54 s, back over 3 s: beyond 20 m for 2.4 s."""
+    back = 100.0 * np.where(TIME_S < 54.0, 0.0, np.clip(1.0 - (TIME_S - 54.0) / 3.0, 0.0, 1.0))
+    found = row(replay(RunLog("back", gnss(back), reference=reference()), SITE))
+    assert found["failure_hazardous_s"] == [pytest.approx(2.4, abs=0.11)]
+    assert (found["failures_within_budget"], found["verdict"]) == (0, "unsafe")
+
+
+@pytest.mark.parametrize("every", [5, 10])
+@pytest.mark.parametrize("driven", [True, False], ids=["odometer", "no_odometer"])
+def test_rows_without_a_position_change_no_time_in_use(every: int, driven: bool):
+    """30 m ahead from 55.45 to 59.55 s; the logger writes 10 rows a second, the receiver fewer positions."""
+    at_position = pl.Series(np.arange(TIME_S.size) % every == 0)
+    written = gnss(30.0 * ((TIME_S > 55.45) & (TIME_S < 59.55)))
+    places = [pl.when(at_position).then(pl.col(name)).alias(name) for name in ("latitude_deg", "longitude_deg")]
+    fix = pl.when(at_position).then(pl.col("fix").cast(pl.String)).otherwise(pl.lit("none"))
+    others = {"reference": reference(), "odometer": counted(WAY_M - 200.0) if driven else None}
+    logs = [
+        written.filter(at_position),
+        written.with_columns(places),
+        written.with_columns(fix=fix.cast(written["fix"].dtype)),
+    ]
+    names = ("verdict", "failures", "failures_within_budget", "failure_hazardous_s", "gnss_rate_hz")
+    left_out, *rows = ([row(replay(RunLog("r", log, **others), SITE))[name] for name in names] for log in logs)
+    assert rows == [left_out, left_out]
+    if not driven:
+        assert left_out[3][0] >= 4.0
+    assert left_out[4] == RATE_HZ / every
+
+
+@pytest.mark.parametrize("step", [9, 12, 20])
+def test_unknown_time_of_a_thinned_log_counts(step: int):
+    """After 60 s the reference ends and few positions are left, which drift away unseen."""
+    kept = pl.Series((TIME_S < 60.0) | (np.arange(TIME_S.size) % step == 0))
+    log = gnss(np.clip(TIME_S - 65.0, 0.0, 60.0)).filter(kept)
+    found = row(replay(RunLog("thin", log, reference=reference(slice(0, 600))), SITE))
+    assert found["share_unknown"] > 0.4
+    assert found["verdict"] == "unproven"
+
+
+@pytest.mark.parametrize("aside_m", [8.0, 12.0])
+def test_a_reference_beside_every_track_tells_nothing(aside_m: float):
+    log = RunLog("aside", gnss(np.zeros(TIME_S.size)), reference=reference(aside_m=aside_m, sigma_m=0.1))
+    tables = replay(log.with_streams(odometer=counted(WAY_M - 200.0)), SITE)
+    assert row(tables)["verdict"] == "unproven"
+    assert "right" not in tables.epochs["judgement"].cast(pl.String).to_list()
+
+
+def test_errors_are_signed_by_the_train_and_not_by_the_odometer():
+    """An odometer that counts up while the train reverses; from the turn on the position is 40 m ahead."""
+    speed = np.interp(np.arange(0.0, 200.0, 0.1), [0, 5, 45, 85, 100, 120, 160, 200], [0, 0, 20, 20, 0, 0, -15, -15])
+    way_m = 800.0 + np.cumsum(speed) / RATE_HZ
+    ahead = np.where(np.arange(way_m.size) < 1250, 0.0, -40.0)
+    log = RunLog("turns", gnss(ahead, way_m), reference=reference(way_m=way_m))
+    wrong = [
+        replay(
+            log.with_streams(odometer=counted(np.cumsum(np.abs(speed) if up else speed) / RATE_HZ)), SITE
+        ).epochs.filter(pl.col("judgement").cast(pl.String) == "wrong")["error_along_m"]
+        for up in (False, True)
+    ]
+    for errors in wrong:
+        assert errors.len() > 500
+        assert errors.mean() == pytest.approx(40.0, abs=1.0)
+
+
+class TestReadsThatNoTrainCanMake:
+    """Two tracks 8 m apart without a link; of the second one a balise is read soon after one of the first."""
+
+    BOTH = builders.site({"a": line((0, 0), (6000, 0)), "b": line((0, 8), (6000, 8))}, sigma_m=0.1)
+    BALISES = balises(
+        *((f"V{km}", "a", 1000.0 * km, "virtual") for km in range(1, 6)),
+        ("A", "a", 1000.0, "physical"), ("B", "a", 2500.0, "physical"), ("X", "b", 2510.0, "physical"),
+        ("C", "a", 4000.0, "physical"),
+    )  # fmt: skip
+
+    def replayed(self, *reads: tuple[str, float]) -> RunTables:
+        log = RunLog("reads", gnss(np.zeros(TIME_S.size)), odometer=counted(WAY_M - 200.0))
+        stamps = [5.0 + (way_m - 200.0) / 30.0 for _, way_m in reads]
+        t = pl.Series("t", np.round(1e9 * np.array(stamps)).astype(np.int64)).cast(pl.Datetime("ns", "UTC"))
+        frame = pl.DataFrame([t, pl.Series("balise_id", [name for name, _ in reads])])
+        site = Site(self.BOTH.track, self.BOTH.links, balises=self.BALISES)
+        return replay(log.with_streams(balise_reads=stream(BaliseReads, frame)), site, KNOWN)
+
+    def test_right_reads_judge_the_positions(self):
+        tables = self.replayed(("A", 1000.0), ("B", 2500.0), ("C", 4000.0))
+        assert "right" in tables.epochs["judgement"].cast(pl.String).to_list()
+        assert "no train can have come" not in tables.runs["notes"][0]
+
+    @pytest.mark.parametrize("apart_m", [0.0, 1.0, 30.0])
+    def test_a_read_of_the_other_track_leaves_the_gaps_around_it_unknown(self, apart_m: float):
+        tables = self.replayed(("A", 1000.0), ("B", 2500.0), ("X", 2500.0 + apart_m), ("C", 4000.0))
+        way_m = 200.0 + 30.0 * (tables.epochs["t"].dt.timestamp("ns") / 1e9 - 5.0)
+        between = tables.epochs.filter((way_m > 1001.0) & (way_m < 3999.0))
+        assert between.height > 900
+        assert set(between["judgement"].cast(pl.String)) == {"unknown"}
+        assert (row(tables)["unsafe_accepted"], row(tables)["odometer_contradicted"]) == (0, 0)
+        assert "no train can have come from one balise read" in tables.runs["notes"][0]
