@@ -146,9 +146,9 @@ class Bench:
     def positions(self) -> Positions:
         """The positions of all epochs.
 
-        The direction of travel is that of the train's own place where the reference tells it, and without an odometer
-        where any evidence does: a position that jumps back does not turn the train, and some odometers count up while
-        the train reverses.
+        Without an odometer the direction of travel is that of the train's own place, where the evidence tells it: a
+        position that jumps back does not turn the train. With one it is the odometer's, but for an odometer that counts
+        up while the train reverses, where the reference tells.
         """
         told = self._positions(ints(self.epochs["direction"], 1))
         found = judge_positions(told, self.evidence.at(self.at_ns), self.legs, self.config.hazards)
@@ -158,15 +158,21 @@ class Bench:
         )
         with np.errstate(invalid="ignore"):
             came_m = train_m[ahead] - train_m
-            sure = np.flatnonzero(np.abs(came_m) > found.half_m + found.half_m[ahead])
-        if sure.size == 0:
-            return told
-        last = np.maximum(np.searchsorted(sure, np.arange(self.t_ns.size), side="right") - 1, 0)
-        by_evidence = np.sign(came_m[sure]).astype(np.int64)[last]
-        if self.odometry is None:
-            return self._positions(by_evidence)
+            sure = np.abs(came_m) > found.half_m + found.half_m[ahead]
+        sense = np.sign(came_m)
         by_reference = found.kind == KINDS.index(Evidence.REFERENCE)
-        return self._positions(np.where(by_reference, by_evidence, told.direction))
+        if self.odometry is not None:
+            # Not over a turn: the odometer knows best when that was.
+            sure &= by_reference & (told.direction == told.direction[ahead])
+            sense *= told.direction
+        rows = np.flatnonzero(sure)
+        if rows.size == 0:
+            return told
+        last = np.maximum(np.searchsorted(rows, np.arange(self.t_ns.size), side="right") - 1, 0)
+        sense = sense[rows].astype(np.int64)[last]
+        if self.odometry is None:
+            return self._positions(sense)
+        return self._positions(told.direction * np.where(by_reference, sense, 1))
 
     def _positions(self, direction: Ints) -> Positions:
         epochs, index = self.epochs, self.evidence.network.track.index
