@@ -12,9 +12,9 @@ import pytest
 from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.bench import Bench
-from pipeline.judge.episodes import Episode, _failure, _is_back
-from pipeline.judge.hazards import _instants, crossed_by, drafts_of, within_budget
-from pipeline.judge.judge import errors_across
+from pipeline.judge.episodes import Episode, _failure, _is_back, _named_onset_ns
+from pipeline.judge.hazards import _instants, crossed_by, drafts_of, rate_mps, size_m, within_budget
+from pipeline.judge.judge import _look_at, errors_across
 from pipeline.judge.judgement import (
     RIGHT,
     UNKNOWN,
@@ -416,3 +416,66 @@ def test_a_jump_crosses_what_the_train_itself_did_not(train_m: float, crossed: l
         path_m=np.array([80.0, 90.0, 100.0, 140.0, 150.0]), direction=np.ones(5), train_m=np.full(5, train_m)
     )
     assert crossed_by(Jump(3, 3, 30.0), cast(Any, offers), cast(Any, series)) == crossed
+
+
+@pytest.mark.parametrize(
+    ("onset_s", "mark_s", "named_s"),
+    [
+        (12, 20, 11),  # the last fault that had begun, of those that lasted
+        (5, 20, 8),  # else the first one after
+        (5, 7, None),
+        (40, 50, 35),  # without an end it lasts
+        (25, 27, None),  # all of the positions' have ended, and the odometer's is none
+    ],
+)
+def test_the_onset_is_that_of_a_fault_of_the_positions_that_lasted(
+    onset_s: int, mark_s: int, named_s: int | None
+) -> None:
+    begins, ends = [8, 11, 21, 35], [15, 14, 60, None]
+    faults = pl.DataFrame(
+        {
+            "t_start": pl.Series(begins, dtype=pl.Int64) * NS,
+            "t_end": pl.Series(ends, dtype=pl.Int64) * NS,
+            "target": ["position", "along", "odometer", "G08"],
+        }
+    ).with_columns(pl.col("t_start", "t_end").cast(pl.Datetime("ns", "UTC")))
+    found = _named_onset_ns(faults, onset_s * NS, mark_s * NS)
+    assert found == (None if named_s is None else named_s * NS)
+    assert _named_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
+    assert _named_onset_ns(None, onset_s * NS, mark_s * NS) is None
+
+
+def test_evidence_is_looked_at_between_positions_that_are_far_apart() -> None:
+    """A look each second at least; a step of 1.5 s is none to fill."""
+    bench = SimpleNamespace(at_ns=seconds(0, 0.5, 2.0, 5.0, 6.0), config=Configuration())
+    assert (_look_at(cast(Any, bench)) / NS).tolist() == [0.0, 0.5, 2.0, 3.0, 4.0, 5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("half_m", "jump", "back", "size", "rate"),
+    [
+        (1.0, None, False, -25.0, -2.5),  # the largest error known to 5 m, and its slope from the onset on
+        (6.0, None, False, -19.0, None),  # none is known: the largest that is sure
+        (6.0, Jump(3, 3, 30.0), False, 30.0, None),
+        (1.0, Jump(3, 3, 30.0), False, -25.0, None),
+        (1.0, Jump(3, 3, 30.0), True, 30.0, None),  # of a jump back its step
+    ],
+)
+def test_the_size_and_slope_of_a_hazard(
+    half_m: float, jump: Jump | None, back: bool, size: float, rate: float | None
+) -> None:
+    """2.5 m more each second; the third position is the onset, and the failure the one after it."""
+    middle_m = -2.5 * np.arange(12.0) + 2.5
+    kind = np.full(12, KINDS.index(Evidence.REFERENCE))
+    judged = Judgements(np.full(12, WRONG), middle_m - half_m, middle_m + half_m, kind, np.zeros(12, dtype=bool))
+    episode = SimpleNamespace(onset=2, end=12, mark=10, failure=3, onset_ns=2 * NS, step=None, jump_back=None)
+    if back:
+        episode.jump_back = jump
+    bench = SimpleNamespace(
+        series=SimpleNamespace(judged=judged, t_ns=seconds(*range(12))), offers=SimpleNamespace(judged=judged),
+        config=Configuration(),
+    )  # fmt: skip
+    draft = cast(Any, SimpleNamespace(episode=episode, jump=jump, hits=[9]))
+    assert size_m(draft, cast(Any, bench)) == pytest.approx(size)
+    found = rate_mps(draft, cast(Any, bench))
+    assert found == (None if rate is None else pytest.approx(rate))
