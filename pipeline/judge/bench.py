@@ -153,17 +153,15 @@ class Bench:
         told = self._positions(ints(self.epochs["direction"], 1))
         found = judge_positions(told, self.evidence.at(self.at_ns), self.legs, self.config.hazards)
         train_m = self.path_m - found.known_m(self.config.hazards.known_error_m) * told.direction
-        ahead = np.searchsorted(self.t_ns, self.t_ns + round(self.config.hazards.turn_s * NS_PER_S)).clip(
-            0, self.t_ns.size - 1
-        )
+        came_m, noise_m, _ = self._came(train_m, found.half_m, self.config.hazards.turn_s)
         with np.errstate(invalid="ignore"):
-            came_m = train_m[ahead] - train_m
-            sure = np.abs(came_m) > found.half_m + found.half_m[ahead]
+            sure = np.abs(came_m) > noise_m
         sense = np.sign(came_m)
         by_reference = found.kind == KINDS.index(Evidence.REFERENCE)
         if self.odometry is not None:
             # Not over a turn: the odometer knows best when that was.
-            sure &= by_reference & (told.direction == told.direction[ahead])
+            turned = self._came(told.direction.astype(np.float64), found.half_m, self.config.hazards.turn_s)[0]
+            sure &= by_reference & (turned == 0.0)
             sense *= told.direction
         rows = np.flatnonzero(sure)
         if rows.size == 0:
@@ -320,14 +318,17 @@ class Bench:
         By the reference it moved where it came farther over a second than the dead band and the noise of both places
         allow. It also tells where the odometer stands or is silent.
         """
-        t_ns, train_m, noise_m = self.at_ns, self.by_reference_m, self.judged.half_m
-        window_ns = round(self.config.align.speed_window_s * NS_PER_S)
-        ahead = np.searchsorted(t_ns, t_ns + window_ns).clip(0, t_ns.size - 1)
-        still_m = self.config.matching.deadband_mps * (t_ns[ahead] - t_ns) / NS_PER_S
+        window_s = self.config.align.speed_window_s
+        came_m, noise_m, elapsed_s = self._came(self.by_reference_m, self.judged.half_m, window_s)
         with np.errstate(invalid="ignore"):
-            came_m = np.abs(train_m[ahead] - train_m)
-            by_reference = came_m > still_m + noise_m + noise_m[ahead]
+            by_reference = np.abs(came_m) > self.config.matching.deadband_mps * elapsed_s + noise_m
         told = np.isfinite(came_m)
         moves, sure = by_reference | (self.odometer_moves & self.odometer_told), told | self.odometer_told
-        sure &= told | ~within_spans(t_ns, self.stood)
-        return held_on(moves[:-1], t_ns.size), held_on(sure[:-1], t_ns.size)
+        sure &= told | ~within_spans(self.at_ns, self.stood)
+        return held_on(moves[:-1], moves.size), held_on(sure[:-1], sure.size)
+
+    def _came(self, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
+        """How far from each epoch to the one `window_s` later [m], what both places may be off by [m], and the time."""
+        t_ns = self.at_ns
+        ahead = np.searchsorted(t_ns, t_ns + round(window_s * NS_PER_S)).clip(0, t_ns.size - 1)
+        return place_m[ahead] - place_m, half_m + half_m[ahead], (t_ns[ahead] - t_ns) / NS_PER_S

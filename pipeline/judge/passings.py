@@ -43,8 +43,9 @@ def train_passings(
     found: dict[str, list[Passing]] = {name: [] for name in names}
     for route, told, told_m in certain:
         rows, at_m = _with_places_before(told, told_m, route, element, measure_m)
+        least_m, most_m = at_m.min(initial=np.inf), at_m.max(initial=-np.inf)
         for balise, visit_m, sense in zip(*route.places(*balises), strict=True):
-            if at_m.min(initial=np.inf) <= visit_m <= at_m.max(initial=-np.inf):
+            if least_m <= visit_m <= most_m:
                 instants = _crossed(t_ns, rows, at_m - visit_m, rearm_m)
                 found[names[balise]] += [one._replace(sense=int(one.sense * sense)) for one in instants]
     return {name: sorted(instants) for name, instants in found.items()}

@@ -8,14 +8,14 @@ import numpy as np
 import polars as pl
 
 from pipeline.matching.doubt import Posterior, rivals_of
-from pipeline.matching.epochs import Assignment, epoch_frame
+from pipeline.matching.epochs import epoch_frame
 from pipeline.matching.find import find_path
 from pipeline.matching.fixes import Fixes, digit_noise, fixes_of
 from pipeline.odometry import Odometry
 from pipeline.odometry.polarity import polarity
-from pipeline.track.network import network_along, network_of, visits_of
+from pipeline.track.network import network_in_pieces
 from pipeline.track.path import TravelledPath
-from pipeline.track.survey import Track, in_pieces, track_of
+from pipeline.track.survey import Track
 from schemas.arrays import Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
@@ -59,7 +59,9 @@ def match(
     arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    path, found, ambiguous, posterior = _path(arrays, odometry, site, config, balise_reads)
+    network = network_in_pieces(site)
+    pinned = pins_of(arrays, site, network.track, balise_reads)
+    path, found, ambiguous, posterior = find_path(arrays, odometry, network, pinned, config)
     epochs = epoch_frame(arrays, fixes["solution"], path, found, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
@@ -78,23 +80,6 @@ def _odometer_sign(odometry: Odometry | None, epochs: pl.DataFrame, config: Matc
     matched = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
     path_m = np.where(matched, floats(epochs, "path_m"), np.nan)
     return polarity(odometry, times_ns(epochs), path_m, config.orientation_distance_m)
-
-
-def _path(
-    fixes: Fixes,
-    odometry: Odometry | None,
-    site: Site,
-    config: MatchingConfig,
-    balise_reads: pl.DataFrame | None,
-) -> tuple[TravelledPath, Assignment, pl.DataFrame, Posterior]:
-    """The path over the network, or over nothing but the given route."""
-    track = track_of(site.track)
-    if site.route is None:
-        network = network_of(in_pieces(track), site.links)
-    else:
-        network = network_along(track, visits_of(track, site.route))
-    pinned = pins_of(fixes, site, network.track, balise_reads)
-    return find_path(fixes, odometry, network, pinned, config)
 
 
 def pins_of(fixes: Fixes, site: Site, track: Track, balise_reads: pl.DataFrame | None) -> Ints:

@@ -41,7 +41,8 @@ def match_reference(
     own = config.model_copy(update={"cross_bias_sigma_m": aside_m, "on_track_bias_m": aside_m})
     sites = [site] if site.route is None else [site, replace(site, route=None)]
     found = [one for one in (_matched(fixes, own, each, balise_reads) for each in sites) if one is not None]
-    return max(found, key=_placed, default=None)
+    # That with the most samples on the track.
+    return max(found, key=lambda one: flags(one.epochs, "on_track").sum(), default=None)
 
 
 def _matched(fixes: pl.DataFrame, own: MatchingConfig, site: Site, balise_reads: pl.DataFrame | None) -> Match | None:
@@ -49,11 +50,6 @@ def _matched(fixes: pl.DataFrame, own: MatchingConfig, site: Site, balise_reads:
         return match(fixes, None, site, Vehicle(), own, FixSigma(), balise_reads)
     except InputError:
         return None
-
-
-def _placed(found: Match) -> int:
-    """How many samples lie on the track."""
-    return int(flags(found.epochs, "on_track").sum())
 
 
 def as_fixes(reference: pl.DataFrame, sigma_default_m: float) -> pl.DataFrame:

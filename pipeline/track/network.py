@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.track.leg import Visit
-from pipeline.track.survey import Track, end_places, gaps_m, pieces_of, track_in_parts, track_of
+from pipeline.track.survey import Track, end_places, gaps_m, in_pieces, pieces_of, track_in_parts, track_of
 from schemas.arrays import Bools, Ints
 from schemas.enums import Navigability
 from schemas.run import Site
@@ -207,6 +207,14 @@ def _joined(track: Track, visits: list[Visit]) -> list[list[Edge]]:
             if all(edge.to != other for edge in successors[one]):
                 successors[one].append(Edge(other, gap, True, True))
     return successors
+
+
+def network_in_pieces(site: Site) -> Network:
+    """The network of a site, or of nothing but its route, with elements that turn round in pieces that do not."""
+    track = track_of(site.track)
+    if site.route is None:
+        return network_of(in_pieces(track), site.links)
+    return network_along(track, visits_of(track, site.route))
 
 
 def site_network(site: Site) -> Network:

@@ -12,9 +12,9 @@ import pytest
 from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.judge.alarms import verdict_within
 from pipeline.judge.bench import Bench
-from pipeline.judge.episodes import Episode, _failure, _is_back
-from pipeline.judge.hazards import _instants, drafts_of, within_budget
-from pipeline.judge.judge import errors_across
+from pipeline.judge.episodes import Episode, _failure, _is_back, _named_onset_ns
+from pipeline.judge.hazards import _instants, crossed_by, drafts_of, rate_mps, size_m, within_budget
+from pipeline.judge.judge import _look_at, errors_across
 from pipeline.judge.judgement import (
     RIGHT,
     UNKNOWN,
@@ -25,7 +25,7 @@ from pipeline.judge.judgement import (
     margins_m,
     with_own_anchors,
 )
-from pipeline.judge.jumps import Jump
+from pipeline.judge.jumps import Jump, find_jumps, steps_of
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.states import in_use_s, odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
@@ -340,7 +340,143 @@ def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> Non
         stood=[(round(3.5 * NS), 4 * NS)],
         config=Configuration(),
     )
+    bench._came = lambda *given: Bench._came(cast(Any, bench), *given)
     moves, sure = cast(Any, Bench.moving).func(bench)
     # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
     assert sure.tolist() == [True, True, True, True, False, False, True, False, True, True]
     assert moves[sure].tolist() == [False, True, True, True, True, False, False]
+
+
+def test_what_an_interval_of_errors_says() -> None:
+    """From 4 m late to 6 m early; from 2 to 4 m early; from 9 to 5 m late, by the odometer alone."""
+    kinds = np.array([KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER)])
+    low_m, high_m = np.array([-4.0, 2.0, -9.0]), np.array([6.0, 4.0, -5.0])
+    judged = Judgements(np.full(3, UNKNOWN), low_m, high_m, kinds, np.zeros(3, dtype=bool))
+    assert judged.middle_m.tolist() == [1.0, 3.0, -7.0]
+    assert judged.half_m.tolist() == [5.0, 1.0, 2.0]
+    assert judged.least_m.tolist() == [0.0, 2.0, 5.0]
+    assert judged.largest_m.tolist() == [6.0, 4.0, 9.0]
+    assert judged.known_m(4.9) == pytest.approx([np.nan, 3.0, np.nan], nan_ok=True)
+    assert judged.known_m(5.0) == pytest.approx([1.0, 3.0, np.nan], nan_ok=True)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize(("onward", "code"), [([0], RIGHT), ([0, 2], WRONG), ([0, 1], RIGHT)])
+def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(
+    onward: list[int], code: int, direction: int
+) -> None:
+    """The train at 95 to 97 m of element 0, the position 10 m on, on element 1; the evidence may go on elsewhere."""
+
+    def route(elements: list[int]) -> Route:
+        size = len(elements)
+        entry_m = 100.0 * np.arange(size)
+        return Route(np.array(elements), np.full(size, True), entry_m, np.zeros(size), np.full(size, 100.0))
+
+    at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
+    positions = Positions(np.array([1]), at_m - 100.0, leg, at_m, np.array([direction]), sure)
+    told = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
+    evidence = EvidenceSet(np.array([KINDS.index(Evidence.BALISE)]), (told,), leg[:0], leg[:0])
+    found = judge_positions(positions, evidence, [route([0, 1])], HazardConfig())
+    assert found.code.tolist() == [code]
+    assert found.wrong_track.tolist() == [code == WRONG]
+    expected_m = (13.0, 15.0) if direction > 0 else (-15.0, -13.0)
+    if code == RIGHT:
+        assert (found.low_m[0], found.high_m[0]) == pytest.approx(expected_m)
+
+
+@pytest.mark.parametrize(
+    ("by_odometer", "gap_s", "direction", "jumps"),
+    [
+        (True, 1.0, 1, [(3, 4, 30.0), (8, 8, -30.0)]),
+        (False, 1.0, 1, [(3, 4, 30.0), (8, 8, -30.0)]),
+        (True, 1.0, -1, [(3, 4, -30.0), (8, 8, 30.0)]),
+        (True, 0.4, 1, []),  # no movement is interpolated over such a step
+    ],
+)
+def test_a_jump_is_what_gathers_within_a_second(
+    by_odometer: bool, gap_s: float, direction: int, jumps: list[tuple[int, int, float]]
+) -> None:
+    """10 m each 0.5 s; 15 m too far at the fourth and again at the fifth position, back at the ninth."""
+    error_m = np.array([0.0, 0.0, 0.0, 15.0, 30.0, 30.0, 30.0, 30.0, 0.0, 0.0])
+    train_m, t_ns = 10.0 * np.arange(10), seconds(*(0.5 * np.arange(10)))
+    unknown = np.full(10, np.nan)
+    told = (unknown, np.full(9, 10.0)) if by_odometer else (train_m, unknown[:9])
+    steps = steps_of(t_ns, train_m + error_m, *told, round(gap_s * NS))
+    found = find_jumps(steps, np.full(10, direction), HazardConfig())
+    assert [(one.first, one.last, one.step_m) for one in found] == jumps
+
+
+@pytest.mark.parametrize(("train_m", "crossed"), [(120.0, [2, 3]), (np.nan, [1, 2, 3]), (128.0, [1, 3])])
+def test_a_jump_crosses_what_the_train_itself_did_not(train_m: float, crossed: list[int]) -> None:
+    """From 100 m to 140 m by a jump of 30 m: the train's own 10 m cross what lies in them, from where it is known."""
+    offers = SimpleNamespace(
+        virtual=np.array([True, True, True, True, False, True]), number=np.array([2, 3, 3, 3, 3, 4]),
+        path_m=np.array([99.0, 125.0, 135.0, 111.0, 138.0, 145.0]),
+    )  # fmt: skip
+    series = SimpleNamespace(
+        path_m=np.array([80.0, 90.0, 100.0, 140.0, 150.0]), direction=np.ones(5), train_m=np.full(5, train_m)
+    )
+    assert crossed_by(Jump(3, 3, 30.0), cast(Any, offers), cast(Any, series)) == crossed
+
+
+@pytest.mark.parametrize(
+    ("onset_s", "mark_s", "named_s"),
+    [
+        (12, 20, 11),  # the last fault that had begun, of those that lasted
+        (5, 20, 8),  # else the first one after
+        (5, 7, None),
+        (40, 50, 35),  # without an end it lasts
+        (25, 27, None),  # all of the positions' have ended, and the odometer's is none
+    ],
+)
+def test_the_onset_is_that_of_a_fault_of_the_positions_that_lasted(
+    onset_s: int, mark_s: int, named_s: int | None
+) -> None:
+    begins, ends = [8, 11, 21, 35], [15, 14, 60, None]
+    faults = pl.DataFrame(
+        {
+            "t_start": pl.Series(begins, dtype=pl.Int64) * NS,
+            "t_end": pl.Series(ends, dtype=pl.Int64) * NS,
+            "target": ["position", "along", "odometer", "G08"],
+        }
+    ).with_columns(pl.col("t_start", "t_end").cast(pl.Datetime("ns", "UTC")))
+    found = _named_onset_ns(faults, onset_s * NS, mark_s * NS)
+    assert found == (None if named_s is None else named_s * NS)
+    assert _named_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
+    assert _named_onset_ns(None, onset_s * NS, mark_s * NS) is None
+
+
+def test_evidence_is_looked_at_between_positions_that_are_far_apart() -> None:
+    """A look each second at least; a step of 1.5 s is none to fill."""
+    bench = SimpleNamespace(at_ns=seconds(0, 0.5, 2.0, 5.0, 6.0), config=Configuration())
+    assert (_look_at(cast(Any, bench)) / NS).tolist() == [0.0, 0.5, 2.0, 3.0, 4.0, 5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("half_m", "jump", "back", "size", "rate"),
+    [
+        (1.0, None, False, -25.0, -2.5),  # the largest error known to 5 m, and its slope from the onset on
+        (6.0, None, False, -19.0, None),  # none is known: the largest that is sure
+        (6.0, Jump(3, 3, 30.0), False, 30.0, None),
+        (1.0, Jump(3, 3, 30.0), False, -25.0, None),
+        (1.0, Jump(3, 3, 30.0), True, 30.0, None),  # of a jump back its step
+    ],
+)
+def test_the_size_and_slope_of_a_hazard(
+    half_m: float, jump: Jump | None, back: bool, size: float, rate: float | None
+) -> None:
+    """2.5 m more each second; the third position is the onset, and the failure the one after it."""
+    middle_m = -2.5 * np.arange(12.0) + 2.5
+    kind = np.full(12, KINDS.index(Evidence.REFERENCE))
+    judged = Judgements(np.full(12, WRONG), middle_m - half_m, middle_m + half_m, kind, np.zeros(12, dtype=bool))
+    episode = SimpleNamespace(onset=2, end=12, mark=10, failure=3, onset_ns=2 * NS, step=None, jump_back=None)
+    if back:
+        episode.jump_back = jump
+    bench = SimpleNamespace(
+        series=SimpleNamespace(judged=judged, t_ns=seconds(*range(12))), offers=SimpleNamespace(judged=judged),
+        config=Configuration(),
+    )  # fmt: skip
+    draft = cast(Any, SimpleNamespace(episode=episode, jump=jump, hits=[9]))
+    assert size_m(draft, cast(Any, bench)) == pytest.approx(size)
+    found = rate_mps(draft, cast(Any, bench))
+    assert found == (None if rate is None else pytest.approx(rate))

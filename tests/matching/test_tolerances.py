@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,8 +16,10 @@ from pipeline.matching.doubt import elements_about
 from pipeline.matching.epochs import on_track_limit_m
 from pipeline.matching.fixes import contradictory_covariances
 from pipeline.matching.likelihood import step_score
+from pipeline.matching.match import pins_of
 from pipeline.matching.steps import spaced
 from pipeline.track.geodesy import points_of
+from pipeline.track.survey import track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.matching.builders import line, run, site
 
@@ -91,3 +94,33 @@ def test_steps_are_a_distance_or_a_time_apart() -> None:
     found = spaced(cast(Any, fixes), rows, MatchingConfig(step_distance_m=10.0, step_time_s=10.0))
     assert t_s[found].tolist() == [0.0, 3.0, 6.0, 10.0, 20.0, 30.0]
     assert t_s[spaced(cast(Any, fixes), rows[:-1], MatchingConfig(step_time_s=100.0))].tolist() == [0.0, 3.0, 6.0, 28.0]
+
+
+def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says() -> None:
+    """a is 500 m long, and the path runs against it; half a metre is what surveys and balise lists round."""
+    place = site({"a": line((0, 0), (500, 0))})
+    balises = pl.DataFrame(
+        {
+            "balise_id": ["before", "inside", "beyond", "off", "elsewhere"],
+            "netelement_id": ["a", "a", "a", "a", "z"],
+            "measure_m": [-0.4, 100.0, 500.4, 500.6, 10.0],
+            "kind": "physical",
+            "location_accuracy_m": 5.0,
+            "linked": True,
+            "link_reaction": "none",
+        }
+    )
+    fixes = run(np.arange(400.0, 50.0, -10.0), np.zeros(35))
+    found = match(fixes, None, place, Vehicle(), MatchingConfig(), FixSigma()).path.balises(balises)
+    assert found["balise_id"].to_list() == ["beyond", "inside", "before"]
+    assert found["path_m"].to_list() == pytest.approx([-0.4, 400.0, 500.4], abs=1e-3)
+    assert found["sense"].to_list() == [-1, -1, -1]
+    # Read between epochs each proves its element at the later one; after the last epoch, and off it, none does.
+    read_ns = pl.Series("t", [0, 1500, 2500, 3500, 99000], dtype=pl.Int64) * 1_000_000
+    stamps = read_ns.cast(pl.Datetime("ns", "UTC"))
+    reads = pl.DataFrame({"t": stamps, "balise_id": ["before", "off", "beyond", "elsewhere", "inside"]})
+    times_ns = np.arange(6) * 1_000_000_000
+    epochs = cast(Any, type("Epochs", (), {"t_ns": times_ns, "__len__": lambda self: 6})())
+    own = replace(place, balises=balises)
+    assert pins_of(epochs, own, track_of(place.track), reads).tolist() == [0, -1, -1, 0, -1, -1]
+    assert pins_of(epochs, own, track_of(place.track), None).tolist() == [-1] * 6
