@@ -115,11 +115,13 @@ class DaskEngine(Engine):
         return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
     def _count(self) -> int:
-        """Threads of all workers."""
+        """Threads of all workers; a scheduler that is silent for once has none, one that is gone is an error."""
         try:
             if self._client.status != "running":
-                raise OSError("connection lost")
-            return sum(self._client.nthreads().values())
+                raise ConnectionError
+            return sum(self._ask(self._client.scheduler.ncores).values())
+        except TimeoutError:
+            return 0
         except Exception as error:
             raise lost_scheduler(self.name) from error
 

@@ -155,16 +155,30 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
     assert str(lost_scheduler("tls://KEY:sec/ret@host:9")).startswith("tls://host:9: the Dask scheduler")
 
 
+@pytest.mark.parametrize("silent", [False, True])
 def test_cluster_that_lost_its_workers(
-    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silent: bool
 ) -> None:
-    """Said within seconds, with what is done and what to do; given up after the patience."""
+    """Said within seconds, with what is done and what to do; given up after the patience.
+
+    The same where the scheduler stands still: nobody can say then whether it has workers.
+    """
     monkeypatch.setattr(WAITS, "lonely_s", 20.0)
+    monkeypatch.setattr(WAITS, "scheduler_answer_s", 0.5)
     clock = Hurried(monkeypatch, "cluster")
     cluster.kill_workers()
-    spy = Spy(lambda *_: clock.hurry(2.0))
-    with pytest.raises(UsageError, match=r"has had no worker for 20 s; 0 of 4 runs are done. Start workers"):
-        run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[spy])
+
+    def wait(*_: object) -> None:
+        if silent:
+            os.kill(cluster.scheduler.pid, signal.SIGSTOP)
+        clock.hurry(2.0)
+
+    spy = Spy(wait)
+    try:
+        with pytest.raises(UsageError, match=r"has had no worker for 20 s; 0 of 4 runs are done. Start workers"):
+            run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[spy])
+    finally:
+        os.kill(cluster.scheduler.pid, signal.SIGCONT)
     assert [
         f"{cluster.address} has no worker left; 0 of 4 runs are done. Start workers" in note for note in spy.notes
     ] == [True]
