@@ -31,22 +31,19 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
     `doubtful`: the least probability of the path there is below `sure`.
     """
     ways = stretches_of(epochs)
-    if not ways.elements or len(set(ways.elements)) < len(ways.elements):
+    if ways.is_empty() or ways["netelement_id"].n_unique() < ways.height:
         return None
     told = (
-        epochs.filter(pl.col("path_m").is_not_null() & pl.col("netelement_id").is_in(ways.elements))
+        epochs.filter(pl.col("path_m").is_not_null())
         .group_by("netelement_id")
         .agg(probability=pl.col("path_probability").min(), t_start=pl.col("t").min(), t_end=pl.col("t").max())
     )
-    directions = ["AB" if sign > 0 else "BA" for sign in ways.sign.tolist()]
-    found = {"netelement_id": ways.elements, "direction": directions, "from_m": ways.first_m}
     return (
-        pl.DataFrame(found)
-        .join(told, on="netelement_id", how="left")
-        .sort("from_m")
+        ways.join(told, on="netelement_id", how="left")
+        .sort("first_m")
         .select(
             "netelement_id",
-            "direction",
+            pl.when(pl.col("sign") > 0).then(pl.lit("AB")).otherwise(pl.lit("BA")).alias("direction"),
             "probability",
             "t_start",
             "t_end",
