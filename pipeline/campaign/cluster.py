@@ -39,7 +39,7 @@ class DaskEngine(Engine):
         self._limit_s = limit_s
         self._threads = 0
         self._counted_s = -WAITS.count_every_s
-        self._seen_s = time.monotonic()
+        self._seen_s = self._heard_s = time.monotonic()
         self.name = redacted(scheduler)
         self._tasks: dict[Result, Any] = {}
         self._workers: dict[str, str] = {}
@@ -76,7 +76,7 @@ class DaskEngine(Engine):
     def kill(self, result: Result) -> None:
         """End the worker that has the run, through its nanny, without waiting for that."""
         task = self._tasks[result]
-        threading.Thread(target=self._end, args=(task, self._workers[task.key]), daemon=True).start()
+        threading.Thread(target=self._end, args=(task, self._workers.get(task.key, "")), daemon=True).start()
 
     def is_lost_worker(self, error: BaseException) -> bool:
         from distributed.scheduler import KilledWorker
@@ -115,15 +115,18 @@ class DaskEngine(Engine):
         return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
     def _count(self) -> int:
-        """Threads of all workers; a scheduler that is silent for once has none, one that is gone is an error."""
+        """Threads of all workers; where the scheduler is silent, but not for ever, those that there were."""
         try:
             if self._client.status != "running":
                 raise ConnectionError
-            return sum(self._ask(self._client.scheduler.ncores).values())
-        except TimeoutError:
-            return 0
+            threads: int = sum(self._ask(self._client.scheduler.ncores).values())
         except Exception as error:
+            silent_s = time.monotonic() - self._heard_s
+            if isinstance(error, TimeoutError) and silent_s < WAITS.lonely_s:
+                return self._threads
             raise lost_scheduler(self.name) from error
+        self._heard_s = time.monotonic()
+        return threads
 
 
 async def passed_on(client: Any, task: Any, result: Result) -> None:

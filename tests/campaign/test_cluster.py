@@ -155,33 +155,40 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
     assert str(lost_scheduler("tls://KEY:sec/ret@host:9")).startswith("tls://host:9: the Dask scheduler")
 
 
-@pytest.mark.parametrize("silent", [False, True])
 def test_cluster_that_lost_its_workers(
-    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silent: bool
+    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Said within seconds, with what is done and what to do; given up after the patience.
-
-    The same where the scheduler stands still: nobody can say then whether it has workers.
-    """
+    """Said within seconds, with what is done and what to do; given up after the patience."""
     monkeypatch.setattr(WAITS, "lonely_s", 20.0)
-    monkeypatch.setattr(WAITS, "scheduler_answer_s", 0.5)
     clock = Hurried(monkeypatch, "cluster")
     cluster.kill_workers()
-
-    def wait(*_: object) -> None:
-        if silent:
-            os.kill(cluster.scheduler.pid, signal.SIGSTOP)
-        clock.hurry(2.0)
-
-    spy = Spy(wait)
-    try:
-        with pytest.raises(UsageError, match=r"has had no worker for 20 s; 0 of 4 runs are done. Start workers"):
-            run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[spy])
-    finally:
-        os.kill(cluster.scheduler.pid, signal.SIGCONT)
+    spy = Spy(lambda *_: clock.hurry(2.0))
+    with pytest.raises(UsageError, match=r"has had no worker for 20 s; 0 of 4 runs are done. Start workers"):
+        run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[spy])
     assert [
         f"{cluster.address} has no worker left; 0 of 4 runs are done. Start workers" in note for note in spy.notes
     ] == [True]
+
+
+def test_scheduler_that_stands_still(
+    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It keeps its connections and says nothing: the campaign looks on, and gives it up after the same patience."""
+    monkeypatch.setattr(WAITS, "lonely_s", 20.0)
+    monkeypatch.setattr(WAITS, "scheduler_answer_s", 0.5)
+    clock, looks = Hurried(monkeypatch, "cluster"), list[str]()
+
+    def stop(run_id: str, _: float) -> None:
+        os.kill(cluster.scheduler.pid, signal.SIGSTOP)
+        looks.append(run_id)
+        clock.hurry(2.0)
+
+    try:
+        with pytest.raises(UsageError, match="Dask scheduler does not answer"):
+            run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[Spy(stop)])
+    finally:
+        os.kill(cluster.scheduler.pid, signal.SIGCONT)
+    assert len(looks) > 3
 
 
 def replace_by_copy(place: Path, log: Path) -> None:
