@@ -11,10 +11,9 @@ import asyncio
 import contextlib
 import logging
 import os
-import secrets
 import threading
 import time
-from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
 from pipeline.campaign.engines import Engine
@@ -37,48 +36,47 @@ class DaskEngine(Engine):
 
     def __init__(self, scheduler: str, limit_s: float) -> None:
         self._client = _connect(scheduler)
-        self._executor = self._client.get_executor(pure=False)
         self._limit_s = limit_s
         self._threads = 0
-        self._counted = -WAITS.count_every_s
-        self._seen_s = time.monotonic()
-        self.name = self._scheduler = redacted(scheduler)
-        self._marks: dict[Result, str] = {}
+        self._counted_s = -WAITS.count_every_s
+        self._seen_s = self._heard_s = time.monotonic()
+        self.name = redacted(scheduler)
+        self._tasks: dict[Result, Any] = {}
         self._workers: dict[str, str] = {}
         self._client.subscribe_topic(_BEGUN, self._note)
 
     def capacity(self) -> int:
         """Twice the cluster's threads, so that no worker waits for the next run."""
-        if time.monotonic() - self._counted > WAITS.count_every_s:
-            self._threads = sum(self._count().values())
-            self._counted = time.monotonic()
+        if time.monotonic() - self._counted_s > WAITS.count_every_s:
+            self._threads = self._count()
+            self._counted_s = time.monotonic()
             if self._threads:
-                self._seen_s = self._counted
+                self._seen_s = self._counted_s
         return max(1, 2 * self._threads)
 
     def lonely_s(self) -> float:
         return 0.0 if self._threads else time.monotonic() - self._seen_s
 
     def submit(self, job: RunJob) -> Result:
-        mark = f"balise-{secrets.token_hex(8)}"
-        self._workers[mark] = ""
-        result: Result = self._executor.submit(replay_there, job, mark, self._limit_s + WAITS.grace_s)
-        self._marks[result] = mark
+        task = self._client.submit(replay_there, job, self._limit_s + WAITS.grace_s, pure=False)
+        result: Result = Future()
+        self._tasks[result] = task
+        self._client.loop.add_callback(passed_on, self._client, task, result)
         return result
 
     def has_begun(self, result: Result) -> bool:
         """Whether a worker has begun the run; until then it waits for its turn."""
-        mark = self._marks[result]
-        if self._workers[mark] or not result.done():
-            return bool(self._workers[mark])
+        key = self._tasks[result].key
+        if key in self._workers or not result.done():
+            return key in self._workers
         with contextlib.suppress(Exception):
-            return bool(self._ask(self._client.scheduler.event_is_set, name=mark))
+            return bool(self._ask(self._client.scheduler.event_is_set, name=key))
         return True
 
     def kill(self, result: Result) -> None:
         """End the worker that has the run, through its nanny, without waiting for that."""
-        worker = self._workers[self._marks[result]]
-        threading.Thread(target=self._end, args=(result, worker), daemon=True).start()
+        task = self._tasks[result]
+        threading.Thread(target=self._end, args=(task, self._workers.get(task.key, "")), daemon=True).start()
 
     def is_lost_worker(self, error: BaseException) -> bool:
         from distributed.scheduler import KilledWorker
@@ -86,25 +84,21 @@ class DaskEngine(Engine):
         return isinstance(error, LostWorkerError | KilledWorker)
 
     def collected(self, result: Result) -> None:
-        mark = self._marks.pop(result)
-        del self._workers[mark]
+        key = self._tasks.pop(result).key
+        self._workers.pop(key, None)
         if self._client.status == "running":
             with contextlib.suppress(Exception):
-                self._ask(self._client.scheduler.event_clear, name=mark)
+                self._ask(self._client.scheduler.event_clear, name=key)
 
     def close(self) -> None:
-        with contextlib.suppress(Exception):
-            self._executor.shutdown(wait=False)
         with contextlib.suppress(Exception):
             self._client.close(timeout=1)
 
     def _note(self, event: tuple[float, dict[str, str]]) -> None:
-        """A worker of this or another campaign has begun a run."""
-        mark = event[1]["mark"]
-        if mark in self._workers:
-            self._workers[mark] = event[1]["worker"]
+        """A worker has begun a run, of this campaign or of another one on the same cluster."""
+        self._workers[event[1]["key"]] = event[1]["worker"]
 
-    def _end(self, result: Result, worker: str) -> None:
+    def _end(self, task: Any, worker: str) -> None:
         with contextlib.suppress(Exception):
             self._client.sync(
                 self._client.scheduler.restart_workers,
@@ -114,52 +108,68 @@ class DaskEngine(Engine):
                 on_error="return",
                 stimulus_id=_BEGUN,
             )
-        result.cancel()
+        # It would be handed out again.
+        task.cancel()
 
     def _ask(self, question: Any, **arguments: str) -> Any:
         return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
-    def _count(self) -> dict[str, int]:
+    def _count(self) -> int:
+        """Threads of all workers; where the scheduler is silent, but not for ever, those that there were."""
         try:
             if self._client.status != "running":
-                raise OSError("connection lost")
-            threads: dict[str, int] = self._client.nthreads()
+                raise ConnectionError
+            threads: int = sum(self._ask(self._client.scheduler.ncores).values())
         except Exception as error:
-            raise lost_scheduler(self._scheduler) from error
+            silent_s = time.monotonic() - self._heard_s
+            if isinstance(error, TimeoutError) and silent_s < WAITS.lonely_s:
+                return self._threads
+            raise lost_scheduler(self.name) from error
+        self._heard_s = time.monotonic()
         return threads
 
 
-def replay_there(job: RunJob, mark: str, limit_s: float) -> RunOutcome:
+async def passed_on(client: Any, task: Any, result: Result) -> None:
+    """Tell the campaign how a task ended, whatever way that was.
+
+    Where a worker dies after the end of its run and before the outcome has left it, Dask lets the task begin again, and
+    it ends with `LostWorkerError`. Dask's own executor (`Client.get_executor`) never tells of such an end.
+    """
+    try:
+        (outcome,) = await client.gather([task], asynchronous=True)
+    except BaseException as error:
+        result.set_exception(error)
+    else:
+        result.set_result(outcome)
+
+
+def replay_there(job: RunJob, limit_s: float) -> RunOutcome:
     """What a worker does: the run, unless another worker had begun it and was lost.
 
     The campaign ends the workers of runs that take too long. Where it cannot, because it is gone itself or has no way
     to, the worker ends itself after `limit_s`.
     """
-    with _ended_after(limit_s):
-        _begin(mark)
-        return replay_one(job)
-
-
-@contextlib.contextmanager
-def _ended_after(limit_s: float) -> Iterator[None]:
     timer = threading.Timer(limit_s, os._exit, args=(1,))
     timer.daemon = True
     timer.start()
     try:
-        yield
+        _begin()
+        return replay_one(job)
     finally:
         timer.cancel()
 
 
-def _begin(mark: str) -> None:
+def _begin() -> None:
+    """Leave the mark of this task at the scheduler, and tell the campaign where it is."""
     from distributed import get_worker
     from distributed.utils import sync
 
     worker = get_worker()
-    if sync(worker.loop, worker.scheduler.event_is_set, name=mark):
+    key = worker.get_current_task()
+    if sync(worker.loop, worker.scheduler.event_is_set, name=key):
         raise LostWorkerError
-    sync(worker.loop, worker.scheduler.event_set, name=mark)
-    worker.log_event(_BEGUN, {"mark": mark, "worker": worker.address})
+    sync(worker.loop, worker.scheduler.event_set, name=key)
+    worker.log_event(_BEGUN, {"key": key, "worker": worker.address})
 
 
 def lost_scheduler(scheduler: str) -> UsageError:

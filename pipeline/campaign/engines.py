@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from types import FrameType
 
-from pipeline.campaign.interruption import StopRun
+from pipeline.campaign.interruption import StopRun, answered
 from pipeline.campaign.outcome import Failure, Result, overdue
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
@@ -84,38 +84,33 @@ class _Overdue(StopRun):
 
 @contextlib.contextmanager
 def _alarm(limit_s: float) -> Iterator[None]:
-    """Raise `_Overdue` after a time; only the main thread can be told."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """Raise `_Overdue` after a time."""
 
     def ring(signum: int, frame: FrameType | None) -> None:
         raise _Overdue
 
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, limit_s)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+    with answered([signal.SIGALRM], ring) as heard:
+        if heard:
+            signal.setitimer(signal.ITIMER_REAL, limit_s)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 class LocalEngine(Engine):
     """Processes of this machine, each in an executor of its own, so that the loss of one touches no other."""
 
     def __init__(self, jobs: int) -> None:
-        self._slots = [_Slot() for _ in range(jobs)]
+        self._idle = [_Slot() for _ in range(jobs)]
         self._busy: dict[Result, _Slot] = {}
 
     def capacity(self) -> int:
-        return len(self._slots)
+        return len(self._idle) + len(self._busy)
 
     def submit(self, job: RunJob) -> Result:
-        taken = set(map(id, self._busy.values()))
-        slot = next(slot for slot in self._slots if id(slot) not in taken)
-        result = slot.submit(job)
-        self._busy[result] = slot
+        result = self._idle[-1].submit(job)
+        self._busy[result] = self._idle.pop()
         return result
 
     def has_begun(self, result: Result) -> bool:
@@ -128,10 +123,10 @@ class LocalEngine(Engine):
         return isinstance(error, BrokenExecutor)
 
     def collected(self, result: Result) -> None:
-        del self._busy[result]
+        self._idle.append(self._busy.pop(result))
 
     def close(self) -> None:
-        for slot in self._slots:
+        for slot in (*self._idle, *self._busy.values()):
             slot.kill()
 
 
@@ -175,23 +170,11 @@ class _Slot:
             context = multiprocessing.get_context("spawn")
             self._executor = ProcessPoolExecutor(1, mp_context=context, initializer=_begin_worker)
             before = set(multiprocessing.active_children())
-            with single_threaded_children(), _deaf():
+            # Deaf to Ctrl-C from its start on: that is the parent's to answer.
+            with single_threaded_children(), answered([signal.SIGINT], signal.SIG_IGN):
                 self._answer = self._executor.submit(os.getpid)
             (self._process,) = set(multiprocessing.active_children()) - before
         return self._executor
-
-
-@contextlib.contextmanager
-def _deaf() -> Iterator[None]:
-    """What a worker inherits from its start on: deafness to Ctrl-C, which is the parent's to answer."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
 
 
 def _begin_worker() -> None:

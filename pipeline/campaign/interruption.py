@@ -5,11 +5,13 @@ from __future__ import annotations
 import signal
 import threading
 from asyncio import CancelledError
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from pipeline.campaign.watch import Summary
+
+Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -32,24 +34,28 @@ class Interrupted(StopRun):
 
 
 @contextmanager
+def answered(signals: Iterable[int], handler: Handler) -> Iterator[bool]:
+    """Let the handler answer these signals meanwhile; only the main thread can, which is what is given."""
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {signum: signal.signal(signum, handler) for signum in signals if in_main}
+    try:
+        yield in_main
+    finally:
+        for signum, earlier in before.items():
+            signal.signal(signum, earlier)
+
+
+@contextmanager
 def listening(heard: Callable[[int], None], at_once: bool) -> Iterator[None]:
     """Pass SIGINT, SIGTERM and SIGHUP on to `heard`; `at_once` also raises `Interrupted` where they arrive.
 
     What the caller ignores (`nohup`) is ignored.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def answer(signum: int, frame: FrameType | None) -> None:
         heard(signum)
         if at_once:
             raise Interrupted(signum)
 
-    signals = [signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN]
-    before = {signum: signal.signal(signum, answer) for signum in signals}
-    try:
+    with answered([signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN], answer):
         yield
-    finally:
-        for signum, handler in before.items():
-            signal.signal(signum, handler)

@@ -1,4 +1,9 @@
-"""The campaign loop: hand out runs, collect outcomes, survive what happens to workers."""
+"""The campaign loop: hand out runs, collect outcomes, survive what happens to workers.
+
+A run waits, is handed to the engine (where it may wait for a worker), is begun (from here on its time counts), and
+ends: with an outcome; with an error of its own; without its worker, and then it waits again; or overdue, and the
+campaign ends its worker. The campaign waits for futures alone: an engine ends each one that it gives, whatever happens.
+"""
 
 from __future__ import annotations
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import resource
 import traceback
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import polars as pl
 
@@ -24,11 +23,11 @@ from schemas.version import SOFTWARE
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What became of one run. `defect` is ours, with its `trace`; everything else is the input's.
+    """What became of one run. With a `trace` its failure is a defect of ours, else the input's.
 
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
-    `faults`: each in words, the worst first. `redo`: the next call tries it again; `proof`: that of `resume`.
+    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved.
     """
 
     run_id: str
@@ -36,18 +35,18 @@ class RunOutcome:
     error: str | None = None
     verdict: RunVerdict | None = None
     skipped: bool = False
-    defect: bool = False
     trace: str | None = None
     seconds: float = 0.0
-    log_bytes: int = 0
     hazards: int | None = None
     missed_detections: int | None = None
-    peak_memory_bytes: int = 0
     attempts: int = 1
     why: str = ""
     faults: tuple[str, ...] = ()
-    redo: bool = False
     proof: str = ""
+
+    @property
+    def defect(self) -> bool:
+        return self.trace is not None
 
 
 @dataclass(frozen=True)
@@ -116,29 +115,22 @@ def worst(runs: pl.DataFrame) -> RunStatus:
     return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in found), RunStatus.OK)
 
 
-def outcome_of(job: RunJob, runs: pl.DataFrame, log_bytes: int, seconds: float) -> RunOutcome:
-    """The outcome that the rows of a run's `runs` table tell; its faults are in another table (`with_faults`)."""
+def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOutcome:
+    """The outcome that a run's own tables tell."""
     errors = runs["error"].drop_nulls().to_list()
     judged = known_counts(runs).drop_nulls("missed_detections")
-    *hazards, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
+    *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
     verdict = worst_verdict(runs["verdict"].to_list())
     return RunOutcome(
         run_id=job.run_id,
         status=worst(runs),
         error=errors[0] if errors else None,
         verdict=verdict,
-        seconds=seconds,
-        log_bytes=log_bytes,
-        hazards=sum(hazards) if judged.height else None,
+        hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         why=_why(runs, verdict, job.config.hazards.unknown_share_limit),
+        faults=tuple(hazard_words(hazards)),
     )
-
-
-def with_faults(outcome: RunOutcome, hazards: pl.DataFrame) -> RunOutcome:
-    """The outcome with its hazards in words, from the run's own table."""
-    return replace(outcome, faults=tuple(hazard_words(hazards)))
 
 
 def _why(runs: pl.DataFrame, verdict: RunVerdict | None, unknown_share_limit: float) -> str:

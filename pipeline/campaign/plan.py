@@ -128,11 +128,6 @@ def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 
-def held_by(plan: Plan, campaign: str) -> Plan:
-    """The plan of the campaign that holds the output under this name."""
-    return replace(plan, jobs=tuple(replace(job, campaign=campaign) for job in plan.jobs))
-
-
 def digests(job: RunJob, files_digest: str) -> dict[str, str]:
     """What decides a run's tables; equal digests mean equal tables, so that the run is skipped."""
     return {

@@ -6,7 +6,6 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
@@ -18,7 +17,7 @@ from pipeline import storage
 from pipeline.campaign.outcome import RunOutcome
 from pipeline.campaign.plan import Plan
 from pipeline.campaign.waits import WAITS
-from pipeline.campaign.watch import Summary, Watch, ending_rows, outcome_line, outcome_rows, summary_line
+from pipeline.campaign.watch import Summary, UnderWay, Watch, ending_rows, outcome_line, outcome_rows, summary_line
 from pipeline.figures.verdict import word_of
 from pipeline.results.terminal import show_table, to_json
 from pipeline.storage.address import is_url, join, redacted
@@ -33,13 +32,13 @@ class LineWatch(Watch):
         self._stream = stream or sys.stderr
         self._said_s = time.monotonic()
 
-    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
+    def look(self, under_way: UnderWay) -> None:
         if time.monotonic() - self._said_s >= WAITS.say_s:
             self._said_s = time.monotonic()
             self.progress(under_way)
 
-    def progress(self, under_way: Sequence[tuple[str, float]]) -> None:
-        self.noted(self.tally.line(under_way))
+    def progress(self, under_way: UnderWay) -> None:
+        self.noted(self.line(under_way))
 
     def noted(self, text: str) -> None:
         """One line; a reader or a terminal that has gone is no reason to stop a campaign."""
@@ -57,14 +56,13 @@ class JsonWatch(LineWatch):
         super().begin(plan)
         self.progress(())
 
-    def progress(self, under_way: Sequence[tuple[str, float]]) -> None:
-        self._say("progress", **self.tally.figures(under_way))
+    def progress(self, under_way: UnderWay) -> None:
+        self._say("progress", **self.figures(under_way))
 
-    def finished(self, outcome: RunOutcome) -> None:
-        self.tally.add(outcome)
+    def told(self, outcome: RunOutcome) -> None:
         names = ("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections")
         told = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
-        self._say("run", **told | {"seconds": round(outcome.seconds, 3)} | self.tally.figures())
+        self._say("run", **told | {"seconds": round(outcome.seconds, 3)} | self.figures())
 
     def lost(self, run_id: str, attempt: int) -> None:
         self._say("lost", run_id=run_id, attempt=attempt)
@@ -86,9 +84,9 @@ class BarWatch(Watch):
         self._task = self._bar.add_task("", total=len(plan.jobs))
         self._bar.start()
 
-    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
-        text = self.tally.line(under_way).partition(", ")[2]
-        self._bar.update(self._task, completed=self.tally.done, description=text)
+    def look(self, under_way: UnderWay) -> None:
+        text = self.line(under_way).partition(", ")[2]
+        self._bar.update(self._task, completed=self.done, description=text)
 
     def noted(self, text: str) -> None:
         self._bar.console.print(text, markup=False, highlight=False)
@@ -104,10 +102,11 @@ class LogWatch(Watch):
     """`OUT/replay.log`: every run with its time; an object store gets it when the campaign ends."""
 
     def begin(self, plan: Plan) -> None:
+        super().begin(plan)
         self._place, self._lines = str(join(plan.out, "replay.log")), list[str]()
         self.noted(f"{SOFTWARE}: {len(plan.jobs)} runs")
 
-    def finished(self, outcome: RunOutcome) -> None:
+    def told(self, outcome: RunOutcome) -> None:
         self.noted(outcome_line(outcome))
         if outcome.trace:
             self.noted(redacted(outcome.trace))

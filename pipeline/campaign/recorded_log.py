@@ -35,10 +35,6 @@ class RecordedLog:
         self._version: str | None = None
         self.state: tuple[storage.FileState, ...] = ()
 
-    @property
-    def size_bytes(self) -> int:
-        return sum(file.size_bytes for file in self.state)
-
     def known_digest(self) -> str:
         """The digest of the log's content, where it can be told without fetching it."""
         self._version = self._stored_version()

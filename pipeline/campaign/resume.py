@@ -67,7 +67,7 @@ def _kept(out: str) -> dict[str, RunOutcome]:
     except (ValueError, OutputError):
         # Of another build, or damaged: a copy that is not needed.
         return {}
-    return {outcome.run_id: replace(outcome, seconds=0.0, log_bytes=0) for outcome in outcomes}
+    return {outcome.run_id: replace(outcome, seconds=0.0) for outcome in outcomes}
 
 
 def _holds(job: RunJob, outcome: RunOutcome) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.campaign.cluster import DaskEngine
@@ -11,7 +12,7 @@ from pipeline.campaign.engines import Engine, LocalEngine, SerialEngine
 from pipeline.campaign.interruption import Interrupted, listening
 from pipeline.campaign.lock import locked
 from pipeline.campaign.loop import CampaignLoop
-from pipeline.campaign.plan import Plan, held_by, with_previous
+from pipeline.campaign.plan import Plan, with_previous
 from pipeline.campaign.resume import keep, unchanged
 from pipeline.campaign.watch import Summary, Watch
 from pipeline.results import store
@@ -47,7 +48,8 @@ def run_campaign(
         store.write_vehicle(plan.out, plan.vehicle)
         note_settings(plan.out, digest_of(plan.config, plan.vehicle), plan.given)
         engine = _engine_for(jobs, len(left.jobs), scheduler, time_limit_s)
-        loop = CampaignLoop(held_by(left, campaign).jobs, engine, time_limit_s, watches, known)
+        held = [replace(job, campaign=campaign) for job in left.jobs]
+        loop = CampaignLoop(held, engine, time_limit_s, watches, known)
         try:
             summary = _watched(plan, loop, watches, at_once=engine.in_process)
         finally:

@@ -11,12 +11,12 @@ from typing import Any
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.plan import Plan, make_plan, software_digest
+from pipeline.campaign.plan import make_plan
 from pipeline.campaign.run import run_campaign
 from pipeline.results import store
 from pipeline.results.manifest import NAME, Manifest, contents_of, own_file_names, read_manifest, write_manifest
 from pipeline.storage.address import Address, join, redacted
-from schemas.config import Configuration, Vehicle, digest_of
+from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.tables import TABLES
 
@@ -82,15 +82,26 @@ def recompute(
         raise UsageError("needs the site", place="--logs", remedy="Give it with --site.")
     with tempfile.TemporaryDirectory(prefix="balise-verify-") as folder:
         plan = make_plan(logs, site, folder, config or store.read_config(out), vehicle, routes)
-        problems = list(_other_inputs(plan, manifest))
-        plan = replace(plan, jobs=tuple(job for job in plan.jobs if job.run_id in manifest["runs"]))
-        if plan.jobs:
-            run_campaign(plan, jobs=jobs)
+        known = tuple(job for job in plan.jobs if job.run_id in manifest["runs"])
+        if known:
+            run_campaign(replace(plan, jobs=known), jobs=jobs)
         again = write_manifest(folder)["runs"]
+    problems = [(f"run {job.run_id}", "a log", "not in the manifest") for job in plan.jobs if job not in known]
     for run_id, found in again.items():
-        problems += _differences_of_run(run_id, found, manifest["runs"][run_id])
-    compared = f"{len(again)} of {len(manifest['runs'])} runs replayed again"
-    return Verification(compared, tuple(problems))
+        expected = manifest["runs"][run_id]
+        if found["config_digest"] != expected["config_digest"]:
+            problems.append((f"run {run_id}, settings", "others", _settings(expected["config_digest"], manifest)))
+        made, named = _parts(found), _parts(expected)
+        for what in dict.fromkeys([*made, *named]):
+            problems += _difference(f"run {run_id}, {what}", made.get(what), named.get(what))
+    return Verification(f"{len(again)} of {len(manifest['runs'])} runs replayed again", tuple(problems))
+
+
+def _parts(run: dict[str, Any]) -> dict[str, str | None]:
+    """The digest of everything that made a run but its settings, and of its tables."""
+    made = {"site": run["site"], "route": run["route_sha256"], "program": run["software_digest"]}
+    logs = {f"log {file['name']}": file["sha256"] for file in sorted(run["log"], key=lambda file: file["name"])}
+    return {**made, **logs, **run["tables"]}
 
 
 def _manifest(out: Address) -> Manifest:
@@ -120,24 +131,6 @@ def _tables(out: Address, runs: Sequence[str], manifest: Manifest) -> Iterator[t
         yield f"run {run}, {table}", _sha256(found.get(place)), manifest["runs"][run]["tables"][table]
 
 
-def _other_inputs(plan: Plan, manifest: Manifest) -> Iterator[tuple[str, str, str]]:
-    """Runs that the manifest does not name, and settings, site or program that are not those of a run."""
-    for job in plan.jobs:
-        expected = manifest["runs"].get(job.run_id)
-        if expected is None:
-            yield f"run {job.run_id}", "a log", "not in the manifest"
-            continue
-        if digest_of(job.config, job.vehicle) != expected["config_digest"]:
-            yield f"run {job.run_id}, settings", "others", _settings(expected["config_digest"], manifest)
-        made = {
-            "site": (job.site_digest, expected["site"]),
-            "route": (job.route_digest or None, expected["route_sha256"]),
-            "program": (software_digest(), expected["software_digest"]),
-        }
-        for what, (found, named) in made.items():
-            yield from _difference(f"run {job.run_id}, {what}", found, named)
-
-
 def _settings(config_digest: str, manifest: Manifest) -> str:
     """The settings files that gave this digest, as options of the command."""
     for entry in manifest["settings"].get(config_digest, []):
@@ -145,14 +138,6 @@ def _settings(config_digest: str, manifest: Manifest) -> str:
         given = [f"{option} {file['name']}" for option, file in named.items() if file]
         return " ".join(given) or "no files"
     return _short(config_digest)
-
-
-def _differences_of_run(run_id: str, found: dict[str, Any], expected: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    logs, named = ({file["name"]: file["sha256"] for file in run["log"]} for run in (found, expected))
-    for name in sorted({*logs, *named}):
-        yield from _difference(f"run {run_id}, log {name}", logs.get(name), named.get(name))
-    for table in TABLES:
-        yield from _difference(f"run {run_id}, {table}", found["tables"][table], expected["tables"][table])
 
 
 def _difference(what: str, found: str | None, expected: str | None) -> list[tuple[str, str, str]]:

@@ -20,7 +20,7 @@ class Waits:
     lonely_said_s: float = 4.0
     """Without any worker, until that is said."""
     lonely_s: float = 300.0
-    """Without any worker, until the campaign gives up: in the night nobody would notice."""
+    """Without any worker, or a word of the scheduler, until the campaign gives up: in the night nobody would notice."""
     runs_per_process: int = 200
     """Until a process is replaced, and its memory is free again."""
     settled_s: float = 2.0

@@ -15,6 +15,8 @@ from pipeline.results.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
 
+UnderWay = Sequence[tuple[str, float]]
+
 _WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
 
 
@@ -56,9 +58,11 @@ class Watch:
     """Whoever wants to see a campaign go on: told of what somebody should see to, and of runs that are not ok."""
 
     def begin(self, plan: Plan) -> None:
-        self.tally = Tally(len(plan.jobs))
+        self.total = len(plan.jobs)
+        self.done = self.failed = self.skipped = 0
+        self.since_s = time.monotonic()
 
-    def look(self, under_way: Sequence[tuple[str, float]]) -> None:
+    def look(self, under_way: UnderWay) -> None:
         """Called several times a second with the runs under way and their age [s]."""
 
     def noted(self, text: str) -> None:
@@ -70,25 +74,17 @@ class Watch:
         self.noted(visible(f"{run_id}: its worker died at attempt {attempt}; tried again"))
 
     def finished(self, outcome: RunOutcome) -> None:
-        self.tally.add(outcome)
+        self.done += 1
+        self.failed += outcome.status is not RunStatus.OK
+        self.skipped += outcome.skipped
+        self.told(outcome)
+
+    def told(self, outcome: RunOutcome) -> None:
+        """A run that has ended, after it was counted."""
         if outcome.status is not RunStatus.OK:
             self.noted(outcome_line(outcome))
 
     def end(self, summary: Summary) -> None: ...
-
-
-class Tally:
-    """Counts that every way of showing progress needs."""
-
-    def __init__(self, total: int) -> None:
-        self.total = total
-        self.done = self.failed = self.skipped = 0
-        self.since_s = time.monotonic()
-
-    def add(self, outcome: RunOutcome) -> None:
-        self.done += 1
-        self.failed += outcome.status is not RunStatus.OK
-        self.skipped += outcome.skipped
 
     @property
     def rate_per_s(self) -> float | None:
@@ -102,7 +98,7 @@ class Tally:
         rate_per_s = self.rate_per_s
         return None if rate_per_s is None else (self.total - self.done) / rate_per_s
 
-    def line(self, under_way: Sequence[tuple[str, float]] = ()) -> str:
+    def line(self, under_way: UnderWay = ()) -> str:
         """One line: done, failed, rate, time left, slow runs."""
         parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed or partial"]
         if self.skipped:
@@ -113,7 +109,7 @@ class Tally:
             parts.append("longest now: " + ", ".join(f"{visible(run)} ({duration_text(age_s)})" for run, age_s in slow))
         return ", ".join(parts)
 
-    def figures(self, under_way: Sequence[tuple[str, float]] = ()) -> dict[str, object]:
+    def figures(self, under_way: UnderWay = ()) -> dict[str, object]:
         """The same for programs."""
         counts = {"done": self.done, "failed": self.failed, "skipped": self.skipped, "total": self.total}
         slow = [{"run_id": run, "seconds": round(age_s, 3)} for run, age_s in slowest(under_way)]
@@ -121,7 +117,7 @@ class Tally:
         return {**counts, **times, "slow": slow}
 
 
-def slowest(under_way: Sequence[tuple[str, float]]) -> list[tuple[str, float]]:
+def slowest(under_way: UnderWay) -> list[tuple[str, float]]:
     """The two runs that have been under way for longest."""
     return sorted(under_way, key=lambda item: -item[1])[:2]
 

@@ -18,7 +18,6 @@ from pipeline.campaign.outcome import (
     failed_tables,
     failure_of,
     outcome_of,
-    with_faults,
     worst,
 )
 from pipeline.campaign.plan import RunJob, digests, software_digest
@@ -41,54 +40,46 @@ def replay_one(job: RunJob) -> RunOutcome:
     Whatever is wrong with the run, a panic of a decoder included, becomes a `runs` row of status `failed`; only an
     output that cannot be written, a changed site and an interruption leave this function as an exception.
     """
-    log = RecordedLog(job)
-    outcome = _replay_one(job, log)
-    return replace(outcome, proof=proof_of(job, log.state) if log.digest and not outcome.redo else "")
-
-
-def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
-    begun = time.monotonic()
+    log, begun = RecordedLog(job), time.monotonic()
     try:
-        _same_software(job)
-        site = _site(job.site, job.site_digest)
-        if (known := log.known_digest()) and _is_done(job, known):
-            return _earlier(job)
-        with log.here() as path:
-            if job.previous is not None and _is_done(job, log.digest_at(path)):
-                return _earlier(job)
-            run = log.read(path)
-            site = with_route(site, job.route) if job.route else site
-            tables = _replayed(job, run, site)
-            if job.write_route:
-                _write_found_route(job, run, site)
+        outcome = _replay_one(job, log)
     except (OutputError, SiteError, UsageError, *ENDING):
         raise
     except BaseException as error:
-        failure = failure_of(error, lasting=bool(log.digest))
-        return fail_run(job, failure, log, time.monotonic() - begun)
-    metadata = _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest}
-    _write(job, tables, metadata)
-    outcome = outcome_of(job, tables.runs, log.size_bytes, time.monotonic() - begun)
-    return with_faults(outcome, tables.hazards)
+        outcome = fail_run(job, failure_of(error, lasting=bool(log.digest)), log)
+    return outcome if outcome.skipped else replace(outcome, seconds=time.monotonic() - begun)
 
 
-def fail_run(job: RunJob, failure: Failure, log: RecordedLog | None = None, seconds: float = 0.0) -> RunOutcome:
+def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
+    _same_software(job)
+    site = _site(job.site, job.site_digest)
+    if (known := log.known_digest()) and _is_done(job, known):
+        return _earlier(job, log)
+    with log.here() as path:
+        if job.previous is not None and _is_done(job, log.digest_at(path)):
+            return _earlier(job, log)
+        run = log.read(path)
+        site = with_route(site, job.route) if job.route else site
+        tables = _replayed(job, run, site)
+        if job.write_route:
+            _write_found_route(job, run, site)
+    _write(job, tables, _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest})
+    return _proved(job, log, outcome_of(job, tables.runs, tables.hazards))
+
+
+def fail_run(job: RunJob, failure: Failure, log: RecordedLog | None = None) -> RunOutcome:
     """Write the tables of a run that failed: one `runs` row that says why, the others empty.
 
     Unless the reason is lasting (a worker was lost, a run took too long) the next campaign tries the run again.
     """
     metadata = _metadata(job, log, RunStatus.FAILED) | ({} if failure.lasting else {"redo": "yes"})
     _write(job, failed_tables(job, failure.error), metadata)
-    defect = failure.trace is not None
-    return RunOutcome(
-        job.run_id,
-        RunStatus.FAILED,
-        failure.error,
-        defect=defect,
-        trace=failure.trace,
-        seconds=seconds,
-        redo=not failure.lasting,
-    )
+    outcome = RunOutcome(job.run_id, RunStatus.FAILED, failure.error, trace=failure.trace)
+    return _proved(job, log, outcome) if failure.lasting and log is not None else outcome
+
+
+def _proved(job: RunJob, log: RecordedLog, outcome: RunOutcome) -> RunOutcome:
+    return replace(outcome, proof=proof_of(job, log.state))
 
 
 def _write(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
@@ -135,13 +126,10 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
     return all(job.previous.get(key) == value for key, value in digests(job, files_digest).items())
 
 
-def _earlier(job: RunJob) -> RunOutcome:
+def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
     """The outcome of a run that is complete already."""
-    runs = store.tables_of(job.out, "runs", [job.run_id])
-    outcome = replace(outcome_of(job, runs, 0, 0.0), skipped=True)
-    if not outcome.hazards:
-        return outcome
-    return with_faults(outcome, store.tables_of(job.out, "hazards", [job.run_id]))
+    runs, hazards = (store.tables_of(job.out, name, [job.run_id]) for name in ("runs", "hazards"))
+    return _proved(job, log, replace(outcome_of(job, runs, hazards), skipped=True))
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:

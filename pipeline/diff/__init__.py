@@ -4,16 +4,8 @@ In: two results. Out: differences by run, hazard and value, with the tolerance o
 Touches files to read them. It judges nothing: it says what is not the same.
 """
 
-from pipeline.diff.hazards import HazardChange, compare_hazards
-from pipeline.diff.results import ResultDiff, RunDiff, diff_results
-from pipeline.diff.tables import Difference, compare_tables
+from pipeline.diff.hazards import compare_hazards
+from pipeline.diff.results import diff_results
+from pipeline.diff.tables import compare_tables
 
-__all__ = [
-    "Difference",
-    "HazardChange",
-    "ResultDiff",
-    "RunDiff",
-    "compare_hazards",
-    "compare_tables",
-    "diff_results",
-]
+__all__ = ["compare_hazards", "compare_tables", "diff_results"]

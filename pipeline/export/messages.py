@@ -165,20 +165,12 @@ def _kind(dtype: pl.DataType) -> str:
 
 
 def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
-    message = message_class(name, fields)()
-    for field, kind in fields:
-        value = values.get(field)
-        if value is None:
-            continue
-        if kind == "time":
-            stamp = getattr(message, field)
-            stamp.SetInParent()
-            stamp.seconds, stamp.nanos = divmod(value, NS_PER_S)
-        elif kind == "doubles":
-            getattr(message, field).extend(value)
-        else:
-            setattr(message, field, value)
-    return bytes(message.SerializeToString(deterministic=True))
+    times = {field: _stamp(values[field]) for field, kind in fields if kind == "time"}
+    return bytes(message_class(name, fields)(**{**values, **times}).SerializeToString(deterministic=True))
+
+
+def _stamp(t_ns: int | None) -> dict[str, int] | None:
+    return None if t_ns is None else dict(zip(("seconds", "nanos"), divmod(t_ns, NS_PER_S), strict=True))
 
 
 Fields = tuple[tuple[str, str], ...]

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.track.geodesy import moved_deg, points_of
 from pipeline.track.survey import Track, track_of
-from schemas.arrays import Floats, Ints, floats
+from schemas.arrays import Floats, floats
 from schemas.run import Site
 
 _POINTS = 3000
@@ -24,17 +24,6 @@ class Ground:
     longitude_deg: Floats
     height_m: Floats
     heading_deg: Floats
-
-
-@dataclass(frozen=True)
-class Stretches:
-    """How path positions lie on net elements: `path_m = offset_m + sign * measure_m` on each, in order of time."""
-
-    elements: tuple[str, ...]
-    sign: Ints
-    offset_m: Floats
-    first_m: Floats
-    last_m: Floats
 
 
 def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) -> Ground:
@@ -65,70 +54,57 @@ def beside(ground: Ground, sign: Floats, left_m: Floats, above_m: Floats) -> Gro
     return Ground(latitude, longitude, height, ground.heading_deg)
 
 
-def stretches_of(epochs: pl.DataFrame) -> Stretches:
-    """The stretches of net elements that a solution's epochs were matched to, each once.
+def stretches_of(epochs: pl.DataFrame) -> pl.DataFrame:
+    """The stretches of net elements that a solution's epochs were matched to, each once, in order of time.
 
-    Path and measure differ by a constant on an element (up to sign), so every pair of epochs there shows both.
+    `netelement_id, sign, offset_m, first_m, last_m`: `path_m = offset_m + sign * measure_m` there, from `first_m` to
+    `last_m` of the path. Path and measure differ by a constant on an element (up to sign), so every pair of epochs
+    there shows both.
     """
     known = epochs.select("netelement_id", "measure_m", "path_m").drop_nulls()
-    runs = (
+    return (
         known.with_columns(run=pl.col("netelement_id").rle_id())
-        .group_by("run", maintain_order=True)
+        .group_by("run", "netelement_id", maintain_order=True)
         .agg(
-            element=pl.col("netelement_id").first(),
             turn=(pl.col("measure_m").diff() * pl.col("path_m").diff()).sum(),
             measure=pl.col("measure_m").last(),
             path=pl.col("path_m").last(),
-            low=pl.col("path_m").min(),
-            high=pl.col("path_m").max(),
+            first_m=pl.col("path_m").min(),
+            last_m=pl.col("path_m").max(),
         )
         .filter(pl.col("turn") != 0.0)
         .with_columns(sign=pl.col("turn").sign().cast(pl.Int64))
-        .with_columns(offset=pl.col("path") - pl.col("sign") * pl.col("measure"))
-    )
-    merged = runs.group_by("element", "sign", pl.col("offset").round(0).alias("about"), maintain_order=True).agg(
-        pl.col("offset").median(), pl.col("low").min(), pl.col("high").max()
-    )
-    return Stretches(
-        tuple(merged["element"].to_list()),
-        merged["sign"].to_numpy().astype(np.int64),
-        merged["offset"].to_numpy().astype(np.float64),
-        merged["low"].to_numpy().astype(np.float64),
-        merged["high"].to_numpy().astype(np.float64),
+        .with_columns(offset_m=pl.col("path") - pl.col("sign") * pl.col("measure"))
+        .group_by("netelement_id", "sign", pl.col("offset_m").round(0).alias("about"), maintain_order=True)
+        .agg(pl.col("offset_m").median(), pl.col("first_m").min(), pl.col("last_m").max())
+        .drop("about")
     )
 
 
-def ground_at(track: pl.DataFrame, stretches: Stretches, path_m: Floats, margin_m: float = 50.0) -> Ground:
+def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, margin_m: float = 50.0) -> Ground:
     """Places of path positions on the stretches; NaN further than `margin_m` beyond what was travelled."""
-    best, chosen = np.full(len(path_m), np.inf), np.full(len(path_m), -1, dtype=np.int64)
+    best, measure_m = np.full(len(path_m), np.inf), np.full(len(path_m), np.nan)
+    names = np.full(len(path_m), None, dtype=object)
     survey = track_of(track)
-    for number, element in enumerate(stretches.elements):
+    for name, sign, offset_m, first_m, last_m in stretches.iter_rows():
         # Path positions of the whole element, not just of the epochs on it.
-        ends = [stretches.first_m[number], stretches.last_m[number]]
-        if element in survey.index:
-            measures = survey.measure_m[survey.vertices(survey.index[element])][[0, -1]]
-            ends += list(stretches.offset_m[number] + stretches.sign[number] * measures)
-        low, high = min(ends), max(ends)
-        away = np.maximum(np.maximum(low - path_m, path_m - high), 0.0)
+        ends = [first_m, last_m]
+        if name in survey.index:
+            measures = survey.measure_m[survey.vertices(survey.index[name])][[0, -1]]
+            ends += list(offset_m + sign * measures)
+        away = np.maximum(np.maximum(min(ends) - path_m, path_m - max(ends)), 0.0)
         nearer = (away < best) & (away <= margin_m)
-        best[nearer], chosen[nearer] = away[nearer], number
-    hit = chosen >= 0
-    measure = np.full(len(path_m), np.nan)
-    measure[hit] = stretches.sign[chosen[hit]] * (path_m[hit] - stretches.offset_m[chosen[hit]])
-    names = pl.Series([stretches.elements[number] if number >= 0 else None for number in chosen], dtype=pl.String)
-    return ground_of(track, names, measure)
+        best[nearer], names[nearer] = away[nearer], name
+        measure_m[nearer] = sign * (path_m[nearer] - offset_m)
+    return ground_of(track, pl.Series(names, dtype=pl.String), measure_m)
 
 
-def sign_of(epochs: pl.DataFrame, stretches: Stretches) -> Floats:
+def sign_of(epochs: pl.DataFrame, stretches: pl.DataFrame) -> Floats:
     """Per epoch +1 where its path grows with the measure, -1 against it, NaN where that is not known."""
-    table = pl.DataFrame(
-        {"netelement_id": stretches.elements, "sign": stretches.sign, "offset": stretches.offset_m},
-        schema={"netelement_id": pl.String, "sign": pl.Int64, "offset": pl.Float64},
-    )
     rows = epochs.select("netelement_id", "measure_m", "path_m").with_row_index("row")
     fitting = (
-        rows.join(table, on="netelement_id", how="left", maintain_order="left")
-        .with_columns(misfit=(pl.col("path_m") - pl.col("sign") * pl.col("measure_m") - pl.col("offset")).abs())
+        rows.join(stretches, on="netelement_id", how="left", maintain_order="left")
+        .with_columns(misfit=(pl.col("path_m") - pl.col("sign") * pl.col("measure_m") - pl.col("offset_m")).abs())
         .sort("row", "misfit", nulls_last=True, maintain_order=True)
         .group_by("row", maintain_order=True)
         .first()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import polars as pl
 
@@ -20,6 +19,7 @@ LOCATION_FIELDS: Fields = (
 _COVARIANCE = tuple(f"cov_{axes}_m2" for axes in ("ee", "en", "eu", "en", "nn", "nu", "eu", "nu", "uu"))
 HELD = {"t", "solution", "latitude_deg", "longitude_deg", "height_m", "fix", *_COVARIANCE}
 """Columns of the stream `gnss` that both messages hold, or that a topic of its own tells."""
+_PLACES = tuple(f"covariance {place}" for place in range(9))
 _UNKNOWN, _KNOWN = 0, 3  # covariance types of both messages
 
 NAVSATFIX = "sensor_msgs/msg/NavSatFix"
@@ -42,7 +42,7 @@ NAVSATFIX_DEFINITION = f"\n{'=' * 80}\n".join(
 _NAVSATFIX_FIELDS: Fields = (
     ("t", "time"), ("frame_id", "string"), ("status", "int8"), ("service", "uint16"),
     ("latitude_deg", "double"), ("longitude_deg", "double"), ("height_m", "double"),
-    *((f"covariance {place}", "double") for place in range(9)), ("type", "uint8"),
+    *((place, "double") for place in _PLACES), ("type", "uint8"),
 )  # fmt: skip
 _NAVSAT_STATUS: Mapping[str, int] = {
     Fix.NONE: -1, Fix.AUTONOMOUS: 0, Fix.SBAS: 1, Fix.DIFFERENTIAL: 2, Fix.RTK_FLOAT: 2, Fix.RTK_FIXED: 2,
@@ -52,40 +52,34 @@ _NAVSAT_STATUS: Mapping[str, int] = {
 
 def location_fix_topic(topic: str, gnss: pl.DataFrame, frame_id: str) -> Topic:
     """One foxglove.LocationFix per row of `gnss`; rows need a position."""
-    rows = (
-        {
-            "latitude": row["latitude_deg"],
-            "longitude": row["longitude_deg"],
-            "altitude": row["height_m"] or 0.0,
-            "position_covariance": covariance,
-            "position_covariance_type": kind,
-            "timestamp": row["t"],
-            "frame_id": frame_id,
-        }
-        for row, covariance, kind in _with_covariance(gnss)
+    rows = _with_covariance(gnss, frame_id).select(
+        pl.col("frame_id"),
+        latitude="latitude_deg",
+        longitude="longitude_deg",
+        altitude=pl.col("height_m").fill_null(0.0),
+        position_covariance=pl.concat_list(_PLACES),
+        position_covariance_type="type",
+        timestamp="t",
     )
-    return message_topic(topic, LOCATION_FIX, LOCATION_FIELDS, _times_ns(gnss), rows, "protobuf")
+    times = rows["timestamp"].to_list()
+    return message_topic(topic, LOCATION_FIX, LOCATION_FIELDS, times, rows.iter_rows(named=True), "protobuf")
 
 
 def navsatfix_topic(topic: str, gnss: pl.DataFrame, frame_id: str) -> Topic:
     """One sensor_msgs/NavSatFix per row of `gnss`; an unknown position or height is NaN."""
-    rows = (
-        row
-        | {"frame_id": frame_id, "status": _NAVSAT_STATUS[row["fix"]], "service": 1, "type": kind}  # SERVICE_GPS
-        | {f"covariance {place}": value for place, value in enumerate(covariance)}
-        for row, covariance, kind in _with_covariance(gnss)
+    status = pl.col("fix").cast(pl.String).replace_strict(_NAVSAT_STATUS, return_dtype=pl.Int8)
+    rows = _with_covariance(gnss, frame_id).with_columns(status=status, service=pl.lit(1))  # SERVICE_GPS
+    messages = cdr_messages(_NAVSATFIX_FIELDS, rows.iter_rows(named=True))
+    return Topic(topic, "cdr", NAVSATFIX, "ros2msg", NAVSATFIX_DEFINITION.encode(), rows["t"].to_list(), messages)
+
+
+def _with_covariance(gnss: pl.DataFrame, frame_id: str) -> pl.DataFrame:
+    """With the covariance, row by row of the matrix [m2], and its type; zeros where it is not known. Times in ns."""
+    known = pl.all_horizontal(pl.col(name).is_not_null() for name in _COVARIANCE)
+    places = zip(_PLACES, _COVARIANCE, strict=True)
+    return gnss.with_columns(
+        pl.col("t").to_physical(),
+        *(pl.when(known).then(pl.col(name)).otherwise(0.0).alias(place) for place, name in places),
+        type=pl.when(known).then(_KNOWN).otherwise(_UNKNOWN),
+        frame_id=pl.lit(frame_id),
     )
-    messages = cdr_messages(_NAVSATFIX_FIELDS, rows)
-    return Topic(topic, "cdr", NAVSATFIX, "ros2msg", NAVSATFIX_DEFINITION.encode(), _times_ns(gnss), messages)
-
-
-def _with_covariance(gnss: pl.DataFrame) -> Iterator[tuple[dict[str, Any], list[float], int]]:
-    """Rows with their covariance, row by row of the matrix [m2], and its type; zeros where it is not known."""
-    for row in gnss.with_columns(pl.col("t").to_physical()).iter_rows(named=True):
-        values = [row[name] for name in _COVARIANCE]
-        known = None not in values
-        yield row, values if known else [0.0] * len(values), _KNOWN if known else _UNKNOWN
-
-
-def _times_ns(gnss: pl.DataFrame) -> list[int]:
-    return gnss["t"].to_physical().to_list()

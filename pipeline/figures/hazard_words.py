@@ -20,7 +20,7 @@ def hazard_words(hazards: pl.DataFrame) -> list[str]:
 
 def hazard_phrase(row: Row) -> str:
     """`VB_JUMP_1B: VB04 502 m early, accepted; no monitor saw it`."""
-    return f"{row['hazard']}: {_what(row)}, {_accepted(row)}; {seen_words(row)}{_in_use(row)}"
+    return f"{row['hazard']}: {_what(row)}, {_accepted(row)}; {_seen(row)}{_in_use(row)}"
 
 
 def _badness(row: Row) -> tuple[Any, ...]:
@@ -31,11 +31,11 @@ def _badness(row: Row) -> tuple[Any, ...]:
 
 def _what(row: Row) -> str:
     """The balises that it hit, how far off and to which side."""
-    off = off_words(row["size_m"], row["timing"])
+    off = _off(row["size_m"], row["timing"])
     return " ".join(text for text in (_some(row["balise_ids"]) or "no balise", off) if text)
 
 
-def off_words(size_m: float | None, timing: Timing | str | None) -> str:
+def _off(size_m: float | None, timing: Timing | str | None) -> str:
     """`502 m early`, `3 m off` where the side is not known, `late` where the size is not; nothing where neither is."""
     size = "" if size_m is None else f"{abs(size_m):.0f} m"
     side = "" if timing in (None, Timing.NONE) else str(timing)
@@ -49,7 +49,7 @@ def _accepted(row: Row) -> str:
     return "accepted" if set(accepted) == set(hit) else f"{_some(accepted)} accepted"
 
 
-def seen_words(row: Row) -> str:
+def _seen(row: Row) -> str:
     """Which monitor saw it, and how late."""
     if not row["detected"]:
         return "no monitor saw it"

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial import cKDTree
 
-from pipeline.export.places import Stretches, ground_of, stretches_of
+from pipeline.export.places import ground_of, stretches_of
 from pipeline.line.pieces import Pieces, plane_of
 from pipeline.line.spans import FIRST_LOSS, State, spans_of, states_of
 from schemas.arrays import Floats, Ints, floats
@@ -86,18 +86,18 @@ def passes_of(
     return _explained(_merged(pl.concat(parts)), hits, alarms)
 
 
-def laid_on(spans: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
+def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """The spans' columns per piece and direction that they touch, with `begin_m, end_m`: the likely way on the piece.
 
     A right span counts on the net elements of its own positions only, so that nothing good is said of a track
     that runs beside it on the path.
     """
     found: list[pl.DataFrame] = []
-    for number, name in enumerate(legs.elements):
+    for name, sign, offset_m in legs.select("netelement_id", "sign", "offset_m").iter_rows():
         element = pieces.track.index.get(name)
         if element is None:
             continue
-        at = _measures(spans, int(legs.sign[number]), float(legs.offset_m[number]))
+        at = _measures(spans, sign, offset_m)
         rows = pieces.track.vertices(element)
         first_m, last_m = pieces.track.measure_m[rows][0], pieces.track.measure_m[rows][-1]
         own = (pl.col("state") > int(State.AFTER_ALARM)) | (pl.col("one") == name) | (pl.col("other") == name)
@@ -148,7 +148,7 @@ def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
     )
 
 
-def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
+def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """Pieces of virtual balises that were accepted at a wrong place, in the direction in which the train went."""
     unsafe = passages.filter(
         (pl.col("status") == PassageStatus.ACCEPTED.value)
@@ -160,7 +160,7 @@ def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: Stretches, piece
 
 
 def _misleading(
-    epochs: pl.DataFrame, states: Ints, legs: Stretches, ground: Ground, criteria: LineCriteria
+    epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, ground: Ground, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
     """Pieces that wrong positions in use claimed, and those beside a position on a wrong track."""
     told = epochs.with_columns(state=pl.Series(states), ahead="direction").filter(pl.col("netelement_id").is_not_null())
@@ -179,13 +179,13 @@ def _misleading(
     return parts
 
 
-def _named(rows: pl.DataFrame, legs: Stretches, pieces: Pieces) -> pl.DataFrame:
+def _named(rows: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """`piece, growing, state, t` of the places that rows name; `ahead`: their direction on growing path.
 
     Both directions where that is not known.
     """
     signs: dict[str, set[int]] = {}
-    for name, sign in zip(legs.elements, legs.sign.tolist(), strict=True):
+    for name, sign in legs.select("netelement_id", "sign").iter_rows():
         signs.setdefault(name, set()).add(sign)
     found: dict[tuple[int, bool], object] = {}
     for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():

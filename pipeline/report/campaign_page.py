@@ -15,7 +15,7 @@ from pipeline.figures.verdict import head_of, run_verdicts, word_of
 from pipeline.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.report.columns import Row, figures, frame_table
 from pipeline.report.ground import availability_map
-from pipeline.report.headline import campaign_headline, run_headline, wrong_acceptances
+from pipeline.report.headline import campaign_headline, run_headline
 from pipeline.report.markup import (
     Cell,
     Json,
@@ -72,7 +72,7 @@ _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunV
 def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
-    head, named = campaign_headline(campaign.runs, campaign.passages, campaign.hazards, made.config)
+    head, named = campaign_headline(campaign.runs, campaign.hazards, made.config)
     # Each run counts once, by the worst of its solutions.
     counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
@@ -160,15 +160,11 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
 
 def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
     """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
-    wrong = wrong_acceptances(campaign.passages).partition_by("run_id", as_dict=True)
-    faults = campaign.hazards.partition_by("run_id", as_dict=True)
-    nothing = campaign.passages.clear(), campaign.hazards.clear()
+    faults, none = campaign.hazards.partition_by("run_id", as_dict=True), campaign.hazards.clear()
     return {
         (row["run_id"], row["solution"]): ""
         if row["verdict"] == RunVerdict.SAFE
-        else run_headline(
-            [row], wrong.get((row["run_id"],), nothing[0]), faults.get((row["run_id"],), nothing[1]), made.config
-        ).worst
+        else run_headline([row], faults.get((row["run_id"],), none), made.config).worst
         for row in campaign.runs.iter_rows(named=True)
     }
 

@@ -12,7 +12,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.export.places import (
-    Stretches,
     beside,
     element_lines_m,
     ground_at,
@@ -41,7 +40,7 @@ class _View:
     """How path positions and epochs become points of the drawing."""
 
     site: Site | None
-    stretches: Stretches
+    stretches: pl.DataFrame
     origin: tuple[float, float]
 
     def at(self, path_m: Floats) -> tuple[Floats, Floats]:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.figures.hazard_words import off_words, seen_words
+from pipeline.figures.hazard_words import hazard_words
 from pipeline.figures.verdict import head_of, run_verdicts, verdict_reasons, word_of, worst_verdict
 from pipeline.report.columns import Row
 from pipeline.report.markup import Cell, cell, number, table
 from pipeline.report.words import WORDS, plural, some_of
 from schemas.config import Configuration
-from schemas.enums import BaliseKind, Hazard, Judgement, PassageStatus, RunVerdict, Timing
+from schemas.enums import RunVerdict
 from schemas.run import RunTables
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
@@ -29,20 +29,13 @@ class Headline:
     reasons: str
 
 
-def wrong_acceptances(passages: pl.DataFrame) -> pl.DataFrame:
-    """Virtual balises that were accepted at a wrong place, the largest error first."""
-    wrong = (pl.col("judgement") == Judgement.WRONG.value) & (pl.col("status") == PassageStatus.ACCEPTED.value)
-    found = passages.filter(wrong & (pl.col("kind") == BaliseKind.VIRTUAL.value))
-    return found.sort(pl.col("location_error_m").abs(), descending=True, nulls_last=True, maintain_order=True)
-
-
-def run_headline(rows: Iterable[Row], passages: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> Headline:
+def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, config: Configuration) -> Headline:
     """Of one run with all its solutions, headed by the worst of them."""
     listed = list(rows)
     verdict = worst_verdict(row["verdict"] for row in listed)
     heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
     limit = config.hazards.unknown_share_limit
-    worst = _worst(heading, passages, hazards, limit) if verdict is not None else heading["error"] or "the run failed"
+    worst = _worst(heading, hazards, limit) if verdict is not None else heading["error"] or "the run failed"
     named = len(listed) > 1
     if named:
         told = " ".join(_told(row, limit) for row in listed)
@@ -56,38 +49,14 @@ def _told(row: Row, limit: float) -> str:
     return f"{row['solution']}: {word_of(row['verdict'])}{why}."
 
 
-def _worst(run: Row, passages: pl.DataFrame, hazards: pl.DataFrame, limit: float) -> str:
-    """What made the verdict, in the fewest words that name it."""
-    own = pl.col("solution") == run["solution"]
-    wrong = wrong_acceptances(passages.filter(own))
-    if wrong.height:
-        return _wrong_acceptance(wrong, hazards.filter(own))
-    if run["verdict"] == RunVerdict.UNSAFE and run["hazardous_max_s"] is not None:
-        return f"a wrong position was in use for {number(run['hazardous_max_s'])} s, longer than allowed"
-    return verdict_reasons(run, limit)
+def _worst(run: Row, hazards: pl.DataFrame, limit: float) -> str:
+    """What made the verdict, in the fewest words that name it: the worst of the faults that did, else the counts."""
+    accepted, late = pl.col("accepted_ids").list.len() > 0, pl.col("within_budget").eq(other=False)
+    guilty = hazards.filter(pl.col("solution") == run["solution"], accepted | late)
+    return next(iter(hazard_words(guilty)), verdict_reasons(run, limit))
 
 
-def _wrong_acceptance(wrong: pl.DataFrame, hazards: pl.DataFrame) -> str:
-    first = wrong.row(0, named=True)
-    hazard = hazards.filter(pl.col("hazard_id") == first["hazard_id"])
-    others = wrong.height - 1
-    more = f" ({plural(others, 'more wrong acceptance')})" if others else ""
-    found = hazard.row(0, named=True) if hazard.height else None
-    seen = "" if found is None else f", {seen_words(found)}"
-    return f"{first['balise_id']} accepted {_where(first['location_error_m'], found)}{more}{seen}"
-
-
-def _where(error_m: float | None, hazard: Row | None) -> str:
-    if hazard is not None and hazard["hazard"] == Hazard.VB_WRONG_TRACK:
-        return "on the wrong track"
-    if error_m is None:
-        return "at a wrong place"
-    return off_words(error_m, Timing.EARLY if error_m > 0 else Timing.LATE)
-
-
-def campaign_headline(
-    runs: pl.DataFrame, passages: pl.DataFrame, hazards: pl.DataFrame, config: Configuration
-) -> tuple[Headline, str | None]:
+def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, config: Configuration) -> tuple[Headline, str | None]:
     """Of all runs, and the run that it names; frames with `run_id`."""
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
@@ -103,8 +72,7 @@ def campaign_headline(
     if worst.is_empty():
         return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said), None
     row = worst.row(0, named=True)
-    own = pl.col("run_id") == row["run_id"]
-    reason = _worst(row, passages.filter(own), hazards.filter(own), config.hazards.unknown_share_limit)
+    reason = _worst(row, hazards.filter(pl.col("run_id") == row["run_id"]), config.hazards.unknown_share_limit)
     return Headline(head.word, f"{reason} (run {row['run_id']})", said), row["run_id"]
 
 

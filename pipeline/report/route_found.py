@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 from html import escape
-from io import BytesIO
 
 import polars as pl
 
 from pipeline.export.places import stretches_of
 from pipeline.report.columns import frame_table
-from pipeline.report.markup import section
+from pipeline.report.markup import link, section
 from pipeline.report.words import some_of
 from pipeline.results.store import file_name
 
@@ -32,22 +31,19 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
     `doubtful`: the least probability of the path there is below `sure`.
     """
     ways = stretches_of(epochs)
-    if not ways.elements or len(set(ways.elements)) < len(ways.elements):
+    if ways.is_empty() or ways["netelement_id"].n_unique() < ways.height:
         return None
     told = (
-        epochs.filter(pl.col("path_m").is_not_null() & pl.col("netelement_id").is_in(ways.elements))
+        epochs.filter(pl.col("path_m").is_not_null())
         .group_by("netelement_id")
         .agg(probability=pl.col("path_probability").min(), t_start=pl.col("t").min(), t_end=pl.col("t").max())
     )
-    directions = ["AB" if sign > 0 else "BA" for sign in ways.sign.tolist()]
-    found = {"netelement_id": ways.elements, "direction": directions, "from_m": ways.first_m}
     return (
-        pl.DataFrame(found)
-        .join(told, on="netelement_id", how="left")
-        .sort("from_m")
+        ways.join(told, on="netelement_id", how="left")
+        .sort("first_m")
         .select(
             "netelement_id",
-            "direction",
+            pl.when(pl.col("sign") > 0).then(pl.lit("AB")).otherwise(pl.lit("BA")).alias("direction"),
             "probability",
             "t_start",
             "t_end",
@@ -57,7 +53,7 @@ def found_route(epochs: pl.DataFrame, sure: float) -> pl.DataFrame | None:
 
 
 def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float) -> str:
-    """The route with its doubtful stretches, and both files to take away; nothing without matched positions."""
+    """The route with its doubtful stretches, and a file of it to take away; nothing without matched positions."""
     if epochs["path_m"].null_count() == epochs.height:
         return ""
     route = found_route(epochs, sure)
@@ -65,21 +61,13 @@ def route_section(identity: str, run_id: str, epochs: pl.DataFrame, sure: float)
         return section(identity, "Route found", f"<p>{_TURNED}</p>")
     doubtful = route.filter("doubtful")["netelement_id"].to_list()
     said = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
-    parquet = BytesIO()
-    route.write_parquet(parquet)
-    files = {"csv": route.write_csv().encode(), "parquet": parquet.getvalue()}
-    downloads = " ".join(_download(run_id, ending, content) for ending, content in files.items())
+    href = f"data:text/csv;base64,{base64.b64encode(route.write_csv().encode()).decode()}"
+    download = link(href, "route as csv", download=f"{file_name(run_id)}.csv")
     shown = route.select("doubtful", "netelement_id", "direction", "probability", "t_start", "t_end")
     return section(
         identity,
         "Route found",
-        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {downloads}</p>',
+        f'<p class="notice {"partial" if doubtful else "ok"}">{escape(said)} {download}</p>',
         f"<p>{_NOTE}</p>",
         frame_table(f"table-{identity}", "Route found, in the order of the path", shown),
     )
-
-
-def _download(run_id: str, ending: str, content: bytes) -> str:
-    """A link that holds its file."""
-    href = f"data:application/octet-stream;base64,{base64.b64encode(content).decode()}"
-    return f'<a download="{escape(file_name(run_id))}.{ending}" href="{href}">route as {ending}</a>'

@@ -76,17 +76,17 @@ def run_page(
     tables: RunTables,
     metadata: Mapping[str, str],
     made: Made,
-    architectures: pl.DataFrame | None = None,
-    neighbours: Neighbours | None = None,
+    architectures: pl.DataFrame,
+    neighbours: Neighbours,
 ) -> str:
     """HTML of one run with all its solutions; one is shown at a time, all of them are in the page.
 
-    `architectures`: the run's solutions side by side, where there are several.
+    `architectures`: the run's solutions side by side, no rows where there is but one.
     """
     rows = list(tables.runs.iter_rows(named=True))
     names = [row["solution"] for row in rows if row["solution"]]
     parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
-    side_by_side = "" if architectures is None else architectures_section("architectures", architectures)
+    side_by_side = architectures_section("architectures", architectures)
     told = pairs(facts(rows, tables, metadata))
     digests = pairs(sorted((name, value) for name, value in metadata.items() if not name.endswith(FILES)))
     provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration(made))
@@ -103,8 +103,8 @@ def run_page(
         "order": [row["solution"] for row in rows],
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
-    head = run_headline(rows, tables.passages, tables.hazards, made.config)
-    verdict, ways = verdict_head(head.word, head.worst, head.reasons), _ways(neighbours or Neighbours())
+    head = run_headline(rows, tables.hazards, made.config)
+    verdict, ways = verdict_head(head.word, head.worst, head.reasons), _ways(neighbours)
     heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)

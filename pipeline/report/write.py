@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import quote
@@ -18,7 +18,6 @@ from pipeline.figures.campaign_figures import derived_tables
 from pipeline.report.campaign_page import Campaign, campaign_page
 from pipeline.report.ground import availability_pieces, together
 from pipeline.report.run_page import Made, Neighbours, run_page
-from pipeline.report.shares import Share, known_shares, remember
 from pipeline.results import catalogue
 from pipeline.results.store import (
     check_site,
@@ -30,26 +29,27 @@ from pipeline.results.store import (
     table_address,
 )
 from pipeline.safety.side_by_side import side_by_side
-from pipeline.safety.tally import added
+from pipeline.safety.tally import COUNTS, added
 from pipeline.storage import files
 from schemas.config import Configuration, to_toml
 from schemas.run import Site
 from schemas.tables import TABLES
 
-# The end of a page: what it was made from.
-_MARK = "<!-- {} -->\n"
+# Kept of each run until it changes: what its page was made from, how many bytes it has, and what the run adds to the
+# page of the campaign, rows of `availability_pieces` and `side_by_side`.
+_KEPT = "pages"
 
 
 @dataclass(frozen=True)
 class _Page:
-    """What the page of one run is made from; `content`: digest of its tables as last read, empty if they changed."""
+    """What the page of one run is made from; `made_of`: the digest of that, empty where nobody knows the state."""
 
     out: Path
     run: str
     path: Path
     made: Made
     neighbours: Neighbours
-    content: str
+    made_of: str = ""
 
 
 def write_report(
@@ -66,29 +66,29 @@ def write_report(
     config = read_config(out)
     made = Made(config or Configuration(), None if config is None else to_toml(config), site)
     states = catalogue.states(out, *TABLES) or {}
-    shares = known_shares(out, states, _settings_digest(made))
     ways = [None, *((run, quote(name)) for run, name in names.items()), None]
-    beside = {run: Neighbours(ways[at], ways[at + 2]) for at, run in enumerate(names)}
+    folder, index = out / "report" / "runs", out / "report" / "index.html"
     pages = [
-        _Page(out, run, out / "report" / "runs" / name, made, beside[run], shares[run].content if run in shares else "")
-        for run, name in names.items()
+        _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), states.get(run))
+        for at, (run, name) in enumerate(names.items())
     ]
-    left = [page for page in pages if not _is_there(page)]
+    shares = _known(out, pages)
+    left = [page for page in pages if page.run not in shares]
     # Starting a process takes as long as some pages.
     jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
-    for done, share in enumerate(each(_written, left, jobs), start=len(pages) - len(left) + 1):
-        shares[share.run] = share
+    for page, share in zip(left, each(_written, left, jobs), strict=True):
+        shares[page.run] = share
         if progress is not None:
-            progress(done, len(pages))
-    if states == catalogue.states(out, *TABLES):
-        remember(out, states, _settings_digest(made), shares)
-    folder, own = out / "report" / "runs", {page.path.name for page in pages}
-    for name in files.list_dir(folder):
-        if name.endswith(".html") and name not in own:
+            progress(len(shares), len(pages))
+    rows = pl.concat([shares[run] for run in names])
+    # Runs that changed while they were read must not pass for what was read.
+    if states and states == catalogue.states(out, *TABLES):
+        catalogue.keep(out, _KEPT, rows, states)
+    for name in set(files.list_dir(folder)) - set(names.values()):
+        if name.endswith(".html"):
             storage.remove(folder / name)
     hrefs = {run: f"runs/{quote(name)}" for run, name in names.items()}
-    index = out / "report" / "index.html"
-    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, shares), made).encode())
+    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, rows), made).encode())
     return [index, *(page.path for page in pages)]
 
 
@@ -97,68 +97,60 @@ def page_name(run_id: str) -> str:
     return f"{file_name(run_id)}.html"
 
 
-def _is_there(page: _Page) -> bool:
-    """Whether the page was made from these very tables; one of a site without digest is never known to be."""
-    known_site = page.made.site is None or page.made.site.digest
-    return bool(page.content and known_site) and _end_of(page.path).endswith(_mark(page, page.content))
+def _with_digest(page: _Page, state: str | None) -> _Page:
+    """With the SHA-256 over all that the page follows from: tables, settings, site, neighbours and program.
+
+    Empty where files have no state, or the site has no digest: such a page is never known to be there.
+    """
+    site = page.made.site
+    if not state or (site is not None and not site.digest):
+        return page
+    places = (page.run, page.neighbours, None if site is None else site.digest)
+    text = f"{software_digest()}\n{page.made.config_text}\n{state}\n{places}"
+    return replace(page, made_of=hashlib.sha256(text.encode()).hexdigest())
 
 
-def _end_of(path: Path) -> bytes:
-    """The last bytes of a file; none of one that cannot be read, which is written anew."""
-    try:
-        with path.open("rb") as file:
-            file.seek(max(path.stat().st_size - len(_MARK.format("0" * 64)), 0))
-            return file.read()
-    except OSError:
-        return b""
+def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
+    """What is kept of the runs whose pages are there and would be the same again, a row each."""
+    kept, _ = catalogue.kept(out, _KEPT)
+    rows = {row["made_of"][0]: row for row in kept.iter_slices(1)}
+    found = ((page, rows.get(page.made_of)) for page in pages if page.made_of)
+    return {page.run: row for page, row in found if row is not None and _size(page.path) == row["page_bytes"][0]}
 
 
-def _written(page: _Page) -> Share:
-    """Write the page unless it is there already; returns what the run adds to the page of the campaign."""
-    contents = {name: storage.content_of(table_address(page.out, name, page.run)) for name in TABLES}
-    metadata = metadata_of(contents["runs"] or b"")
+def _size(path: Path) -> int:
+    """Bytes of a file; -1 for none."""
+    return path.stat().st_size if path.exists() else -1
+
+
+def _written(page: _Page) -> pl.DataFrame:
+    """Write the page; returns the row to keep of it."""
+    metadata = metadata_of(Path(table_address(page.out, "runs", page.run)))
     check_site(page.made.site, metadata.get("site_digest"), page.run)
     tables = read_run(page.out, page.run)
-    several, config = tables.runs.height > 1, page.made.config
     judged = (tables.epochs, tables.hazards, tables.alarms, tables.runs)
-    tallies = side_by_side(*judged, config) if several else None
-    share = Share(page.run, _digest(contents), availability_pieces(tables.epochs.lazy()), tallies)
-    if not _is_there(replace(page, content=share.content)):
-        html = run_page(tables, metadata, page.made, share.tallies, page.neighbours)
-        storage.write_bytes(page.path, html.encode() + _mark(page, share.content))
-    return share
+    tallies = side_by_side(*judged, page.made.config) if tables.runs.height > 1 else pl.DataFrame(schema=COUNTS)
+    content = run_page(tables, metadata, page.made, tallies, page.neighbours).encode()
+    storage.write_bytes(page.path, content)
+    return pl.DataFrame({"made_of": page.made_of, "page_bytes": len(content)}).with_columns(
+        pieces=pl.lit(availability_pieces(tables.epochs.lazy()).to_struct()).implode(),
+        tallies=pl.lit(tallies.to_struct()).implode(),
+    )
 
 
-def _digest(contents: Mapping[str, bytes | None]) -> str:
-    digest = hashlib.sha256()
-    for content in contents.values():
-        digest.update(hashlib.sha256(b"missing" if content is None else content).digest())
-    return digest.hexdigest()
+def _unlisted(rows: pl.DataFrame, name: str) -> pl.DataFrame:
+    """What the runs add, one after the other."""
+    return rows[name].explode().drop_nulls().struct.unnest()
 
 
-def _mark(page: _Page, content: str) -> bytes:
-    """SHA-256 over the run's tables, the settings, the site and the program: all that its page follows from."""
-    site = page.made.site
-    beside = f"{page.run}\n{page.neighbours}\n{None if site is None else site.digest}"
-    digest = hashlib.sha256(f"{_settings_digest(page.made)}\n{content}\n{beside}".encode())
-    return _MARK.format(digest.hexdigest()).encode()
-
-
-def _settings_digest(made: Made) -> str:
-    """SHA-256 over the program and the configuration."""
-    return hashlib.sha256(f"{software_digest()}\n{made.config_text}".encode()).hexdigest()
-
-
-def _campaign(out: Path, made: Made, hrefs: dict[str, str], shares: Mapping[str, Share]) -> Campaign:
+def _campaign(out: Path, made: Made, hrefs: dict[str, str], rows: pl.DataFrame) -> Campaign:
     found = catalogue.gather(out)
-    runs, hazards, passages, alarms = (found[name] for name in ("runs", "hazards", "passages", "alarms"))
-    in_order = [shares[run] for run in hrefs]
     return Campaign(
-        runs=runs,
-        hazards=hazards,
-        passages=passages,
-        derived=derived_tables(runs, hazards, passages, alarms, made.config),
-        pieces=together(pl.concat([share.pieces for share in in_order])),
+        runs=found["runs"],
+        hazards=found["hazards"],
+        passages=found["passages"],
+        derived=derived_tables(found["runs"], found["hazards"], found["passages"], found["alarms"], made.config),
+        pieces=together(_unlisted(rows, "pieces")),
         hrefs=hrefs,
-        architectures=added(share.tallies for share in in_order if share.tallies is not None),
+        architectures=added([_unlisted(rows, "tallies")]),
     )

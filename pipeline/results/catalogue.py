@@ -12,7 +12,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 import polars as pl
@@ -32,6 +31,9 @@ _MARKER = "runs"
 # Hexadecimal digits that tell one state of a run's files from another.
 _STATE = 20
 
+States = Mapping[str, str]
+"""What changes with the files of each run."""
+
 
 def gather(out: Address) -> dict[str, pl.DataFrame]:
     """The small tables of all complete runs with `run_id` in front, in order of the runs; keeps them for later."""
@@ -40,8 +42,15 @@ def gather(out: Address) -> dict[str, pl.DataFrame]:
 
 def fresh(out: Address, table: str) -> pl.LazyFrame | None:
     """This table of all complete runs from the catalogue; none where it is missing or stale."""
-    found = digest(out, table) if table in CATALOGUED else None
-    return None if found is None else _kept(out, table, found)
+    wanted = states(out, table) if table in CATALOGUED else None
+    content = _content(out, table)
+    if wanted is None or _states_in(content) != wanted:
+        return None
+    try:
+        frame = parquet.read_parquet(content)
+    except parquet.ParquetError:
+        return None  # damaged, and only a copy
+    return source_of(frame.schema, lambda columns, _: iter([frame.select(columns)]))
 
 
 def scan(out: Address, table: str) -> pl.LazyFrame:
@@ -50,13 +59,7 @@ def scan(out: Address, table: str) -> pl.LazyFrame:
     return store.read_table(out, table) if kept is None else kept
 
 
-def digest(out: Address, table: str) -> str | None:
-    """SHA-256 over the contract and the versions of this table's files; none where files have no version."""
-    found = states(out, table)
-    return None if found is None else _digest_of(found)
-
-
-def states(out: Address, *tables: str) -> dict[str, str] | None:
+def states(out: Address, *tables: str) -> States | None:
     """What changes with the content of these tables, per complete run in order; none where files have no version."""
     versions = [storage.versions(join(out, name), f"{name}.parquet") for name in (_MARKER, *tables)]
     markers, *others = [found for found in versions if found is not None]
@@ -73,74 +76,41 @@ def states(out: Address, *tables: str) -> dict[str, str] | None:
     return dict(sorted(found.items()))
 
 
-def keep(out: Address, name: str, found: Mapping[str, Any]) -> None:
-    """Keep under this name what costs time to find again."""
-    storage.write_bytes(_address(out, name), json.dumps(found).encode())
+def keep(out: Address, name: str, frame: pl.DataFrame, found: States) -> None:
+    """Keep under this name what costs time to find again, and the states of the runs when it was found."""
+    storage.write_bytes(_address(out, name), store.parquet_bytes(frame, {"states": json.dumps(found)}))
 
 
-def kept(out: Address, name: str) -> dict[str, Any]:
-    """What `keep` was given; nothing where it is missing or damaged."""
-    try:
-        found = json.loads(storage.content_of(_address(out, name)) or b"{}")
-    except ValueError:
-        return {}
-    return dict(found) if isinstance(found, dict) else {}
-
-
-def keep_frame(out: Address, name: str, frame: pl.DataFrame, metadata: Mapping[str, str]) -> None:
-    """The same for a frame and what should be known of it."""
-    storage.write_bytes(_address(out, name), store.parquet_bytes(frame, metadata))
-
-
-def kept_frame(out: Address, name: str) -> tuple[pl.DataFrame, dict[str, str]]:
-    """What `keep_frame` was given; an empty frame and nothing where it is missing or damaged."""
+def kept(out: Address, name: str) -> tuple[pl.DataFrame, States]:
+    """What `keep` was given; an empty frame and nothing where it is missing or damaged."""
     content = _content(out, name)
     try:
-        return parquet.read_parquet(content), store.metadata_of(content)
+        return parquet.read_parquet(content), _states_in(content)
     except parquet.ParquetError:
         return pl.DataFrame(), {}
 
 
-def _digest_of(found: Mapping[str, str]) -> str:
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
-
-
 def _gathered(out: Address, table: str) -> pl.DataFrame:
-    before = states(out, table)
-    if before is None:
+    """From what the catalogue holds of the runs that are as they were, and from the files of the others."""
+    wanted = states(out, table)
+    if wanted is None:
         return store.read_table(out, table).collect()
-    kept = _kept(out, table, _digest_of(before))
-    if kept is not None:
-        return kept.collect()
-    frame = _with_changed(out, table, before)
-    # Files that changed while they were read must not pass for what was read.
-    if before == states(out, table):
-        metadata = {"table": table, "files": _digest_of(before), "states": json.dumps(before)}
-        storage.write_bytes(_address(out, table), store.parquet_bytes(frame, metadata))
-    return frame
-
-
-def _with_changed(out: Address, table: str, wanted: Mapping[str, str]) -> pl.DataFrame:
-    """The table from what the catalogue holds of the runs that are as they were, and from the files of the others."""
-    kept, metadata = kept_frame(out, table)
-    known = json.loads(metadata.get("states", "{}"))
+    frame, known = kept(out, table)
+    if known == wanted:
+        return frame
     same = [run for run, state in wanted.items() if known.get(run) == state]
     others = store.scan_runs(out, table, sorted(set(wanted) - set(same))).collect()
-    if not same:
-        return others
-    return pl.concat([kept.filter(pl.col("run_id").is_in(same)), others]).sort("run_id", maintain_order=True)
+    if same:
+        others = pl.concat([frame.filter(pl.col("run_id").is_in(same)), others]).sort("run_id", maintain_order=True)
+    # Files that changed while they were read must not pass for what was read.
+    if wanted == states(out, table):
+        keep(out, table, others, wanted)
+    return others
 
 
-def _kept(out: Address, table: str, wanted: str) -> pl.LazyFrame | None:
-    """What the catalogue holds, if it was made of these very files."""
-    content = _content(out, table)
-    if store.metadata_of(content).get("files") != wanted:
-        return None
-    try:
-        frame = parquet.read_parquet(content)
-    except parquet.ParquetError:
-        return None  # damaged, and only a copy
-    return source_of(frame.schema, lambda columns, _: iter([frame.select(columns)]))
+def _states_in(content: bytes | Path) -> States:
+    found: States = json.loads(store.metadata_of(content).get("states", "{}"))
+    return found
 
 
 def _content(out: Address, table: str) -> bytes | Path:

@@ -18,6 +18,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import polars as pl
+
 from pipeline import storage
 from pipeline.results import catalogue, store
 from pipeline.storage import FileDigest, files
@@ -79,16 +81,16 @@ def write_manifest(out: Address) -> Manifest:
     _write(out, manifest)
     # Runs that changed while they were read must not pass for what was read.
     if states and states == catalogue.states(out):
-        catalogue.keep(out, NAME, {"of": _sha256(_content(manifest)), "states": states})
+        catalogue.keep(out, NAME, pl.DataFrame({"of": [_sha256(_content(manifest))]}), states)
     return manifest
 
 
 def _unchanged(out: Address, earlier: Manifest, states: Mapping[str, str]) -> dict[str, Any]:
     """The runs of the manifest as it was gathered last whose files are as they were then."""
-    known = catalogue.kept(out, NAME)
-    if not known or known.get("of") != _sha256(storage.content_of(join(out, NAME)) or b""):
+    kept, known = catalogue.kept(out, NAME)
+    if kept.rows() != [(_sha256(storage.content_of(join(out, NAME)) or b""),)]:
         return {}
-    return {run: earlier["runs"][run] for run, state in states.items() if known["states"].get(run) == state}
+    return {run: earlier["runs"][run] for run, state in states.items() if known.get(run) == state}
 
 
 def read_manifest(out: Address) -> Manifest | None:

@@ -49,10 +49,9 @@ def test_same_answers_with_and_without(out: Path, query: str) -> None:
 
 
 def test_it_is_what_answers(out: Path) -> None:
-    """Told apart by a catalogue that holds something else under the right digest."""
-    file = out / ".catalogue/passages"
-    digest = store.metadata_of(file)["files"]
-    file.write_bytes(store.parquet_bytes(pl.read_parquet(file).head(1), {"files": digest}))
+    """Told apart by a catalogue that holds something else of the right files."""
+    frame, states = catalogue.kept(out, "passages")
+    catalogue.keep(out, "passages", frame.head(1), states)
     assert run_sql(out, "SELECT COUNT(*) AS n FROM passages")["n"].to_list() == [1]
 
 

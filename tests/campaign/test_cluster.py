@@ -7,13 +7,15 @@ import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Never
 
 import pytest
 
 from benchmarks.cluster import Cluster
-from pipeline.campaign import run_campaign
-from pipeline.campaign.cluster import lost_scheduler
+from pipeline.campaign import RunOutcome, run_campaign
+from pipeline.campaign.cluster import lost_scheduler, replay_there
 from pipeline.campaign.outcome import lost, overdue
+from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.results import store
 from schemas.enums import RunStatus
@@ -118,6 +120,34 @@ def test_killed_worker_and_scheduler(
     assert result_bytes(out) == result_bytes(undisturbed)
 
 
+class Parcel(RunOutcome):
+    """An outcome that takes its worker with it when it is sent."""
+
+    def __reduce__(self) -> Never:
+        os._exit(1)
+
+
+def replayed_and_lost(job: RunJob, limit_s: float) -> RunOutcome:
+    outcome, first = replay_there(job, limit_s), Path(job.out, "first")
+    if first.exists():
+        return outcome
+    first.touch()
+    return Parcel(**vars(outcome))
+
+
+def test_worker_that_dies_with_the_outcome_of_its_run(
+    small_trial: SmallTrial, undisturbed: Path, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run is complete then, but nobody was told; Dask alone would begin it again, and never say how that ended."""
+    monkeypatch.setattr("pipeline.campaign.cluster.replay_there", replayed_and_lost)
+    spy = Spy(lambda *_: None)
+    plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
+    outcome = by_run(run_campaign(plan, scheduler=cluster.address, watches=[spy]))["run0"]
+    assert (outcome.status, outcome.attempts, spy.losses) == (RunStatus.OK, 2, [("run0", 1)])
+    mine = {name: data for name, data in result_bytes(undisturbed).items() if "run_id=run0" in name}
+    assert result_bytes(tmp_path) == mine
+
+
 def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(WAITS, "scheduler_s", 1.0)
     with pytest.raises(UsageError, match="Dask scheduler does not answer"):
@@ -138,6 +168,27 @@ def test_cluster_that_lost_its_workers(
     assert [
         f"{cluster.address} has no worker left; 0 of 4 runs are done. Start workers" in note for note in spy.notes
     ] == [True]
+
+
+def test_scheduler_that_stands_still(
+    small_trial: SmallTrial, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It keeps its connections and says nothing: the campaign looks on, and gives it up after the same patience."""
+    monkeypatch.setattr(WAITS, "lonely_s", 20.0)
+    monkeypatch.setattr(WAITS, "scheduler_answer_s", 0.5)
+    clock, looks = Hurried(monkeypatch, "cluster"), list[str]()
+
+    def stop(run_id: str, _: float) -> None:
+        os.kill(cluster.scheduler.pid, signal.SIGSTOP)
+        looks.append(run_id)
+        clock.hurry(2.0)
+
+    try:
+        with pytest.raises(UsageError, match="Dask scheduler does not answer"):
+            run_campaign(plan_of(small_trial, tmp_path / "out"), scheduler=cluster.address, watches=[Spy(stop)])
+    finally:
+        os.kill(cluster.scheduler.pid, signal.SIGCONT)
+    assert len(looks) > 3
 
 
 def replace_by_copy(place: Path, log: Path) -> None:

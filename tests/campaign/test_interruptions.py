@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,6 @@ from benchmarks.interruptions import Job, Victim, disturb
 from pipeline import storage
 from pipeline.campaign import Interrupted, make_plan, run_campaign
 from pipeline.campaign.lock import locked
-from pipeline.campaign.plan import held_by
 from pipeline.campaign.worker import replay_one
 from pipeline.results import store
 from pipeline.storage.address import Address
@@ -132,7 +132,7 @@ def test_a_campaign_that_has_ended_writes_no_more(small_trial: SmallTrial, tmp_p
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
     run_campaign(plan)
     before = result_bytes(tmp_path)
-    orphan = held_by(plan, "lost").jobs[0]
+    orphan = replace(plan.jobs[0], campaign="lost")
     with pytest.raises(OutputError, match="no longer held by this campaign"):
         replay_one(orphan)
     with locked(tmp_path), pytest.raises(OutputError, match="no longer held by this campaign"):

@@ -6,6 +6,7 @@ import io
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,6 @@ from rich.console import Console
 import cli
 from pipeline.campaign import Plan, RunOutcome, Summary, progress, watch
 from pipeline.campaign.progress import BarWatch, JsonWatch, LineWatch, LogWatch, watches
-from pipeline.campaign.watch import Tally
 from schemas.enums import RunStatus, RunVerdict
 from tests.campaign.compare import plan_of
 from tests.conftest import SmallTrial
@@ -47,23 +47,25 @@ def plan(small_trial: SmallTrial, tmp_path: Path) -> Plan:
     return plan_of(small_trial, tmp_path)
 
 
-def test_tally_in_one_line(clock: Clock) -> None:
-    tally = Tally(10)
+def test_counts_in_one_line(clock: Clock, plan: Plan) -> None:
+    watch = LineWatch(io.StringIO())
+    watch.begin(replace(plan, jobs=10 * plan.jobs[:1]))
     for outcome in (OK, BAD, OLD):
-        tally.add(outcome)
+        watch.finished(outcome)
     clock.now_s += 4.0
-    line = tally.line([("quick", 1.0), ("slow", 90.0), ("slower", 120.0)])
+    line = watch.line([("quick", 1.0), ("slow", 90.0), ("slower", 120.0)])
     assert line == (
         "3/10 runs, 1 failed or partial, 1 skipped, 0.50 runs/s, 14 s left, "
         "longest now: slower (2 min 0 s), slow (1 min 30 s)"
     )
 
 
-def test_no_rate_before_the_first_run(clock: Clock) -> None:
-    tally = Tally(2)
-    tally.add(OLD)
+def test_no_rate_before_the_first_run(clock: Clock, plan: Plan) -> None:
+    watch = LineWatch(io.StringIO())
+    watch.begin(plan)
+    watch.finished(OLD)
     clock.now_s += 1.0
-    assert tally.line() == "1/2 runs, 0 failed or partial, 1 skipped"
+    assert watch.line() == "1/4 runs, 0 failed or partial, 1 skipped"
 
 
 def test_lines_in_a_pipe(clock: Clock, plan: Plan) -> None:
@@ -103,7 +105,7 @@ def test_log_beside_the_results(plan: Plan) -> None:
     Path(plan.out).mkdir(exist_ok=True)
     watch.begin(plan)
     watch.finished(OK)
-    watch.finished(RunOutcome("d", RunStatus.FAILED, "defect", defect=True, trace="at s3://me:secret@store/x\n"))
+    watch.finished(RunOutcome("d", RunStatus.FAILED, "defect", trace="at s3://me:secret@store/x\n"))
     watch.end(Summary(4, (OK,), 5.0))
     lines = (Path(plan.out) / "replay.log").read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ ", line) for line in lines if line)

@@ -54,15 +54,14 @@ def test_path_that_runs_against_the_measure() -> None:
         }
     )
     stretches = stretches_of(epochs)
-    assert stretches.elements == ("B", "A")
-    assert stretches.sign.tolist() == [-1, -1]
+    assert stretches.select("netelement_id", "sign").rows() == [("B", -1), ("A", -1)]
     ground = ground_at(equator("A", "B"), stretches, np.array([0.0, 1000.0, 1500.0, 2300.0]))
     np.testing.assert_allclose(ground.longitude_deg * DEGREE_M, [2000.0, 1000.0, 500.0, np.nan], atol=1e-6)
 
 
 def test_a_stand_still_has_no_direction() -> None:
     epochs = pl.DataFrame({"netelement_id": ["A", "A"], "measure_m": [5.0, 5.0], "path_m": [5.0, 5.0]})
-    assert stretches_of(epochs).elements == ()
+    assert stretches_of(epochs).is_empty()
 
 
 def test_truth_is_the_reference_of_the_log(result: Result) -> None:

@@ -116,7 +116,7 @@ def test_the_worst_balise_stands_first(out: Path) -> None:
 
 def test_the_found_route_can_be_taken_away(out: Path, site: Site, replayed: dict[str, RunTables]) -> None:
     text = text_of(out, "runs/jump_two.html")
-    name, packed = re.findall(r'download="(.*?)" href="data:application/octet-stream;base64,(.*?)"', text)[0]
+    ((packed, name),) = re.findall(r'href="data:text/csv;base64,(.*?)" download="(.*?)"', text)[:1]
     assert name == "jump_two.csv"
     breaches: list[str] = []
     route = route_table(name, base64.b64decode(packed), breaches)

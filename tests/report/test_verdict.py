@@ -37,9 +37,9 @@ def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTab
     errors_m, hit_by = ([0.5, None, 500.0], [None, None, 0]) if failed_s else ([0.5], [None])
     offers: dict[str, Any] = {"solution": "primary", "status": "accepted", "measure_m": 1.0, "path_m": 1.0}
     offers |= {"judgement": judgement[: len(errors_m)], "balise_id": ["VB0", "VB1", "VB2"][: len(errors_m)]}
-    hit = (
-        hazards(1, solution="primary", accepted_ids=[["VB2"]], t_failure=NS, budget_s=0.5025) if failed_s else hazards()
-    )
+    fault: dict[str, Any] = {"hazard": "VB_JUMP_1B", "size_m": 500.0, "timing": "early", "budget_s": 0.5025}
+    fault |= {"balise_ids": [["VB2"]], "accepted_ids": [["VB2"]], "t_failure": NS, "solution": "primary"}
+    hit = hazards(1, **fault) if failed_s else hazards()
     return RunTables(
         run_id,
         epochs=epochs([0.0, 1.0, 2.0], solution="primary", judgement=judgement, netelement_id="A", measure_m=1.0),
@@ -66,9 +66,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("page", "word", "reason"),
     [
-        ("index.html", "unsafe", "VB2 accepted 500 m early, no monitor saw it (run bad)."),
+        ("index.html", "unsafe", "VB_JUMP_1B: VB2 500 m early, accepted; no monitor saw it (run bad)."),
         ("runs/good.html", "safe", "every acceptance right, every position failure within the time allowed."),
-        ("runs/bad.html", "unsafe", "VB2 accepted 500 m early, no monitor saw it."),
+        ("runs/bad.html", "unsafe", "VB_JUMP_1B: VB2 500 m early, accepted; no monitor saw it."),
         ("runs/lost.html", "failed", "gnss.parquet: column t: not in order."),
     ],
 )
