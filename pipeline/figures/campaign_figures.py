@@ -26,7 +26,7 @@ from pipeline.figures.campaign_tables import (
     counted_runs,
     with_truth,
 )
-from pipeline.figures.independent import independent_episodes
+from pipeline.figures.independent import independent_episodes, without_copies
 from pipeline.figures.map_errors import map_places
 from pipeline.figures.undetected import spacing_of_runs
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
@@ -191,14 +191,19 @@ def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
 def derived_tables(
     runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
 ) -> dict[str, pl.DataFrame]:
-    """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order."""
-    told = with_truth(passages, runs)
+    """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order.
+
+    What has bounds over runs counts no recording twice.
+    """
+    once = without_copies(runs)
+    of_once = hazards.join(once, on=["run_id", "solution"], how="semi")
+    told = with_truth(passages.join(once, on=["run_id", "solution"], how="semi"), once)
     return {
         "runs": campaign_runs(runs, hazards, config),
         "balises": campaign_balises(told),
         "accuracy": campaign_accuracy(told, config),
-        "figures": measured_figures(runs, hazards, config.safety),
-        "detection": detection_by_level(runs, hazards, config.safety),
+        "figures": measured_figures(once, of_once, config.safety),
+        "detection": detection_by_level(once, of_once, config.safety),
         "levels": campaign_levels(runs, config),
         "map": map_places(alarms, config.hazards.map_reach_m),
     }

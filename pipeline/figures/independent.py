@@ -1,10 +1,16 @@
-"""Hazard rows as independent events: what may be counted in a rate."""
+"""Runs and hazard rows as independent events: what may be counted in a rate."""
 
 from __future__ import annotations
 
 import polars as pl
 
 from schemas.enums import TRUTH
+
+
+def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
+    """Rows of `runs` with every recording once: a log under two names has one content (`input_digest`)."""
+    content = pl.struct("solution", "input_digest")
+    return runs.sort("run_id", "solution").filter(content.is_first_distinct() | pl.col("input_digest").is_null())
 
 
 def missed_detection() -> pl.Expr:

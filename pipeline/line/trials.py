@@ -12,7 +12,8 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     """Rows of `runs` by run and solution without further recordings or replays of one journey, and a remark on them.
 
     Runs of one solution that begin and end at the same nanoseconds are one journey: one log under two names, or in
-    two formats. The one with the worst verdict stays.
+    two formats. The one with the worst verdict stays. Of runs that overlap in time otherwise nobody knows whether one
+    train made them: they stay, with a remark.
     """
     order = (
         pl.col("verdict")
@@ -22,12 +23,15 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     kept = runs.sort("solution", order, "run_id").filter(
         pl.struct("solution", "t_start", "t_end").is_first_distinct() | pl.col("t_start").is_null()
     )
-    if kept.height == runs.height:
-        return runs, []
     left = runs.height - kept.height
-    return kept.sort("run_id", "solution"), [
-        f"{left} runs begin and end with another one: counted once, as one journey."
-    ]
+    ends_before = pl.col("t_end").shift().cum_max().over("solution")
+    overlapping = kept.sort("solution", "t_start").filter(pl.col("t_start") < ends_before).height
+    remarks = {
+        f"{left} runs begin and end with another one: counted once, as one journey.": left,
+        f"{overlapping} runs overlap in time with another one. If they are pieces of one recording, the bounds are "
+        "too favourable: remove what repeats others.": overlapping,
+    }
+    return kept.sort("run_id", "solution"), [text for text, count in remarks.items() if count]
 
 
 def trials_needed(bad: int, number: int, limit: float, confidence: float = CONFIDENCE) -> int | None:
