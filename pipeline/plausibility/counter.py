@@ -5,24 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
-from pipeline.plausibility.course import Course, Places
+from pipeline.plausibility.pairs import PairFit
+from pipeline.plausibility.records import Places, Record
 from pipeline.plausibility.robust import LEAST
 from schemas.arrays import runs_of
 
 _SIGNS = "sign of the odometer's speed against its distance"
 _TURNS = "direction of the counter where the train reverses"
-# The way before and after a stand that tells the heading [s], how much of it the counter has to gain as well, and how
-# far both headings have to point the same way or back.
-_HEADING_S, _SAME_WAY, _OPPOSITE = 20.0, 0.3, 0.7
 
 
-def sign_check(courses: dict[str, Course]) -> list[Check]:
+def sign_check(counters: dict[str, Record]) -> list[Check]:
     """Speed and distance of one odometer; none where it has not both."""
-    if len(courses) < 2:
+    if len(counters) < 2:
         return []
-    begin_s, end_s = max(one.t_s[0] for one in courses.values()), min(one.t_s[-1] for one in courses.values())
+    begin_s, end_s = max(one.t_s[0] for one in counters.values()), min(one.t_s[-1] for one in counters.values())
     starts = np.linspace(begin_s, max(end_s - 10.0, begin_s), 300)
-    gained = np.array([courses[name].gained(starts, starts + 10.0) for name in ("distance", "speed")])
+    gained = np.array([counters[name].gained(starts, starts + 10.0) for name in ("distance", "speed")])
     # By the median of what moves: a counter that is reset seems to run far, once.
     moves = np.all(np.nan_to_num(gained) != 0.0, axis=0)
     least = 0.2 * np.median(np.abs(gained[:, moves]), axis=1, keepdims=True) if moves.any() else 0.0
@@ -42,19 +40,20 @@ def sign_check(courses: dict[str, Course]) -> list[Check]:
     return [fits(_SIGNS, "the same")]
 
 
-def turn_check(gnss: Places, counter: Course, factor: float, lag_s: float, moving_mps: float) -> Check:
+def turn_check(gnss: Places, counter: Record, pair: PairFit) -> Check:
     """Whether the counter turns where the train does; stands beside a jump of the position tell nothing."""
+    config, lag_s = gnss.config, pair.lag_s
     grid = np.arange(gnss.t_s[0], gnss.t_s[-1], 1.0)
-    firsts, lasts = (grid[rows] for rows in runs_of(gnss.speed(grid) < moving_mps))
-    sides = (firsts - _HEADING_S, firsts), (lasts, lasts + _HEADING_S)
-    moved = np.stack([gnss.moved(*side) for side in sides])
+    firsts, lasts = (grid[rows] for rows in runs_of(gnss.speed(grid) < config.moving_mps))
+    sides = (firsts - config.heading_s, firsts), (lasts, lasts + config.heading_s)
+    moved = np.stack([gnss.gained(*side) for side in sides])
     sizes = np.linalg.norm(moved, axis=2)
-    gained = np.stack([counter.gained(begin + lag_s, end + lag_s) / factor for begin, end in sides])
+    gained = np.stack([counter.gained(begin + lag_s, end + lag_s) / pair.factor for begin, end in sides])
     with np.errstate(invalid="ignore", divide="ignore"):
         cosine = np.einsum("ij,ij->i", *moved) / sizes.prod(axis=0)
-        told = np.isfinite(cosine) & (sizes.min(axis=0) > 2.0 * moving_mps * _HEADING_S)
-        told &= np.all(np.abs(np.abs(gained) - sizes) < _SAME_WAY * sizes, axis=0)
-        reversal, onward = told & (cosine < -_OPPOSITE), told & (cosine > _OPPOSITE)
+        told = np.isfinite(cosine) & (sizes.min(axis=0) > 2.0 * config.moving_mps * config.heading_s)
+        told &= np.all(np.abs(np.abs(gained) - sizes) < config.heading_way * sizes, axis=0)
+        reversal, onward = told & (cosine < -config.heading_cosine), told & (cosine > config.heading_cosine)
         turns = gained.prod(axis=0) < 0
     never, wrongly = int((reversal & ~turns).sum()), int((onward & turns).sum())
     if never and never == reversal.sum():

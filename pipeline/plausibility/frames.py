@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipeline.plausibility.robust import Shift
 from schemas.arrays import Floats
 from schemas.config import PlausibilityConfig
 
@@ -73,23 +74,17 @@ DATUMS = {
 
 
 @dataclass(frozen=True)
-class Datum:
-    """A national datum, and how far a survey in it, read as WGS 84, lies east and north of the positions here."""
+class Datum(Shift):
+    """A national datum; the shift is that of a survey in it, read as WGS 84, from the positions here."""
 
     name: str
     epsg: int
-    east_m: float
-    north_m: float
 
-    def off_m(self, east_m: float, north_m: float) -> float:
-        """How far a shift is from this one."""
-        return float(np.hypot(self.east_m - east_m, self.north_m - north_m))
-
-    def explains(self, east_m: float, north_m: float, one_heading: bool, config: PlausibilityConfig) -> bool:
+    def explains(self, shift: Shift, one_heading: bool, config: PlausibilityConfig) -> bool:
         """Whether it is this shift; of a single heading only the part across it is known."""
-        size_m = float(np.hypot(east_m, north_m))
+        east_m, north_m, size_m = shift.east_m, shift.north_m, shift.shift_m
         across_m = abs((self.east_m - east_m) * east_m + (self.north_m - north_m) * north_m) / size_m
-        off_m = across_m if one_heading else self.off_m(east_m, north_m)
+        off_m = across_m if one_heading else self.off_m(shift)
         return off_m < max(config.datum_near_m, config.datum_near_share * size_m)
 
 
@@ -109,5 +104,5 @@ def datums_at(latitude_deg: float, longitude_deg: float) -> list[Datum]:
         longitude, latitude = turn.transform(longitude_deg, latitude_deg)
         azimuth_deg, _, distance_m = geod.inv(longitude, latitude, longitude_deg, latitude_deg)
         azimuth = np.radians(azimuth_deg)
-        found.append(Datum(name, code, float(distance_m * np.sin(azimuth)), float(distance_m * np.cos(azimuth))))
+        found.append(Datum(float(distance_m * np.sin(azimuth)), float(distance_m * np.cos(azimuth)), name, code))
     return found

@@ -6,53 +6,46 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plausibility.course import Places
-from pipeline.plausibility.robust import LEAST, explains, regressed, sampled
+from pipeline.plausibility.records import Places
+from pipeline.plausibility.robust import LEAST, Shift, explains, regressed, sampled
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
 
-# Lags found place by place agree within so much [s].
-_BIN_S = 2.0
-
 
 @dataclass(frozen=True)
-class PlaceFit:
+class PlaceFit(Shift):
     """How a record of places fits the GNSS: `lag_s` is its stamp of a moment minus the GNSS's.
 
-    `east_m`, `north_m`: the record's place minus the GNSS's. `agreeing`: share of moving epochs that agree then, and
+    The shift is the record's place minus the GNSS's. `agreeing`: share of moving epochs that agree then, and
     `as_recorded` as they are. Steady is what both halves of the run show. `reason`: why nothing is told.
     """
 
-    lag_s: float = 0.0
-    lag_sigma_s: float = float("inf")
     east_m: float = 0.0
     north_m: float = 0.0
+    lag_s: float = 0.0
+    lag_sigma_s: float = float("inf")
     agreeing: float = 0.0
     as_recorded: float = 0.0
     lag_is_steady: bool = True
     shift_is_steady: bool = True
     reason: str = ""
 
-    @property
-    def shift_m(self) -> float:
-        return float(np.hypot(self.east_m, self.north_m))
 
-
-def fit_places(gnss: Places, record: Places, config: PlausibilityConfig) -> PlaceFit:
+def fit_places(gnss: Places, record: Places) -> PlaceFit:
     """Lag and shift of another record of the same journey; a shift of its clock has to explain more than none."""
-    as_recorded = _refined(gnss, record, 0.0, config)
-    moving = sampled(np.nan_to_num(gnss.speed(gnss.t_s)) > config.moving_mps, 100)
-    number, passed_s = passes(record, gnss.points.surface[moving], config.same_place_m, config)
-    lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()))
-    if lag_s is None or abs(lag_s) <= _BIN_S:
+    config, as_recorded = gnss.config, _refined(gnss, record, 0.0)
+    moving = sampled(gnss.moving, 100)
+    number, passed_s = passes(record, gnss.points.surface[moving], config.same_place_m)
+    lag_s, _ = common_lag(passed_s - gnss.t_s[moving][number], int(moving.sum()), config)
+    if lag_s is None or abs(lag_s) <= config.passing_s:
         return as_recorded
-    shifted = _refined(gnss, record, lag_s, config)
+    shifted = _refined(gnss, record, lag_s)
     if shifted.reason or not explains(shifted.agreeing, 0.0 if as_recorded.reason else as_recorded.agreeing):
         return as_recorded
     return replace(shifted, as_recorded=0.0 if as_recorded.reason else as_recorded.as_recorded)
 
 
-def passes(track: Places, places_m: Floats, within_m: float, config: PlausibilityConfig) -> tuple[Ints, Floats]:
+def passes(track: Places, places_m: Floats, within_m: float) -> tuple[Ints, Floats]:
     """Which places at height zero a moving record passes, and when [s]; a place as often as it is passed."""
     surface = track.points.surface
     centre = surface.mean(axis=0)
@@ -72,32 +65,33 @@ def passes(track: Places, places_m: Floats, within_m: float, config: Plausibilit
         better = (left_m < away_m) & (period_s <= track.limit_s)
         at_s = np.where(better, track.t_s[begin] + part * period_s, at_s)
         away_m = np.where(better, left_m, away_m)
-    kept = (away_m < within_m) & (np.nan_to_num(track.speed(at_s)) > config.moving_mps)
+    kept = (away_m < within_m) & track.moves(at_s)
     return place[kept], at_s[kept]
 
 
-def common_lag(lags_s: Floats, count: int) -> tuple[float | None, float]:
+def common_lag(lags_s: Floats, count: int, config: PlausibilityConfig) -> tuple[float | None, float]:
     """What most of so many passages agree on, with its sigma [s]; None where they do not."""
     if lags_s.size < 3:
         return None, np.inf
     ordered = np.sort(lags_s)
-    counts = np.searchsorted(ordered, lags_s + _BIN_S, "right") - np.searchsorted(ordered, lags_s - _BIN_S, "left")
+    near_s = config.passing_s
+    counts = np.searchsorted(ordered, lags_s + near_s, "right") - np.searchsorted(ordered, lags_s - near_s, "left")
     best = int(counts.argmax())
-    if counts[best] < max(0.6 * count, 3):
+    if counts[best] < max(config.passing_share * count, 3):
         return None, np.inf
-    agreeing = lags_s[np.abs(lags_s - lags_s[best]) <= _BIN_S]
+    agreeing = lags_s[np.abs(lags_s - lags_s[best]) <= near_s]
     return float(np.median(agreeing)), float(np.std(agreeing) / np.sqrt(agreeing.size))
 
 
-def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityConfig) -> PlaceFit:
+def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
     """Shift and the rest of the lag by robust regression of what both are apart on the velocity."""
-    t_s = gnss.t_s
+    config, t_s = gnss.config, gnss.t_s
     known = record.known(t_s + lag_s) & record.known(t_s + lag_s + 1.0) & record.known(t_s + lag_s - 1.0)
     rows = np.flatnonzero(sampled(known))
     t_s = t_s[rows] + lag_s
     axes = np.stack([gnss.points.east[rows], gnss.points.north[rows]], axis=1)
     velocity = np.einsum("ijk,ik->ij", axes, (record.at(t_s + 1.0) - record.at(t_s - 1.0)) / 2.0)
-    apart = np.einsum("ijk,ik->ij", axes, record.at(t_s) - gnss.ecef_m[rows])
+    apart = np.einsum("ijk,ik->ij", axes, record.at(t_s) - gnss.values[rows])
     moves = np.linalg.norm(velocity, axis=1) > config.moving_mps
     if moves.sum() < 3 * LEAST:
         return PlaceFit(reason="hardly any movement in common")
@@ -112,6 +106,5 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
     # The record is ahead by so much way at its stamp: it stamps a place so much too early.
     rest_s, east_m, north_m = fit.estimate.tolist()
     sigma_s = 3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity))
-    return PlaceFit(
-        lag_s - rest_s, sigma_s, east_m, north_m, agreeing, before, fit.steady(0, 1, lag_s), fit.steady(1, 3)
-    )
+    steady = fit.steady(0, 1, lag_s), fit.steady(1, 3)
+    return PlaceFit(east_m, north_m, lag_s - rest_s, sigma_s, agreeing, before, *steady)

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.plausibility.course import Places
-from pipeline.plausibility.robust import regressed, sampled, steady, usual
+from pipeline.plausibility.records import Places
+from pipeline.plausibility.robust import Shift, regressed, sampled
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import track_of
 from schemas.arrays import Floats
-from schemas.config import PlausibilityConfig
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -40,32 +39,19 @@ class Line:
 
 
 @dataclass(frozen=True)
-class SurveyFit:
-    """How positions lie to the track; shifts [m] are the survey's place minus the positions'.
+class SurveyFit(Shift):
+    """How positions lie to the track; the shift is the survey's place minus the positions'.
 
-    `aside_m`: usual distance beside the track as recorded, `left_m`: with the shift; `share`: of positions within
-    `left_m` and some metres then. `one_heading`: the shift along the track is not known. Steady is what both halves of
-    the run show: a drift of the positions is no shift. `up_m`: the survey's height minus the positions', one by one.
+    `aside_m`: usual distance beside the track as recorded; `constant`: one shift explains most of it, in both halves of
+    the run: a drift of the positions is no shift. `one_heading`: the shift along the track is not known. `up_m`: the
+    survey's height minus the positions', one by one.
     """
 
-    east_m: float
-    north_m: float
     aside_m: float
-    left_m: float
-    share: float
+    constant: bool
     one_heading: bool
-    shift_is_steady: bool
     height_m: Floats
     up_m: Floats
-
-    @property
-    def shift_m(self) -> float:
-        return float(np.hypot(self.east_m, self.north_m))
-
-    @property
-    def constant(self) -> bool:
-        """Whether one shift explains most of how the positions lie beside the track."""
-        return self.left_m < 0.5 * self.aside_m and self.share > 0.75 and self.shift_is_steady
 
 
 def line_of(frame: pl.DataFrame) -> Line:
@@ -90,14 +76,12 @@ def line_of(frame: pl.DataFrame) -> Line:
     return Line(places, along, heights, cKDTree(places))
 
 
-def fit_survey(
-    gnss: Places, line: Line, config: PlausibilityConfig, start_m: tuple[float, float] = (0.0, 0.0)
-) -> SurveyFit:
+def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
     """The constant shift that brings moving positions onto the track, by repeated projection and robust regression.
 
     `start_m`: a shift to begin with.
     """
-    moving = np.nan_to_num(gnss.speed(gnss.t_s)) > config.moving_mps
+    config, moving = gnss.config, gnss.moving
     rows = np.flatnonzero(sampled(moving if moving.sum() >= 20 else np.ones_like(moving), 400))
     points = gnss.points.take(rows)
     axes = np.stack([points.east, points.north], axis=1)
@@ -117,23 +101,16 @@ def fit_survey(
         fit = regressed(across[:, None, :], apart[:, None], floor=1.0, told=config.one_heading, halves=False)
         shift = fit.estimate
     left = np.abs(apart - across @ shift)
+    left_m, half = float(np.median(left)), len(apart) // 2
     toward, whole = (across @ shift) * apart, (across @ shift) ** 2
-    half = len(apart) // 2
+    steady = all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None)))
+    near = float(np.mean(left < 4.5 * left_m + 3.0)) > config.shift_positions
     return SurveyFit(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
         aside_m=aside_m,
-        left_m=float(np.median(left)),
-        share=float(np.mean(left < 4.5 * np.median(left) + 3.0)),
+        constant=left_m < config.shift_leaves * aside_m and near and steady,
         one_heading=not fit.whole,
-        shift_is_steady=all(toward[part].sum() > 0.5 * whole[part].sum() for part in (slice(half), slice(half, None))),
         height_m=gnss.height_m[rows],
         up_m=height_m - gnss.height_m[rows],
     )
-
-
-def steady_median(values: Floats) -> tuple[float, bool]:
-    """Usual value, NaN where none is known, and whether both halves show it."""
-    half = len(values) // 2
-    whole, *halves = (np.array([usual(part)]) for part in (values, values[:half], values[half:]))
-    return float(whole[0]), steady(whole, *halves)

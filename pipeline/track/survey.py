@@ -51,6 +51,14 @@ class Track:
         """Vertex at an end of an element: 0 its start, 1 its end."""
         return int(self.first[element]) if position == 0 else int(self.first[element + 1]) - 1
 
+    def holding(self, name: str, measure_m: float) -> int | None:
+        """The element of a name if a measure lies on it, within the tolerance; none where it lies nowhere."""
+        if (element := self.index.get(name)) is None:
+            return None
+        first, last = (self.measure_m[self.end(element, position)] for position in (0, 1))
+        on_it = first - MEASURE_TOLERANCE_M <= measure_m <= last + MEASURE_TOLERANCE_M
+        return element if on_it else None
+
     def elements(self) -> Iterator[tuple[int, str, slice]]:
         for element, name in enumerate(self.ids):
             yield element, name, self.vertices(element)
