@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -11,31 +10,27 @@ import polars as pl
 from pipeline.plausibility.records import Places
 from pipeline.plausibility.robust import Shift, regressed, sampled
 from pipeline.track.geodesy import points_of
+from pipeline.track.segments import Polyline, on_segments
 from pipeline.track.survey import track_of
 from schemas.arrays import Floats
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
-# Points of the track lie so far apart [m]; each round finds the nearest of them anew.
-_SPACING_M, _ROUNDS = 20.0, 8
+# Each round finds the nearest segments of the track anew.
+_ROUNDS = 8
 
 
 @dataclass(frozen=True)
-class Line:
-    """The survey as points close together, with the direction of the track at each, in earth-centred metres."""
+class Line(Polyline):
+    """The segments of a survey, with the heights of their ends."""
 
-    places_m: Floats
-    along: Floats
-    height_m: Floats
-    tree: cKDTree
+    height_start_m: Floats
+    height_end_m: Floats
 
     def far_m(self, latitude_deg: Floats, longitude_deg: Floats) -> float:
         """Usual distance of some positions from the track."""
         if np.any(np.abs(latitude_deg) > 90.0):
             return float("inf")
         rows = slice(None, None, max(1, len(latitude_deg) // 100))
-        return float(np.median(self.tree.query(points_of(latitude_deg[rows], longitude_deg[rows]).surface)[0]))
+        return float(np.median(self.samples[0].query(points_of(latitude_deg[rows], longitude_deg[rows]).surface)[0]))
 
 
 @dataclass(frozen=True)
@@ -55,25 +50,12 @@ class SurveyFit(Shift):
 
 
 def line_of(frame: pl.DataFrame) -> Line:
-    """The points of a site's track."""
-    from scipy.spatial import cKDTree
-
+    """The segments of a site's track."""
     track = track_of(frame)
     surface = points_of(track.latitude_deg, track.longitude_deg).surface
-    parts: list[tuple[Floats, Floats, Floats]] = []
-    for _, _, part in track.elements():
-        step = np.diff(surface[part], axis=0)
-        length = np.linalg.norm(step, axis=1)
-        way = np.concatenate([[0.0], np.cumsum(length)])
-        if way[-1] <= 0.0:
-            continue
-        at = np.linspace(0.0, way[-1], int(way[-1] / _SPACING_M) + 2)
-        segment = np.searchsorted(way, at, side="right").clip(1, way.size - 1) - 1
-        places = np.column_stack([np.interp(at, way, axis) for axis in surface[part].T])
-        along = step[segment] / np.maximum(length[segment], 1e-9)[:, None]
-        parts.append((places, along, np.interp(at, way, track.height_m[part])))
-    places, along, heights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Line(places, along, heights, cKDTree(places))
+    within = np.setdiff1d(np.arange(len(surface) - 1), track.first[1:-1] - 1)
+    rows = within[np.any(surface[within] != surface[within + 1], axis=1)]
+    return Line(surface[rows], surface[rows + 1], track.height_m[rows], track.height_m[rows + 1])
 
 
 def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.0)) -> SurveyFit:
@@ -87,12 +69,14 @@ def fit_survey(gnss: Places, line: Line, start_m: tuple[float, float] = (0.0, 0.
     axes = np.stack([points.east, points.north], axis=1)
 
     def beside(shift_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Direction across the track at the nearest point of each moved position, how far it is, and its height."""
-        nearest = line.tree.query(points.surface + np.einsum("ijk,j->ik", axes, shift_m))[1]
-        along = np.einsum("ijk,ik->ij", axes, line.along[nearest])
+        """Direction across the track at the nearest segment of each moved position, how far it is, and its height."""
+        tree, segment = line.samples
+        nearest = segment[tree.query(points.surface + np.einsum("ijk,j->ik", axes, shift_m))[1]]
+        along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-        off = np.einsum("ijk,ik->ij", axes, line.places_m[nearest] - points.surface)
-        return across, np.einsum("ij,ij->i", off, across), line.height_m[nearest]
+        feet = on_segments(points, line, nearest)
+        part, low_m = np.clip(feet.fraction, 0.0, 1.0), line.height_start_m[nearest]
+        return across, -feet.offset_m, low_m + part * (line.height_end_m[nearest] - low_m)
 
     aside_m = float(np.median(np.abs(beside(np.zeros(2))[1])))
     shift = np.array(start_m)
