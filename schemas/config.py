@@ -546,6 +546,26 @@ class CalibrationConfig(Settings):
     sigma_spread_share: Probability = 0.05
 
 
+class SiteConfig(Settings):
+    """What is broken in a site, and what is remarkable."""
+
+    # Ends that a relation joins and that lie farther apart make the path position wrong by a position failure (20 m).
+    joined_m: Positive = 20.0
+    # Free ends are one place within the first, and one track with a piece missing if they face each other within the
+    # second; a curve turns by 20 degrees at most in between.
+    near_ends_m: Positive = 5.0
+    facing_m: Positive = 300.0
+    facing_cosine: Probability = 0.94
+    # A declared length is that of the geometry within this share: 3-D against 2-D on a grade of 4 %.
+    length_share: Probability = 1e-3
+    # Straight lines between points leave the curve by this: a quarter of the survey's own sigma.
+    chord_m: Positive = 0.25
+    # Half a UTM zone: lines that cross a border stay in one system of coordinates.
+    beyond_area_deg: Positive = 3.0
+    # Balises are announced from so far back: more than twice their longest spacing (DOMAIN section 4).
+    announced_m: Positive = 6000.0
+
+
 class SurveyConfig(Settings):
     """A site from a survey of the line (`balise site`)."""
 
@@ -572,6 +592,10 @@ class SurveyConfig(Settings):
     kink_aside_m: Positive = 0.3
     # The branches of the longest switches (radius 1,200 m) part as far as `same_track_m` within 60 m.
     doubled_m: Positive = 100.0
+    # A corner is a kink too if it turns by so much on a curve that no track has; less is how dense surveys scatter.
+    corner_deg: Positive = 8.0
+    # Scatter is judged where points are about evenly spaced: no step is so many times another.
+    uneven_steps: Positive = 3.0
     # Scatter makes a line longer: told from this share of its length on, that of the best odometer scale.
     longer_share: Probability = 1e-4
     # Kilometres are posts, not lengths: so far they stray from the track between two points, in metres or by share.
@@ -628,6 +652,7 @@ class Configuration(Settings):
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
     undetected: UndetectedConfig = UndetectedConfig()
+    site: SiteConfig = SiteConfig()
     survey: SurveyConfig = SurveyConfig()
     calibration: CalibrationConfig = CalibrationConfig()
 
