@@ -16,7 +16,7 @@ import polars as pl
 
 from pipeline.claim.areas import Placed, placed
 from pipeline.claim.profile import Method
-from pipeline.claim.tally import codes
+from pipeline.claim.tally import codes, within
 from pipeline.epochs.clock import Clock
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
@@ -66,9 +66,7 @@ class Front:
 
     def within(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
         """Whether the estimate is at most so far ahead of the train and so far behind it (`codes`)."""
-        with np.errstate(invalid="ignore"):
-            beyond = (self.low_m > over_m) | (self.high_m < -np.asarray(under_m))
-            inside = (self.high_m <= over_m) & (self.low_m >= -np.asarray(under_m))
+        inside, beyond = within(self.low_m, self.high_m, over_m, under_m)
         asked = np.isfinite(over_m) | np.isfinite(under_m)
         return codes(asked & self.proved & inside, asked & ((self.judged & beyond) | self.wrong_track))
 

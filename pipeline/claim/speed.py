@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.claim.front import Front
 from pipeline.claim.profile import KMH_PER_MPS
-from pipeline.claim.tally import codes
+from pipeline.claim.tally import codes, within
 from schemas.arrays import NS_PER_S, Floats, Ints
 
 
@@ -26,12 +26,9 @@ class SpeedErrors:
     low_kmh: Floats
     high_kmh: Floats
 
-    def within(self, over_kmh: Floats, under_kmh: Floats) -> Ints:
+    def within(self, over_kmh: Floats | float, under_kmh: Floats | float) -> Ints:
         """Whether the estimate is at most so much above the train's speed and so much below it (`codes`)."""
-        with np.errstate(invalid="ignore"):
-            inside = (self.high_kmh <= over_kmh) & (self.low_kmh >= -under_kmh)
-            beyond = (self.low_kmh > over_kmh) | (self.high_kmh < -under_kmh)
-        return codes(inside, beyond)
+        return codes(*within(self.low_kmh, self.high_kmh, over_kmh, under_kmh))
 
 
 def speed_errors(front: Front, window_s: float) -> SpeedErrors:

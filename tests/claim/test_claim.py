@@ -377,7 +377,7 @@ def test_means_of_speed_call_no_accuracy_met() -> None:
         rides = [Ride(f"{number}", found, epochs(seconds), passages(), PROFILE) for number in range(300)]
         counts = sum((asked.count(ride) for ride in rides), Tally())
         assert (counts.trials, counts.kept, counts.broken) in ((300, 300, 0), (300, 0, 300))
-        assert asked.shown(counts).finding == finding
+        assert asked.demand.shown(counts).finding == finding
 
 
 def test_after_a_balise_start_and_availability() -> None:
