@@ -11,9 +11,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.claim.areas import AREA_TYPES, NO_AREA
-from pipeline.claim.front import Front
+from pipeline.claim.front import Front, SpeedErrors, speed_errors
 from pipeline.claim.profile import KMH_PER_MPS, AreaLimits, Profile
-from pipeline.claim.speed import SpeedErrors, speed_errors
 from pipeline.claim.tally import (
     ALWAYS,
     BROKEN,

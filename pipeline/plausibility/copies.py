@@ -18,7 +18,7 @@ import polars as pl
 from pipeline.plausibility.check import Check, State
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.robust import LEAST
-from pipeline.plausibility.survey import fit_survey
+from pipeline.plausibility.shifts import fit_survey
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
 from schemas.arrays import Bools, Floats, floats
 from schemas.config import FixSigma

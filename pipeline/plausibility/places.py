@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.plausibility.causes import explain_factor
+from pipeline.plausibility.causes import Datum, datums_at, explain_factor
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
 from pipeline.plausibility.copies import copy_check
-from pipeline.plausibility.frames import Datum, datums_at
-from pipeline.plausibility.passing import common_lag, fit_places, passes
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.records import Places
 from pipeline.plausibility.robust import explains, steady_median
-from pipeline.plausibility.survey import Line, SurveyFit, fit_survey
+from pipeline.plausibility.shifts import Line, SurveyFit, common_lag, fit_places, fit_survey, passes
 from pipeline.plausibility.witnesses import Lag
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import track_of
@@ -69,7 +67,8 @@ def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
     known = np.array([name in places for name in names], dtype=np.bool_)
     if known.sum() < 3:
         return Lag("balise_reads", reason="fewer than three reads of balises of the site")
-    number, passed_s = passes(of.gnss, np.array([places[name] for name in names if name in places]), config.read_m)
+    at_deg = np.array([places[name] for name in names if name in places])
+    number, passed_s = passes(of.gnss, points_of(*at_deg.T), config.read_m)
     t_s = of.seconds(reads)[known]
     lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()), config)
     if lag_s is None:
@@ -78,16 +77,15 @@ def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
     return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.lag_limit_s)
 
 
-def _balise_places(site: Site) -> dict[str, Floats]:
-    """Places of the balises on their net elements, at height zero."""
+def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
+    """Latitude and longitude of the balises on their net elements [deg]."""
     track, places = track_of(site.track), {}
     rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
     for name, element, measure_m in rows:
         if (number := track.holding(element, measure_m)) is not None:
             part = track.vertices(number)
             degrees = (track.latitude_deg[part], track.longitude_deg[part])
-            at = (np.interp([measure_m], track.measure_m[part], axis) for axis in degrees)
-            places[name] = points_of(*at).surface[0]
+            places[name] = tuple(float(np.interp(measure_m, track.measure_m[part], axis)) for axis in degrees)
     return places
 
 

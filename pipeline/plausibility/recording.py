@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.plausibility.axes import VelocityFit, fit_velocity
 from pipeline.plausibility.pairs import PairFit, fit_pair
 from pipeline.plausibility.records import Places, Record, counters_of, places_of, seconds_since
-from pipeline.plausibility.survey import Line, line_of
+from pipeline.plausibility.shifts import Line, line_of
 from schemas.arrays import Floats, times_ns
 from schemas.config import PlausibilityConfig, Vehicle
 from schemas.run import RunLog, Site

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.plausibility.causes import SLIPS, Slip
 from pipeline.plausibility.check import Check, State, correction, not_checked
-from pipeline.plausibility.frames import SLIPS, Slip
 from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.records import Places
 from pipeline.track.geodesy import points_of

@@ -12,9 +12,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.site.tables import RawTable, typed_table
-from pipeline.survey.kilometres import measures_at
 from pipeline.survey.network import Network
-from pipeline.survey.pieces import Survey
+from pipeline.survey.pieces import Survey, measures_at
 from pipeline.survey.sources import content_of_survey
 from pipeline.survey.tables import placed_table
 from pipeline.track.geodesy import points_of

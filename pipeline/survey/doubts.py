@@ -9,9 +9,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.matching.candidates import candidates_of, segments_of
-from pipeline.survey.kilometres import spans
 from pipeline.survey.network import Network, arms_of
-from pipeline.survey.pieces import Piece
+from pipeline.survey.pieces import Piece, spans
 from pipeline.track.geodesy import points_of, way_m
 from pipeline.track.network import Network as Ground
 from pipeline.track.network import network_of

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 import cli
 from pipeline.claim import claim, load_profile, read_areas
 from pipeline.claim.claim import claim_table
-from pipeline.claim.front import Front, front_of
+from pipeline.claim.front import Front, front_of, speed_errors
 from pipeline.claim.requirements import Ride, requirements, tallies
-from pipeline.claim.speed import speed_errors
 from pipeline.claim.tally import (
     Finding,
     Tally,
