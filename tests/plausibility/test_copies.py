@@ -138,6 +138,8 @@ def test_positions_without_errors_may_equal_the_truth() -> None:
     site = Site(track, Links.create_empty(), None, None)
     assert _copies(gnss, _copied(gnss), site) == []
     assert len(_copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), site)) == 1
+    near = PlausibilityConfig(without_error=0.9)
+    assert _copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), site, near) == []
 
 
 def test_a_run_with_a_copy_fails_or_is_unproven() -> None:
@@ -149,3 +151,14 @@ def test_a_run_with_a_copy_fails_or_is_unproven() -> None:
     (row,) = replayed(copied, trial.site, trial.vehicle, warn).runs.to_dicts()
     assert row["verdict"] in ("unproven", "unsafe")
     assert "copy of the solution" in row["notes"]
+
+
+def test_what_makes_a_copy_is_configuration(run: RunLog) -> None:
+    gnss = _gnss(run)
+    half = _moved(_copied(gnss), 2.0).with_columns(
+        pl.when(pl.int_range(pl.len()) % 10 < 9).then(_copied(gnss)[name]).otherwise(name).alias(name)
+        for name in ("latitude_deg", "longitude_deg")
+    )
+    assert len(_copies(gnss, half)) == 1
+    assert _copies(gnss, half, config=PlausibilityConfig(copy_share=0.95)) == []
+    assert _copies(gnss, half, config=PlausibilityConfig(copy_chance=1e-30)) == []
