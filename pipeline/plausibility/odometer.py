@@ -17,6 +17,8 @@ from schemas.arrays import runs_of
 from schemas.config import PlausibilityConfig, Vehicle
 
 LATENCY = "GNSS latency of the vehicle file"
+_SIGNS = "sign of the odometer's speed against its distance"
+_TURNS = "direction of the counter where the train reverses"
 _TO_VEHICLE = "append to the vehicle file"
 
 
@@ -143,10 +145,6 @@ def _of_file(what: str, found: str, wrong: bool, lines: str, no_train: bool = Fa
     cause = "the vehicle file is of another vehicle or out of date, or the GNSS drifts over the whole run"
     state, cause = (State.IMPOSSIBLE, "no odometer has such a scale") if no_train else (State.MISFIT, cause)
     return Check(what, state, found, cause, lines, "write instead in the vehicle file")
-
-
-_SIGNS = "sign of the odometer's speed against its distance"
-_TURNS = "direction of the counter where the train reverses"
 
 
 def sign_check(counters: dict[str, Record]) -> list[Check]:

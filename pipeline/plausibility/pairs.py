@@ -18,6 +18,8 @@ from schemas.config import PlausibilityConfig
 
 # Windows overlap by half, which makes sigmas larger by so much; positions a step apart are no better known [m].
 _OVERLAP, _LEAST_SPREAD_M = 1.5, 0.05
+# Lags that are worth a closer look: so many, so far from each other [s], improved in these steps.
+_CANDIDATES, _APART_S, _CLIMB_S = 4, 15.0, (8.0, 4.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -146,10 +148,6 @@ def _windows(gnss: Places, counter: Record, begin_s: float, end_s: float, lag_s:
     size = np.abs(found[1])
     counts = size > config.slow_share * usual(size, 0.8)
     return found[:, counts], float(counts.mean()) if counts.size else 1.0
-
-
-# Lags that are worth a closer look: so many, so far from each other [s], improved in these steps.
-_CANDIDATES, _APART_S, _CLIMB_S = 4, 15.0, (8.0, 4.0, 2.0, 1.0)
 
 
 def clock_lag(gnss: Places, counter: Record) -> tuple[float, str]:

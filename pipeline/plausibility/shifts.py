@@ -15,6 +15,9 @@ from pipeline.track.survey import track_of
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
 
+# Each round finds the nearest segments of the track anew.
+_ROUNDS = 8
+
 
 @dataclass(frozen=True)
 class PlaceFit(Shift):
@@ -110,10 +113,6 @@ def _refined(gnss: Places, record: Places, lag_s: float) -> PlaceFit:
     sigma_s = 3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity))
     steady = fit.steady(0, 1, lag_s), fit.steady(1, 3)
     return PlaceFit(east_m, north_m, lag_s - rest_s, sigma_s, agreeing, before, *steady)
-
-
-# Each round finds the nearest segments of the track anew.
-_ROUNDS = 8
 
 
 @dataclass(frozen=True)

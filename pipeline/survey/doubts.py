@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.survey.network import Network, arms_of
-from pipeline.survey.pieces import Piece, spans
+from pipeline.survey.pieces import Piece, kilometre_spans
 from pipeline.track.geodesy import points_of, way_m
 from pipeline.track.network import Network as Ground
 from pipeline.track.network import network_of
@@ -84,7 +84,7 @@ def _last_step(element: Piece, position: int) -> Piece:
 
 def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
     way = way_m(element.surface)
-    known, off_m, jumps = spans(element.line_km, way, config)
+    known, off_m, jumps = kilometre_spans(element.line_km, way, config)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))
         first, last = known[row], known[row + 1]

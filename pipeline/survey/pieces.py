@@ -124,7 +124,7 @@ def with_own_names(pieces: list[Piece]) -> list[Piece]:
     return named
 
 
-def spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
+def kilometre_spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
     """Points with a kilometre; how far [m] the kilometres stray from the way to the next of them; where they jump."""
     known = np.flatnonzero(np.isfinite(line_km))
     by_km, by_way = np.diff(line_km[known]) * 1000.0, np.diff(way_m[known])
@@ -135,7 +135,7 @@ def spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, F
 
 def measures_at(line_km: Floats, measure_m: Floats, km: float, config: SurveyConfig) -> list[float]:
     """All measures at which an element has a line kilometre; a kilometre within a jump is nowhere."""
-    known, _, jumps = spans(line_km, measure_m, config)
+    known, _, jumps = kilometre_spans(line_km, measure_m, config)
     found = []
     for low, high in zip(known[:-1][~jumps].tolist(), known[1:][~jumps].tolist(), strict=True):
         a, b = line_km[low], line_km[high]
