@@ -235,7 +235,7 @@ def claim(
     from pipeline.results.answer_files import write_csv
 
     wanted = load_profile(profile)
-    ground = _ground(site) if site else None
+    ground = _ground(site, _used(out)) if site else None
     found = hold(out, wanted, ground, read_areas(site, ground) if site and ground else None, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
@@ -259,7 +259,7 @@ def inspect(
     from pipeline.results.inspection import inspect_path, show
 
     settings = _configuration(config)
-    tables = inspect_path(path, settings, result, settings.matching, site, _vehicle(vehicle))
+    tables = inspect_path(path, settings, result, site, _vehicle(vehicle))
     _print_json(tables) if as_json else show(tables)
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
@@ -276,7 +276,8 @@ def inject(
     from datasets.inject import inject_into, load_faults
 
     faults = load_faults(fault)
-    inject_into(run, _configuration(config), faults, _ground(site) if site else None, out)
+    settings = _configuration(config)
+    inject_into(run, settings, faults, _ground(site, settings) if site else None, out)
     print(f"{len(faults)} faults injected into {run}: {out}")
 
 
@@ -296,7 +297,7 @@ def undetected(
     from datasets.undetected import largest_fault, told, write_fault
 
     settings, train = _configuration(config), _vehicle(vehicle)
-    found = largest_fault(_log(run, settings), _ground(site), train, settings, solution, balise, at_s, behind)
+    found = largest_fault(_log(run, settings), _ground(site, settings), train, settings, solution, balise, at_s, behind)
     file = write_fault(found, solution if settings.undetected.solutions_at_fault == "one" else None, out)
     print(f"{told(found)}\nTo check it: balise inject {run} --site {site} --fault {file} --out RUN2, and replay RUN2.")
 
@@ -378,7 +379,7 @@ def calibrate(
 
     settings = _configuration(config)
     logs = [_log(address, settings) for address in find_runs(runs).values()]
-    found = measure(logs, _ground(site), _vehicle(vehicle), settings, solution)
+    found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     measured = {"vehicle": found.vehicle.model_dump(), "monitors": found.monitors()}
     tables = {"Scale and latency": found.runs, "Sigma of the monitors": found.sigmas}
@@ -457,7 +458,7 @@ def report(
     from pipeline.report import write_report
     from pipeline.results.terminal import how_far
 
-    pages = write_report(out, _ground(site) if site else None, jobs, None if quiet else how_far("pages"))
+    pages = write_report(out, _ground(site, _used(out)) if site else None, jobs, None if quiet else how_far("pages"))
     if not quiet:
         print(f"{len(pages)} files; begin with {pages[0]}")
 
@@ -483,7 +484,7 @@ def line(
 
     given, keys = None if points is None else read_points(points), "docs/line.md lists every key."
     decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
-    found = write_line(out, _ground(site), decided, solution, given, to)
+    found = write_line(out, _ground(site, _used(out)), decided, solution, given, to)
     told = {"pieces": found.pieces, "proposals": found.proposals, "remarks": list(found.remarks)}
     tables = {"Pieces of track": found.summary, "Proposals": found.proposals}
     files = f"{len(found.files)} files; begin with {found.files[0]}"
@@ -505,7 +506,8 @@ def export(
     """Write one run with its results for MCAP viewers (Foxglove, Lichtblick, Rerun) or as GeoJSON or GPX."""
     from pipeline.export import export_run
 
-    recorded, ground = _log(log, _configuration(config), True) if log else None, _ground(site) if site else None
+    recorded = _log(log, _configuration(config), True) if log else None
+    ground = _ground(site, _used(out)) if site else None
     files, missing = export_run(out, run, to, ground, recorded, "ros" if ros else "foxglove")
     print("\n".join(["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]))
 
@@ -620,10 +622,17 @@ def _log(address: str, settings: Configuration, with_digest: bool = False) -> Ru
     return read_run(address, settings.ingest, with_digest)
 
 
-def _ground(site: str) -> Ground:
+def _ground(site: str, settings: Configuration) -> Ground:
     from pipeline.site.read import read_site
 
-    return read_site(site)
+    return read_site(site, settings.site)
+
+
+def _used(out: str | Path) -> Configuration:
+    """The configuration that a result was made with."""
+    from pipeline.results.store import read_config
+
+    return read_config(out) or _configuration(None)
 
 
 def _show(table: pl.DataFrame, title: str = "") -> None:

@@ -102,7 +102,8 @@ def demo(
     """
     scenario = demo_scenario(seed)
     paths = write_trial(scenario, out, _ended(progress, "written"))
-    return replay_trial(scenario, read_site(out / "site"), paths, config or Configuration(), progress)
+    config = config or Configuration()
+    return replay_trial(scenario, read_site(out / "site", config.site), paths, config, progress)
 
 
 def demo_scenario(seed: int | None = None) -> Scenario:

@@ -116,6 +116,10 @@ class PlausibilityConfig(Settings):
     shift_told_m: Positive = 8.0
     # Slower, positions that scatter by some metres may be of a train that stands.
     moving_mps: Positive = 1.0
+    # A speed is a mean over this time: positions that scatter by 2 m give it to 0.7 m/s. A pause as long is bridged,
+    # and one of so many usual periods: loggers drop single rows.
+    speed_s: Positive = 4.0
+    bridged_periods: Positive = 3.5
     # With less in common, of all and of the shorter record, any two journeys look alike.
     overlap_s: Positive = 90.0
     overlap_share: Probability = 0.6
@@ -125,12 +129,31 @@ class PlausibilityConfig(Settings):
     # agrees nearly as well at another one.
     speeds_agree: Probability = 0.93
     lag_rival: Probability = 0.05
+    # Speeds agree within this share of themselves and this one of the usual speed: scatter of 0.7 m/s at 17 m/s.
+    speed_alike_share: Probability = 0.07
+    speed_alike_usual: Probability = 0.04
     # To so much a lag is known by speeds alone, which are means over 4 s.
     speed_lag_s: Positive = 2.0
     # Below this share of the usual speed a record tells more of noise than of the scale.
     slow_share: Probability = 0.2
     # Ways are compared over windows of this length: positions that scatter by 2 m tell them to 2 %.
     window_m: Positive = 150.0
+    # They last so long: over less the stamps tell little, over more a train does not keep its speed.
+    window_least_s: Positive = 8.0
+    window_most_s: Positive = 60.0
+    # A window agrees on a factor within so much: positions, curves and slip together.
+    window_agrees: Positive = 0.12
+    # A lag is told where its sigma is smaller than this; lags and factors where they are so many sigmas apart.
+    lag_sigma_s: Positive = 0.5
+    told_sigmas: Positive = 5.0
+    # Which way the train goes is told by the way of this time before and after a stand, of which the counter shows the
+    # same within this share; headings turn back or go on by more than this cosine.
+    heading_s: Positive = 20.0
+    heading_way: Probability = 0.3
+    heading_cosine: Probability = 0.7
+    # Passages of single places agree on a lag within this time, and so large a share of them has to.
+    passing_s: Positive = 2.0
+    passing_share: Probability = 0.6
     # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
     unit_share: Probability = 0.045
     # So many windows agree on the factor of a unit. Pulses, which no unit explains, have to be clearer, and far from 1.
@@ -150,6 +173,15 @@ class PlausibilityConfig(Settings):
     # Velocities fit if they differ from the displacement by a smaller share of it; slower, scatter turns that.
     velocity_share: Probability = 0.3
     velocity_mps: Positive = 3.0
+    # Exchanged axes or signs explain velocities that are off by this share at least, if they leave at most this part.
+    velocity_turned: Probability = 0.1
+    velocity_explained: Probability = 0.35
+    # Up is told from down by this correlation, where the slope changes by so much over the run.
+    climb_agrees: Probability = 0.6
+    climb_mps: Positive = 0.1
+    # One shift of the survey is told if it leaves this share of the distance at most, for so many of the positions.
+    shift_leaves: Probability = 0.5
+    shift_positions: Probability = 0.75
     # A survey is in a national datum if its shift is so near to the datum's.
     datum_near_m: Positive = 12.0
     datum_near_share: Probability = 0.12
@@ -522,6 +554,26 @@ class CalibrationConfig(Settings):
     sigma_spread_share: Probability = 0.05
 
 
+class SiteConfig(Settings):
+    """What is broken in a site, and what is remarkable."""
+
+    # Ends that a relation joins and that lie farther apart make the path position wrong by a position failure (20 m).
+    joined_m: Positive = 20.0
+    # Free ends are one place within the first, and one track with a piece missing if they face each other within the
+    # second; a curve turns by 20 degrees at most in between.
+    near_ends_m: Positive = 5.0
+    facing_m: Positive = 300.0
+    facing_cosine: Probability = 0.94
+    # A declared length is that of the geometry within this share: 3-D against 2-D on a grade of 4 %.
+    length_share: Probability = 1e-3
+    # Straight lines between points leave the curve by this: a quarter of the survey's own sigma.
+    chord_m: Positive = 0.25
+    # Half a UTM zone: lines that cross a border stay in one system of coordinates.
+    beyond_area_deg: Positive = 3.0
+    # Balises are announced from so far back: more than twice their longest spacing (DOMAIN section 4).
+    announced_m: Positive = 6000.0
+
+
 class SurveyConfig(Settings):
     """A site from a survey of the line (`balise site`)."""
 
@@ -548,6 +600,10 @@ class SurveyConfig(Settings):
     kink_aside_m: Positive = 0.3
     # The branches of the longest switches (radius 1,200 m) part as far as `same_track_m` within 60 m.
     doubled_m: Positive = 100.0
+    # A corner is a kink too if it turns by so much on a curve that no track has; less is how dense surveys scatter.
+    corner_deg: Positive = 8.0
+    # Scatter is judged where points are about evenly spaced: no step is so many times another.
+    uneven_steps: Positive = 3.0
     # Scatter makes a line longer: told from this share of its length on, that of the best odometer scale.
     longer_share: Probability = 1e-4
     # Kilometres are posts, not lengths: so far they stray from the track between two points, in metres or by share.
@@ -604,6 +660,7 @@ class Configuration(Settings):
     hazards: HazardConfig = HazardConfig()
     safety: SafetyConfig = SafetyConfig()
     undetected: UndetectedConfig = UndetectedConfig()
+    site: SiteConfig = SiteConfig()
     survey: SurveyConfig = SurveyConfig()
     calibration: CalibrationConfig = CalibrationConfig()
 

@@ -85,7 +85,7 @@ def make_plan(
     except InputError as error:
         # Nobody knows which runs there are: no run failed, the command cannot be met.
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
-    ground = read_site(site)
+    ground = read_site(site, config.site)
     base = RunJob(
         run_id="",
         address="",

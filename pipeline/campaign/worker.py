@@ -28,6 +28,7 @@ from pipeline.site.read import read_site
 from pipeline.site.route import with_route
 from pipeline.storage import files
 from pipeline.storage.address import redacted
+from schemas.config import SiteConfig
 from schemas.enums import RunStatus
 from schemas.errors import OutputError, SiteError, UsageError
 from schemas.run import RunLog, RunTables, Site
@@ -52,14 +53,14 @@ def replay_one(job: RunJob) -> RunOutcome:
 
 def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     _same_software(job)
-    site = _site(job.site, job.site_digest)
+    site = _site(job.site, job.site_digest, job.config.site)
     if (known := log.known_digest()) and _is_done(job, known):
         return _earlier(job, log)
     with log.here() as path:
         if job.previous is not None and _is_done(job, log.digest_at(path)):
             return _earlier(job, log)
         run = log.read(path)
-        site = with_route(site, job.route) if job.route else site
+        site = with_route(site, job.route, job.config.site) if job.route else site
         tables = _replayed(job, run, site)
         if job.write_route:
             _write_found_route(job, run, site)
@@ -98,10 +99,10 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
 
 
 @lru_cache(maxsize=2)
-def _site(address: str, digest: str) -> Site:
+def _site(address: str, digest: str, config: SiteConfig) -> Site:
     """The site, read once per worker."""
     storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
-    site = read_site(address)
+    site = read_site(address, config)
     if site.digest != digest:
         raise SiteError(
             "has changed since the campaign began", place=redacted(address), remedy="Start the campaign again."

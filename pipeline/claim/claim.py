@@ -11,13 +11,7 @@ import polars as pl
 from pipeline.claim.front import front_of
 from pipeline.claim.profile import Profile
 from pipeline.claim.requirements import ALL, Requirement, Ride, Tallies, requirements, tallies
-from pipeline.claim.tally import (
-    S_PER_H,
-    Finding,
-    Tally,
-    drawn,
-    of_always,
-)
+from pipeline.claim.tally import ALWAYS, S_PER_H, Finding, Tally, drawn
 from pipeline.line import distinct
 from pipeline.results import store
 from pipeline.storage.address import Address
@@ -119,13 +113,13 @@ def claim_table(found: dict[str, Tallies], profile: Profile) -> pl.DataFrame:
 
 
 def _row(solution: str, one: Requirement, counts: Tally) -> dict[str, Any]:
-    shown = one.shown(counts)
+    shown = one.demand.shown(counts)
     return {
         "solution": solution,
         "requirement": one.name,
         "applies_to": one.applies_to,
         "limit": one.limit,
-        "demanded": one.demanded,
+        "demanded": one.demand.words,
         "finding": shown.finding.value,
         "events": counts.events,
         "possible_events": counts.possible,
@@ -168,7 +162,7 @@ def _reason(one: Requirement, finding: Finding, counts: Tally) -> str | None:
         return "nothing recorded to which it applies"
     if not counts.known_s:
         return "the evidence says nothing of it: too wide, missing, or the position in doubt"
-    if one.shown is of_always:
+    if one.demand is ALWAYS:
         return "no exceedance was seen, and no number of hours proves a maximum that is demanded without a probability"
     if counts.events == 0 and counts.known_s < counts.held_s:
         return "too few runs or hours; part of the time the evidence does not say"

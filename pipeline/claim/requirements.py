@@ -11,21 +11,19 @@ import numpy as np
 import polars as pl
 
 from pipeline.claim.areas import AREA_TYPES, NO_AREA
-from pipeline.claim.front import Front
+from pipeline.claim.front import Front, SpeedErrors, speed_errors
 from pipeline.claim.profile import KMH_PER_MPS, AreaLimits, Profile
-from pipeline.claim.speed import SpeedErrors, speed_errors
 from pipeline.claim.tally import (
+    ALWAYS,
     BROKEN,
     NOT_KNOWN,
     S_PER_H,
-    Finding,
-    Shown,
+    Demand,
     Tally,
+    at_least,
+    below,
     codes,
-    of_always,
     of_availability,
-    of_rate,
-    of_share,
     tally,
 )
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags
@@ -101,15 +99,14 @@ Tallies = dict[Key, Tally]
 
 @dataclass(frozen=True)
 class Requirement:
-    """One requirement: its limit in words, what is demanded, how a run counts, how counts become a finding."""
+    """One requirement: its limit in words, what is demanded, and how a run counts."""
 
     name: str
     applies_to: str
     limit: str
-    demanded: str
+    demand: Demand
     clause: str
-    shown: Callable[[Tally], Shown]
-    count: Callable[[Ride], Tally]
+    count: Callable[[Ride], Tally] = lambda _: Tally()
 
     @property
     def key(self) -> Key:
@@ -126,8 +123,8 @@ def requirements(profile: Profile) -> list[Requirement]:
     rate = profile.failure_rate
     return [
         *(one for kind, area in profile.areas.items() for one in _of_area(kind, area, profile)),
-        _rate("safe_front_end", ALL, rate.aim_per_h, profile, lambda ride: ride.front.output),
-        _rate("safe_front_end_bound", ALL, rate.bound_per_h, profile, lambda ride: ride.front.output),
+        Requirement("safe_front_end", ALL, "own CI", below(rate.aim_per_h), rate.clause, _safe),
+        Requirement("safe_front_end_bound", ALL, "own CI", below(rate.bound_per_h), rate.clause, _safe),
         *(one for kind in profile.slow.area_types for one in _slow(kind, profile)),
         *_after_balise(profile),
         *_speed(profile),
@@ -136,26 +133,10 @@ def requirements(profile: Profile) -> list[Requirement]:
     ]
 
 
-def _always(
-    name: str, applies_to: str, limit: str, clause: str, count: Callable[[Ride], Tally] = lambda _: Tally()
-) -> Requirement:
-    return Requirement(name, applies_to, limit, "always", clause, of_always, count)
-
-
-def _share(
-    name: str, applies_to: str, limit: str, share: float, clause: str, count: Callable[[Ride], Tally]
-) -> Requirement:
-    return Requirement(name, applies_to, limit, f"p >= {share:g}", clause, lambda found: of_share(found, share), count)
-
-
-def _rate(
-    name: str, applies_to: str, rate_per_h: float, profile: Profile, where: Callable[[Ride], Bools]
-) -> Requirement:
-    def count(ride: Ride) -> Tally:
-        return ride.tally(ride.safe, where(ride), ride.front.least_m)
-
-    demanded, clause = f"< {rate_per_h:g} /h", profile.failure_rate.clause
-    return Requirement(name, applies_to, "own CI", demanded, clause, lambda found: of_rate(found, rate_per_h), count)
+def _safe(ride: Ride, kind: AreaType | None = None) -> Tally:
+    """The train between min and max safe front end, in areas of one type or wherever it is."""
+    where = ride.front.output if kind is None else ride.inside(kind)
+    return ride.tally(ride.safe, where, ride.front.least_m)
 
 
 def _asked(code: Ints, limit: Floats) -> Ints:
@@ -171,22 +152,22 @@ def _of_area(kind: AreaType, area: AreaLimits, profile: Profile) -> list[Require
         code = ride.front.within(area.accuracy_m, area.accuracy_m)
         return ride.tally(code, ride.inside(kind), ride.front.least_m)
 
+    of, rate = kind.value, profile.failure_rate
     limit = f"{area.limit_m:g} m" if not area.way_s else f"{area.limit_m:g} m/{area.way_s:g} s"
+    near, often = f"{area.accuracy_m:g} m", at_least(area.accuracy_share)
     return [
         *(
-            _always(name, kind.value, limit, area.limit_clause, partial(exceeded, name=name))
+            Requirement(name, of, limit, ALWAYS, area.limit_clause, partial(exceeded, name=name))
             for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu")
         ),
-        _rate("safe_front_end", kind.value, profile.failure_rate.aim_per_h, profile, lambda ride: ride.inside(kind)),
-        _share(
-            "front_accuracy", kind.value, f"{area.accuracy_m:g} m", area.accuracy_share, area.accuracy_clause, close
-        ),
+        Requirement("safe_front_end", of, "own CI", below(rate.aim_per_h), rate.clause, partial(_safe, kind=kind)),
+        Requirement("front_accuracy", of, near, often, area.accuracy_clause, close),
     ]
 
 
 def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
     """Safe and precise operation at low speed: claimed and known."""
-    slow = profile.slow
+    slow, of = profile.slow, kind.value
 
     def here(ride: Ride) -> Bools:
         return ride.inside(kind) & (np.abs(ride.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
@@ -199,11 +180,11 @@ def _slow(kind: AreaType, profile: Profile) -> list[Requirement]:
         return ride.tally(ride.front.within(limit_m, limit_m), here(ride))
 
     limit, close = f"{slow.limit_m:g} m", f"{slow.accuracy_m:g} m"
-    accurate = partial(known, limit_m=slow.accuracy_m)
+    safe, accurate = (partial(known, limit_m=one) for one in (slow.limit_m, slow.accuracy_m))
     return [
-        _always("slow_claimed", kind.value, limit, slow.clause, claimed),
-        _always("slow_front_end", kind.value, limit, slow.clause, partial(known, limit_m=slow.limit_m)),
-        _share("slow_accuracy", kind.value, close, slow.accuracy_share, slow.clause, accurate),
+        Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, claimed),
+        Requirement("slow_front_end", of, limit, ALWAYS, slow.clause, safe),
+        Requirement("slow_accuracy", of, close, at_least(slow.accuracy_share), slow.clause, accurate),
     ]
 
 
@@ -227,9 +208,9 @@ def _after_balise(profile: Profile) -> list[Requirement]:
         return replace(counts, held_s=float(held.sum()), known_s=float(held[known].sum()))
 
     near = f"{after.fixed_m:g} m, from {after.below_kmh:g} km/h {after.offset_m:g} m + {after.per_mps_s:g} s·v"
+    often, kinds = at_least(after.share), (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
     return [
-        _share("after_balise", kind.value, near, after.share, after.clause, partial(count, kind=kind))
-        for kind in (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
+        Requirement("after_balise", kind.value, near, often, after.clause, partial(count, kind=kind)) for kind in kinds
     ]
 
 
@@ -252,29 +233,20 @@ def _first_after(front: Front, at_ns: Ints) -> Ints:
 def _speed(profile: Profile) -> list[Requirement]:
     safe, speed = profile.safe_speed, profile.speed
 
-    def over(ride: Ride) -> Tally:
-        limit = safe.limit_kmh(ride.speeds.fastest_kmh)
-        return _of_windows(ride, ride.speeds.within(limit, np.full(limit.size, np.inf)), np.isfinite(limit))
-
-    def under(ride: Ride) -> Tally:
-        limit = safe.limit_kmh(ride.speeds.fastest_kmh)
-        return _of_windows(ride, ride.speeds.within(np.full(limit.size, np.inf), limit), np.isfinite(limit))
-
-    def close(ride: Ride) -> Tally:
-        limit = speed.limit_kmh(ride.speeds.fastest_kmh)
-        return _of_windows(ride, ride.speeds.within(limit, limit), np.isfinite(limit))
-
-    def never_met(found: Tally) -> Shown:
-        shown = of_share(found, speed.share)
-        finding = Finding.NOT_SHOWN if shown.finding is Finding.MET else shown.finding
-        return replace(shown, finding=finding, needed_h=None)
+    def count(ride: Ride, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True) -> Tally:
+        limit = limit_kmh(ride.speeds.fastest_kmh)
+        code = ride.speeds.within(limit if over else np.inf, limit if under else np.inf)
+        return _of_windows(ride, code, np.isfinite(limit))
 
     margin = f"{safe.low_kmh:g} km/h to {safe.below_kmh:g}, {safe.high_kmh:g} at {safe.at_kmh:g} km/h"
     near = f"{speed.fixed_kmh:g} km/h to {speed.to_kmh:g} km/h, {speed.above_share:.0%} above"
+    ahead = partial(count, limit_kmh=safe.limit_kmh, under=False)
+    behind = partial(count, limit_kmh=safe.limit_kmh, over=False)
+    close = partial(count, limit_kmh=speed.limit_kmh)
     return [
-        _always("maso", ALL, margin, safe.clause, over),
-        _always("masu", ALL, margin, safe.clause, under),
-        Requirement("speed_accuracy", ALL, near, f"p >= {speed.share:g}", speed.clause, never_met, close),
+        Requirement("maso", ALL, margin, ALWAYS, safe.clause, ahead),
+        Requirement("masu", ALL, margin, ALWAYS, safe.clause, behind),
+        Requirement("speed_accuracy", ALL, near, at_least(speed.share, by_means=True), speed.clause, close),
     ]
 
 
@@ -306,10 +278,10 @@ def _start(profile: Profile) -> list[Requirement]:
 
     moved = profile.cold_movement
     return [
-        _always("start", "last position", f"{start.last_position_s:g} s", start.clause, first),
-        _always("start", "cold movement", f"{start.cold_movement_s:g} s", start.clause),
-        _always("start", "nothing known", f"{start.nothing_s:g} s", start.clause, nothing),
-        _always("cold_movement", ALL, f"{moved.detected_h:g} h", moved.clause),
+        Requirement("start", "last position", f"{start.last_position_s:g} s", ALWAYS, start.clause, first),
+        Requirement("start", "cold movement", f"{start.cold_movement_s:g} s", ALWAYS, start.clause),
+        Requirement("start", "nothing known", f"{start.nothing_s:g} s", ALWAYS, start.clause, nothing),
+        Requirement("cold_movement", ALL, f"{moved.detected_h:g} h", ALWAYS, moved.clause),
     ]
 
 
@@ -327,14 +299,10 @@ def _operation(profile: Profile) -> list[Requirement]:
     """Availability, and ways without physical balises: none is ever proved."""
     asked, way_m = profile.availability, profile.way.without_balise_m
     outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
-    demanded = f"p >= {asked.share:g}"
-
-    def shown(found: Tally) -> Shown:
-        return of_availability(found, asked.share, asked.outside_s)
-
+    demand = Demand(f"p >= {asked.share:g}", lambda found: of_availability(found, asked.share, asked.outside_s))
     return [
-        Requirement("availability", ALL, outside, demanded, asked.clause, shown, _availability),
-        _always("way_without_balise", ALL, f"{way_m / 1000:g} km", profile.way.clause, _ways),
+        Requirement("availability", ALL, outside, demand, asked.clause, _availability),
+        Requirement("way_without_balise", ALL, f"{way_m / 1000:g} km", ALWAYS, profile.way.clause, _ways),
     ]
 
 

@@ -8,7 +8,8 @@ not known; that counts as broken before anything is called `met`, and as kept be
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -62,6 +63,12 @@ class Tally:
         sizes = [size for size in (self.worst, other.worst) if size is not None]
         counts = {name: getattr(self, name) + getattr(other, name) for name in _COUNTS}
         return Tally(**counts, worst=max(sizes, default=None), longest_s=max(self.longest_s, other.longest_s))
+
+
+def within(low: Floats, high: Floats, over: Floats | float, under: Floats | float) -> tuple[Bools, Bools]:
+    """Whether an error between `low` and `high` is at most `over` and not below `-under`; whether it is beyond."""
+    with np.errstate(invalid="ignore"):
+        return (high <= over) & (low >= -np.asarray(under)), (low > over) | (high < -np.asarray(under))
 
 
 def codes(kept: Bools, broken: Bools) -> Ints:
@@ -138,6 +145,29 @@ class Shown:
     needed_h: float | None = None
 
 
+@dataclass(frozen=True)
+class Demand:
+    """What is demanded of a requirement in words, and what counts show of it."""
+
+    words: str
+    shown: Callable[[Tally], Shown]
+
+
+def at_least(share: float, by_means: bool = False) -> Demand:
+    """This share of all trials; `by_means`: what is kept as a mean may be exceeded at an instant, so is never met."""
+
+    def shown(found: Tally) -> Shown:
+        told = of_share(found, share)
+        unmet = Finding.NOT_SHOWN if told.finding is Finding.MET else told.finding
+        return replace(told, finding=unmet, needed_h=None) if by_means else told
+
+    return Demand(f"p >= {share:g}", shown)
+
+
+def below(rate_per_h: float) -> Demand:
+    return Demand(f"< {rate_per_h:g} /h", lambda found: of_rate(found, rate_per_h))
+
+
 def of_share(found: Tally, share: float) -> Shown:
     """At least this share, by exact bounds over runs (Clopper and Pearson)."""
     measured = clopper_pearson(found.kept, found.kept + found.broken)
@@ -181,3 +211,6 @@ def of_availability(found: Tally, share: float, outside_s: float) -> Shown:
     lost = (broken.low or 0.0) * outside_s / found.longest_s if found.longest_s > 0 else 0.0
     measured = Estimate(found.known_s / found.held_s, None, 1.0 - lost) if found.held_s > 0 else UNKNOWN
     return Shown(Finding.NOT_MET if lost > 1.0 - share else Finding.NOT_SHOWN, measured)
+
+
+ALWAYS = Demand("always", of_always)

@@ -16,12 +16,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.plausibility.check import Check, State
-from pipeline.plausibility.course import Places, seconds_since
+from pipeline.plausibility.recording import Recording
 from pipeline.plausibility.robust import LEAST
-from pipeline.plausibility.survey import Line, fit_survey
+from pipeline.plausibility.shifts import fit_survey
 from pipeline.track.geodesy import SEMI_MAJOR_AXIS_M, points_of
 from schemas.arrays import Bools, Floats, floats
-from schemas.config import FixSigma, PlausibilityConfig
+from schemas.config import FixSigma
 from schemas.enums import Fix
 
 _WHAT = "reference against the positions"
@@ -43,22 +43,16 @@ class _Track(NamedTuple):
         return _Track(self.t_s[rows], self.degrees[rows])
 
 
-def copy_check(
-    fixes: pl.DataFrame,
-    gnss: Places,
-    reference: pl.DataFrame,
-    record: Places,
-    epoch_ns: int,
-    line: Line | None,
-    config: PlausibilityConfig,
-) -> Check | None:
-    """`impossible` where the reference is a copy of the solution `fixes`; None where it is none, or nothing tells.
+def copy_check(of: Recording) -> Check | None:
+    """`impossible` where the reference is a copy of the solution; None where it is none, or nothing tells.
 
-    `gnss`, `record`: the places of both; `line`: the survey. An exact, a rounded or a thinned copy is told, and one
-    with other stamps.
+    An exact, a rounded or a thinned copy is told, and one with other stamps.
     """
-    own, other = _track(fixes, epoch_ns), _track(reference, epoch_ns)
-    other = other.take(np.nan_to_num(record.speed(other.t_s)) > config.moving_mps)
+    config, fixes, reference = of.config, of.fixes, of.run.reference
+    if reference is None or of.reference is None:
+        return None
+    own, other = _track(fixes, of.seconds(fixes)), _track(reference, of.seconds(reference))
+    other = other.take(of.reference.moves(other.t_s))
     other = other.take(np.arange(other.t_s.size) % max(1, other.t_s.size // _ROWS) == 0)
     if min(own.t_s.size, other.t_s.size) < _FEWEST:
         return None
@@ -77,7 +71,7 @@ def copy_check(
     if equal.size < _FEWEST or equal.mean() < config.copy_share:
         return None
     exact_m = config.without_error * float(sigma_m.min())
-    if line is not None and fit_survey(gnss, line, config).aside_m < exact_m:
+    if of.line is not None and fit_survey(of.gnss, of.line).aside_m < exact_m:
         return None
     stamps = f", at stamps {lag_s:+.2f} s from them" if abs(lag_s) > config.same_stamp_s else ""
     found = (
@@ -90,9 +84,9 @@ def copy_check(
     return Check(_WHAT, State.IMPOSSIBLE, found, cause, advice=advice)
 
 
-def _track(frame: pl.DataFrame, epoch_ns: int) -> _Track:
+def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:
     degrees = np.column_stack([floats(frame, name) for name in ("latitude_deg", "longitude_deg")])
-    return _Track(seconds_since(epoch_ns, frame), degrees).take(np.all(np.isfinite(degrees), axis=1))
+    return _Track(t_s, degrees).take(np.all(np.isfinite(degrees), axis=1))
 
 
 def _lag_s(own: _Track, other: _Track, reach_m: float, same_stamp_s: float) -> float | None:

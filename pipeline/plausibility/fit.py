@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import polars as pl
-
 from pipeline.plausibility.axes import velocity_checks
 from pipeline.plausibility.check import Check, State, not_checked
-from pipeline.plausibility.course import places_of
 from pipeline.plausibility.odometer import LATENCY, odometer_checks
 from pipeline.plausibility.places import reads_lag, reference_checks, survey_checks
-from pipeline.plausibility.survey import line_of
-from pipeline.plausibility.witnesses import Clocks, Lag
+from pipeline.plausibility.recording import recording_of
+from pipeline.plausibility.witnesses import Lag, clock_checks
 from pipeline.plausibility.written import reference_elsewhere, written_checks
-from schemas.arrays import times_ns
 from schemas.config import IngestConfig, PlausibilityConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -40,38 +36,28 @@ class Fit:
 
 def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityConfig, site: Site | None = None) -> Fit:
     """Compare the streams of a cleaned run with one solution, the site and the vehicle file where there are any."""
-    fixes = run.gnss.filter(pl.col("solution") == solution)
-    epoch_ns = int(times_ns(run.gnss)[0])
-    gnss = places_of(fixes, epoch_ns)
-    if gnss is None:
+    of = recording_of(run, solution, config, vehicle, site)
+    if of is None:
         return Fit((not_checked("positions", "hardly any is valid"),))
-    line = None if site is None else line_of(site.track)
     # Positions that lie on another continent fit nothing else.
-    if written := written_checks(run, fixes, gnss, line, epoch_ns, config):
+    if written := written_checks(of):
         return Fit(tuple(written))
-    checks: list[Check] = []
+    checks = reference_elsewhere(of)
     lags: list[Lag] = []
-    of_reference: Lag | None = None
     beside_reference = False
-    if run.reference is not None and run.reference.height:
-        checks += reference_elsewhere(gnss, run.reference, epoch_ns, config)
-        if not checks:
-            of_reference, checks, beside_reference = reference_checks(
-                fixes, gnss, run.reference, epoch_ns, config, line
-            )
-            lags.append(of_reference)
-    of_odometer, odometer_lags = odometer_checks(run, gnss, epoch_ns, vehicle, config, of_reference)
+    if not checks and run.reference is not None and run.reference.height:
+        of_reference, checks, beside_reference = reference_checks(of)
+        lags.append(of_reference)
+    of_odometer, odometer_lags = odometer_checks(of, lags[0] if lags else None)
     checks, lags = [*of_odometer, *checks], [*odometer_lags, *lags]
     if run.balise_reads is not None and run.balise_reads.height and site is not None:
-        lags.append(reads_lag(gnss, run.balise_reads, site, epoch_ns, config))
-    if line is not None:
-        checks = survey_checks(gnss, line, vehicle, config, beside_reference) + checks
-    checks += velocity_checks(fixes, gnss, epoch_ns, config)
-    streams = [name for name in ("gnss", "satellites") if run.stream(name) is not None]
-    several = solution if len(run.solutions()) > 1 else None
+        lags.append(reads_lag(of, run.balise_reads, site))
+    if of.line is not None:
+        checks = survey_checks(of, of.line, beside_reference) + checks
+    if of.fixes["vel_e_mps"].null_count() < of.fixes.height:
+        checks += velocity_checks(of.velocity, of.gnss)
     believed = all(check.state is not State.MISFIT for check in checks if check.what == LATENCY)
-    latency_s = (vehicle.gnss_latency_s or 0.0) if believed else 0.0
-    return Fit((*checks, *Clocks(streams, several, epoch_ns, config, latency_s).checks(lags)))
+    return Fit((*checks, *clock_checks(of, lags, (vehicle.gnss_latency_s or 0.0) if believed else 0.0)))
 
 
 def refuse_impossible(fit: Fit, place: str, config: IngestConfig) -> None:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.plausibility.causes import explain_factor
+from pipeline.plausibility.causes import Datum, datums_at, explain_factor
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
 from pipeline.plausibility.copies import copy_check
-from pipeline.plausibility.course import Places, places_of, seconds_since
-from pipeline.plausibility.frames import Datum, datums_at
-from pipeline.plausibility.passing import PlaceFit, common_lag, fit_places, passes
-from pipeline.plausibility.robust import explains
-from pipeline.plausibility.survey import Line, SurveyFit, fit_survey, steady_median
+from pipeline.plausibility.recording import Recording
+from pipeline.plausibility.records import Places
+from pipeline.plausibility.robust import explains, steady_median
+from pipeline.plausibility.shifts import Line, SurveyFit, common_lag, fit_places, fit_survey, passes
 from pipeline.plausibility.witnesses import Lag
 from pipeline.track.geodesy import points_of
+from pipeline.track.survey import track_of
 from schemas.arrays import Floats
-from schemas.config import PlausibilityConfig, Vehicle
+from schemas.config import PlausibilityConfig
 from schemas.run import Site
 
 _REFERENCE = "places of the reference against the positions"
@@ -26,24 +26,17 @@ _GEOID_M = 107.0
 _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
-def reference_checks(
-    fixes: pl.DataFrame,
-    gnss: Places,
-    reference: pl.DataFrame,
-    epoch_ns: int,
-    config: PlausibilityConfig,
-    line: Line | None,
-) -> tuple[Lag, list[Check], bool]:
+def reference_checks(of: Recording) -> tuple[Lag, list[Check], bool]:
     """Clock, place and heights of the reference; and whether it lies where the positions do. A copy tells nothing."""
-    record = places_of(reference, epoch_ns)
-    if record is None:
+    config = of.config
+    if of.reference is None:
         return Lag("reference", reason="hardly any place"), [], False
-    if copied := copy_check(fixes, gnss, reference, record, epoch_ns, line, config):
+    if copied := copy_check(of):
         return Lag("reference", reason="a copy of the positions"), [copied], False
-    found = fit_places(gnss, record, config)
+    found = fit_places(of.gnss, of.reference)
     if found.reason:
         return Lag("reference", reason=found.reason), [not_checked(_REFERENCE, found.reason)], False
-    told = abs(found.lag_s) > max(config.lag_told_s, 5.0 * found.lag_sigma_s)
+    told = abs(found.lag_s) > max(config.lag_told_s, config.told_sigmas * found.lag_sigma_s)
     agrees = explains(found.agreeing, 0.0)
     small = abs(found.lag_s) <= config.lag_limit_s and agrees
     sure = told and found.lag_is_steady and (small or explains(found.agreeing, found.as_recorded))
@@ -51,87 +44,74 @@ def reference_checks(
     if not agrees:
         words = "no one lag or shift explains them; the positions may be wrong"
         return lag, [not_checked(_REFERENCE, words)], False
-    near = found.shift_m <= config.shift_told_m
-    beside = _beside_reference(found, near or not found.shift_is_steady)
-    return lag, [beside, *_reference_heights(gnss, record, found.lag_s, config)], near
-
-
-def _beside_reference(found: PlaceFit, fit: bool) -> Check:
-    words = f"{towards(found.east_m, found.north_m)} of them"
-    if fit:
-        return fits(_REFERENCE, words)
+    near, words = found.shift_m <= config.shift_told_m, f"{found.towards} of them"
     # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
     cause, advice = "another datum, or a fixed offset between both antennas", "Find out which of both is off."
-    return Check(_REFERENCE, State.MISFIT, words, cause, advice=advice)
+    beside = Check(_REFERENCE, State.MISFIT, words, cause, advice=advice)
+    beside = fits(_REFERENCE, words) if near or not found.shift_is_steady else beside
+    return lag, [beside, *_reference_heights(of.gnss, of.reference, found.lag_s)], near
 
 
-def _reference_heights(gnss: Places, record: Places, lag_s: float, config: PlausibilityConfig) -> list[Check]:
-    known = np.isfinite(record.height_m)
+def _reference_heights(gnss: Places, record: Places, lag_s: float) -> list[Check]:
+    known, t_s = np.isfinite(record.height_m), gnss.t_s + lag_s
     if known.sum() < 2 or not np.isfinite(gnss.height_m).any():
         return []
-    t_s = gnss.t_s + lag_s
-    up_m = (
-        np.where(record.known(t_s), np.interp(t_s, record.t_s[known], record.height_m[known]), np.nan) - gnss.height_m
-    )
-    return _heights("reference", up_m, gnss.height_m, 0.0, config)
+    height_m = np.where(record.known(t_s), np.interp(t_s, record.t_s[known], record.height_m[known]), np.nan)
+    return _heights("reference", height_m - gnss.height_m, gnss.height_m, 0.0, gnss.config)
 
 
-def reads_lag(gnss: Places, reads: pl.DataFrame, site: Site, epoch_ns: int, config: PlausibilityConfig) -> Lag:
+def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
     """The clock of the balise reads: where the positions pass a balise that was read."""
-    places = _balise_places(site)
+    config, places = of.config, _balise_places(site)
     names = reads["balise_id"].to_list()
     known = np.array([name in places for name in names], dtype=np.bool_)
     if known.sum() < 3:
         return Lag("balise_reads", reason="fewer than three reads of balises of the site")
-    number, passed_s = passes(gnss, np.array([places[name] for name in names if name in places]), config.read_m, config)
-    t_s = seconds_since(epoch_ns, reads)[known]
-    lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()))
+    at_deg = np.array([places[name] for name in names if name in places])
+    number, passed_s = passes(of.gnss, points_of(*at_deg.T), config.read_m)
+    t_s = of.seconds(reads)[known]
+    lag_s, sigma_s = common_lag(t_s[number] - passed_s, int(known.sum()), config)
     if lag_s is None:
         return Lag("balise_reads", reason="no one lag explains the reads")
     # Antennas far from each other pass a balise at other times: what a train can have may be theirs.
     return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.lag_limit_s)
 
 
-def _balise_places(site: Site) -> dict[str, Floats]:
-    """Places of the balises on their net elements, at height zero."""
-    if site.balises is None:
-        return {}
-    places: dict[str, Floats] = {}
-    tracks = {part["netelement_id"][0]: part for part in site.track.partition_by("netelement_id", maintain_order=True)}
-    for name, element, measure_m in site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows():
-        if (track := tracks.get(element)) is not None:
-            at = [np.interp([measure_m], track["measure_m"], track[f"{one}_deg"]) for one in ("latitude", "longitude")]
-            places[name] = points_of(*at).surface[0]
+def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:
+    """Latitude and longitude of the balises on their net elements [deg]."""
+    track, places = track_of(site.track), {}
+    rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
+    for name, element, measure_m in rows:
+        if (number := track.element_at(element, measure_m)) is not None:
+            part = track.vertices(number)
+            degrees = (track.latitude_deg[part], track.longitude_deg[part])
+            places[name] = tuple(float(np.interp(measure_m, track.measure_m[part], axis)) for axis in degrees)
     return places
 
 
-def survey_checks(
-    gnss: Places, line: Line, vehicle: Vehicle, config: PlausibilityConfig, beside_reference: bool
-) -> list[Check]:
+def survey_checks(of: Recording, line: Line, beside_reference: bool) -> list[Check]:
     """Positions and heights against the survey; `beside_reference`: the reference lies where the positions do."""
-    found, datum = _by_datum(fit_survey(gnss, line, config), gnss, line, config)
-    heights = _heights("survey", found.up_m, found.height_m, vehicle.antenna_height_m, config)
-    return [_beside(found, datum, config, ("gnss", "reference") if beside_reference else ("gnss",)), *heights]
+    found, datum = _by_datum(fit_survey(of.gnss, line), of.gnss, line)
+    heights = _heights("survey", found.up_m, found.height_m, of.vehicle.antenna_height_m, of.config)
+    streams = ("gnss", "reference") if beside_reference else ("gnss",)
+    return [_beside(found, datum, of.config, streams), *heights]
 
 
-def _by_datum(found: SurveyFit, gnss: Places, line: Line, config: PlausibilityConfig) -> tuple[SurveyFit, Datum | None]:
+def _by_datum(found: SurveyFit, gnss: Places, line: Line) -> tuple[SurveyFit, Datum | None]:
     """The datum that the survey may be in; between curves a large shift is found only from near it."""
-    if found.aside_m < config.shift_told_m:
+    if found.aside_m < gnss.config.shift_told_m:
         return found, None
     datums = datums_at(float(np.median(gnss.latitude_deg)), float(np.median(gnss.longitude_deg)))
+    fitted = [(found if found.constant else fit_survey(gnss, line, (one.east_m, one.north_m)), one) for one in datums]
     named = [
-        (fit, datum)
-        for datum in datums
-        for start_m in [(datum.east_m, datum.north_m)]
-        for fit in [found if found.constant else fit_survey(gnss, line, config, start_m)]
-        if fit.constant and datum.explains(fit.east_m, fit.north_m, fit.one_heading, config)
+        (fit, datum) for fit, datum in fitted if fit.constant and datum.explains(fit, fit.one_heading, gnss.config)
     ]
-    return min(named, key=lambda item: item[1].off_m(item[0].east_m, item[0].north_m), default=(found, None))
+    return min(named, key=lambda item: item[1].off_m(item[0]), default=(found, None))
 
 
 def _beside(found: SurveyFit, datum: Datum | None, config: PlausibilityConfig, streams: tuple[str, ...]) -> Check:
     unknown = " (along the track not known: one heading)" if found.one_heading else ""
-    words = f"the survey lies {towards(found.east_m, found.north_m)} of them{unknown}"
+    words = f"the survey lies {found.towards} of them{unknown}"
     told = found.shift_m > config.shift_told_m and found.aside_m > 0.4 * config.shift_told_m
     if not told or not found.constant:
         if found.aside_m > config.shift_told_m:
@@ -150,12 +130,6 @@ def _beside(found: SurveyFit, datum: Datum | None, config: PlausibilityConfig, s
     cause = "a datum or map shift, or an antenna far from the track's middle"
     cause = "the reference lies where they do: a datum or map shift" if len(streams) > 1 else cause
     return Check(_SURVEY, State.MISFIT, words, cause, lines, advice=advice)
-
-
-def towards(east_m: float, north_m: float) -> str:
-    """A shift in words."""
-    east, north = ("east" if east_m >= 0 else "west"), ("north" if north_m >= 0 else "south")
-    return f"{abs(east_m):.0f} m {east}, {abs(north_m):.0f} m {north}"
 
 
 def _heights(other: str, up_m: Floats, height_m: Floats, offset_m: float, config: PlausibilityConfig) -> list[Check]:

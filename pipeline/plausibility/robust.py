@@ -15,6 +15,28 @@ LEAST = 6
 
 
 @dataclass(frozen=True)
+class Shift:
+    """How far one record lies from another [m]."""
+
+    east_m: float
+    north_m: float
+
+    @property
+    def shift_m(self) -> float:
+        return float(np.hypot(self.east_m, self.north_m))
+
+    @property
+    def towards(self) -> str:
+        """In words."""
+        east, north = ("east" if self.east_m >= 0 else "west"), ("north" if self.north_m >= 0 else "south")
+        return f"{abs(self.east_m):.0f} m {east}, {abs(self.north_m):.0f} m {north}"
+
+    def off_m(self, other: Shift) -> float:
+        """How far this shift is from another."""
+        return float(np.hypot(self.east_m - other.east_m, self.north_m - other.north_m))
+
+
+@dataclass(frozen=True)
 class Regression:
     """`estimate` with `sigma` (inf: not told); `halves`: the estimates of the first and second half of the run alone.
 
@@ -94,3 +116,10 @@ def usual(values: Floats, share: float = 0.5) -> float:
     """Quantile of what is known; NaN where nothing is."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
+
+
+def steady_median(values: Floats) -> tuple[float, bool]:
+    """Usual value, NaN where none is known, and whether both halves show it."""
+    half = len(values) // 2
+    whole, *halves = (np.array([usual(part)]) for part in (values, values[:half], values[half:]))
+    return float(whole[0]), steady(whole, *halves)

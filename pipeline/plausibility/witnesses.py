@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from pipeline.plausibility.causes import explain_lag, leap_seconds
 from pipeline.plausibility.check import Check, State, correction, fits, not_checked
-from schemas.config import PlausibilityConfig
+from pipeline.plausibility.recording import Recording
 
 NAMES = {"odometer": "odometer", "reference": "reference", "balise_reads": "balise reads"}
 
@@ -27,63 +27,59 @@ class Lag:
     latency_known: bool = False
 
 
-@dataclass(frozen=True)
-class Clocks:
-    """The streams of a run, the GNSS solution if there are several, an instant of it, and what is still no misfit.
+def clock_checks(of: Recording, lags: list[Lag], latency_s: float) -> list[Check]:
+    """One check per stream. What two recorders say against the GNSS is the GNSS's own.
 
     `latency_s`: how late the GNSS is by the vehicle file; only what is beyond is told.
     """
+    config = of.config
+    lags = [replace(lag, lag_s=lag.lag_s + latency_s) for lag in lags]
+    sure_s = [lag.lag_s for lag in lags if lag.sure]
 
-    streams: list[str]
-    solution: str | None
-    t_ns: int
-    config: PlausibilityConfig
-    latency_s: float = 0.0
+    def large(lag: Lag) -> bool:
+        return abs(lag.lag_s) > config.lag_limit_s
 
-    def checks(self, lags: list[Lag]) -> list[Check]:
-        """One check per stream. What two recorders say against the GNSS is the GNSS's own."""
-        lags = [replace(lag, lag_s=lag.lag_s + self.latency_s) for lag in lags]
-        sure = [lag.lag_s for lag in lags if lag.sure]
-        # Two recorders that show the same lag are surer than each.
-        lags = [lag if lag.reason else replace(lag, sure=self._as_sure(lag, sure)) for lag in lags]
-        wrong = [lag for lag in lags if lag.sure and abs(lag.lag_s) > self.config.lag_limit_s]
-        others = [lag for lag in lags if not lag.reason and abs(lag.lag_s) <= self.config.lag_limit_s]
-        alike = all(abs(one.lag_s - wrong[0].lag_s) < self.config.same_clock_s for one in wrong)
-        # One clock has one lag, and one line that mends it.
-        of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
-        return [self._check(lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
+    def seconded(lag: Lag) -> bool:
+        """Two recorders that show the same lag are surer than each."""
+        return lag.sure or (large(lag) and any(abs(lag.lag_s - one_s) < config.same_clock_s for one_s in sure_s))
 
-    def _as_sure(self, lag: Lag, sure_s: list[float]) -> bool:
-        beyond = abs(lag.lag_s) > self.config.lag_limit_s
-        return lag.sure or (beyond and any(abs(lag.lag_s - one_s) < self.config.same_clock_s for one_s in sure_s))
+    lags = [lag if lag.reason else replace(lag, sure=seconded(lag)) for lag in lags]
+    wrong = [lag for lag in lags if lag.sure and large(lag)]
+    others = [lag for lag in lags if not lag.reason and not large(lag)]
+    alike = all(abs(one.lag_s - wrong[0].lag_s) < config.same_clock_s for one in wrong)
+    # One clock has one lag, and one line that mends it.
+    of_gnss = min(wrong, key=lambda lag: lag.sigma_s) if len(wrong) >= 2 and alike and not others else None
+    return [_check(of, lag, of_gnss, known=bool(others) or len(wrong) >= 2) for lag in lags]
 
-    def _check(self, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
-        what, size_s = f"clock of the {NAMES[lag.stream]} against the GNSS", abs(lag.lag_s)
-        if lag.reason:
-            return not_checked(what, lag.reason)
-        if not lag.sure and size_s > max(self.config.lag_told_s, 5.0 * lag.sigma_s):
-            return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
-        if not lag.sure or size_s <= self.config.lag_told_s:
-            sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
-            return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
-        later = "later" if lag.lag_s > 0 else "earlier"
-        found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {NAMES[lag.stream]} are {later}"
-        if size_s <= self.config.lag_limit_s:
-            return _small(what, found, lag)
-        told = of_gnss or lag
-        explained = explain_lag(told.lag_s, self.t_ns, min(3.0 * told.sigma_s, 3.0), self.config)
-        exact_s = round(told.lag_s if explained is None else explained.exact, 2)
-        cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
-        at_gnss = of_gnss is not None or (
-            not known and _rather_gnss(lag.lag_s, cause, self.t_ns, self.config.same_clock_s)
-        )
-        pair = ("GNSS", NAMES[lag.stream]) if at_gnss else (NAMES[lag.stream], "GNSS")
-        cause += f", in the {pair[0]}" if known else f", rather in the {pair[0]} than in the {pair[1]}"
-        if not at_gnss:
-            return Check(what, State.IMPOSSIBLE, found, cause, correction(lag.stream, shift_s=-exact_s))
-        streams = [stream for stream in ("gnss", "satellites") if stream in self.streams]
-        lines = "".join(correction(stream, shift_s=exact_s, solution=self.solution) for stream in streams)
-        return Check(what, State.IMPOSSIBLE, found, cause, lines)
+
+def _check(of: Recording, lag: Lag, of_gnss: Lag | None, known: bool) -> Check:
+    name, config = NAMES[lag.stream], of.config
+    what, size_s = f"clock of the {name} against the GNSS", abs(lag.lag_s)
+    if lag.reason:
+        return not_checked(what, lag.reason)
+    if not lag.sure and size_s > max(config.lag_told_s, config.told_sigmas * lag.sigma_s):
+        return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
+    if not lag.sure or size_s <= config.lag_told_s:
+        sigma = f" (sigma {lag.sigma_s:.2g} s)" if lag.sigma_s < 100.0 else ""
+        return fits(what, f"{lag.lag_s:+.2f} s{sigma}")
+    later = "later" if lag.lag_s > 0 else "earlier"
+    found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {name} are {later}"
+    if size_s <= config.lag_limit_s:
+        return _small(what, found, lag)
+    told = of_gnss or lag
+    explained = explain_lag(told.lag_s, of.epoch_ns, min(3.0 * told.sigma_s, 3.0), config)
+    exact_s = round(told.lag_s if explained is None else explained.exact, 2)
+    cause = "a constant lag: a clock that was not set" if explained is None else explained.cause
+    rather = _rather_gnss(lag.lag_s, cause, of.epoch_ns, config.same_clock_s)
+    at_gnss = of_gnss is not None or (not known and rather)
+    pair = ("GNSS", name) if at_gnss else (name, "GNSS")
+    cause += f", in the {pair[0]}" if known else f", rather in the {pair[0]} than in the {pair[1]}"
+    if not at_gnss:
+        return Check(what, State.IMPOSSIBLE, found, cause, correction(lag.stream, shift_s=-exact_s))
+    streams = ("gnss",) if of.run.satellites is None else ("gnss", "satellites")
+    only = of.solution if len(of.run.solutions()) > 1 else None
+    lines = "".join(correction(stream, shift_s=exact_s, solution=only) for stream in streams)
+    return Check(what, State.IMPOSSIBLE, found, cause, lines)
 
 
 def _rather_gnss(lag_s: float, cause: str, t_ns: int, same_s: float) -> bool:

@@ -20,7 +20,7 @@ from pipeline.results.terminal import show_tables
 from pipeline.site.read import is_geojson, read_site
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, redacted
-from schemas.config import Configuration, MatchingConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from schemas.run import STREAMS, Finding, Site
 
@@ -38,7 +38,6 @@ def inspect_path(
     path: Address,
     config: Configuration | None = None,
     result: Address | None = None,
-    matching: MatchingConfig | None = None,
     site: Address | None = None,
     vehicle: Vehicle | None = None,
 ) -> dict[str, pl.DataFrame]:
@@ -46,17 +45,18 @@ def inspect_path(
 
     `result`: runs over a site, for what they say of its survey. `site`, `vehicle`: what a log is held against.
     """
+    config = config or Configuration()
     if not files.exists(path):
         raise UsageError("does not exist", place=redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()
     if names & _SITE_FILES or (is_geojson(path) and not names):
-        return inspect_site(path, result, matching or MatchingConfig())
+        return inspect_site(path, result, config)
     if result is not None:
         raise UsageError("is not a site", place=redacted(str(path)), expected="a site, to compare the result with")
     if "runs" in names and store.run_ids(path):
         return inspect_result(path)
     if name_of(path).endswith(".mcap") or names & {f"{stream}.parquet" for stream in STREAMS}:
-        return inspect_log(path, config or Configuration(), None if site is None else read_site(site), vehicle)
+        return inspect_log(path, config, None if site is None else read_site(site, config.site), vehicle)
     if name_of(path).lower().endswith(".csv"):
         return inspect_csv(Path(path))
     raise UsageError(
@@ -120,7 +120,7 @@ def _topic_row(topic: TopicSummary) -> dict[str, object]:
 
 
 def inspect_site(
-    path: Address, result: Address | None = None, matching: MatchingConfig | None = None
+    path: Address, result: Address | None = None, config: Configuration | None = None
 ) -> dict[str, pl.DataFrame]:
     """Figures and findings of a site; among these balises that linking cannot tell apart, and tracks that positions
     cannot.
@@ -132,8 +132,9 @@ def inspect_site(
     from pipeline.site.describe import describe_site, elements_table, without_balises
     from pipeline.site.survey_findings import survey_findings
 
-    site = read_site(path)
-    alike = (*window_findings(site), *parallel_findings(site, matching or MatchingConfig()))
+    config = config or Configuration()
+    site = read_site(path, config.site)
+    alike = (*window_findings(site, config.lds, config.site), *parallel_findings(site, config.matching))
     found = (*site.findings, *without_balises(site.balises), *alike)
     tables = {
         "Site": _figures(describe_site(site)),
@@ -143,7 +144,7 @@ def inspect_site(
     if result is None:
         return tables
     epochs = (store.read_table(result, "epochs", run).collect() for run in store.complete_runs(result))
-    return {**tables, "Survey": survey_findings(epochs, site.track)}
+    return {**tables, "Survey": survey_findings(epochs, site.track, config.matching)}
 
 
 def inspect_result(path: Address) -> dict[str, pl.DataFrame]:

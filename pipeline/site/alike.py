@@ -15,13 +15,11 @@ from pipeline.track.network import Network, network_of
 from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import Track, places_along, track_of
 from schemas.arrays import Floats
-from schemas.config import LdsConfig, MatchingConfig
+from schemas.config import LdsConfig, MatchingConfig, SiteConfig
 from schemas.enums import BaliseKind
 from schemas.run import Finding, Site
 
-# Twice the longest spacing of balises (DOMAIN section 4): nothing is announced from farther back,
-# so that the search of ways ends there.
-_REACH_M = 6000.0
+_DEFAULTS = SiteConfig()
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class _Point:
     at_m: float
 
 
-def window_findings(site: Site, config: LdsConfig = DEFAULTS) -> list[Finding]:
+def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig = _DEFAULTS) -> list[Finding]:
     """One warning per pair of announced balises whose windows overlap, both measured from a balise before them.
 
     Ways over several net elements and switches count, in each direction that navigability allows. Virtual and
@@ -48,7 +46,7 @@ def window_findings(site: Site, config: LdsConfig = DEFAULTS) -> list[Finding]:
         points = _points(balises, network)
         for oriented, on_it in sorted(points.items()):
             for index, reference in enumerate(on_it):
-                for near, far in _ahead(network, points, oriented, index):
+                for near, far in _ahead(network, points, oriented, index, limits.announced_m):
                     if finding := _judge(reference, near, far, config):
                         first, second = sorted((near[0].balise_id, far[0].balise_id))
                         found.setdefault((first, second), finding)
@@ -60,8 +58,7 @@ def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
     points: dict[int, list[_Point]] = {}
     columns = ("balise_id", "netelement_id", "measure_m", "location_accuracy_m")
     for name, netelement_id, measure_m, accuracy_m in balises.select(columns).iter_rows():
-        element = network.track.index.get(netelement_id)
-        if element is None:
+        if (element := network.track.element_at(netelement_id, measure_m)) is None:
             continue
         for oriented in (2 * element, 2 * element + 1):
             at_m = network.track.along_m(oriented, measure_m)
@@ -75,15 +72,17 @@ _Met = tuple[_Point, float]
 """A balise with its distance from the reference [m]."""
 
 
-def _ahead(network: Network, points: dict[int, list[_Point]], oriented: int, index: int) -> Iterator[tuple[_Met, _Met]]:
-    """The next two balises on each way ahead of one."""
+def _ahead(
+    network: Network, points: dict[int, list[_Point]], oriented: int, index: int, announced_m: float
+) -> Iterator[tuple[_Met, _Met]]:
+    """The next two balises on each way ahead of one, as far as it is announced."""
     reference = points[oriented][index]
     waiting: list[tuple[int, float, int, tuple[_Met, ...]]] = [(oriented, -reference.at_m, index + 1, ())]
     seen: set[tuple[int, tuple[str, ...]]] = set()
     while waiting:
         here, entry_m, first, met = waiting.pop()
         key = here, tuple(point.balise_id for point, _ in met)
-        if key in seen or entry_m > _REACH_M:
+        if key in seen or entry_m > announced_m:
             continue
         seen.add(key)
         met = (*met, *((point, entry_m + point.at_m) for point in points.get(here, [])[first:]))[:2]

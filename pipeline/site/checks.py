@@ -14,6 +14,7 @@ from pipeline.track.geodesy import points_of
 from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import GAP_COUNTS_M, MEASURE_TOLERANCE_M, Track, end_places, geometric_measures_m, track_of
 from schemas.arrays import Bools, Floats
+from schemas.config import SiteConfig
 from schemas.enums import Navigability
 from schemas.run import Finding
 
@@ -21,32 +22,12 @@ from schemas.run import Finding
 BALISE_PLACE = "balises: "
 
 
-@dataclass(frozen=True)
-class Limits:
-    """From where on a survey is remarkable, or broken."""
-
-    gap_m: float = 20.0
-    """Between ends that a relation joins: beyond this the path position would be wrong by a position failure, so the
-    site is refused. Up to `GAP_COUNTS_M` it is survey noise; between the two a finding, and counts as track."""
-    near_ends_m: float = 5.0
-    facing_reach_m: float = 300.0
-    """Two ends that point at each other so far apart are one track with a piece missing."""
-    facing_cosine: float = 0.94
-    """A curve turns less in between."""
-    length_share: float = 1e-3
-    """By which a declared length may differ from that of the geometry."""
-    chord_error_m: float = 0.25
-    """By which straight lines between points may leave the curve."""
-
-
-LIMITS = Limits()
-
-
 @dataclass
 class Remarks:
-    """Findings, fatal breaches, and the links without those to nowhere."""
+    """Findings, fatal breaches, and the links without those to nowhere; what is either is configuration."""
 
     links: pl.DataFrame
+    config: SiteConfig
     findings: list[Finding] = field(default_factory=list)
     breaches: list[str] = field(default_factory=list)
 
@@ -57,19 +38,20 @@ def remarks(
     balises: pl.DataFrame | None,
     route: pl.DataFrame | None,
     declared_length_m: dict[str, float],
+    config: SiteConfig,
 ) -> Remarks:
     """All checks over the tables of a site."""
     track = track_of(frame)
     known, findings = _relations_to_nowhere(track, links)
     passable, turning = _relations_that_turn_back(track, known)
-    found = Remarks(passable, findings + turning)
+    found = Remarks(passable, config, findings + turning)
     _check_elements(track, declared_length_m, found)
     _check_gaps(track, found)
-    found.findings += _near_misses(track, known)
+    found.findings += _near_misses(track, known, config)
     if balises is not None:
         _check_balises(track, balises, found)
     if route is not None:
-        found.breaches += route_breaches(track, route)
+        found.breaches += route_breaches(track, route, config)
     return found
 
 
@@ -155,11 +137,11 @@ def _check_elements(track: Track, declared_length_m: dict[str, float], found: Re
         if length < GAP_COUNTS_M:
             found.findings.append(Finding("warning", place, f"is only {length:.2f} m long"))
         for declared in (float(track.length_m[element]), declared_length_m.get(name, float("nan"))):
-            if abs(declared - length) > max(MEASURE_TOLERANCE_M, LIMITS.length_share * length):
+            if abs(declared - length) > max(MEASURE_TOLERANCE_M, found.config.length_share * length):
                 text = f"the declared length is {declared:.1f} m, the geometry is {length:.1f} m long"
                 found.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         error = chord_errors_m(track, part).max(initial=0.0)
-        if error > LIMITS.chord_error_m:
+        if error > found.config.chord_m:
             spacing = float(np.diff(geometric).max())
             text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by {error:.2f} m"
             found.findings.append(Finding("note", place, text, "Survey curves with closer points."))
@@ -197,8 +179,8 @@ def _check_gaps(track: Track, found: Remarks) -> None:
         one, other = places[track.index[a], position_a], places[track.index[b], position_b]
         gap = float(np.linalg.norm(one - other))
         text = f"end {position_a} of {a} and end {position_b} of {b} are linked but {gap:.1f} m apart"
-        if gap > LIMITS.gap_m and navigability != Navigability.NONE.value:
-            found.breaches.append(f"links: {text}; expected at most {LIMITS.gap_m:g} m")
+        if gap > found.config.joined_m and navigability != Navigability.NONE.value:
+            found.breaches.append(f"links: {text}; expected at most {found.config.joined_m:g} m")
         elif gap > GAP_COUNTS_M:
             remedy = "The straight line between them counts as track; survey the missing piece."
             found.findings.append(Finding("warning", "links", text, remedy))
@@ -209,7 +191,7 @@ def _check_gaps(track: Track, found: Remarks) -> None:
             found.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
-def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
+def _near_misses(track: Track, links: pl.DataFrame, config: SiteConfig) -> Iterator[Finding]:
     """Free ends from which a train could go on: to a near end of another element, or to one that faces it."""
     ends = [(name, position) for name in track.ids for position in (0, 1)]
     joined = {(row[0], row[1]) for row in links.iter_rows()} | {(row[2], row[3]) for row in links.iter_rows()}
@@ -217,7 +199,7 @@ def _near_misses(track: Track, links: pl.DataFrame) -> Iterator[Finding]:
     places = end_places(track).reshape(-1, 3)
     inward = outward(track).reshape(-1, 3)
     inward /= np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
-    for one, other, gap in _nearly_met(places, inward, free):
+    for one, other, gap in _nearly_met(places, inward, free, config):
         (a, position_a), (b, position_b) = ends[one], ends[other]
         if a != b:
             text = f"end {position_a} of {a} and end {position_b} of {b} are {gap:.2f} m apart and not linked"
@@ -237,17 +219,17 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
     return pairs[near]
 
 
-def _nearly_met(places: Floats, inward: Floats, free: np.ndarray) -> list[tuple[int, int, float]]:
+def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteConfig) -> list[tuple[int, int, float]]:
     """Pairs of ends, and how far apart they are."""
-    near = _pairs_within(places, LIMITS.near_ends_m)
+    near = _pairs_within(places, config.near_ends_m)
     onward = np.einsum("ij,ij->i", inward[near[:, 0]], inward[near[:, 1]]) < 0.0
     near = near[onward & free[near].any(axis=1)]
     alone = np.flatnonzero(free)
-    far = alone[_pairs_within(places[alone], LIMITS.facing_reach_m)]
+    far = alone[_pairs_within(places[alone], config.facing_m)]
     way = places[far[:, 1]] - places[far[:, 0]]
     gap = np.linalg.norm(way, axis=1)
     ahead = [sign * np.einsum("ij,ij->i", inward[far[:, side]], way) for side, sign in ((0, -1.0), (1, 1.0))]
-    facing = (gap > LIMITS.near_ends_m) & (np.minimum(*ahead) > gap * LIMITS.facing_cosine)
+    facing = (gap > config.near_ends_m) & (np.minimum(*ahead) > gap * config.facing_cosine)
     nearest: dict[int, int] = {}
     for row in np.flatnonzero(facing)[np.argsort(gap[facing], kind="stable")].tolist():
         for end in far[row].tolist():
@@ -275,15 +257,15 @@ def _off_the_track(track: Track, element: str, measure_m: float) -> tuple[str, s
     """Why no run will pass a balise, and what to mend."""
     if element not in track.index:
         return f"lies on element {element}, which is not in the track: no run will pass it", "Correct netelement_id."
+    if track.element_at(element, measure_m) is not None:
+        return None
     number = track.index[element]
     low, high = float(track.begin_m[number]), float(track.end_m[number])
-    if low - MEASURE_TOLERANCE_M <= measure_m <= high + MEASURE_TOLERANCE_M:
-        return None
     text = f"measure {measure_m:.1f} m is off element {element} ({low:.1f} to {high:.1f} m): no run will pass it"
     return text, "Correct measure_m."
 
 
-def route_breaches(track: Track, route: pl.DataFrame) -> list[str]:
+def route_breaches(track: Track, route: pl.DataFrame, config: SiteConfig) -> list[str]:
     """A route must be one continuous run over elements that exist, within each `leg` where it has that column."""
     columns = ["netelement_id", "direction"]
     rows = route.select(*columns, leg="leg" if "leg" in route.columns else pl.lit(0)).rows()
@@ -296,7 +278,7 @@ def route_breaches(track: Track, route: pl.DataFrame) -> list[str]:
         end = places[track.index[a], 1 if direction_a == "AB" else 0]
         start = places[track.index[b], 0 if direction_b == "AB" else 1]
         gap = float(np.linalg.norm(end - start))
-        if gap > LIMITS.gap_m and leg == other_leg:
+        if gap > config.joined_m and leg == other_leg:
             text = f"{a} ({direction_a}) ends {gap:.0f} m from where {b} ({direction_b}) begins"
-            breaches.append(f"route: {text}; expected at most {LIMITS.gap_m:g} m")
+            breaches.append(f"route: {text}; expected at most {config.joined_m:g} m")
     return breaches

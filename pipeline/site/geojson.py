@@ -64,7 +64,8 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     ignored = 0
     for number, feature in enumerate(features):
         try:
-            geometry, keys = _part(feature, "geometry"), _plain_keys(feature)
+            properties, geometry = parts_of(feature)
+            keys = _plain_keys(feature.get("id"), properties)
             if any(key in keys for key in _A_KEYS):
                 relations.append(_relation(keys))
             elif geometry.get("type") in ("LineString", "MultiLineString"):
@@ -78,19 +79,27 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> Network | None:
     return Network(track, links, lengths, ignored)
 
 
-def _part(feature: Any, name: str) -> Mapping[str, Any]:
-    """The geometry or properties of a feature, empty where it has none."""
-    found = (feature.get(name) or {}) if isinstance(feature, Mapping) else None
-    if not isinstance(found, Mapping):
-        raise ValueError("not a feature with properties and a geometry")
-    return found
+def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Properties and geometry of a feature, empty where it has none. Raises `ValueError`."""
+    found = [(feature.get(name) or {}) if isinstance(feature, Mapping) else None for name in ("properties", "geometry")]
+    if not all(isinstance(part, Mapping) for part in found):
+        raise ValueError("a feature is no object with properties and a geometry")
+    return found[0], found[1]  # type: ignore[return-value]
 
 
-def _plain_keys(feature: Any) -> dict[str, Any]:
+def triple(point: Any) -> tuple[float, float, float | None]:
+    """Longitude, latitude and height (none where there is none). Raises `ValueError`."""
+    try:
+        longitude, latitude, *height = point
+        return float(longitude), float(latitude), float(height[0]) if height and height[0] is not None else None
+    except _MALFORMED:
+        raise ValueError("coordinates are not numbers [longitude, latitude(, height)]") from None
+
+
+def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
     """Properties by lower-case name without underscores; the feature's own `id` where they have none."""
-    properties = _part(feature, "properties")
     keys = {re.sub(r"[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
-    return keys if feature.get("id") is None else {"id": feature["id"], **keys}
+    return keys if own_id is None else {"id": own_id, **keys}
 
 
 def _first(keys: Mapping[str, Any], names: tuple[str, ...]) -> Any:
@@ -114,17 +123,9 @@ def _element(geometry: Mapping[str, Any], keys: Mapping[str, Any], lengths: dict
     declared = _first(keys, _LENGTH_KEYS)
     declared_m = _metres(declared) if isinstance(declared, int | float) else None
     sigma_m = _metres(keys.get("sigmam"))
-    points = [(str(name), *_triple(point), sigma_m) for point in lines[0]]
+    points = [(str(name), *triple(point), sigma_m) for point in lines[0]]
     lengths[str(name)] = float("nan") if declared_m is None else declared_m
     return points
-
-
-def _triple(point: Any) -> tuple[float, float, float | None]:
-    """Longitude, latitude and height."""
-    try:
-        return float(point[0]), float(point[1]), float(point[2]) if len(point) > 2 else None
-    except _MALFORMED:
-        raise ValueError("coordinates are not numbers [longitude, latitude(, height)]") from None
 
 
 def _metres(value: Any) -> float | None:

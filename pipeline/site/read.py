@@ -17,6 +17,7 @@ from pipeline.storage.address import join, name_of, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
 from pipeline.track.survey import geometric_measures_m, track_of
+from schemas.config import SiteConfig
 from schemas.errors import InputError, SiteError, listed
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site
@@ -26,11 +27,10 @@ _SUFFIXES = {"track": (".parquet", ".csv", ".geojson"), "links": (".parquet", ".
 _TABLES = (".parquet", ".csv")
 # GeoJSON and PROJ know these as longitude and latitude on (nearly) the ellipsoid of WGS 84.
 _SAME_AS_WGS84 = (EPSG_WGS84, 4979)
-# Half a UTM zone: lines that cross a border stay in one system.
-_NEIGHBOURS_DEG = 3.0
+_DEFAULTS = SiteConfig()
 
 
-def read_site(path: Path | str) -> Site:
+def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
     """The site of a folder (CONTRACT section 2) or of one GeoJSON file with track and links, positions in WGS 84.
 
     `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its
@@ -44,7 +44,7 @@ def read_site(path: Path | str) -> Site:
     """
     files = _files(path)
     breaches: list[str] = []
-    track, network, notes = _read_track(files, breaches)
+    track, network, notes = _read_track(files, config, breaches)
     links = _read_links(files, network, breaches)
     raw = _load(files, "balises", breaches)
     balises = None if raw is None else typed_table(raw, "balises", breaches)
@@ -56,7 +56,7 @@ def read_site(path: Path | str) -> Site:
     lengths = network.declared_length_m if network else {}
     unchecked = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
     notes += [Finding("note", name, "has no page checksums: damage to it may not be seen") for name in unchecked]
-    found = remarks(track, links, balises, route, lengths)
+    found = remarks(track, links, balises, route, lengths, config)
     if found.breaches:
         raise _refusal(path, found.breaches)
     return Site(
@@ -113,7 +113,7 @@ def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable 
 
 
 def _read_track(
-    files: dict[str, bytes], breaches: list[str]
+    files: dict[str, bytes], config: SiteConfig, breaches: list[str]
 ) -> tuple[pl.DataFrame | None, Network | None, list[Finding]]:
     network: Network | None = None
     if "track.geojson" in files:
@@ -127,7 +127,7 @@ def _read_track(
     if frame.is_empty():
         breaches.append(f"{raw.file}: has no points of net elements")
         return None, network, []
-    frame = to_wgs84(raw, frame, breaches)
+    frame = to_wgs84(raw, frame, config, breaches)
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
     if network and network.ignored:
         text = f"{network.ignored} features are not used: they are neither net element nor relation"
@@ -154,10 +154,10 @@ def _in_degrees(raw: RawTable) -> RawTable:
     return RawTable(raw.file, raw.frame.rename(given), raw.epsg)
 
 
-def to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
+def to_wgs84(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
     """Positions in WGS 84, checked for range."""
     if raw.epsg not in _SAME_AS_WGS84:
-        frame = _transformed(raw, frame, breaches)
+        frame = _transformed(raw, frame, config, breaches)
     outside = (frame["latitude_deg"].abs() > 90) | (frame["longitude_deg"].abs() > 180)
     if outside.any():
         row = frame.filter(outside).row(0, named=True)
@@ -169,7 +169,7 @@ def to_wgs84(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.Data
     return frame
 
 
-def _transformed(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:
+def _transformed(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
     import pyproj
 
     try:
@@ -182,7 +182,8 @@ def _transformed(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.
     if not np.isfinite(longitude).all():
         breaches.append(f"{raw.file}: some positions are outside the area of this coordinate system")
         return frame
-    if _outside(pyproj.CRS(raw.epsg).area_of_use, float(np.median(longitude)), float(np.median(latitude))):
+    beyond_deg = _beyond_deg(pyproj.CRS(raw.epsg).area_of_use, float(np.median(longitude)), float(np.median(latitude)))
+    if beyond_deg > config.beyond_area_deg:
         text = f"the positions lie far outside the area for which EPSG:{raw.epsg} is made"
         breaches.append(f"{raw.file}: {text}; easting and northing may be exchanged, or the code be another")
         return frame
@@ -191,17 +192,12 @@ def _transformed(raw: RawTable, frame: pl.DataFrame, breaches: list[str]) -> pl.
     )
 
 
-def _outside(area: Any, longitude_deg: float, latitude_deg: float) -> bool:
-    """Whether a place is farther from a system's area than neighbours use it; false where the area is not known."""
+def _beyond_deg(area: Any, longitude_deg: float, latitude_deg: float) -> float:
+    """How far a place is outside a system's area; 0 where the area is not known."""
     if area is None or area.west > area.east:
-        return False
-    beyond = (
-        area.west - longitude_deg,
-        longitude_deg - area.east,
-        area.south - latitude_deg,
-        latitude_deg - area.north,
-    )
-    return bool(max(beyond) > _NEIGHBOURS_DEG)
+        return 0.0
+    along = max(area.west - longitude_deg, longitude_deg - area.east)
+    return float(max(along, area.south - latitude_deg, latitude_deg - area.north, 0.0))
 
 
 def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> pl.DataFrame:

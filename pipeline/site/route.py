@@ -12,6 +12,7 @@ from pipeline.site.tables import load_table, typed_table
 from pipeline.storage.address import Address, name_of, shown
 from pipeline.storage.files import read_bytes
 from pipeline.track.survey import track_of
+from schemas.config import SiteConfig
 from schemas.errors import InputError
 from schemas.inputs import Route
 from schemas.run import Site
@@ -39,7 +40,7 @@ def route_table(file: str, data: bytes, breaches: list[str]) -> pl.DataFrame | N
     return route.with_columns(direction.alias("direction"))
 
 
-def with_route(site: Site, address: Address) -> Site:
+def with_route(site: Site, address: Address, config: SiteConfig) -> Site:
     """The site for one run whose route is known. Raises `InputError` where the route does not fit the site.
 
     A run of several legs (it turned back over a switch) gets a site of nothing but the elements of its route.
@@ -48,7 +49,7 @@ def with_route(site: Site, address: Address) -> Site:
     breaches: list[str] = []
     route = route_table(name_of(address), data, breaches)
     if route is not None and not breaches:
-        breaches = route_breaches(track_of(site.track), route)
+        breaches = route_breaches(track_of(site.track), route, config)
     if route is None or breaches:
         remedy = "Correct the route; `balise replay --write-route` writes the route that was found."
         raise InputError("; ".join(breaches), place=shown(address), remedy=remedy)

@@ -12,15 +12,14 @@ from scipy.sparse.csgraph import dijkstra
 
 from pipeline.matching.candidates import candidates_of, segments_of
 from pipeline.site.tables import RawTable, typed_table
-from pipeline.survey.kilometres import measures_at
 from pipeline.survey.network import Network
-from pipeline.survey.pieces import Survey
+from pipeline.survey.pieces import Survey, measures_at
 from pipeline.survey.sources import content_of_survey
 from pipeline.survey.tables import placed_table
 from pipeline.track.geodesy import points_of
 from pipeline.track.network import network_of
 from pipeline.track.survey import Track, track_of
-from schemas.config import SurveyConfig
+from schemas.config import Configuration, SurveyConfig
 from schemas.errors import SiteError
 from schemas.inputs import Balises
 
@@ -71,20 +70,20 @@ def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
 
 
 def balises_of_list(
-    path: Path, network: Network, epsg: int | None, survey: Survey, config: SurveyConfig
+    path: Path, network: Network, epsg: int | None, survey: Survey, config: Configuration
 ) -> pl.DataFrame:
     """The balises of a table, each at its net element and measure, its coordinates, or its line kilometre.
 
     Raises `SiteError` for a balise that no track, or more than one, can be meant for.
     """
     place = str(path)
-    table = placed_table(place, content_of_survey(path), epsg)
+    table = placed_table(place, content_of_survey(path), epsg, config.site)
     track = track_of(network.track)
     if "balise_id" not in table.columns:
         table = table.with_columns(balise_id=pl.Series([f"B{row}" for row in range(1, table.height + 1)]))
     kind = pl.col("kind").fill_null("virtual") if "kind" in table.columns else pl.lit("virtual")
     table = table.with_columns(kind=kind)
-    placer = _Placer(place, network, track, survey, config)
+    placer = _Placer(place, network, track, survey, config.survey)
     found = [placer.placed(row) for row in table.iter_rows(named=True)]
     columns = {"netelement_id": pl.String, "measure_m": pl.Float64}
     placed = pl.DataFrame(found, schema=columns, orient="row")

@@ -9,30 +9,25 @@ import numpy as np
 import polars as pl
 
 from pipeline.matching.candidates import candidates_of, segments_of
-from pipeline.site.checks import LIMITS
-from pipeline.survey.kilometres import spans
 from pipeline.survey.network import Network, arms_of
-from pipeline.survey.pieces import Piece
+from pipeline.survey.pieces import Piece, kilometre_spans
 from pipeline.track.geodesy import points_of, way_m
 from pipeline.track.network import Network as Ground
 from pipeline.track.network import network_of
 from pipeline.track.segments import SAMPLE_SPACING_M
 from pipeline.track.survey import in_pieces, places_along, track_of
 from schemas.arrays import Floats
-from schemas.config import SurveyConfig
+from schemas.config import SiteConfig, SurveyConfig
 from schemas.enums import Navigability
 from schemas.run import Finding
 
-# Points with neighbours at distances that differ by more are not judged.
-_UNEVEN = 3.0
 
-
-def doubts(network: Network, config: SurveyConfig) -> list[Finding]:
+def doubts(network: Network, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
     """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
     track = track_of(network.track)
     in_parts = network_of(in_pieces(track), network.links)
     found = [*_heights(network.elements), *_doubled(in_parts, config)]
-    found += _open_ends(network_of(track, network.links), config.same_track_m)
+    found += _open_ends(network_of(track, network.links), config.same_track_m, site.near_ends_m)
     for element in network.elements:
         found += [*_kinks(element, config), *_kilometres(element, config), *_scattered(element, config)]
     return [*found, *_corners(network, config)]
@@ -59,7 +54,7 @@ def _kinks(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
     unit = steps / length[:, None]
     turn = np.arccos(np.clip(np.einsum("ij,ij->i", unit[:-1], unit[1:]), -1.0, 1.0))
     short = np.minimum(length[:-1], length[1:])
-    sharp = (turn > np.radians(8.0)) & (short / np.maximum(turn, 1e-9) < config.kink_radius_m)
+    sharp = (turn > np.radians(config.corner_deg)) & (short / np.maximum(turn, 1e-9) < config.kink_radius_m)
     # A corner within centimetres is how dense surveys scatter.
     aside = short * np.sin(np.minimum(turn, np.pi / 2)) > config.kink_aside_m
     kinks = np.flatnonzero(aside & (sharp | (turn > np.radians(config.kink_deg))))
@@ -89,7 +84,7 @@ def _last_step(element: Piece, position: int) -> Piece:
 
 def _kilometres(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
     way = way_m(element.surface)
-    known, off_m, jumps = spans(element.line_km, way, config)
+    known, off_m, jumps = kilometre_spans(element.line_km, way, config)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))
         first, last = known[row], known[row + 1]
@@ -104,8 +99,8 @@ def _scattered(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
     """Points that lie aside of a smooth line through their neighbours make the element longer than the track is."""
     flat, solid = replace(element, height_m=np.zeros(len(element))).solid, element.solid
     way = way_m(flat)
-    by_plan = _longer_m(flat, way)
-    by_height = max(0.0, min(_longer_m(solid, way) - by_plan, float(way_m(solid)[-1] - way[-1])))
+    by_plan = _longer_m(flat, way, config.uneven_steps)
+    by_height = max(0.0, min(_longer_m(solid, way, config.uneven_steps) - by_plan, float(way_m(solid)[-1] - way[-1])))
     if by_plan + by_height > max(config.shape_m, config.longer_share * way[-1]):
         what, longer_m, remedy = "positions", by_plan, "Export all decimals; do not draw by hand."
         if by_height > by_plan:
@@ -114,7 +109,7 @@ def _scattered(element: Piece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, remedy)
 
 
-def _longer_m(places: Floats, way: Floats) -> float:
+def _longer_m(places: Floats, way: Floats, uneven_steps: float) -> float:
     """By how much scatter lengthens a line: each point's variance over its spacing.
 
     The variance is that of its distance from the cubic through two neighbours on either side, which curves and
@@ -124,7 +119,7 @@ def _longer_m(places: Floats, way: Floats) -> float:
         return 0.0
     at = np.stack([way[shift : len(way) - 4 + shift] for shift in range(5)])
     step = np.diff(at, axis=0)
-    even = step.max(axis=0) < _UNEVEN * step.min(axis=0)
+    even = step.max(axis=0) < uneven_steps * step.min(axis=0)
     sides = (0, 1, 3, 4)
     factors = ([(at[2] - at[k]) / (at[own] - at[k]) for k in sides if k != own] for own in sides)
     weights = np.stack([np.prod(own, axis=0) for own in factors])
@@ -153,7 +148,7 @@ def _doubled(ground: Ground, config: SurveyConfig) -> Iterator[Finding]:
             yield Finding("warning", f"track: {track.ids[one]}", text, "Look whether one track was surveyed twice.")
 
 
-def _open_ends(ground: Ground, same_track_m: float) -> Iterator[Finding]:
+def _open_ends(ground: Ground, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
     """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
     track = ground.track
     element, position = np.nonzero(~ground.linked_ends())
@@ -161,7 +156,7 @@ def _open_ends(ground: Ground, same_track_m: float) -> Iterator[Finding]:
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
     # Farther aside is the next track.
     found = candidates_of(points, ground, segments_of(track), 2 * same_track_m)
-    middle = np.minimum(found.along_m, found.left_m) > LIMITS.near_ends_m
+    middle = np.minimum(found.along_m, found.left_m) > near_ends_m
     for near in np.flatnonzero(middle & (found.element != element[found.step])).tolist():
         end, other = int(found.step[near]), track.ids[int(found.element[near])]
         beside = f"{found.distance_m[near]:.1f} m from the middle of {other}"

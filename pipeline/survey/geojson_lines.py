@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from pipeline.site.geojson import parts_of, triple
 from pipeline.survey.pieces import Survey, piece_of
 from schemas.errors import SiteError
 
@@ -52,17 +53,12 @@ def _kind(tags: Mapping[str, Any]) -> str:
 
 
 def _feature(item: Any) -> tuple[dict[str, Any], Mapping[str, Any]]:
-    """Tags and geometry; some programs put tags into a property of their own. Raises TypeError."""
-    if not isinstance(item, Mapping):
-        raise TypeError("a feature is no object")
-    tags = dict(item.get("properties") or {})
-    nested = tags.get("tags")
-    tags |= nested if isinstance(nested, Mapping) else {}
+    """Tags and geometry; some programs put tags into a property of their own."""
+    properties, geometry = parts_of(item)
+    nested = properties.get("tags")
+    tags = dict(properties) | (dict(nested) if isinstance(nested, Mapping) else {})
     if item.get("id") not in (None, ""):
         tags["@id"] = item["id"]
-    geometry = item.get("geometry") or {}
-    if not isinstance(geometry, Mapping):
-        raise TypeError("a geometry is no object")
     return tags, geometry
 
 
@@ -83,11 +79,9 @@ def _piece(place: str, name: str, line: Any) -> Any:
 
 
 def _numbers(place: str, point: Any) -> tuple[float, float, float | None]:
-    """Longitude, latitude and height (none where there is none)."""
     try:
-        longitude, latitude, *height = point
-        return float(longitude), float(latitude), float(height[0]) if height and height[0] is not None else None
-    except (TypeError, ValueError):
+        return triple(point)
+    except ValueError:
         raise SiteError(
             "a coordinate cannot be read", place=place, found=repr(point)[:60], expected="[longitude, latitude]"
         ) from None

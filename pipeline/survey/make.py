@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.site.checks import LIMITS, remarks
+from pipeline.site.checks import remarks
 from pipeline.site.describe import without_balises
 from pipeline.storage.writing import replace_files
 from pipeline.survey.balises import balises_every, balises_of_list
@@ -18,7 +18,7 @@ from pipeline.survey.network import Network, make_network
 from pipeline.survey.pieces import Survey
 from pipeline.survey.sources import read_surveys
 from pipeline.survey.trace import clean_traces
-from schemas.config import Configuration, SurveyConfig, Vehicle
+from schemas.config import Configuration, Vehicle
 from schemas.errors import SiteError, UsageError
 from schemas.run import Finding, Site
 
@@ -49,8 +49,6 @@ def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: 
         spacing = _number(text.removesuffix("m"))
         if spacing is None or not 1.0 <= spacing <= 1e6:
             raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
-    if join_m is not None and not 0.0 <= join_m <= LIMITS.gap_m:
-        raise UsageError("is no reach", place=f"--join {join_m:g}", expected=f"0 to {LIMITS.gap_m:g} m")
     if not surveys:
         raise UsageError("no survey is named", expected="GPX, KML, GeoJSON, CSV or a run")
     return Wish(surveys, spacing, None if spacing or balises is None else Path(balises), epsg, join_m, flat)
@@ -59,24 +57,32 @@ def wish_of(surveys: list[Path], balises: str | None, epsg: int | None, join_m: 
 def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     """The site of surveys, with findings of the survey and of the site itself. `track` has `line_km` besides.
 
-    Raises `SiteError`.
+    Raises `SiteError`, `UsageError`.
     """
+    if wish.join_m is not None and not 0.0 <= wish.join_m <= config.site.joined_m:
+        expected = f"0 to {config.site.joined_m:g} m"
+        raise UsageError("is no reach", place=f"--join {wish.join_m:g}", expected=expected)
     survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config), config.survey)
     if wish.flat:
         survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
     network = make_network(survey, wish.join_m, config.survey)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
-    balises = _balises(wish, network, survey, config.survey)
+    balises = _balises(wish, network, survey, config)
     track = network.track
-    found = remarks(track, network.links, balises, None, {})
+    found = remarks(track, network.links, balises, None, {}, config.site)
     if found.breaches:
         raise SiteError(found.breaches[0], place=", ".join(map(str, wish.surveys)))
-    findings = (*survey.findings, *doubts(network, config.survey), *found.findings, *without_balises(balises))
+    findings = (
+        *survey.findings,
+        *doubts(network, config.survey, config.site),
+        *found.findings,
+        *without_balises(balises),
+    )
     return Site(track, found.links, balises, None, findings)
 
 
-def _balises(wish: Wish, network: Network, survey: Survey, config: SurveyConfig) -> pl.DataFrame | None:
+def _balises(wish: Wish, network: Network, survey: Survey, config: Configuration) -> pl.DataFrame | None:
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m)
         return table if table.height else None

@@ -1,15 +1,22 @@
-"""Which reader a survey needs, by its name."""
+"""Which reader a survey needs, by its name; and the line of a run: its reference, else its RTK positions."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import polars as pl
+
+from pipeline.ingest.run import read_run
+from pipeline.matching.fixes import fixes_of
+from pipeline.matching.reference import as_fixes
+from pipeline.matching.steps import believable, travelled
 from pipeline.survey.geojson_lines import read_geojson
-from pipeline.survey.pieces import MOST_BYTES, Survey, with_own_names
-from pipeline.survey.recorded import read_recorded
+from pipeline.survey.pieces import MOST_BYTES, Survey, piece_of, with_own_names
 from pipeline.survey.tables import read_points
 from pipeline.survey.xml_lines import read_kmz, read_xml
 from schemas.config import Configuration, Vehicle
+from schemas.enums import Fix
 from schemas.errors import SiteError
 
 _KINDS = "GPX, KML, KMZ, GeoJSON, CSV, Parquet, or a run (folder or .mcap) with a reference"
@@ -39,7 +46,7 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration)
         case ".geojson" | ".json":
             return read_geojson(place, path.stem, data)
         case ".csv" | ".txt" | ".parquet":
-            return read_points(place, path.stem, data, epsg)
+            return read_points(place, path.stem, data, epsg, config.site)
     raise SiteError("is no survey that is known", place=place, found=suffix or "no suffix", expected=_KINDS)
 
 
@@ -51,3 +58,35 @@ def content_of_survey(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise SiteError(f"cannot be read: {error.strerror}", place=str(path)) from None
+
+
+def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+    """One recorded piece; heights are those of the rail where the vehicle file says how high the antenna is.
+
+    Raises `InputError` where the run cannot be read, `SiteError` where it has no position better than GNSS alone.
+    """
+    run = read_run(str(path), config.ingest, with_digest=False)
+    points = run.reference
+    if points is None:
+        fixed = run.gnss.filter(pl.col("fix").cast(pl.String) == Fix.RTK_FIXED.value)
+        sigma_m = ((pl.col("cov_ee_m2") + pl.col("cov_nn_m2")) / 2).sqrt()
+        first = fixed["solution"].unique().sort().head(1)
+        points = fixed.filter(pl.col("solution").is_in(first.implode())).with_columns(sigma_m=sigma_m)
+    points = points.drop_nulls(["latitude_deg", "longitude_deg"]).sort("t")
+    if points.height < 2:
+        expected = "a stream `reference`, or positions with fix `rtk_fixed`"
+        raise SiteError("has no position better than GNSS alone", place=str(path), expected=expected)
+    survey = Survey()
+    fixes = fixes_of(as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
+    reached = believable(fixes, fixes.valid, travelled(fixes, None), config.matching)
+    if (jumped := points.height - len(reached)) > 0:
+        text = f"{jumped} positions to which no train can have come are left out"
+        survey.told("warning", f"track: {run.run_id}", text, "Look at the recording there.")
+    points = points[reached]
+    height = points["height_m"].fill_null(np.nan) - vehicle.antenna_height_m
+    columns = {"latitude_deg": points["latitude_deg"], "longitude_deg": points["longitude_deg"], "height_m": height}
+    survey.pieces.append(piece_of(str(path), run.run_id, {**columns, "sigma_m": points["sigma_m"]}, recorded=True))
+    if "antenna_height_m" not in vehicle.model_fields_set and points["height_m"].null_count() < points.height:
+        text = "heights are those of the antenna: the vehicle file does not say how high it is over the rail"
+        survey.told("warning", f"track: {run.run_id}", text, "Give --vehicle with antenna_height_m.")
+    return survey

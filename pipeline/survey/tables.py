@@ -9,6 +9,7 @@ import polars as pl
 from pipeline.site.read import to_wgs84
 from pipeline.site.tables import EPSG_WGS84, RawTable, load_table
 from pipeline.survey.pieces import COLUMNS, Survey, piece_of
+from schemas.config import SiteConfig
 from schemas.errors import SiteError
 
 _NAMES = {
@@ -25,9 +26,9 @@ _NAMES = {
 NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "line_km", "sigma_m")
 
 
-def read_points(place: str, stem: str, data: bytes, epsg: int | None) -> Survey:
+def read_points(place: str, stem: str, data: bytes, epsg: int | None, config: SiteConfig) -> Survey:
     """One piece per net element, in the order of the rows; one piece in all without a column for it."""
-    table = placed_table(place, data, epsg)
+    table = placed_table(place, data, epsg, config)
     for name in ("latitude_deg", "longitude_deg"):
         if name not in table.columns:
             raise SiteError(
@@ -47,7 +48,7 @@ def read_points(place: str, stem: str, data: bytes, epsg: int | None) -> Survey:
     return survey
 
 
-def placed_table(place: str, data: bytes, epsg: int | None) -> pl.DataFrame:
+def placed_table(place: str, data: bytes, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
     """A table with the contract's column names, numbers as numbers, positions in WGS 84, line metres as kilometres.
 
     `epsg`: of x and y where the file does not say. Columns that are not known stay as they are. Raises `SiteError`.
@@ -61,10 +62,10 @@ def placed_table(place: str, data: bytes, epsg: int | None) -> pl.DataFrame:
     table = table.with_columns(_numbers(place, table[name]) for name in known if name in table.columns)
     if "line_m" in table.columns and "line_km" not in table.columns:
         table = table.with_columns(line_km=pl.col("line_m") / 1000)
-    return _in_degrees(place, table, raw.epsg if raw.epsg != EPSG_WGS84 else epsg)
+    return _in_degrees(place, table, raw.epsg if raw.epsg != EPSG_WGS84 else epsg, config)
 
 
-def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None) -> pl.DataFrame:
+def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
     if not {"x_m", "y_m"} <= set(table.columns) or "latitude_deg" in table.columns:
         return table
     if epsg is None:
@@ -76,7 +77,8 @@ def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None) -> pl.DataFra
     breaches: list[str] = []
     plane = RawTable(place, table, epsg)
     known = table["x_m"].is_not_null() & table["y_m"].is_not_null()
-    turned = to_wgs84(plane, table.filter(known).rename({"x_m": "longitude_deg", "y_m": "latitude_deg"}), breaches)
+    named = table.filter(known).rename({"x_m": "longitude_deg", "y_m": "latitude_deg"})
+    turned = to_wgs84(plane, named, config, breaches)
     if breaches or not known.all():
         raise SiteError(breaches[0] if breaches else f"{place}: row {(~known).arg_true()[0] + 1} has no x or no y")
     return turned

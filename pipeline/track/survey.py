@@ -87,6 +87,13 @@ class Track:
         """Vertex at an end of an element: 0 its start, 1 its end."""
         return int(self.first[element]) if position == 0 else int(self.first[element + 1]) - 1
 
+    def element_at(self, name: str, measure_m: float) -> int | None:
+        """The net element of a name if it holds the measure, as `holding` has it; none where it does not."""
+        if (element := self.index.get(name)) is None:
+            return None
+        low_m, high_m = float(self.begin_m[element]), float(self.end_m[element])
+        return element if low_m - MEASURE_TOLERANCE_M <= measure_m <= high_m + MEASURE_TOLERANCE_M else None
+
     def elements(self) -> Iterator[tuple[int, str, slice]]:
         for element, name in enumerate(self.ids):
             yield element, name, self.vertices(element)

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 import cli
 from pipeline.claim import claim, load_profile, read_areas
 from pipeline.claim.claim import claim_table
-from pipeline.claim.front import Front, front_of
+from pipeline.claim.front import Front, front_of, speed_errors
 from pipeline.claim.requirements import Ride, requirements, tallies
-from pipeline.claim.speed import speed_errors
 from pipeline.claim.tally import (
     Finding,
     Tally,
@@ -377,7 +376,7 @@ def test_means_of_speed_call_no_accuracy_met() -> None:
         rides = [Ride(f"{number}", found, epochs(seconds), passages(), PROFILE) for number in range(300)]
         counts = sum((asked.count(ride) for ride in rides), Tally())
         assert (counts.trials, counts.kept, counts.broken) in ((300, 300, 0), (300, 0, 300))
-        assert asked.shown(counts).finding == finding
+        assert asked.demand.shown(counts).finding == finding
 
 
 def test_after_a_balise_start_and_availability() -> None:

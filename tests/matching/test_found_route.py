@@ -13,6 +13,7 @@ from pipeline.matching.found_route import found_route
 from pipeline.results import store
 from pipeline.site.read import read_site
 from pipeline.site.route import with_route
+from schemas.config import SiteConfig
 from schemas.errors import InputError, UsageError
 from schemas.run import Site
 from tests.matching.builders import line, matched, odometer, run, site
@@ -108,7 +109,7 @@ def test_a_run_that_turned_back_over_a_switch_takes_its_own_route_again(tmp_path
     first = matched(fixes, place, odometer(distance - distance[0]))
     file = tmp_path / "shunter.csv"
     found_route(first, 0.99).write_csv(file)
-    known = with_route(place, file)
+    known = with_route(place, file, SiteConfig())
     assert isinstance(known, Site)
     again = matched(fixes, known, odometer(distance - distance[0]))
     assert again.path.elements() == first.path.elements()
@@ -129,4 +130,4 @@ def test_a_route_that_does_not_fit_the_site_is_named(tmp_path: Path, text: str, 
     file = tmp_path / "route.csv"
     file.write_text(text)
     with pytest.raises(InputError, match=message):
-        with_route(read_site(home), file)
+        with_route(read_site(home), file, SiteConfig())

@@ -10,13 +10,12 @@ import pytest
 
 from datasets.random_trials import random_trial
 from pipeline.plausibility.copies import copy_check
-from pipeline.plausibility.course import places_of
-from pipeline.plausibility.survey import Line, line_of
+from pipeline.plausibility.recording import recording_of
 from pipeline.stages import replay as replayed
-from schemas.arrays import times_ns
-from schemas.config import Configuration, PlausibilityConfig
+from schemas.config import Configuration, PlausibilityConfig, Vehicle
 from schemas.errors import InputError
-from schemas.run import RunLog
+from schemas.inputs import Links
+from schemas.run import RunLog, Site
 
 _METRES = 111_319.5
 _COLUMNS = ("t", "latitude_deg", "longitude_deg", "height_m")
@@ -54,13 +53,12 @@ def _moved(frame: pl.DataFrame, sigma_m: float, seed: int = 1) -> pl.DataFrame:
 
 
 def _copies(
-    gnss: pl.DataFrame, reference: pl.DataFrame, line: Line | None = None, config: PlausibilityConfig | None = None
+    gnss: pl.DataFrame, reference: pl.DataFrame, site: Site | None = None, config: PlausibilityConfig | None = None
 ) -> list[str]:
-    epoch_ns = int(times_ns(gnss)[0])
-    places, record = places_of(gnss, epoch_ns), places_of(reference, epoch_ns)
-    assert places is not None
-    assert record is not None
-    check = copy_check(gnss, places, reference, record, epoch_ns, line, config or PlausibilityConfig())
+    run = RunLog("r", gnss, reference=reference)
+    recording = recording_of(run, "primary", config or PlausibilityConfig(), Vehicle(), site)
+    assert recording is not None
+    check = copy_check(recording)
     return [] if check is None else [check.found]
 
 
@@ -133,12 +131,15 @@ def test_positions_without_errors_may_equal_the_truth() -> None:
         longitude_deg=4.0,
         height_m=pl.lit(None, pl.Float64),
         fix=pl.lit("sbas"),
+        solution=pl.lit("primary"),
         cov_nn_m2=1.0,
         cov_ee_m2=1.0,
     )
-    line = line_of(track)
-    assert _copies(gnss, _copied(gnss), line) == []
-    assert len(_copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), line)) == 1
+    site = Site(track, Links.create_empty(), None, None)
+    assert _copies(gnss, _copied(gnss), site) == []
+    assert len(_copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), site)) == 1
+    near = PlausibilityConfig(without_error=0.9)
+    assert _copies(_moved(gnss, 0.5), _copied(_moved(gnss, 0.5)), site, near) == []
 
 
 def test_a_run_with_a_copy_fails_or_is_unproven() -> None:
@@ -150,3 +151,14 @@ def test_a_run_with_a_copy_fails_or_is_unproven() -> None:
     (row,) = replayed(copied, trial.site, trial.vehicle, warn).runs.to_dicts()
     assert row["verdict"] in ("unproven", "unsafe")
     assert "copy of the solution" in row["notes"]
+
+
+def test_what_makes_a_copy_is_configuration(run: RunLog) -> None:
+    gnss = _gnss(run)
+    half = _moved(_copied(gnss), 2.0).with_columns(
+        pl.when(pl.int_range(pl.len()) % 10 < 9).then(_copied(gnss)[name]).otherwise(name).alias(name)
+        for name in ("latitude_deg", "longitude_deg")
+    )
+    assert len(_copies(gnss, half)) == 1
+    assert _copies(gnss, half, config=PlausibilityConfig(copy_share=0.95)) == []
+    assert _copies(gnss, half, config=PlausibilityConfig(copy_chance=1e-30)) == []

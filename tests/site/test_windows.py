@@ -7,6 +7,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.site.alike import window_findings
+from schemas.config import LdsConfig, SiteConfig
 from schemas.inputs import Balises
 from schemas.run import Site
 from tests.matching import builders
@@ -71,6 +72,7 @@ def test_over_the_borders_of_net_elements() -> None:
     across = {"V1": ("A", 440.0), "V2": ("B", 10.0), "V3": ("C", 60.0)}
     assert "70.0 m apart" in told(site_of(PIECES, ROW, across))[0][1]
     assert told(site_of(PIECES, [], across)) == []
+    assert window_findings(site_of(PIECES, ROW, across), LdsConfig(), SiteConfig(announced_m=5.0)) == []
 
 
 def test_only_ways_that_a_train_may_run_count() -> None:
