@@ -84,6 +84,24 @@ def test_an_accuracy_that_jumps_up_and_creeps_down_for_hours_keeps_its_variance_
     assert (last[:, 2] < 2.0 * first[:, 2]).all()
 
 
+def test_a_variance_is_never_less_than_what_is_new_in_it():
+    """Sigma falls by 1.4 a second, phi is 1/2: the printed form falls below what is new, g^2 (R (1 - phi^2) + w)."""
+    sigma_m, lost, gain = 10.0 * 1.4 ** -np.arange(14.0)[:, None], np.full((14, 1), 0.5), np.full((14, 1), 0.3)
+    white_m2, printed, c = np.full(14, 0.01), [], 0.0
+    for r in (sigma_m**2).ravel().tolist():
+        v = printed[-1] if printed else 0.0
+        printed.append(0.7**2 * v + 0.3**2 * (0.25 * r + 0.75 * r + 0.01) - 2.0 * 0.3 * 0.7 * 0.5 * c)
+        c = 0.7 * 0.5 * c + 0.3 * (0.75 - 0.25) * r
+    errors = sigma_m, sigma_m, lost
+    increment_m2 = increment_variance(*errors) + white_m2
+    found, _ = variance_of_ewma(1.0 - gain, gain, *errors, increment_m2, white_m2, AxisState.at_restart(1, 1))
+    least = 0.3**2 * (0.75 * sigma_m.ravel() ** 2 + 0.01)
+    below = np.flatnonzero(np.array(printed) < least)
+    assert 3 <= below.size < 14
+    np.testing.assert_allclose(found[: below[0], 0], printed[: below[0]], rtol=1e-12)
+    np.testing.assert_allclose(found[below[0], 0], least[below[0]], rtol=1e-12)
+
+
 def test_variance_stays_true_where_the_accuracy_jumps():
     """Sigma between 0.1 and 5 m every 20 s, against 4,000 sampled paths: within 15 %, and never negative."""
     from scipy.signal import lfilter  # takes long to load
