@@ -121,7 +121,7 @@ class _Builder:
         if config.survey_length_m is None:
             survey = np.zeros(rows.size)
         error = np.where(unstated, config.survey_wander_m, np.nan_to_num(survey))
-        length = np.where(unstated, config.survey_wander_length_m, config.survey_length_m or np.inf)
+        length = np.where(unstated, config.survey_wander_length_m, config.survey_length_m or config.survey_wander_length_m)
         return error, -np.expm1(-way / length)
 
     def _chord_error(self, rows: Ints) -> Source:
