@@ -118,11 +118,11 @@ class _Builder:
         config = self._config.monitors
         survey, way = self._column("survey_sigma_m", rows), self._way(rows)
         unstated = np.isnan(survey) & np.isnan(self._column("vertical_m", rows))
-        if config.survey_length_m is None:
-            survey = np.zeros(rows.size)
-        error = np.where(unstated, config.survey_wander_m, np.nan_to_num(survey))
-        length = np.where(unstated, config.survey_wander_length_m, config.survey_length_m or config.survey_wander_length_m)
-        return error, -np.expm1(-way / length)
+        stated_m, length_m = np.nan_to_num(survey), config.survey_length_m
+        if length_m is None:
+            stated_m, length_m = np.zeros(rows.size), config.survey_wander_length_m
+        error = np.where(unstated, config.survey_wander_m, stated_m)
+        return error, -np.expm1(-way / np.where(unstated, config.survey_wander_length_m, length_m))
 
     def _chord_error(self, rows: Ints) -> Source:
         """The polyline's chord error [m] and its decorrelation over the way of each step."""
