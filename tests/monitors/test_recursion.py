@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.monitors.axis import AxisSeries, errors_of, run_axis
 from pipeline.monitors.recursion import (
     AxisState,
     before_steps,
@@ -15,6 +16,7 @@ from pipeline.monitors.recursion import (
     linear_recurrence,
     variance_of_ewma,
 )
+from schemas.config import MonitorConfig
 
 SHARES = np.array([0.083, 0.014, 0.150, 0.752])
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
@@ -188,3 +190,27 @@ def test_sigmas_before_steps_leave_the_sigmas_as_they_are():
     before = before_steps(sigma_m, decorrelation, 1.5)
     assert sigma_m.tolist() == kept.tolist()
     assert before.tolist() == [[1.0, 1.0, 1.0], [1.0, 1.0, 3.0], [1.0, 3.0, 1.0], [2.0, 3.0, 1.0]]
+
+
+@pytest.mark.parametrize("first", [1, 2, 9])
+def test_an_axis_goes_on_from_where_it_stopped(first):
+    """Averages and sigmas, uncertain scale and latency among them, are those of a run in one go."""
+    dice, count = np.random.default_rng(5), 20
+    dt_s, zero, nothing = dice.uniform(0.5, 2.0, count), np.zeros(count), np.zeros(count, dtype=bool)
+    series = AxisSeries(
+        epoch=np.arange(count),
+        fresh=np.arange(count) == 0,
+        border=nothing,
+        dt_s=dt_s,
+        rate_mps=dice.normal(size=count),
+        **errors_of(dice.uniform(0.5, 3.0, count), dt_s, [], MonitorConfig()),
+        white_m2=0.0025 * dt_s,
+        border_m2=zero,
+        steady_mps=dice.uniform(0.1, 1.0, count),
+        latency_mps=dice.normal(size=count),
+    )
+    value, sigma, _ = run_axis(series, ALPHAS)
+    *before, state = run_axis(series.between(0, first), ALPHAS)
+    *after, _ = run_axis(series.between(first, count), ALPHAS, state)
+    for whole, parts in zip((value, sigma), zip(before, after, strict=True), strict=True):
+        np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-9)
