@@ -28,7 +28,7 @@ from datasets.trial import build_run, build_site
 from pipeline.stages import diagnosed, replay
 from pipeline.undetected.columns import Diagnosis, rows_of
 from pipeline.undetected.profile import Profile, profile_at
-from pipeline.undetected.windows import windows
+from pipeline.undetected.watched import windows
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, Site

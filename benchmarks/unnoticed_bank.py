@@ -27,7 +27,7 @@ from pipeline.undetected.error import largest_errors
 from pipeline.undetected.shapes import Shape, largest_of_shape
 from pipeline.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Floats
-from schemas.config import MonitorConfig, threshold_factor
+from schemas.config import Configuration, MonitorConfig, threshold_factor
 
 BANKS: dict[str, tuple[float, ...]] = {
     "0.1 0.01 0.001": (0.1, 0.01, 0.001),
@@ -127,7 +127,7 @@ def bank_figures(
             size = _WARM_S + 60 * minutes[-1] + 1
             rows = watched_of(noise_of(sigmas, size, rng), sigmas, alphas)
             seen = _with_doppler(rows.since(_WARM_S, size - 1)) if velocity else rows.since(_WARM_S, size - 1)
-            both = [largest_errors(one).most_m for one in (seen, seen.mirrored())]
+            both = [largest_errors(one, Configuration().undetected).most_m for one in (seen, seen.mirrored())]
             larger.append(np.maximum(*both))
     median = np.median(larger, axis=0)
     beyond = np.flatnonzero(median > 20.0)

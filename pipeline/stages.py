@@ -27,7 +27,7 @@ from pipeline.plausibility.fit import Fit, fit_run, refuse_impossible
 from pipeline.results.provenance import Provenance, provenance
 from pipeline.track.network import Network, site_network
 from pipeline.undetected.columns import Diagnosis, undetected_of
-from pipeline.undetected.windows import fixes_ns
+from pipeline.undetected.watched import fixes_ns
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped

@@ -407,6 +407,9 @@ class MonitorConfig(Settings):
     # A drawn line is not a survey: 2-D surveys without a sigma wander across the track.
     survey_wander_m: NonNegative = 0.3
     survey_wander_length_m: Positive = 100.0
+    # The error of a survey that states its sigma: constant in place (DOMAIN section 3), but for the steps between net
+    # elements. With a length it also changes along the track, by all of the sigma over some of these lengths.
+    survey_length_m: Positive | None = None
     # A sigma that changes by a larger factor between two epochs is another kind of fix, not a drift of the accuracy.
     sigma_step_factor: Positive = 1.5
     # DIAG regresses thresholds on sigma; `balise calibrate` fits both.
@@ -530,6 +533,10 @@ class UndetectedConfig(Settings):
     solutions_at_fault: Literal["all", "one"] = "all"
     # Physical balises are thought of at epochs so far apart, to find their largest spacing.
     spacing_step_s: Positive = 60.0
+    # ... and at more of them until it is known to this share: never too large, by so much too small at most.
+    spacing_close_share: Annotated[Number, Field(gt=0, lt=1)] = 0.1
+    # A test of the position itself is looked back at over so long: until then the bank has learned as much.
+    look_back_s: Positive = 60.0
     # A monitor holds a bound if it pays for this share of it at least.
     holding_share: Probability = 0.01
     # A curve hides this share of a fault at most: of positions farther beside it nothing could be said any more.
@@ -550,6 +557,9 @@ class CalibrationConfig(Settings):
     white_share: Probability = 0.001
     # A standard deviation from so many is known to 7 %, if they were independent.
     least_epochs: Annotated[int, Field(strict=True, gt=0)] = 100
+    # Standard errors of the sigmas come from leaving out one run, or one piece of a few runs, of so many: epochs are
+    # correlated over minutes, so pieces have to be long.
+    left_out_pieces: Annotated[int, Field(strict=True, ge=2)] = 8
     # With a sigma that varies by a smaller share, intercept and slope cannot be told apart.
     sigma_spread_share: Probability = 0.05
 

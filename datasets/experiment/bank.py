@@ -35,12 +35,10 @@ _MAP_M = 0.1
 # A train that is stopped by its own diagnosis more often than this is not operated.
 _MOST_ALARMS_PER_H = 0.01
 _SURE = 0.95
-_SHOWN = 5
-_CHOICES = ("alphas", "sensors", "probability", "rate_hz")
 
 
 def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
-    """`comparison` by bank and fault, `ranking` with the best first, `recommendation.md`.
+    """`comparison` by bank and fault, and `ranking`: the first is the one to use, `reason` says why.
 
     A configured bank enters the comparison beside the candidates.
     """
@@ -52,8 +50,7 @@ def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = 
             for rate_hz in (1.0, 10.0)
         ]
     comparison = compare_banks(list(dict.fromkeys(specs)), repetitions=repetitions, seed=seed, jobs=jobs)
-    ranking = rank_banks(comparison)
-    return {"comparison": comparison, "ranking": ranking, "recommendation.md": recommendation_page(ranking)}
+    return {"comparison": comparison, "ranking": rank_banks(comparison)}
 
 
 def candidates() -> list[BankSpec]:
@@ -200,49 +197,3 @@ def _reason(row: dict[str, object]) -> str:
     if row["unseen"]:
         text += f"; mostly not seen at all: {row['unseen']}"
     return text
-
-
-def recommendation_page(ranking: pl.DataFrame) -> str:
-    """Markdown: the recommended bank and why, the runners-up, and where the replay's default stands and differs."""
-    best = ranking.row(0, named=True)
-    lines = [
-        "# Which bank",
-        "",
-        f"Recommended: {_bank(best)}. {best['reason']}.",
-        "",
-        "Ranked by: at most one false alarm in 100 h; then faults that are surely negated in time (95 %), faults seen "
-        "at all, mean share in time, fewer false alarms.",
-        "",
-        "| rank | bank | faults in time | seen | one false alarm in |",
-        "|---|---|---|---|---|",
-        *(_ranked(row) for row in ranking.head(_SHOWN).iter_rows(named=True)),
-        "",
-        "## The replay's default",
-        "",
-        *(_default(row, best) for row in ranking.filter(pl.col("replay_default")).iter_rows(named=True)),
-        "",
-        "The default keeps the published probability of 1e-7 per sample and monitor (DIAG, eq. 17), so that results "
-        "can be compared with the paper's; `monitors.false_alarm_probability` sets another.",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _bank(row: Row) -> str:
-    sensors = str(row["sensors"]).replace("_", " ")
-    return f"weights {row['alphas']}, {sensors}, {row['probability']:.0e} per sample, {row['rate_hz']:g} Hz"
-
-
-def _hours(row: Row) -> str:
-    alarms = float(str(row["false_alarms_per_h"]))
-    return f"{1.0 / alarms:.0f} h" if alarms > 0.0 else "-"
-
-
-def _ranked(row: Row) -> str:
-    in_time = f"{row['faults_in_time']} of {row['faults_judged']}"
-    return f"| {row['rank']} | {_bank(row)} | {in_time} | {row['faults_seen']} | {_hours(row)} |"
-
-
-def _default(row: Row, best: Row) -> str:
-    differs = [f"{name.replace('_', ' ')} {row[name]} for {best[name]}" for name in _CHOICES if row[name] != best[name]]
-    how = "the recommended one" if not differs else "differs from the recommended one in " + "; ".join(differs)
-    return f"- rank {row['rank']}, {_bank(row)}: {how}. {row['reason']}."

@@ -24,8 +24,6 @@ from schemas.tables import AXES, BANK_MONITORS, SCALES
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
 # than a fifth of its standard error.
 _BINS = 12
-# Pieces of which one at a time is left out where runs are fewer: standard errors depend on it, fits do not.
-_BLOCKS_OF_ONE_RUN = 8
 
 
 @dataclass(frozen=True)
@@ -48,25 +46,24 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: Calibrat
     `factor` is k_T, by which thresholds exceed sigmas. Errors are jackknifed over runs, or over stretches of a
     few runs, as epochs are correlated.
     """
-    fits = []
+    fits, least = [], -(-config.left_out_pieces // max(len(runs), 1))
     for monitor in BANK_MONITORS:
         axis = next(name for name in AXES if monitor.removeprefix(name + "_") in SCALES)
-        pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, len(runs))]
+        pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, least)]
         samples = np.concatenate(pieces) if pieces else np.zeros((0, 2))
         if len(samples) >= config.least_epochs:
             fits.append(_fit_with_errors(monitor, pieces, config))
     return fits
 
 
-def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, runs: int) -> list[Floats]:
-    """Rows (sigma of the axis, value over predicted sigma) of evaluated epochs, in blocks for the jackknife."""
+def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: int) -> list[Floats]:
+    """Rows (sigma of the axis, value over predicted sigma) of evaluated epochs, in so many pieces for the jackknife."""
     sigma = f"sigma_{axis}_m"
     chosen = run.filter(pl.col(f"{monitor}_state") != "not_evaluated").select(
         pl.col(sigma), (factor * pl.col(f"{monitor}_value") / pl.col(f"{monitor}_threshold")).alias("ratio")
     )
     rows = chosen.drop_nulls().filter(pl.col(sigma) > 0).to_numpy()
-    blocks = 1 if runs >= _BLOCKS_OF_ONE_RUN else -(-_BLOCKS_OF_ONE_RUN // runs)
-    return [block for block in np.array_split(rows, blocks) if len(block)]
+    return [piece for piece in np.array_split(rows, count) if len(piece)]
 
 
 def _fit_with_errors(monitor: str, pieces: list[Floats], config: CalibrationConfig) -> SigmaFit:

@@ -92,7 +92,7 @@ def time_steps(t_s: Floats, gap_reset_s: float) -> tuple[Floats, Bools]:
 def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None) -> tuple[Floats, Floats, AxisState]:
     """Values and sigmas of the axis [m/s] from `state`, or from a restart, on, and the state to carry on with.
 
-    Shapes (rows, 1 + alphas): raw first, then the EWMAs.
+    Shapes (rows, 1 + alphas), of one row at least: raw first, then the EWMAs.
     """
     state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1])
     moving = ~series.fresh
@@ -111,8 +111,6 @@ def run_axis(series: AxisSeries, alphas: Floats, state: AxisState | None = None)
     raw_variance = _raw_variance(series, increment_m2)
     sigma = np.sqrt(np.column_stack([raw_variance, variance + steady**2 + latency**2]))
     value = np.column_stack([series.rate_mps, ewma])
-    if series.epoch.size == 0:
-        return value, sigma, state
     return value, sigma, AxisState(ewma[-1], variance[-1], covariance, steady[-1], latency[-1])
 
 

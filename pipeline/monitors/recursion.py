@@ -90,7 +90,7 @@ def variance_of_ewma(
         covariance = _solved(keep[:, index, None] * carried, drive, before)
         coupling[1:, index] = (covariance[:-1] * change[1:]).sum(axis=1)
         coupling[:1, index] = (before * change[:1]).sum(axis=1)
-        covariances[index] = covariance[-1] if len(gain) else before
+        covariances[index] = covariance[-1]
     fresh = gain**2 * increment_m2[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.

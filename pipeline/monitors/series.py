@@ -110,19 +110,30 @@ class _Builder:
         return np.nan_to_num(turning) * self._column("calibrated_along_m", rows)
 
     def _wander(self, rows: Ints) -> Source:
-        """How a 2-D survey of no stated accuracy wanders along its elements [m], and its decorrelation."""
+        """How the survey's error changes along the elements [m], and its decorrelation over the way of each step.
+
+        A 2-D survey of no stated accuracy wanders; one that states its sigma is off by the same in place, unless the
+        configuration says over which length it changes.
+        """
         config = self._config.monitors
-        unstated = np.isnan(self._column("survey_sigma_m", rows)) & np.isnan(self._column("vertical_m", rows))
-        way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
-        return np.where(unstated, config.survey_wander_m, 0.0), -np.expm1(-way / config.survey_wander_length_m)
+        survey, way = self._column("survey_sigma_m", rows), self._way(rows)
+        unstated = np.isnan(survey) & np.isnan(self._column("vertical_m", rows))
+        stated_m, length_m = np.nan_to_num(survey), config.survey_length_m
+        if length_m is None:
+            stated_m, length_m = np.zeros(rows.size), config.survey_wander_length_m
+        error = np.where(unstated, config.survey_wander_m, stated_m)
+        return error, -np.expm1(-way / np.where(unstated, config.survey_wander_length_m, length_m))
 
     def _chord_error(self, rows: Ints) -> Source:
         """The polyline's chord error [m] and its decorrelation over the way of each step."""
         error = np.nan_to_num(self._column("interpolation_error_m", rows))
         curvature = np.abs(np.nan_to_num(self._column("curvature_per_m", rows)))
         length = np.sqrt(8.0 * error / np.maximum(curvature, _STRAIGHT_PER_M))  # chord of an arc with this sagitta
-        way = np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
-        return error, -np.expm1(-way / np.maximum(length, 1.0))
+        return error, -np.expm1(-self._way(rows) / np.maximum(length, 1.0))
+
+    def _way(self, rows: Ints) -> Floats:
+        """Along the path from each row to the next [m]."""
+        return np.abs(_steps(np.nan_to_num(self._column("path_m", rows))))
 
 
 def _steps(values: Floats) -> Floats:

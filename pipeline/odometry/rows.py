@@ -24,8 +24,8 @@ class Ways(NamedTuple):
 def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: float, config: AlignConfig) -> Ways:
     """Ways between rows at these times [s]; `distance_m` and `speed_mps` as recorded, NaN where not.
 
-    A leap of the distance is no way: there the speeds tell it where they agree with the distance elsewhere. Over a
-    pause longer than `limit_s` a counter tells what it gained, also where rows are by turns.
+    A leap of the distance is no way: there the speeds tell it where they agree with the distance elsewhere. Where rows
+    are by turns, nothing is carried over more than `limit_s`.
     """
     dt_s = np.diff(t_s)
     distance_m = _without_spikes(t_s, distance_m, config)
@@ -41,7 +41,6 @@ def ways_between(t_s: Floats, distance_m: Floats, speed_mps: Floats, limit_s: fl
     leap = leaps(carried_m, dt_s, config)
     recorded = np.where(unknown & ~leap, carried_m, recorded)
     driven = _trusted(_driven(_carried(t_s, speed_mps, limit_s), dt_s), recorded, leap, config)
-    recorded = _over_pauses(t_s, distance_m, recorded, driven, dt_s > limit_s, config)
     counted = ~np.isnan(recorded)
     return Ways(np.where(counted, recorded, driven), counted)
 
@@ -92,28 +91,6 @@ def _carried(t_s: Floats, values: Floats, limit_s: float) -> Floats:
     return np.where(
         np.isfinite(values), values, np.where(near & inside, np.interp(t_s, t_s[known], values[known]), np.nan)
     )
-
-
-def _over_pauses(
-    t_s: Floats, distance_m: Floats, recorded_m: Floats, driven_m: Floats, pause: Bools, config: AlignConfig
-) -> Floats:
-    """Recorded steps, and over a pause between rows without a distance what the counter gained around it.
-
-    The counter's last row before the pause and its first after it tell, less the steps to and from the pause. A
-    missing distance beside a speed is no pause: there the counter may have been set to zero. Nor does it tell where it
-    was reset in the pause itself.
-    """
-    known = np.flatnonzero(np.isfinite(distance_m))
-    steps = np.where(np.isnan(recorded_m), driven_m, recorded_m)
-    result = recorded_m.copy()
-    for gap in np.flatnonzero(pause & np.isnan(recorded_m)).tolist():
-        after = int(np.searchsorted(known, gap, side="right"))
-        if 0 < after < known.size:
-            begin, end = int(known[after - 1]), int(known[after])
-            beside, gained = np.delete(steps[begin:end], gap - begin), distance_m[end] - distance_m[begin]
-            leap = leaps(gained, t_s[end] - t_s[begin], config)
-            result[gap] = np.nan if leap else gained - beside.sum()
-    return result
 
 
 def filled_in(

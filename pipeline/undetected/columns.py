@@ -13,13 +13,11 @@ from pipeline.figures.undetected import Spacing
 from pipeline.lds.relink import Held
 from pipeline.monitors.bank import AxisRecord
 from pipeline.undetected.error import largest_errors
-from pipeline.undetected.levels import bounded, with_channel
-from pipeline.undetected.ranges import range_bounds
+from pipeline.undetected.levels import bounded, range_bounds, with_channel
 from pipeline.undetected.spacing import largest_spacing
-from pipeline.undetected.watched import Watched, watched
-from pipeline.undetected.windows import Window, windows
+from pipeline.undetected.watched import Watched, Window, watched, windows
 from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, UndetectedConfig, Vehicle
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
 from schemas.tables import SCALES, Epochs, Passages
@@ -84,12 +82,12 @@ def undetected_of(
         return Undetected(_nothing(Epochs, epochs.height), _nothing(Passages, passages.height))
     rows, t_ns = rows_of(diagnosis, vehicle, config), times_ns(epochs)
     parts = windows(rows, t_ns, diagnosis.fixes_ns)
-    found = _both(rows, parts)
+    found = _both(rows, parts, config.undetected)
     ranges = diagnosis.satellites
     of_range = None
     if ranges is not None:
         low_m, high_m = range_bounds(epochs, ranges, config)
-        of_range = _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts)
+        of_range = _both(bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, config.undetected)
     spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
     at = rows_of_passages(passages, crossings, rows, t_ns, config)
     facing = ints(epochs["direction"], unknown=1)
@@ -111,13 +109,13 @@ def rows_of(diagnosis: Diagnosis, vehicle: Vehicle, config: Configuration) -> Wa
     return with_channel(rows, diagnosis.epochs, diagnosis.channel, diagnosis.other, config.lds)
 
 
-def _both(rows: Watched, parts: list[Window]) -> _Both:
+def _both(rows: Watched, parts: list[Window], config: UndetectedConfig) -> _Both:
     error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
     paid, outright = np.zeros((rows.rows, 1 + rows.weight.shape[1])), np.zeros(rows.rows, dtype=np.bool_)
     for window in parts:
         seen = rows.since(window.start, window.end, window.since_s)
-        ahead, behind = largest_errors(seen), largest_errors(seen.mirrored())
+        ahead, behind = (largest_errors(one, config) for one in (seen, seen.mirrored()))
         part, worse = slice(window.start + 1, window.end + 1), ahead.most_m >= behind.most_m
         error[:, part], since_ns[part] = (ahead.most_m, behind.most_m), window.since_ns
         paid[part] = np.where(worse[:, None], ahead.paid_m, behind.paid_m)

@@ -11,15 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.undetected.growth import Growth, growth_of, horizons
-from pipeline.undetected.shares import best_shares
+from pipeline.undetected.shares import Growth, best_shares, growth_of, horizons
 from pipeline.undetected.stretch import Stretch, stretch_after
 from pipeline.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Bools, Floats, Ints
-
-# A test of the position itself is looked back at over so many seconds.
-_LOOK_BACK_S = 60.0
-
+from schemas.config import UndetectedConfig
 
 Grow = Callable[[Stretch], Growth]
 # How many rows to look back over, and the split of these rows.
@@ -35,7 +31,9 @@ class Errors:
     outright: Bools
 
 
-def largest_errors(window: Watched, grow: Grow = growth_of, after: After | None = None) -> Errors:
+def largest_errors(
+    window: Watched, config: UndetectedConfig, grow: Grow = growth_of, after: After | None = None
+) -> Errors:
     """The largest error ahead at all rows but the first, of a fault that began after the first (`Watched.since`).
 
     `after`: splits to look back at tests of the position with, by default the best ones here; any of them is a bound.
@@ -43,7 +41,7 @@ def largest_errors(window: Watched, grow: Grow = growth_of, after: After | None 
     most = np.zeros(window.rows)
     paid = np.zeros((window.rows, 1 + window.weight.shape[1]))
     outright = np.zeros(window.rows, dtype=np.bool_)
-    after_level = _after_levels(window, splits_after(window) if after is None else after)
+    after_level = _after_levels(window, splits_after(window, config) if after is None else after)
     begins = [0, *(1 + np.flatnonzero(window.fresh[1:] | window.free[1:])).tolist()]
     for begin, beyond in zip(begins, [*begins[1:], window.rows], strict=True):
         if begin:
@@ -96,13 +94,13 @@ def _unbroken(window: Watched, begins: Ints, lag: int) -> Bools:
     return unbroken
 
 
-def splits_after(window: Watched) -> After:
+def splits_after(window: Watched, config: UndetectedConfig) -> After:
     """Splits for stretches whose averages at the start are not known, as a longest stretch in the middle has them."""
     if not np.isfinite(window.high_m[1:]).any():
         return []
     first, last = window.longest
     period_s = max(float(np.median(np.diff(window.t_s[first : last + 1]))) if last > first else 1.0, 1e-3)
-    most = min(last - first - 1, int(_LOOK_BACK_S / period_s))
+    most = min(last - first - 1, int(config.look_back_s / period_s))
     middle = (first + last - most) // 2
     lags = [1, *horizons(most)] if most > 0 else []
     return [(lag, best_shares(stretch_after(window, middle, middle + lag, known=False))) for lag in lags]

@@ -11,7 +11,7 @@ from pipeline.undetected.columns import Diagnosis, rows_of, rows_of_passages
 from pipeline.undetected.error import largest_errors
 from pipeline.undetected.exact import MARGIN, largest_profile
 from pipeline.undetected.shapes import largest_of_shape
-from pipeline.undetected.windows import windows
+from pipeline.undetected.watched import windows
 from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
@@ -58,7 +58,7 @@ def profile_at(diagnosis: Diagnosis, epoch: int, behind: bool, vehicle: Vehicle,
         ),
         t=pl.Series("t", [window.since_ns, int(t_ns[epoch])]).cast(pl.Datetime("ns", "UTC")),
         error_m=found.error_m,
-        bound_m=float(largest_errors(seen).most_m[-1]),
+        bound_m=float(largest_errors(seen, config.undetected).most_m[-1]),
         step_m=largest_of_shape(seen, "step"),
         ramp_m=largest_of_shape(seen, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in found.binding),

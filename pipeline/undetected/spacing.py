@@ -13,14 +13,11 @@ import numpy as np
 
 from pipeline.figures.undetected import Spacing
 from pipeline.undetected.error import Errors, largest_errors, splits_after
-from pipeline.undetected.growth import growth_with, splits_of
+from pipeline.undetected.shares import growth_with, splits_of
 from pipeline.undetected.stretch import stretch_after
 from pipeline.undetected.watched import Watched
 from schemas.arrays import Floats
 from schemas.config import Configuration
-
-# More starts are tried until the shortest way is known to this share.
-_CLOSE = 0.1
 
 
 def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tuple[Spacing, Floats]:
@@ -32,19 +29,21 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
         return Spacing(), np.full(rows.rows, np.nan)
     step_s = config.undetected.spacing_step_s
     both, grow = (rows, rows.mirrored()), partial(growth_with, splits=splits_anywhere(rows))
-    errors = partial(largest_errors, grow=grow, after=splits_after(rows))
+    errors = partial(largest_errors, config=config.undetected, grow=grow, after=splits_after(rows, config.undetected))
     search = partial(_first_beyond, both, errors=errors, limit_m=config.hazards.failure_limit_m, ahead_s=step_s)
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
     found = {start: search(start) for start in starts if start + 1 < rows.rows}
-    ways, times = (_shortest(found, place, search) for place in (way_m, rows.t_s))
+    close = 1.0 - config.undetected.spacing_close_share
+    ways, times = (_shortest(found, place, close, search) for place in (way_m, rows.t_s))
     reached = sum(row < rows.rows for row in found.values())
     return Spacing(ways, times, len(found), reached), _before(found, way_m)
 
 
-def _shortest(found: dict[int, int], place: Floats, search: Callable[[int], int]) -> float | None:
+def _shortest(found: dict[int, int], place: Floats, close: float, search: Callable[[int], int]) -> float | None:
     """The shortest way (or time) from any row to the last one within the limit; `found`: first row beyond, by start.
 
-    From between two starts it is no shorter than from the second one to where the first reaches the limit.
+    From between two starts it is no shorter than from the second one to where the first reaches the limit. More starts
+    are tried until the two agree to the share `close`.
     """
     while True:
         starts = sorted(found)
@@ -53,7 +52,7 @@ def _shortest(found: dict[int, int], place: Floats, search: Callable[[int], int]
         least, one, after = min((item for item in sure if found[item[1]] < place.size), default=(None, 0, 0))
         if least is None:
             return None
-        if after <= one + 1 or least >= (1.0 - _CLOSE) * (place[found[one] - 1] - place[one]):
+        if after <= one + 1 or least >= close * (place[found[one] - 1] - place[one]):
             return max(least, 0.0)
         found[(one + after) // 2] = search((one + after) // 2)
 

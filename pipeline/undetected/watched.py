@@ -2,12 +2,14 @@
 
 A fault f(t) is added to the position along growing path. From row to row the bank sees its change as a rate, on top of
 the rate u that was recorded; y = u + g df/dt is what it would have seen. Its averages are linear in y, so every
-threshold is a linear bound on y, and the fault is what y gathers beyond u.
+threshold is a linear bound on y, and the fault is what y gathers beyond u. It began after the last independent fix.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from datetime import datetime
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -15,8 +17,10 @@ import polars as pl
 from pipeline.lds.relink import Held
 from pipeline.monitors.bank import AxisRecord
 from pipeline.monitors.recursion import ewma_weight
-from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
-from schemas.config import Configuration, Vehicle
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
+from schemas.config import Configuration, UndetectedConfig, Vehicle
+from schemas.enums import BaliseKind
+from schemas.run import RunLog
 
 NO_ROW = -1
 _BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
@@ -195,3 +199,45 @@ def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
             held_low[row], held_high[row] = bounds[0] - late_m, bounds[1] + late_m
         free[row] = not rows.fresh[row]
     return replace(rows, anchor=anchor, low_m=low, high_m=high, held_low_m=held_low, held_high_m=held_high, free=free)
+
+
+def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:
+    """Instants at which something else than GNSS said where the train was, in order [ns].
+
+    Physical balises read on the path, the reference by configuration, and configured starts of mission. The run's
+    first row is a start of mission in any case.
+    """
+    found: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in missions], dtype=np.int64)]
+    if "read" in config.fixes:
+        found.append(times_ns(crossings.filter(kind=BaliseKind.PHYSICAL.value)))
+    if "reference" in config.fixes and run.reference is not None:
+        found.append(times_ns(run.reference))
+    return np.unique(np.concatenate(found))
+
+
+class Window(NamedTuple):
+    """Rows over which a fault may grow: none at `start`, the last row at or before the fix, and free up to `end`.
+
+    `since_ns`: the fix, or the first row where the run begins without one; `since_s`: seconds after the first epoch.
+    """
+
+    start: int
+    end: int
+    since_ns: int
+    since_s: float
+
+
+def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[Window]:
+    """The windows of a run, in order; `t_ns`: stamps of all epochs."""
+    if not rows.rows:
+        return []
+    stamps = t_ns[rows.epoch]
+    last = np.searchsorted(stamps, fixes, side="right") - 1
+    # Of several fixes between two rows the last one counts.
+    began = {0: int(stamps[0])} | dict(zip(last[last >= 0].tolist(), fixes[last >= 0].tolist(), strict=True))
+    ends = [*sorted(began)[1:], rows.rows - 1]
+    return [
+        Window(start, end, began[start], (began[start] - int(t_ns[0])) / NS_PER_S)
+        for start, end in zip(sorted(began), ends, strict=True)
+        if end > start
+    ]

@@ -269,3 +269,14 @@ def test_a_position_far_beside_its_place_says_nothing_of_the_scale():
     told, known = estimates_of(seen_at(learner, after, 12.0)), estimates_of(before.joint)
     assert abs(told.scale - known.scale) < 0.5 * known.scale_sigma
     assert told.scale_sigma > 0.95 * known.scale_sigma
+
+
+@pytest.mark.parametrize(("at_s", "speed_mps"), [(0.0, 10.0), (4.0, 15.0), (8.0, 40.0)])
+def test_the_speed_is_centred_but_where_the_odometer_ends(at_s, speed_mps):
+    """Rows 2 s apart, 10 m/s to 4 s, 20 m/s to 6 s, then 40 m/s; over 2 s to both sides, as far as there are rows."""
+    odometry = odometry_from(odometer_of([0.0, 2.0, 4.0, 6.0, 8.0], distance_m=[0.0, 20.0, 40.0, 80.0, 160.0]))
+    odometry = replace(odometry, t_s=np.arange(0.0, 9.0, 2.0), distance_m=np.array([0.0, 20.0, 40.0, 80.0, 160.0]))
+    learner = ScaleLatencyFilter(*error_model(CONFIG.monitors), odometry, CONFIG.align)
+    way_m, found_mps = learner._odometer_at(at_s, 0.0)
+    assert way_m == np.interp(at_s, odometry.t_s, odometry.distance_m)
+    assert found_mps == pytest.approx(speed_mps)

@@ -64,6 +64,17 @@ def test_a_constant_sigma_gives_a_slope_alone() -> None:
     assert fit.slope == pytest.approx(2.0, rel=0.02)
 
 
+def test_fewer_pieces_left_out_change_the_standard_errors_alone() -> None:
+    """A run in two halves a and b: the jackknife's error of their ratio is half the difference of the halves."""
+    run = monitored(1, 0.0, 2.0, spread=0.0)
+    halves = CalibrationConfig(left_out_pieces=2)
+    (eight,), (two,) = (regress_sigmas([run], FACTOR, config) for config in (CONFIG, halves))
+    assert (two.ratio, two.slope) == (eight.ratio, eight.slope)
+    parts = [regress_sigmas([part], FACTOR, CONFIG)[0].ratio for part in (run[:10_000], run[10_000:])]
+    assert two.ratio_error == pytest.approx(0.5 * abs(parts[0] - parts[1]), rel=1e-9)
+    assert two.ratio_error != eight.ratio_error
+
+
 def test_the_loudest_proven_monitor_decides() -> None:
     (fit,) = regress_sigmas([monitored(1, 0.0, 1.2)], FACTOR, CONFIG)
     lucky = type(fit)("up_raw", 100, 1.4, 0.5, 0.0, 0.0, 1.4, 0.5)

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from datasets.experiment import EXPERIMENTS
-from datasets.experiment.bank import FEWEST_RUNS, compare_banks, rank_banks, recommendation_page
+from datasets.experiment.bank import FEWEST_RUNS, compare_banks, rank_banks
 from datasets.experiment.bank_faults import CATALOGUE, Fault, WhiteNoise, failure_s, fault_response
 from datasets.experiment.geometry import default_geometry
 from datasets.experiment.linear_bank import BankSpec, linear_bank
@@ -141,10 +141,8 @@ def test_the_recommendation_says_why_and_where_the_default_stands() -> None:
     ]
     ranking = rank_banks(compare_banks(specs, (Fault("step", "along", 25.0),), FEWEST_RUNS, seed=1))
     assert ranking["probability"].to_list() == [1e-8, 1e-7]
-    page = recommendation_page(ranking)
-    assert (
-        "Recommended: weights 1, 0.1, 0.01, 0.001, odometer and track, 1e-08 per sample, 10 Hz. 1 of 1 faults" in page
-    )
-    assert "- rank 2, weights 1, 0.1, 0.01, 0.001, odometer and track, 1e-07 per sample, 10 Hz: differs" in page
-    assert "in probability 1e-07 for 1e-08. 1 of 1 faults negated in time" in page
-    assert "more often than one in 100 h" in page
+    assert ranking["replay_default"].to_list() == [False, True]
+    best, default = ranking["reason"]
+    assert best.startswith("1 of 1 faults negated in time, one false alarm in ")
+    assert "more often than one in 100 h" not in best
+    assert "more often than one in 100 h" in default

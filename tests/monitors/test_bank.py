@@ -64,6 +64,16 @@ def test_a_flat_survey_of_no_stated_accuracy_may_wander():
     assert unstated**2 - stated**2 == pytest.approx(2 * 0.3**2 * (1 - np.exp(-0.2)), rel=1e-9)
 
 
+def test_a_stated_survey_changes_along_the_track_by_configuration_alone():
+    """0.1 m, decorrelated over 20 m of way as exp(-20/500) where a length is configured; along the track never."""
+    epochs = steady(3, survey_sigma_m=[0.1] * 3)
+    changing = Configuration.model_validate({"monitors": {"survey_length_m": 500.0}})
+    constant, wandering = (table(bank_of(*epochs, config=config)) for config in (Configuration(), changing))
+    before, after = (one["cross_raw_threshold"][1] / FACTOR for one in (constant, wandering))
+    assert after**2 - before**2 == pytest.approx(2 * 0.1**2 * (1 - np.exp(-20.0 / 500.0)), rel=1e-9)
+    assert constant["along_raw_threshold"].equals(wandering["along_raw_threshold"])
+
+
 def test_a_curve_turns_the_error_along_the_track_across_it():
     straight = table(bank_of(*steady(3)))["cross_raw_threshold"][2] / FACTOR
     curved = table(bank_of(*steady(3, curvature_per_m=[1e-3] * 3)))["cross_raw_threshold"][2] / FACTOR

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.monitors.axis import AxisSeries, errors_of, run_axis
 from pipeline.monitors.recursion import (
     AxisState,
     before_steps,
@@ -15,6 +16,7 @@ from pipeline.monitors.recursion import (
     linear_recurrence,
     variance_of_ewma,
 )
+from schemas.config import MonitorConfig
 
 SHARES = np.array([0.083, 0.014, 0.150, 0.752])
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
@@ -82,6 +84,24 @@ def test_an_accuracy_that_jumps_up_and_creeps_down_for_hours_keeps_its_variance_
     assert (found > 0).all()
     np.testing.assert_allclose(last[:, :2], first[:, :2], rtol=1e-3)
     assert (last[:, 2] < 2.0 * first[:, 2]).all()
+
+
+def test_a_variance_is_never_less_than_what_is_new_in_it():
+    """Sigma falls by 1.4 a second, phi is 1/2: the printed form falls below what is new, g^2 (R (1 - phi^2) + w)."""
+    sigma_m, lost, gain = 10.0 * 1.4 ** -np.arange(14.0)[:, None], np.full((14, 1), 0.5), np.full((14, 1), 0.3)
+    white_m2, printed, c = np.full(14, 0.01), [], 0.0
+    for r in (sigma_m**2).ravel().tolist():
+        v = printed[-1] if printed else 0.0
+        printed.append(0.7**2 * v + 0.3**2 * (0.25 * r + 0.75 * r + 0.01) - 2.0 * 0.3 * 0.7 * 0.5 * c)
+        c = 0.7 * 0.5 * c + 0.3 * (0.75 - 0.25) * r
+    errors = sigma_m, sigma_m, lost
+    increment_m2 = increment_variance(*errors) + white_m2
+    found, _ = variance_of_ewma(1.0 - gain, gain, *errors, increment_m2, white_m2, AxisState.at_restart(1, 1))
+    least = 0.3**2 * (0.75 * sigma_m.ravel() ** 2 + 0.01)
+    below = np.flatnonzero(np.array(printed) < least)
+    assert 3 <= below.size < 14
+    np.testing.assert_allclose(found[: below[0], 0], printed[: below[0]], rtol=1e-12)
+    np.testing.assert_allclose(found[below[0], 0], least[below[0]], rtol=1e-12)
 
 
 def test_variance_stays_true_where_the_accuracy_jumps():
@@ -170,3 +190,27 @@ def test_sigmas_before_steps_leave_the_sigmas_as_they_are():
     before = before_steps(sigma_m, decorrelation, 1.5)
     assert sigma_m.tolist() == kept.tolist()
     assert before.tolist() == [[1.0, 1.0, 1.0], [1.0, 1.0, 3.0], [1.0, 3.0, 1.0], [2.0, 3.0, 1.0]]
+
+
+@pytest.mark.parametrize("first", [1, 2, 9])
+def test_an_axis_goes_on_from_where_it_stopped(first):
+    """Averages and sigmas, uncertain scale and latency among them, are those of a run in one go."""
+    dice, count = np.random.default_rng(5), 20
+    dt_s, zero, nothing = dice.uniform(0.5, 2.0, count), np.zeros(count), np.zeros(count, dtype=bool)
+    series = AxisSeries(
+        epoch=np.arange(count),
+        fresh=np.arange(count) == 0,
+        border=nothing,
+        dt_s=dt_s,
+        rate_mps=dice.normal(size=count),
+        **errors_of(dice.uniform(0.5, 3.0, count), dt_s, [], MonitorConfig()),
+        white_m2=0.0025 * dt_s,
+        border_m2=zero,
+        steady_mps=dice.uniform(0.1, 1.0, count),
+        latency_mps=dice.normal(size=count),
+    )
+    value, sigma, _ = run_axis(series, ALPHAS)
+    *before, state = run_axis(series.between(0, first), ALPHAS)
+    *after, _ = run_axis(series.between(first, count), ALPHAS, state)
+    for whole, parts in zip((value, sigma), zip(before, after, strict=True), strict=True):
+        np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-9)

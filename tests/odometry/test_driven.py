@@ -33,6 +33,17 @@ SHUNTING = {
 }
 
 
+def test_a_stand_lasts_to_its_last_count_and_to_the_end_of_the_record():
+    """Counts of a metre at 1 m/s, a stand from 10 to 70 s at 10 m, and one from 90 s to the last row at 30 m."""
+    t_s = np.arange(0.0, 101.0)
+    counts = np.where(t_s < 70.0, np.minimum(t_s, 10.0), np.minimum(t_s - 60.0, 30.0))
+    at_s, at_m = evenly_driven(t_s, counts, np.full(t_s.size, 1.0 / np.sqrt(12.0)), 0.3, AlignConfig())
+    nodes = list(zip(at_s.tolist(), at_m.tolist(), strict=True))
+    around = nodes.index((10.0, 10.0))
+    assert nodes[around + 1 : around + 3] == [(70.0, 10.0), (71.0, 11.0)]
+    assert nodes[-2:] == [(90.0, 30.0), (100.0, 30.0)]
+
+
 def test_hysteresis_by_hand():
     rows = np.array([0.0, 0.8, -0.7, 3.0, 2.5, 1.5, 0.5, 5.0, np.nan, 6.0])
     held = with_hysteresis(rows, np.full(10, 1.0))

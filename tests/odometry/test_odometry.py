@@ -10,7 +10,7 @@ import pytest
 from pipeline.odometry.driven import turns_of
 from pipeline.odometry.odometry import Noise
 from pipeline.odometry.odometry import odometry_of as odometry_of_stream
-from pipeline.odometry.polarity import polarity
+from pipeline.odometry.polarity import grows_with, polarity
 from pipeline.odometry.quantisation import QuantisationNoise
 from pipeline.odometry.rows import ways_between
 from schemas.config import AlignConfig, Configuration, Vehicle
@@ -50,15 +50,14 @@ def test_distance_and_speed_by_turns_are_carried_between_their_own_rows():
     assert odometry.known_at_s(np.array(t)).all()
 
 
-def test_a_distance_by_turns_carries_over_a_pause_between_any_rows():
+def test_where_distance_and_speed_by_turns_pause_the_way_is_lost():
+    """The counter's next row stands after a speed's: nobody knows whether it went on counting in between."""
     nan = np.nan
     t = [0.0, 0.5, 1.0, 1.5, 8.0, 8.5, 9.0]
     distance = [0.0, nan, 10.0, nan, nan, 80.0, nan]
     speed = [nan, 10.0, nan, 10.0, 12.0, nan, 12.0]
     odometry = odometry_from(odometer_of(t, distance_m=distance, speed_mps=speed))
-    assert odometry.segment.tolist() == [0] * 7
-    # A straight line of speeds over the pause would be 71.5 m; the counter gained 59 m.
-    np.testing.assert_allclose(odometry.distance_m, [0.0, 5.0, 10.0, 15.0, 74.0, 80.0, 86.0])
+    assert odometry.segment[3] < odometry.segment[4]
     assert odometry.known_at_s(np.array([1.5, 4.0, 8.0])).tolist() == [True, False, True]
 
 
@@ -108,6 +107,20 @@ def test_a_leap_in_the_first_metres_does_not_turn_the_odometer_round():
     odometry = odometry_from(odometer_of(t, distance_m=5.0 * t))
     path = 5.0 * t - np.where((t > 3.9) & (t < 4.2), 300.0, 0.0)
     assert polarity(odometry, np.round(1e9 * t).astype(np.int64), path, 20.0) == 1
+
+
+@pytest.mark.parametrize("counts", [1.0, -1.0])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_the_first_movement_went_as_positions_say_along_which_the_odometer_says_how_far(way, counts):
+    """Forwards or backwards, counted up or down; a leap just when 20 m are covered misleads positions alone."""
+    t = np.arange(0.0, 10.0, 0.1)
+    path = 500.0 + way * (5.0 * t - np.where((t > 3.95) & (t < 4.25), 300.0, 0.0))
+    t_ns, odometry = (
+        np.round(1e9 * t).astype(np.int64),
+        odometry_from(odometer_of(t, distance_m=counts * way * 5.0 * t)),
+    )
+    assert grows_with(path, t_ns, odometry, 20.0) == (way > 0.0)
+    assert grows_with(path, t_ns, None, 20.0) == (way < 0.0)
 
 
 @pytest.mark.parametrize("speed", [None, 10.0])

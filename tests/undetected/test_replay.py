@@ -17,7 +17,7 @@ from datasets.trial import build_run, build_site
 from pipeline.stages import diagnosed, replay
 from pipeline.undetected.columns import Diagnosis, rows_of
 from pipeline.undetected.error import largest_errors
-from pipeline.undetected.ranges import range_bounds
+from pipeline.undetected.levels import range_bounds
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, RunTables, Site
@@ -99,7 +99,7 @@ def since_the_start(
     """The largest errors ahead since the first row, their epochs, and what watched."""
     diagnosis, _, _ = diagnosed(run, site, vehicle, settings, "primary")
     rows = rows_of(diagnosis, vehicle, settings)
-    return largest_errors(rows.since(0, rows.rows - 1)).most_m, rows.epoch[1:], diagnosis
+    return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], diagnosis
 
 
 def test_no_vehicle_file_no_close_bound() -> None:
