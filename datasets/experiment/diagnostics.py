@@ -29,8 +29,12 @@ _PMD_POINTS = 81
 
 
 def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
-    """`pmd`, `detection` and `geometry` of the experiment."""
-    return run_diagnostics(repetitions, seed, jobs)
+    """`pmd`, `detection`, `geometry` and pictures of the experiment."""
+    from datasets.experiment.figures import drawn_figures, require_matplotlib
+
+    require_matplotlib()
+    frames = run_diagnostics(repetitions, seed, jobs)
+    return {**frames, **drawn_figures(frames["pmd"], frames["detection"], frames["geometry"])}
 
 
 def run_diagnostics(repetitions: int = REPETITIONS, seed: int = 1, jobs: int = 1) -> dict[str, pl.DataFrame]:

@@ -17,8 +17,8 @@ from pipeline.figures.bounds import CONFIDENCE, clopper_pearson
 from pipeline.storage.parquet import parquet_bytes
 from schemas.arrays import Floats
 
-# By name: tables, and pages under their whole name.
-Contents = Mapping[str, pl.DataFrame | str]
+# By name: tables, and pages and pictures under their whole name.
+Contents = Mapping[str, pl.DataFrame | str | bytes]
 Row = dict[str, object]
 
 
@@ -82,8 +82,9 @@ def write(out: Path, contents: Contents, settings: Mapping[str, object]) -> list
     """Every content and `settings.json`, which made them; the same content gives the same bytes."""
     files = {**contents, "settings.json": json.dumps(dict(settings), indent=2, sort_keys=True) + "\n"}
     for name, content in files.items():
-        made = parquet_bytes(content) if isinstance(content, pl.DataFrame) else content.encode()
-        storage.write_bytes(_path(out, name), made)
+        if isinstance(content, pl.DataFrame):
+            content = parquet_bytes(content)
+        storage.write_bytes(_path(out, name), content.encode() if isinstance(content, str) else content)
     return [_path(out, name) for name in files]
 
 
