@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from datasets.random_deviations import deviations
+from benchmarks.random_deviations import deviations
 from datasets.random_trials import random_trial
 from pipeline.stages import replay
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import polars as pl
 import pytest
 
-from datasets.random_deviations import deviations
+from benchmarks.random_deviations import deviations
 from datasets.random_trials import KINDS
 from datasets.random_trials import random_trial as draw_trial
 from pipeline.stages import replay
