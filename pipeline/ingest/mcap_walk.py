@@ -25,6 +25,7 @@ _AFTER_THE_DATA = (
     Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
 )  # fmt: skip
 _ONLY_THERE = _AFTER_THE_DATA[2:]
+_KNOWN = int(max(Opcode))  # unknown records, of higher ones, are skipped, by specification
 _TOGETHER = 8 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _LEAST_PIECE = 8 * 1024  # what a piece that waits takes itself
 _LOOSE = 64 * 1024  # of a log without chunks read at once
@@ -133,20 +134,20 @@ class McapWalk:
         self._last_chunk = None
         if opcode == Opcode.MESSAGE:
             return self._loose_messages(length, position)
+        if opcode == Opcode.CHUNK:
+            return self._chunk(self._body(opcode, length, position), position)
         if opcode in _ONLY_THERE:
             raise DamageError(position, f"a {Opcode(opcode).name} record is not allowed in the data section")
         if opcode == Opcode.ATTACHMENT:  # passed by
             self.met.attachments += 1
         elif opcode == Opcode.METADATA:
             self.met.metadata += 1
-        elif opcode <= max(Opcode):  # unknown ones are skipped, by specification
+        elif opcode <= _KNOWN:
             self._of_data(opcode, self._body(opcode, length, position), position)
         return position + HEAD_SIZE + length
 
     def _of_data(self, opcode: int, body: bytes, position: int) -> None:
-        if opcode == Opcode.CHUNK:
-            self._chunk(body, position)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._definition(opcode, body, position)
         elif opcode == Opcode.HEADER:
             if position != len(MAGIC):
@@ -192,7 +193,8 @@ class McapWalk:
         if record.id not in self.channels:
             self.channels[record.id] = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
 
-    def _chunk(self, body: bytes, position: int) -> None:
+    def _chunk(self, body: bytes, position: int) -> int:
+        """The messages of a chunk; the position behind it, and behind its message indexes where they prove right."""
         chunk = parse(records.Chunk, body, position)
         if (size := chunk.uncompressed_size) > self._limit:
             told = f"a chunk declares {size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
@@ -202,31 +204,36 @@ class McapWalk:
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
-        content, indexes = unpacked(chunk, position), self._indexes_behind(end, size)
-        self._last_chunk = piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes)
-        self._keep(self._last_chunk)
+        indexes, behind = self._indexes_at(end, size)
+        piece = piece_of_chunk(unpacked(chunk, position), position, self._chunk_record, self._allowance, indexes)
+        self._last_chunk = piece
+        self._keep(piece)
+        return behind if piece.proved else end
 
-    def _indexes_behind(self, position: int, room: int) -> dict[int, bytes]:
-        """What the message indexes of a chunk name. They are met like all records, and held against it, later."""
+    def _indexes_at(self, position: int, room: int) -> tuple[dict[int, bytes], int]:
+        """What the message indexes here name, by channel, and the position behind them: as far as they are in order."""
         indexes: dict[int, bytes] = {}
         while position + HEAD_SIZE <= self._size:
             opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
-            body, position = position + HEAD_SIZE, position + HEAD_SIZE + length
+            body, end = position + HEAD_SIZE, position + HEAD_SIZE + length
             # A message takes more room in the chunk than its entry in the index.
-            if opcode != Opcode.MESSAGE_INDEX or length > room or position > self._size:
+            if opcode != Opcode.MESSAGE_INDEX or length > room or end > self._size:
                 break
             try:
-                channel, indexes[channel] = parse_message_index(self._read(body, length), body)
+                channel, entries = parse_message_index(self._read(body, length), body)
             except DamageError:
                 break
+            if channel in indexes:
+                break
+            indexes[channel], position = entries, end
             room -= length
-        return indexes
+        return indexes, position
 
     def _chunk_record(self, opcode: int, body: bytes, position: int) -> None:
         """A record inside a chunk that is no message."""
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._definition(opcode, body, position)
-        elif opcode <= max(Opcode):
+        elif opcode <= _KNOWN:
             raise DamageError(position, f"a record of opcode {opcode} is not allowed inside a chunk")
 
     def _message_index(self, body: bytes, position: int) -> None:
@@ -291,7 +298,7 @@ class McapWalk:
     def _summary_record(self, opcode: int, length: int, position: int) -> int | None:
         """A record behind the data; the position of the next, none after the closing magic."""
         assert self._summary is not None
-        if opcode <= max(Opcode) and opcode not in _AFTER_THE_DATA:
+        if opcode <= _KNOWN and opcode not in _AFTER_THE_DATA:
             raise DamageError(position, f"a {Opcode(opcode).name} record comes after the end of the data")
         body = self._body(opcode, length, position)
         whole = HEAD.pack(opcode, length) + body
