@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -81,10 +80,7 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
 
 @dataclass(frozen=True)
 class Piece:
-    """Records side by side, as of one chunk, and the messages among them; `offset`: its place in the file.
-
-    `proved`: they were found by the message indexes of the chunk, which name each of them.
-    """
+    """Records side by side, as of one chunk, and the messages among them; `offset`: its place in the file."""
 
     data: Bytes
     starts: Ints
@@ -92,29 +88,14 @@ class Piece:
     lengths: Ints
     log_times: Ints
     offset: int
-    proved: bool = False
-
-    @cached_property
-    def entries(self) -> tuple[npt.NDArray[np.uint16], Ints]:
-        """What message indexes must say: channel, and pairs of log time and offset, by channel."""
-        order = np.argsort(self.channels, kind="stable")
-        return self.channels[order], np.column_stack([self.log_times, self.starts])[order]
-
-    def check_index(self, channel: int, entries: bytes) -> None:
-        """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
-        channels, found = self.entries
-        first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
-        told = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
-        if not np.array_equal(told[np.argsort(told[:, 1], kind="stable")], found[first:end]):
-            raise DamageError(self.offset, "a message index disagrees with its chunk")
 
 
-def _piece(data: Bytes, starts: Ints, offset: int, proved: bool = False) -> Piece:
+def _piece(data: Bytes, starts: Ints, offset: int) -> Piece:
     if not len(starts):
-        return Piece(data, starts, starts.astype(np.uint16), starts, starts, offset, proved)
+        return Piece(data, starts, starts.astype(np.uint16), starts, starts, offset)
     heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
     lengths, log_times = heads["length"].astype(np.int64), heads["log_time"].astype(np.int64)
-    return Piece(data, starts, heads["channel"].astype(np.uint16), lengths, log_times, offset, proved)
+    return Piece(data, starts, heads["channel"].astype(np.uint16), lengths, log_times, offset)
 
 
 @dataclass
@@ -129,13 +110,15 @@ class Allowance:
 
 
 def piece_of_chunk(
-    content: Any, offset: int, on_record: OnRecord, allowance: Allowance, indexes: Mapping[int, bytes]
+    content: Any, offset: int, on_record: OnRecord, allowance: Allowance, indexes: Sequence[tuple[int, bytes]] = ()
 ) -> Piece:
     """The messages of a chunk, which its records must fill exactly; other records go to `on_record`.
 
-    Where all records from the first on that `indexes` name are the messages as they tell, they are not walked.
+    `indexes` are its message indexes, channel and entries. Where all records from the first on that they name are the
+    messages as they tell, these are not walked.
     """
     view, starts = memoryview(content), array("q")
+    indexes = [(channel, entries) for channel, entries in indexes if entries]  # recovered logs have empty ones
     named = _named(np.frombuffer(content, dtype=np.uint8), offset, indexes)
     end = int(named.starts[0]) if named else len(view)
     at = _walk(view, 0, end, starts, offset, on_record, allowance)
@@ -145,23 +128,36 @@ def piece_of_chunk(
     if at != len(view):
         how = "is cut off by" if at < len(view) else "runs past"
         raise DamageError(offset, f"a record {how} the end of its chunk")
-    return _found(content, starts, offset)
+    piece = _found(content, starts, offset)
+    _check_indexes(piece, indexes)
+    return piece
 
 
-def _named(data: Bytes, offset: int, indexes: Mapping[int, bytes]) -> Piece | None:
+def _check_indexes(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> None:
+    """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
+    order = np.argsort(piece.channels, kind="stable")
+    channels, found = piece.channels[order], np.column_stack([piece.log_times, piece.starts])[order]
+    for channel, entries in indexes:
+        first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
+        told = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
+        if not np.array_equal(told[np.argsort(told[:, 1], kind="stable")], found[first:end]):
+            raise DamageError(piece.offset, "a message index disagrees with its chunk")
+
+
+def _named(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> Piece | None:
     """The messages by their indexes; none unless they follow each other to the end and are as told."""
-    counts = [len(entries) // 16 for entries in indexes.values()]
-    told = np.frombuffer(b"".join(indexes.values()), dtype="<i8").reshape(-1, 2)
+    told = np.frombuffer(b"".join(entries for _, entries in indexes), dtype="<i8").reshape(-1, 2)
+    channels = np.repeat([channel for channel, _ in indexes], [len(entries) // 16 for _, entries in indexes])
     order = np.argsort(told[:, 1], kind="stable")
     starts = told[order, 1]
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - MESSAGE_HEAD.itemsize:
         return None
-    piece = _piece(data, starts, offset, proved=True)
+    piece = _piece(data, starts, offset)
     ends = starts + HEAD_SIZE + piece.lengths
     tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and piece.lengths.min() >= _FIXED_FIELDS
     as_told = (
         (data[starts] == int(Opcode.MESSAGE)).all()
-        and (piece.channels == np.repeat(np.array(list(indexes)), counts)[order]).all()
+        and (piece.channels == channels[order]).all()
         and (piece.log_times == told[order, 0]).all()
     )
     return piece if as_told and tiled else None

@@ -51,7 +51,6 @@ class McapWalk:
         self._known: set[bytes] = set()
         self._pieces: list[Piece] = []
         self._waiting = 0
-        self._last_chunk: Piece | None = None
         self._loose_until = 0
         self._ordinal = 0
         self._allowance = Allowance(_FREE_RECORDS + size)
@@ -129,9 +128,7 @@ class McapWalk:
     def _record(self, opcode: int, length: int, position: int) -> int:
         """Meet one record of the data section; the position of the next."""
         if opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(self._body(opcode, length, position), position)
-            return position + HEAD_SIZE + length
-        self._last_chunk = None
+            raise DamageError(position, "a message index does not follow a chunk")
         if opcode == Opcode.MESSAGE:
             return self._loose_messages(length, position)
         if opcode == Opcode.CHUNK:
@@ -194,7 +191,7 @@ class McapWalk:
             self.channels[record.id] = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
 
     def _chunk(self, body: bytes, position: int) -> int:
-        """The messages of a chunk; the position behind it, and behind its message indexes where they prove right."""
+        """The messages of a chunk; the position behind it and the message indexes that follow it."""
         chunk = parse(records.Chunk, body, position)
         if (size := chunk.uncompressed_size) > self._limit:
             told = f"a chunk declares {size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
@@ -204,29 +201,22 @@ class McapWalk:
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
-        indexes, behind = self._indexes_at(end, size)
-        piece = piece_of_chunk(unpacked(chunk, position), position, self._chunk_record, self._allowance, indexes)
-        self._last_chunk = piece
-        self._keep(piece)
-        return behind if piece.proved else end
+        content, (indexes, end) = unpacked(chunk, position), self._indexes(end, position, size)
+        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes))
+        return end
 
-    def _indexes_at(self, position: int, room: int) -> tuple[dict[int, bytes], int]:
-        """What the message indexes here name, by channel, and the position behind them: as far as they are in order."""
-        indexes: dict[int, bytes] = {}
+    def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, bytes]], int]:
+        """Channel and entries of the message indexes of a chunk, and the position behind them or a cut in them."""
+        indexes: list[tuple[int, bytes]] = []
         while position + HEAD_SIZE <= self._size:
             opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
-            body, end = position + HEAD_SIZE, position + HEAD_SIZE + length
-            # A message takes more room in the chunk than its entry in the index.
-            if opcode != Opcode.MESSAGE_INDEX or length > room or end > self._size:
+            if opcode != Opcode.MESSAGE_INDEX or position + HEAD_SIZE + length > self._size:
                 break
-            try:
-                channel, entries = parse_message_index(self._read(body, length), body)
-            except DamageError:
-                break
-            if channel in indexes:
-                break
-            indexes[channel], position = entries, end
             room -= length
+            if room < -_SLACK:  # a message takes more room in the chunk than its entry in an index
+                raise DamageError(chunk, "a message index disagrees with its chunk")
+            indexes.append(parse_message_index(self._read(position + HEAD_SIZE, length), position))
+            position += HEAD_SIZE + length
         return indexes, position
 
     def _chunk_record(self, opcode: int, body: bytes, position: int) -> None:
@@ -235,13 +225,6 @@ class McapWalk:
             self._definition(opcode, body, position)
         elif opcode <= _KNOWN:
             raise DamageError(position, f"a record of opcode {opcode} is not allowed inside a chunk")
-
-    def _message_index(self, body: bytes, position: int) -> None:
-        if self._last_chunk is None:
-            raise DamageError(position, "a message index does not follow a chunk")
-        channel, entries = parse_message_index(body, position)
-        if entries:  # recovered logs have empty ones
-            self._last_chunk.check_index(channel, entries)
 
     def _loose_messages(self, length: int, position: int) -> int:
         """Messages outside of chunks, some at once; the position behind them."""

@@ -103,10 +103,10 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
     spent = mcap_block.Allowance(3)
     records = definitions() + some_messages(1)
-    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {}).starts.tolist() == [len(definitions())]
+    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
     assert spent.left == 0
     with pytest.raises(mcap_block.DamageError, match="more records"):
-        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {})
+        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
 
 
 def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
@@ -115,26 +115,19 @@ def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
     allowance = mcap_block.Allowance(1000)
 
     def piece(entries: bytes) -> mcap_block.Piece:
-        return mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, {1: entries})
+        return mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, [(1, entries)])
 
-    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, {})
-    right = walked.entries[1].tobytes()
-    assert piece(right).proved
+    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance)
+    right = np.column_stack([walked.log_times, walked.starts]).tobytes()
     pairs = np.frombuffer(right, dtype="<i8").reshape(-1, 2)
     shifted, beyond, late = (pairs + np.array(change) for change in ([0, 1], [0, 1 << 40], [1, 0]))
-    for entries in (
-        right,
-        b"",
-        right[16:],
-        right[:-16],
-        right + right[:16],
-        *(a.tobytes() for a in (shifted, beyond, late)),
-    ):
-        assert piece(entries).starts.tolist() == walked.starts.tolist()
-        if entries not in (right, b""):
-            assert not piece(entries).proved
-            with pytest.raises(mcap_block.DamageError, match="disagrees"):
-                piece(entries).check_index(1, entries)
+    for entries in (right, b"", pairs[::-1].tobytes()):
+        found = piece(entries)
+        for name in ("starts", "channels", "lengths", "log_times"):
+            assert getattr(found, name).tolist() == getattr(walked, name).tolist()
+    for entries in (right[16:], right[:-16], right + right[:16], *(a.tobytes() for a in (shifted, beyond, late))):
+        with pytest.raises(mcap_block.DamageError, match="disagrees"):
+            piece(entries)
 
 
 def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
