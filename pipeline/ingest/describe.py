@@ -15,7 +15,7 @@ from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_run import LARGEST_MESSAGE, walk_log
-from pipeline.ingest.plan import Sample, candidates, source_of
+from pipeline.ingest.plan import Sample, sources_of
 from pipeline.ingest.run import read_run
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of
@@ -199,7 +199,7 @@ def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
 def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
     sample = Sample(met.channel, met.fields)
     span_s = (max(met.span_ns) - min(met.span_ns)) / 1e9
-    sources = [source_of(sample, candidate) for candidate in candidates(sample, config)] if met.fields else []
+    sources = sources_of(sample, config) if met.fields else []
     source = next((source for source in sources if not source.dropped), None)
     mapping = {}
     if source is not None:
@@ -213,7 +213,7 @@ def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
         encoding=met.channel.encoding,
         messages=met.messages,
         rate_hz=(met.messages - 1) / span_s if span_s > 0 else None,
-        stream=source.stream if source else None,
+        stream=source.recipe.stream if source else None,
         mapping=mapping,
         fields=met.fields,
         remark=source.recipe.remark if source else "",

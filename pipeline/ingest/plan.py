@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import polars as pl
 
@@ -41,43 +41,30 @@ class Source:
 
     channel: Channel
     recipe: Recipe
+    mapping: StreamMapping | None
     columns: Mapping[str, pl.Expr]
     times: Mapping[str, TimeSource | CivilTime]
     types: Mapping[str, pl.DataType]
-    solution: str | None = None
-    breaches: tuple[InputError, ...] = ()
-    mapped: bool = False
-    doubtful: Mapping[str, str] = field(default_factory=dict)
-    implicit: tuple[str, ...] = ()
+    breaches: Sequence[InputError]
+    doubtful: Mapping[str, str]
+    implicit: Sequence[str]
 
     @property
     def dropped(self) -> bool:
         """A driver's optional message that is not as its recipe knows it: left over, not an error."""
-        optional = self.stream == "satellites" or self.recipe.supplement
-        return bool(self.breaches) and optional and not self.mapped and not self.recipe.own
-
-    @property
-    def stream(self) -> Stream:
-        return self.recipe.stream
+        optional = self.recipe.stream == "satellites" or self.recipe.supplement
+        return bool(self.breaches) and optional and self.mapping is None and not self.recipe.own
 
 
-Candidate = tuple[Recipe, StreamMapping | None]
-
-
-def candidates(sample: Sample, config: IngestConfig) -> list[Candidate]:
-    """The streams that a channel may feed: by configuration, else by its schema."""
-    channel = sample.channel
-    known = _fitting(sample)
-    found: list[Candidate] = []
+def sources_of(sample: Sample, config: IngestConfig) -> list[Source]:
+    """What the channel may feed: by configuration, else by its schema."""
+    known = _by_schema(sample)
+    found: list[Source] = []
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
-        found += [
-            (mapped_recipe(known, sample.fields, stream, mapping), mapping)
-            for mapping in mappings
-            if mapping.topic == channel.topic
-        ]
-        if known is not None and known.stream == stream and (not mappings or known.supplement):
-            found.append((known, None))
+        found += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
+        if known is not None and known.recipe.stream == stream and (not mappings or known.recipe.supplement):
+            found.append(known)
     return found
 
 
@@ -87,23 +74,21 @@ def is_candidate(channel: Channel, config: IngestConfig) -> bool:
     return mapped or bool(recipes_for(channel.schema_name, channel.topic))
 
 
-def _fitting(sample: Sample) -> Recipe | None:
-    """The first recipe of the schema whose fields are all there, else the first at all."""
-    recipes = recipes_for(sample.channel.schema_name, sample.channel.topic)
-    if len(recipes) == 1:
-        return recipes[0]
-    whole = (recipe for recipe in recipes if not source_of(sample, (recipe, None)).breaches)
-    return next(whole, recipes[0] if recipes else None)
+def _by_schema(sample: Sample) -> Source | None:
+    """By the first recipe of the schema whose fields are all there, else by the first at all."""
+    known = [_source(sample, recipe) for recipe in recipes_for(sample.channel.schema_name, sample.channel.topic)]
+    return next((source for source in known if not source.breaches), known[0] if known else None)
 
 
 def mapped_source(sample: Sample, stream: Stream, mapping: StreamMapping) -> Source:
     """The source that the configuration makes of a channel."""
-    return source_of(sample, (mapped_recipe(_fitting(sample), sample.fields, stream, mapping), mapping))
+    known = _by_schema(sample)
+    recipe = mapped_recipe(known.recipe if known else None, sample.fields, stream, mapping)
+    return _source(sample, recipe, mapping)
 
 
-def source_of(sample: Sample, candidate: Candidate) -> Source:
+def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None) -> Source:
     """How the channel's messages make rows; `breaches` tells what they lack."""
-    recipe, mapping = candidate
     contract = STREAM_SCHEMAS[recipe.stream].columns()
     closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
     columns: dict[str, pl.Expr] = {}
@@ -123,19 +108,8 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
     types = {path: recipe.type_of(path) for path in paths}
     for time in times.values():
         types |= time.types
-    solution = mapping.solution if mapping else None
-    return Source(
-        sample.channel,
-        recipe,
-        columns,
-        times,
-        types,
-        solution,
-        tuple(breaches),
-        mapping is not None,
-        doubtful,
-        _without_presence(sample.channel, columns) if recipe.own else (),
-    )
+    implicit = _without_presence(sample.channel, columns) if recipe.own else ()
+    return Source(sample.channel, recipe, mapping, columns, times, types, breaches, doubtful, implicit)
 
 
 def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from pipeline.ingest.breaches import refuse
 from pipeline.ingest.mapping import mappings_of
@@ -18,13 +17,15 @@ def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfi
     breaches = _absent_topics(topics, config, file)
     kept: list[Source] = []
     for stream in STREAMS:
-        chosen = _preferred([source for source in sources if source.stream == stream and not source.dropped])
-        _refuse_shared_solutions(stream, chosen)
-        breaches += _competing(stream, chosen, file)
+        chosen = _preferred([s for s in sources if s.recipe.stream == stream and not s.dropped])
+        if stream == "gnss":
+            _refuse_shared_solutions(chosen)
+        elif stream != "satellites":
+            breaches += _competing(stream, chosen, file)
         breaches += [breach for source in chosen for breach in source.breaches]
         kept += chosen
     refuse(breaches)
-    return _with_solutions(kept)
+    return kept
 
 
 def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[InputError]:
@@ -50,19 +51,16 @@ def _preferred(sources: Sequence[Source]) -> list[Source]:
     return list(sources) if whole else []
 
 
-def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
+def _refuse_shared_solutions(sources: Sequence[Source]) -> None:
     """Two receivers under one name would be read as one that jumps between their positions."""
-    if stream != "gnss":
-        return
     topics: dict[str, str] = {}
     for source in sources:
-        if source.solution is None or source.recipe.supplement:
-            continue
-        if topics.setdefault(source.solution, source.channel.topic) != source.channel.topic:
+        name = source.mapping.solution if source.mapping and not source.recipe.supplement else None
+        if name is not None and topics.setdefault(name, source.channel.topic) != source.channel.topic:
             raise ConfigError(
                 "several topics feed the same solution",
-                place=f"[ingest.gnss] solution {source.solution}",
-                found=f"{topics[source.solution]}, {source.channel.topic}",
+                place=f"[ingest.gnss] solution {name}",
+                found=f"{topics[name]}, {source.channel.topic}",
                 expected="one name per topic",
                 remedy="Give each [[ingest.gnss]] a `solution` of its own.",
             )
@@ -71,7 +69,7 @@ def _refuse_shared_solutions(stream: Stream, sources: Sequence[Source]) -> None:
 def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
     """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
     topics = list(dict.fromkeys(source.channel.topic for source in sources))
-    if stream in ("gnss", "satellites") or len(topics) < 2:
+    if len(topics) < 2:
         return []
     return [
         InputError(
@@ -84,16 +82,13 @@ def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Inp
     ]
 
 
-def _with_solutions(sources: Sequence[Source]) -> list[Source]:
-    """Names of solutions: as configured, `primary` for the only topic, else after the topic."""
-    topics = {source.channel.topic for source in sources if source.stream == "gnss" and not source.recipe.supplement}
-    return [
-        source
-        if source.solution is not None or source.stream not in ("gnss", "satellites")
-        else replace(source, solution=_named_after(source.channel.topic) if len(topics) > 1 else "primary")
-        for source in sources
-    ]
-
-
-def _named_after(topic: str) -> str:
-    return topic.strip("/").replace("/", "_") or "primary"
+def solution_of(source: Source, settled: Sequence[Source]) -> str | None:
+    """The name of a solution: as configured, `primary` for the only topic, else after the topic."""
+    if source.recipe.stream not in ("gnss", "satellites"):
+        return None
+    if source.mapping and source.mapping.solution is not None:
+        return source.mapping.solution
+    whole = [other for other in settled if other.recipe.stream == "gnss" and not other.recipe.supplement]
+    if len({other.channel.topic for other in whole}) < 2:
+        return "primary"
+    return source.channel.topic.strip("/").replace("/", "_") or "primary"
