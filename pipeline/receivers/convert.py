@@ -191,7 +191,7 @@ def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mappin
     for frame in frames(content, lambda: dropped.update(["damaged message"])):
         if frame.protocol in decoders:
             _decode(frame, decoders[frame.protocol], gathered[frame.protocol])
-    nmea.settle_first_day(gathered[Protocol.NMEA], date)
+    nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
     told = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
     best = max(told, key=lambda protocol: _worth(protocol, told[protocol]))
@@ -269,5 +269,5 @@ _PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[], Decode]]] 
     Protocol.UBX: (ubx.parse, lambda: ubx.UbxDecoder().decode),
     Protocol.SBF: (sbf.parse, lambda: sbf.decode),
     Protocol.NOVATEL: (novatel.parse, lambda: novatel.decode),
-    Protocol.NMEA: (nmea.parse, lambda: nmea.NmeaDecoder().decode),
+    Protocol.NMEA: (nmea.parse, lambda: nmea.decode),
 }
