@@ -20,15 +20,12 @@ from pipeline.receivers.adding import Purpose, Streams, added, assigned
 from pipeline.receivers.bags import is_bag, read_bag
 from pipeline.receivers.csv import TABLES, names_file, read_csv
 from pipeline.receivers.epochs import Epochs, Gathered
-from pipeline.receivers.frames import Frame, Protocol, frames
-from pipeline.receivers.names import name_of
+from pipeline.receivers.frames import Frame, Protocol, frames, name_of
 from pipeline.receivers.rtklib import is_solution, read_solution
 from pipeline.receivers.unpack import BAG_FOLDER, unpacked
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import InputError
 from schemas.run import STREAMS, RunLog, Stream
-
-Decode = Callable[[Gathered, Any, bytes], None]
 
 
 @dataclass(frozen=True)
@@ -186,11 +183,10 @@ def _of_topics(config: IngestConfig) -> IngestConfig:
 def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mapping[str, int]]:
     """The epochs of the protocol that tells most; what is damaged or told twice is counted."""
     dropped: Counter[str] = Counter()
-    decoders = {protocol: make() for protocol, (_, make) in _PROTOCOLS.items()}
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
     for frame in frames(content, lambda: dropped.update(["damaged message"])):
-        if frame.protocol in decoders:
-            _decode(frame, decoders[frame.protocol], gathered[frame.protocol])
+        if frame.protocol in gathered:
+            _decode(frame, gathered[frame.protocol])
     nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
     told = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
@@ -232,8 +228,8 @@ def _worth(protocol: Protocol, epochs: Epochs) -> int:
     return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
 
 
-def _decode(frame: Frame, decode: Decode, gathered: Gathered) -> None:
-    parse, _ = _PROTOCOLS[frame.protocol]
+def _decode(frame: Frame, gathered: Gathered) -> None:
+    parse, decode = _PROTOCOLS[frame.protocol]
     try:
         message = parse(frame.content)
     except ImportError as error:
@@ -264,10 +260,10 @@ _MOST_NAMES = 20
 _UNFIT = "message that does not fit its definition"
 
 
-# By protocol: what makes a message of a frame, and what makes a decoder of its messages. The first wins a tie.
-_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[], Decode]]] = {
-    Protocol.UBX: (ubx.parse, lambda: ubx.UbxDecoder().decode),
-    Protocol.SBF: (sbf.parse, lambda: sbf.decode),
-    Protocol.NOVATEL: (novatel.parse, lambda: novatel.decode),
-    Protocol.NMEA: (nmea.parse, lambda: nmea.decode),
+# By protocol: what makes a message of a frame, and what adds it to its epoch. The first wins a tie.
+_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[Gathered, Any, bytes], None]]] = {
+    Protocol.UBX: (ubx.parse, ubx.decode),
+    Protocol.SBF: (sbf.parse, sbf.decode),
+    Protocol.NOVATEL: (novatel.parse, novatel.decode),
+    Protocol.NMEA: (nmea.parse, nmea.decode),
 }
