@@ -16,7 +16,7 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from pipeline.ingest.mcap_block import Bytes, Messages, stretches_of
+from pipeline.ingest.mcap_block import Bytes, Messages
 from schemas.arrays import Bools, Ints
 
 _MOST_LAYOUTS = 256  # of one channel; beyond, messages are decoded one by one
@@ -115,7 +115,7 @@ class Layout:
 
     def rows(self, messages: Messages) -> list[Bytes]:
         """Each stretch of each message."""
-        return [stretches_of(messages.data, messages.start + s.start, s.end - s.start) for s in self.stretches]
+        return [messages.stretches(stretch.start, stretch.end) for stretch in self.stretches]
 
     def of(self, stretches: Sequence[Bytes]) -> Bools:
         """Whether each message has this layout."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,14 @@ _FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
 
 @dataclass(frozen=True)
 class Messages:
-    """Messages of one channel in a block, in order of the file: where their payloads lie in `data`.
+    """Messages of one channel in a block, in order of the file.
 
+    `start` says where payloads lie in `pieces`, counted as if these followed each other; `bases` is where each begins.
     Times are in nanoseconds; `before` is the size of all blocks before this one.
     """
 
-    data: Bytes
+    pieces: Sequence[Bytes]
+    bases: Ints
     start: Ints
     length: Ints
     log_time: Ints
@@ -53,17 +56,30 @@ class Messages:
     @property
     def publish_time(self) -> Ints:
         """The last field of the heads that stand before the payloads."""
-        return stretches_of(self.data, self.start - 8, 8).view("<i8")[:, 0]
+        return self.stretches(-8, 0).view("<i8")[:, 0]
+
+    def by_piece(self) -> Iterator[tuple[Bytes, Ints, Ints]]:
+        """Each piece that holds some, with the offsets in it from which and to which each payload goes."""
+        bounds = [*np.searchsorted(self.start, self.bases).tolist(), len(self)]
+        for piece, base, (first, end) in zip(self.pieces, self.bases, pairwise(bounds), strict=True):
+            if first < end:
+                starts = self.start[first:end] - base
+                yield piece, starts, starts + self.length[first:end]
+
+    def stretches(self, start: int, end: int) -> Bytes:
+        """From one byte to another of each payload, one row each; the payloads must be that long."""
+        parts = [stretches_of(piece, starts + start, end - start) for piece, starts, _ in self.by_piece()]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def payload(self, row: int) -> bytes:
-        first = int(self.start[row])
-        return self.data[first : first + int(self.length[row])].tobytes()
+        ((piece, (start,), (end,)),) = self.chosen(slice(row, row + 1)).by_piece()
+        return piece[start:end].tobytes()
 
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
         if isinstance(rows, np.ndarray) and rows.dtype == np.bool_:
             rows = np.flatnonzero(rows)
-        return Messages(self.data, self.start[rows], self.length[rows], self.log_time[rows], self.before)
+        return replace(self, start=self.start[rows], length=self.length[rows], log_time=self.log_time[rows])
 
 
 Block = dict[int, Messages]  # by channel
@@ -208,19 +224,18 @@ def _found(content: Any, starts: array[int], offset: int) -> Piece:
 
 def block_of(pieces: list[Piece], before: int) -> Block:
     """The messages of neighbouring pieces, by channel; `before` is the size of the pieces before these."""
-    data = pieces[0].data if len(pieces) == 1 else np.concatenate([piece.data for piece in pieces])
-    bases = np.cumsum([0, *(len(piece.data) for piece in pieces[:-1])])
+    data = [piece.data for piece in pieces]
+    bases = np.cumsum([0, *map(len, data[:-1])])
     starts = np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)])
     channels, lengths, log_times = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("channels", "lengths", "log_times")
     )
     order = np.argsort(channels, kind="stable")
     ordered = channels[order]
-    firsts = np.flatnonzero(np.diff(ordered.astype(np.int64), prepend=-1))
     return {
         int(channels[rows[0]]): Messages(
-            data, starts[rows] + MESSAGE_HEAD.itemsize, lengths[rows] - _FIXED_FIELDS, log_times[rows], before
+            data, bases, starts[rows] + MESSAGE_HEAD.itemsize, lengths[rows] - _FIXED_FIELDS, log_times[rows], before
         )
-        for rows in np.split(order, firsts[1:])
+        for rows in np.split(order, np.flatnonzero(ordered[1:] != ordered[:-1]) + 1)
         if len(rows)
     }

@@ -18,6 +18,7 @@ from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
 from pipeline.ingest.protobuf import layout_by
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
+from schemas.arrays import Ints
 
 ORDINAL = "(ordinal)"  # place of a message in the file
 
@@ -67,12 +68,16 @@ class SourceReader:
 
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""
-        whole = pl.DataFrame({name: _joined(self._parts.pop(name), dtype) for name, dtype in self._types.items()})
-        return whole if whole[ORDINAL].is_sorted() else whole.sort(ORDINAL, maintain_order=True)
+        places = _joined(self._parts[ORDINAL], pl.Int64())
+        order = None if places.is_sorted() else np.argsort(places.to_numpy(), kind="stable")
+        return pl.DataFrame({name: _joined(self._parts.pop(name), dtype, order) for name, dtype in self._types.items()})
 
 
-def _joined(parts: list[Values], dtype: pl.DataType) -> pl.Series:
+def _joined(parts: list[Values], dtype: pl.DataType, order: Ints | None = None) -> pl.Series:
+    """The parts one after the other, or in this order."""
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if parts and len(arrays) == len(parts):
-        return pl.Series(np.concatenate(arrays), dtype=dtype)
-    return pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
+        values = np.concatenate(arrays)
+        return pl.Series(values if order is None else values[order], dtype=dtype)
+    whole = pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
+    return whole if order is None else whole.gather(order)

@@ -132,8 +132,8 @@ def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
 
 def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
     """A protobuf message is empty where all its fields have their defaults."""
-    numbers = [np.array([number]) for number in (3, 0, 0)]
-    message = mcap_block.Messages(np.frombuffer(b"abc", dtype=np.uint8), *numbers)
+    numbers = [np.array([number]) for number in (0, 3, 0, 0)]
+    message = mcap_block.Messages([np.frombuffer(b"abc", dtype=np.uint8)], *numbers)
     fields = {"x": constant(0.0, pl.Float64())}
     decoder = LayoutDecoder(lambda payload: layout_of(payload, bytearray(payload), fields))
     ((_, columns),), left = decoder.decode(message)
