@@ -9,9 +9,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.clean import StreamCounts, stamp_counts
-from pipeline.ingest.generic import UndecodableError, decoder_for
+from pipeline.ingest.generic import UndecodableError, decoder_for, fields_of
 from pipeline.ingest.guesses import NAMES, columns_in, mapping_lines, word_of
-from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_run import LARGEST_MESSAGE, walk_log

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from graphlib import TopologicalSorter
 from typing import Any
@@ -14,6 +14,9 @@ from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel, Schema
 from pipeline.ingest.ros_message import Definition, DefinitionError, RosWalk, parse_definitions, short_name
 from schemas.errors import InputError
+
+_LARGEST_LIST = 64  # elements of a list that are offered one by one
+_DEEPEST = 12
 
 Value = Any
 Decode = Callable[[bytes], Value]
@@ -241,3 +244,40 @@ def _fitting(value: Value, dtype: pl.DataType) -> Value:
     if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
         return int(value)
     raise UndecodableError(f"{_shown(value)} is not {name}")
+
+
+def fields_of(message: Any) -> dict[str, str]:
+    """Field paths of a decoded message with their kind: `int`, `float`, `text`, `flag`, `null`."""
+    return dict(_leaves(message, "", 0))
+
+
+def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, str]]:
+    if depth > _DEEPEST:
+        return
+    children = _children(value)
+    if children is None:
+        yield path, _kind(value)
+        return
+    for name, child in children:
+        joined = f"{path}{name}" if name.startswith("[") or not path else f"{path}.{name}"
+        yield from _leaves(child, joined, depth + 1)
+
+
+def _children(value: Any) -> list[tuple[str, Any]] | None:
+    """Named parts of a message or list; none for a plain value."""
+    if isinstance(value, dict):
+        return [(str(name), child) for name, child in value.items()]
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    if descriptor is not None:
+        # A message that is not set is shown with its defaults, down to one level of a type.
+        recursive = {field.name for field in descriptor.fields if field.message_type is descriptor}
+        names = [field.name for field in descriptor.fields]
+        return [(name, None if name in recursive else getattr(value, name)) for name in names]
+    if isinstance(value, str | bytes) or not hasattr(value, "__len__"):
+        return None
+    return [(f"[{index}]", child) for index, child in enumerate(list(value[:_LARGEST_LIST]))]
+
+
+def _kind(value: Any) -> str:
+    kinds = {bool: "flag", int: "int", float: "float", type(None): "null"}
+    return next((name for kind, name in kinds.items() if isinstance(value, kind)), "text")

@@ -12,15 +12,13 @@ import polars as pl
 
 from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import refuse
-from pipeline.ingest.generic import UndecodableError, decoder_for, undecodable
-from pipeline.ingest.inventory import fields_of
+from pipeline.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_records import DamageError
 from pipeline.ingest.mcap_walk import McapWalk
-from pipeline.ingest.plan import Sample, is_candidate, sources_of
+from pipeline.ingest.plan import Sample, is_candidate, settle, solution_of, sources_of
 from pipeline.ingest.reader import SourceReader
-from pipeline.ingest.settle import settle, solution_of
 from pipeline.storage import files
 from pipeline.storage.address import Address, stem_of
 from schemas.config import IngestConfig

@@ -1,4 +1,4 @@
-"""Which streams a channel of a log may feed, and how its messages make rows."""
+"""Which streams a channel of a log may feed, how its messages make rows, and which of the channels do feed them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from pipeline.ingest.breaches import refuse
 from pipeline.ingest.generic import protobuf_descriptor
-from pipeline.ingest.inventory import stamp_parts
 from pipeline.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.recipe import Recipe
 from pipeline.ingest.recipes import recipes_for
-from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, time_source
+from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, stamp_parts, time_source
 from schemas.config import IngestConfig, StreamMapping
-from schemas.errors import InputError
+from schemas.errors import ConfigError, InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
@@ -160,7 +160,7 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
         return time_source((PUBLISH_TIME,), {PUBLISH_TIME: "int"}, mapping)
     named = wanted.removeprefix("field:") if wanted != "auto" else mapping.fields.get("t") if mapping else None
     for candidate in (named,) if named else (path, *_USUAL_STAMPS):
-        parts = stamp_parts(dict(sample.fields), candidate)
+        parts = stamp_parts(sample.fields, candidate)
         unfit = [sample.fields[part] for part in parts if sample.fields[part] not in TIME_KINDS]
         if parts and not unfit:
             return time_source(parts, sample.fields, mapping)
@@ -171,3 +171,85 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
     if named:
         breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
     return log_time
+
+
+def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
+    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
+    breaches = _absent_topics(topics, config, file)
+    kept: list[Source] = []
+    for stream in STREAMS:
+        chosen = _preferred([s for s in sources if s.recipe.stream == stream and not s.dropped])
+        if stream == "gnss":
+            _refuse_shared_solutions(chosen)
+        elif stream != "satellites":
+            breaches += _competing(stream, chosen, file)
+        breaches += [breach for source in chosen for breach in source.breaches]
+        kept += chosen
+    refuse(breaches)
+    return kept
+
+
+def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[InputError]:
+    return [
+        InputError(
+            f"is configured for {stream} but has no messages",
+            place=f"{file}: topic {mapping.topic}",
+            found=", ".join(sorted(set(topics))) or "no topics",
+            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
+        )
+        for stream in STREAMS
+        for mapping in mappings_of(config, stream)
+        if mapping.topic not in topics
+    ]
+
+
+def _preferred(sources: Sequence[Source]) -> list[Source]:
+    """This project's own schema alone where it is present; a supplement only with what it adds to."""
+    own = [source for source in sources if source.recipe.own]
+    if own:
+        return own
+    whole = [source for source in sources if not source.recipe.supplement]
+    return list(sources) if whole else []
+
+
+def _refuse_shared_solutions(sources: Sequence[Source]) -> None:
+    """Two receivers under one name would be read as one that jumps between their positions."""
+    topics: dict[str, str] = {}
+    for source in sources:
+        name = source.mapping.solution if source.mapping and not source.recipe.supplement else None
+        if name is not None and topics.setdefault(name, source.channel.topic) != source.channel.topic:
+            raise ConfigError(
+                "several topics feed the same solution",
+                place=f"[ingest.gnss] solution {name}",
+                found=f"{topics[name]}, {source.channel.topic}",
+                expected="one name per topic",
+                remedy="Give each [[ingest.gnss]] a `solution` of its own.",
+            )
+
+
+def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
+    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
+    topics = list(dict.fromkeys(source.channel.topic for source in sources))
+    if len(topics) < 2:
+        return []
+    return [
+        InputError(
+            f"several topics could be the {stream}",
+            place=file,
+            found=", ".join(topics),
+            expected="one",
+            remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration.",
+        )
+    ]
+
+
+def solution_of(source: Source, settled: Sequence[Source]) -> str | None:
+    """The name of a solution: as configured, `primary` for the only topic, else after the topic."""
+    if source.recipe.stream not in ("gnss", "satellites"):
+        return None
+    if source.mapping and source.mapping.solution is not None:
+        return source.mapping.solution
+    whole = [other for other in settled if other.recipe.stream == "gnss" and not other.recipe.supplement]
+    if len({other.channel.topic for other in whole}) < 2:
+        return "primary"
+    return source.channel.topic.strip("/").replace("/", "_") or "primary"

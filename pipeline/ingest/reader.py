@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.cdr import layout_of_cdr
 from pipeline.ingest.generic import decode_columns, protobuf_descriptor, ros_definitions
 from pipeline.ingest.json_columns import JsonDecoder
 from pipeline.ingest.layout import Columns, LayoutDecoder, Values
@@ -17,6 +16,7 @@ from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
 from pipeline.ingest.protobuf import layout_by
+from pipeline.ingest.ros_message import layout_of_cdr
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
 from schemas.arrays import Ints
 
