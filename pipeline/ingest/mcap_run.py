@@ -21,6 +21,7 @@ from pipeline.ingest.plan import Sample, is_candidate, settle, solution_of, sour
 from pipeline.ingest.reader import SourceReader
 from pipeline.storage import files
 from pipeline.storage.address import Address, stem_of
+from schemas.arrays import times_ns
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog
@@ -98,7 +99,7 @@ def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> 
     return RunLog(
         run_id=stem_of(path),
         notes=IngestNotes(
-            partial_until_ns=_last_ns(frames["gnss"]) if walk.cut_at is not None else None,
+            partial_until_ns=times_ns(frames["gnss"]).max().item() if walk.cut_at is not None else None,
             damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
             slow_path_messages=slow_messages,
             chunks_without_crc=walk.without_crc,
@@ -171,8 +172,3 @@ def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Input
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",
     )
-
-
-def _last_ns(gnss: pl.DataFrame) -> int:
-    """The latest epoch that was read."""
-    return int(gnss["t"].to_physical().max())  # type: ignore[arg-type]

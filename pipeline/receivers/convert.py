@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import date
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -93,12 +94,11 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
                     if plain == log:
                         raise
                     strangers.append(error)
-                    continue
                 except NoEpochError as error:
                     failures.append(error)
-                    continue
-                parts.append((log if plain == log else log / plain.name, streams))
-                dropped.update(counts)
+                else:
+                    parts.append((log if plain == log else log / plain.name, streams))
+                    dropped.update(counts)
     if failures and not any("gnss" in streams for _, streams in parts):
         raise failures[0]
     if strangers and not parts:
@@ -135,24 +135,21 @@ def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
 
 def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
     """Two receivers under one name would be read as one that jumps between their positions."""
-    spans: dict[str, list[tuple[Any, Any, Path]]] = {}
-    for log, streams in parts:
-        frame = streams.get("gnss", pl.DataFrame({"solution": [], "t": []})).drop_nulls("t")
-        for name, start, end in (
-            frame.group_by("solution", maintain_order=True)
-            .agg(pl.col("t").min().alias("start"), pl.col("t").max().alias("end"))
-            .rows()
-        ):
-            for other_start, other_end, other in spans.setdefault(name, []):
-                if other != log and start < other_end and other_start < end:
-                    raise InputError(
-                        "two logs hold positions of the same time under one solution",
-                        place=f"{other}, {log}",
-                        found=f"solution {name} in both, from {max(start, other_start)} on",
-                        expected="one receiver per call",
-                        remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
-                    )
-            spans[name].append((start, end, log))
+    spans = [
+        (name, fixes["t"].min(), fixes["t"].max(), log)
+        for log, streams in parts
+        if "gnss" in streams
+        for (name,), fixes in streams["gnss"].drop_nulls("t").group_by("solution", maintain_order=True)
+    ]
+    for (name, start, end, log), (of, since, until, other) in combinations(spans, 2):
+        if name == of and log != other and start < until and since < end:  # type: ignore[operator]
+            raise InputError(
+                "two logs hold positions of the same time under one solution",
+                place=f"{log}, {other}",
+                found=f"solution {name} in both, from {max(start, since)} on",  # type: ignore[type-var]
+                expected="one receiver per call",
+                remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
+            )
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[Streams, Mapping[str, int]]:
