@@ -13,6 +13,9 @@ import numpy as np
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import LdsConfig
 
+# CONTRACT section 3, `outages`: what is longer lacks an epoch.
+GAP_PERIODS = 1.5
+
 
 @dataclass(frozen=True)
 class Uptime:
@@ -34,7 +37,7 @@ def nominal_period_s(t_ns: Ints) -> float | None:
 
 def linking_gap_s(period_s: float | None, crossing_gap_s: float = 1.0) -> float:
     """Longest time between epochs [s] over which a movement is interpolated (DOMAIN section 4)."""
-    return max(1.5 * (period_s or 0.0), crossing_gap_s)
+    return max(GAP_PERIODS * (period_s or 0.0), crossing_gap_s)
 
 
 def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:

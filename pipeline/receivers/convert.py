@@ -135,18 +135,18 @@ def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
 
 def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
     """Two receivers under one name would be read as one that jumps between their positions."""
-    spans = [
+    spans: list[tuple[Any, Any, Any, Path]] = [
         (name, fixes["t"].min(), fixes["t"].max(), log)
         for log, streams in parts
         if "gnss" in streams
         for (name,), fixes in streams["gnss"].drop_nulls("t").group_by("solution", maintain_order=True)
     ]
     for (name, start, end, log), (of, since, until, other) in combinations(spans, 2):
-        if name == of and log != other and start < until and since < end:  # type: ignore[operator]
+        if name == of and log != other and start < until and since < end:
             raise InputError(
                 "two logs hold positions of the same time under one solution",
                 place=f"{log}, {other}",
-                found=f"solution {name} in both, from {max(start, since)} on",  # type: ignore[type-var]
+                found=f"solution {name} in both, from {max(start, since)} on",
                 expected="one receiver per call",
                 remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
             )
