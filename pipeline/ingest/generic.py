@@ -30,15 +30,14 @@ def decoder_for(channel: Channel) -> Decode:
     """The decoder of a channel's messages: to dicts (json, cdr) or messages with attributes (protobuf)."""
     if channel.encoding == "json":
         return parse_json
-    makers = {"protobuf": _protobuf_decoder, "cdr": _cdr_decoder}
-    if channel.encoding not in makers:
+    if channel.encoding not in _DEFINITIONS:
         raise InputError(
             "has an encoding that this program does not read",
             place=channel.place,
             found=channel.encoding or "none",
             expected="json, protobuf or cdr",
         )
-    return makers[channel.encoding](channel)
+    return _protobuf_decoder(channel) if channel.encoding == "protobuf" else _cdr_decoder(channel)
 
 
 def parse_json(payload: bytes) -> Value:
@@ -64,7 +63,7 @@ def _refuse_literal(literal: str) -> Value:
 def _protobuf_decoder(channel: Channel) -> Decode:
     from google.protobuf.message import DecodeError
 
-    make = _made(_protobuf_class, channel)
+    make = definition_of(channel)
 
     def checked(payload: bytes) -> Value:
         message = make()
@@ -78,7 +77,7 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    definitions, name = ros_definitions(channel)
+    definitions, name = definition_of(channel)
 
     def checked(payload: bytes) -> Value:
         try:
@@ -115,12 +114,20 @@ def _ros_definitions(schema: Schema) -> tuple[Mapping[str, Definition], str]:
     return definitions, name
 
 
-_SCHEMA_ENCODINGS = {"protobuf": "protobuf", "cdr": "ros2msg"}
+# By encoding of messages: that of their schemas, and what makes a definition of these.
+_DEFINITIONS: Mapping[str, tuple[str, Callable[[Schema], Any]]] = {
+    "protobuf": ("protobuf", _protobuf_class),
+    "cdr": ("ros2msg", _ros_definitions),
+}
 
 
-def _made(make: Callable[[Schema], Any], channel: Channel) -> Any:
-    """What `make` makes of the schema; parsers of schemas raise whatever they stumble over."""
-    if channel.schema is None or channel.schema.encoding != _SCHEMA_ENCODINGS[channel.encoding]:
+def definition_of(channel: Channel) -> Any:
+    """What a channel's messages are made of: the class of protobuf messages, or ROS 2 definitions and a name of them.
+
+    Parsers of schemas raise whatever they stumble over.
+    """
+    encoding, make = _DEFINITIONS[channel.encoding]
+    if channel.schema is None or channel.schema.encoding != encoding:
         raise InputError(
             "has a schema encoding that does not fit its message encoding",
             place=channel.place,
@@ -134,17 +141,6 @@ def _made(make: Callable[[Schema], Any], channel: Channel) -> Any:
         raise InputError(
             f"has a schema that cannot be parsed: {reason[:200]}", place=channel.place, found=channel.schema_name
         ) from None
-
-
-def protobuf_descriptor(channel: Channel) -> Any:
-    """The descriptor of a channel's messages."""
-    return _made(_protobuf_class, channel).DESCRIPTOR
-
-
-def ros_definitions(channel: Channel) -> tuple[Mapping[str, Definition], str]:
-    """The definitions that a channel's messages are made of, and the name of theirs."""
-    found: tuple[Mapping[str, Definition], str] = _made(_ros_definitions, channel)
-    return found
 
 
 def decode_columns(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.ingest.breaches import refuse
-from pipeline.ingest.generic import protobuf_descriptor
+from pipeline.ingest.generic import definition_of
 from pipeline.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.recipe import Recipe
@@ -116,7 +116,7 @@ def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ..
     """Columns whose protobuf field has its default where it was not set (proto3 without `optional`)."""
     if channel.encoding != "protobuf":
         return ()
-    known = protobuf_descriptor(channel).fields_by_name
+    known = definition_of(channel).DESCRIPTOR.fields_by_name
     return tuple(name for name in columns if name in known and not known[name].has_presence)
 
 

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.generic import decode_columns, protobuf_descriptor, ros_definitions
+from pipeline.ingest.generic import decode_columns, definition_of
 from pipeline.ingest.json_columns import JsonDecoder
 from pipeline.ingest.layout import Columns, LayoutDecoder, Values
 from pipeline.ingest.mcap_block import Messages
@@ -33,8 +33,9 @@ def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder:
     if channel.encoding == "json":
         return JsonDecoder(types)
     if channel.encoding == "cdr":
-        return LayoutDecoder(partial(layout_of_cdr, *ros_definitions(channel), types))
-    return LayoutDecoder(layout_by(protobuf_descriptor(channel), types))
+        definitions, name = definition_of(channel)
+        return LayoutDecoder(partial(layout_of_cdr, definitions, name, types))
+    return LayoutDecoder(layout_by(definition_of(channel).DESCRIPTOR, types))
 
 
 class SourceReader:

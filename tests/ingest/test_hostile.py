@@ -16,7 +16,7 @@ import zstandard
 from pipeline.ingest import mcap_block, read_run
 from pipeline.ingest.clean import clean, of_the_journey
 from pipeline.ingest.describe import describe_log
-from pipeline.ingest.layout import LayoutDecoder, constant, layout_of
+from pipeline.ingest.layout import LayoutDecoder, UnfitError, constant, fixed, layout_of
 from pipeline.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig
@@ -139,6 +139,25 @@ def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
     ((_, columns),), left = decoder.decode(message)
     assert columns["x"].to_list() == [0.0]
     assert left == []
+
+
+def test_payloads_are_taken_from_the_piece_that_they_lie_in() -> None:
+    pieces = [np.frombuffer(content, dtype=np.uint8) for content in (b"-ab-cd", b"", b"--ef")]
+    start, length = np.array([1, 4, 8]), np.array([2, 2, 2])
+    messages = mcap_block.Messages(pieces, np.array([0, 6, 6]), start, length, start, before=100)
+    assert [messages.payload(row) for row in range(3)] == [b"ab", b"cd", b"ef"]
+    assert messages.stretches(0, 2).tobytes() == b"abcdef"
+    assert messages.chosen(np.array([False, False, True])).stretches(-1, 1).tobytes() == b"-e"
+    assert messages.ordinal.tolist() == [101, 104, 108]
+
+
+def test_a_number_beyond_64_bits_with_a_sign_is_left_to_the_ordinary_decoder() -> None:
+    rows = np.array([1, 2**63], dtype="<u8").view(np.uint8).reshape(2, 8)
+    whole, real = (fixed(0, "<u8").as_type(dtype) for dtype in (pl.Int64(), pl.Float64()))
+    assert list(whole.values(rows[:1])) == [1]
+    assert list(real.values(rows)) == [1.0, 2.0**63]
+    with pytest.raises(UnfitError):
+        whole.values(rows)
 
 
 LETTERS = "A" * 26
