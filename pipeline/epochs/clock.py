@@ -14,6 +14,9 @@ import polars as pl
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration, LdsConfig
 
+# CONTRACT section 3, `outages`: what is longer lacks an epoch.
+GAP_PERIODS = 1.5
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -94,12 +97,12 @@ def crossing_gap_ns(t_ns: Ints, lds: LdsConfig) -> int:
 
     For so long at most a position stands for what comes before it.
     """
-    return round(max(1.5 * (nominal_period_s(t_ns) or 0.0), lds.crossing_gap_s) * NS_PER_S)
+    return round(max(GAP_PERIODS * (nominal_period_s(t_ns) or 0.0), lds.crossing_gap_s) * NS_PER_S)
 
 
 def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
     """Longest distance of epochs [s] that is not yet a gap (CONTRACT section 3, `outages`)."""
-    return min(gap_reset_s, max(1.5 * (period_s or 0.0), 1.0))
+    return min(gap_reset_s, max(GAP_PERIODS * (period_s or 0.0), 1.0))
 
 
 def outages_s(t_ns: Ints, usable: Bools, limit_s: float) -> Floats:

@@ -20,6 +20,7 @@ class Decoded:
     """Fields of all messages of a source, one row per message, with its times and place in the file."""
 
     source: Source
+    solution: str | None
     frame: pl.DataFrame
 
 
@@ -32,7 +33,7 @@ def stream_frames(
     """
     frames: dict[str, pl.DataFrame] = {}
     for stream in STREAMS:
-        parts = [part for part in decoded if part.source.stream == stream]
+        parts = [part for part in decoded if part.source.recipe.stream == stream]
         if parts:
             frames[stream] = _stream(stream, parts, breaches, few, remarks)
     return frames
@@ -82,7 +83,7 @@ def _rows(part: Decoded, supplements: Sequence[Decoded], few: float, remarks: li
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
     columns = _explicit(columns, source)
-    frame = _supplemented(_named(columns.with_columns(times), source), part, supplements)
+    frame = _supplemented(_named(columns.with_columns(times), part), part, supplements)
     if "t" not in source.times:
         return frame
     if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), few, remarks):
@@ -122,7 +123,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     """What a protobuf field without presence holds: a column that is 0 throughout was not recorded."""
     if not source.implicit:
         return frame
-    contract = STREAM_SCHEMAS[source.stream].columns()
+    contract = STREAM_SCHEMAS[source.recipe.stream].columns()
     names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
     silent = [name for name in names if not (frame[name] != 0).any()]
     if "speed_mps" in silent and not _counted(frame, silent):  # a train that stands says so
@@ -162,11 +163,11 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
     return frame.filter(~unset.fill_null(False))
 
 
-def _named(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
+def _named(frame: pl.DataFrame, part: Decoded) -> pl.DataFrame:
     """With the solution: what the messages say, else the source's."""
-    if source.solution is None:
+    if part.solution is None:
         return frame
-    name = pl.lit(source.solution, dtype=pl.String)
-    if "solution" in source.columns:
+    name = pl.lit(part.solution, dtype=pl.String)
+    if "solution" in part.source.columns:
         name = pl.coalesce(pl.col("solution"), name)
     return frame.with_columns(name.alias("solution"))

@@ -75,12 +75,18 @@ def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog,
             far, recorded = frame.filter(stray), frame.filter(~stray)
         kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
         streams[name], counts[name] = kept, replace(found, far_off=int(stray.sum()))
-    parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
-    solutions = {part["solution"][0]: _of_solution(part, far) for part in parts}
     streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
-    solutions = {name: replace(one, placeholders=placeholders.get(name, 0)) for name, one in solutions.items()}
+    parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
+    names = [part["solution"][0] for part in parts]
+    solutions = {
+        name: replace(_of_solution(part, far), placeholders=placeholders.get(name, 0))
+        for name, part in zip(names, parts, strict=True)
+    }
     gnss, odometer = streams["gnss"], streams.get("odometer")
-    _require_two_positions(run.run_id, gnss)
+    sizes = gnss.group_by("solution", maintain_order=True).len()
+    if not (sizes["len"] >= 2).any():
+        of = f" of solution {gnss['solution'][0]!r}" if gnss.height else ""
+        require_two_times(gnss.head(1), f"{run.run_id}: gnss", of)
     if odometer is not None:
         require_two_times(odometer, f"{run.run_id}: odometer")
         _require_common_time(run.with_streams(**streams))
@@ -110,14 +116,13 @@ def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame
     """Positions without placeholders, and how many these were, by solution."""
     if not {"fix", *_PLACE} <= set(gnss.columns):
         return gnss, {}
-    parts = gnss.with_row_index("_row").partition_by("solution", maintain_order=True)
-    marked = [
-        (part["solution"][0], *without_placeholders(part, config.ingest, config.align.fastest_mps)) for part in parts
-    ]
-    counts = {name: count for name, _, count in marked}
-    if any(counts.values()):
-        gnss = pl.concat([part for _, part, _ in marked]).sort("_row").drop("_row")
-    return gnss, counts
+    counts: dict[str, int] = {}
+    marked: list[pl.DataFrame] = []
+    for part in gnss.with_row_index("_row").partition_by("solution", maintain_order=True):
+        found, count = without_placeholders(part, config.ingest, config.align.fastest_mps)
+        marked.append(found)
+        counts[part["solution"][0]] = count
+    return (pl.concat(marked).sort("_row").drop("_row") if any(counts.values()) else gnss), counts
 
 
 def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
@@ -128,13 +133,6 @@ def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNote
         if found.far_off and name != "gnss"
     ]
     return replace(notes, skipped_topics=(*notes.skipped_topics, *told))
-
-
-def _require_two_positions(run_id: str, gnss: pl.DataFrame) -> None:
-    parts = gnss.select("solution").partition_by("solution", maintain_order=True)
-    if all(part.height < 2 for part in parts):
-        of = f" of solution {gnss['solution'][0]!r}" if parts else ""
-        require_two_times(parts[0] if parts else gnss, f"{run_id}: gnss", of)
 
 
 def _strays(frame: pl.DataFrame, few: float) -> Bools:
@@ -162,10 +160,10 @@ def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
 
 def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
     """Times more than a day before or after every position, in 64 bits without overflow."""
-    known = np.sort(positions.to_physical().to_numpy())
+    t_ns, known = (series.cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy() for series in (t, positions))
     if not known.size:
         return np.zeros(t.len(), dtype=np.bool_)
-    t_ns = t.cast(pl.Datetime("ns", "UTC")).to_physical().to_numpy()
+    known = np.sort(known)
     at = np.searchsorted(np.minimum(known, np.iinfo(np.int64).max - _DAY_NS) + _DAY_NS, t_ns)
     far: Bools = (at == known.size) | (t_ns < known[np.minimum(at, known.size - 1)] - _DAY_NS)
     return far
@@ -204,18 +202,12 @@ def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
-        return frame, StreamCounts(0, 0)
-    late = _out_of_order(frame, [key for key in keys if key == "solution"])
+        return frame, StreamCounts()
+    latest = pl.col("t").cum_max()  # of those recorded so far
+    late = frame.select((pl.col("t") < (latest.over("solution") if "solution" in keys else latest)).sum()).item()
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
     unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
     return unique, StreamCounts(frame.height - unique.height, late)
-
-
-def _out_of_order(frame: pl.DataFrame, by: list[str]) -> int:
-    """Rows whose time lies before the latest time recorded so far."""
-    latest = pl.col("t").cum_max()
-    late = pl.col("t") < (latest.over(by) if by else latest)
-    return int(frame.select(late.sum()).item())
 
 
 def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:

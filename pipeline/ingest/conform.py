@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import dataframely as dy
 import polars as pl
@@ -29,8 +29,13 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Inpu
     if frame.height == 0 and stream in NEVER_EMPTY:
         breaches.append(InputError("has no rows", place=place, expected="at least one", remedy="Record the stream."))
     result = conform_to(STREAM_SCHEMAS[stream].columns(), frame, place, breaches, DEFAULTS)
-    if stream == "odometer":
-        _check_odometer(result, place, breaches)
+    if stream == "odometer" and {"distance_m", "speed_mps"} <= set(result.columns):
+        neither = result["distance_m"].is_null() & result["speed_mps"].is_null()
+        if neither.any():
+            told = {"found": f"null in {rows_text(neither)}", "expected": "distance or speed in every row"}
+            remedy = "Record one of the two, or leave the stream out."
+            where = f"{place}: columns distance_m, speed_mps"
+            breaches.append(InputError("are both empty", place=where, **told, remedy=remedy))
     return result
 
 
@@ -38,48 +43,24 @@ def conform_to(
     columns: Mapping[str, dy.Column], frame: pl.DataFrame, place: str, breaches: list[InputError], defaults: Defaults
 ) -> pl.DataFrame:
     """As `conform`, for any columns; `defaults` fill those that are absent, and nulls in those that are there."""
-    conformed = {
-        name: _column(frame, name, column, place, breaches, defaults)
-        for name, column in columns.items()
-        if name in frame.columns or name in defaults or _may_be_absent(name, column, frame, place, breaches)
-    }
-    return pl.DataFrame({name: series for name, series in conformed.items() if series is not None})
-
-
-def _may_be_absent(name: str, column: dy.Column, frame: pl.DataFrame, place: str, breaches: list[InputError]) -> bool:
-    if column.nullable:
-        return True
-    breaches.append(
-        InputError(
-            "is missing",
-            place=f"{place}: column {name}",
-            found=", ".join(frame.columns) or "no columns",
-            expected=type_name(column),
-            remedy="Add the column.",
-        )
-    )
-    return False
-
-
-def _column(
-    frame: pl.DataFrame, name: str, column: dy.Column, place: str, breaches: list[InputError], defaults: Defaults
-) -> pl.Series | None:
-    where = f"{place}: column {name}"
-    if name not in frame.columns:
-        return pl.Series(name, [defaults.get(name)], dtype=column.dtype).new_from_index(0, frame.height)
-    series = _converted(frame[name], column)
-    if name in defaults and not isinstance(series, str) and series.null_count():
-        series = series.fill_null(defaults[name])
-    if isinstance(series, str):
-        breaches.append(
-            InputError("has the wrong type", place=where, found=series, expected=type_name(column), remedy=_RETYPE)
-        )
-        return None
-    _check_values(series, column, where, breaches)
-    return series
-
-
-_RETYPE = "Write the column with that type."
+    conformed: dict[str, pl.Series] = {}
+    for name, column in columns.items():
+        where = f"{place}: column {name}"
+        if name in frame.columns:
+            series = _converted(frame[name], column)
+            if isinstance(series, str):
+                told = {"found": series, "expected": type_name(column), "remedy": "Write the column with that type."}
+                breaches.append(InputError("has the wrong type", place=where, **told))
+                continue
+            conformed[name] = series.fill_null(defaults[name]) if name in defaults and series.null_count() else series
+            breaches += _strange_values(conformed[name], column, where)
+        elif name in defaults or column.nullable:
+            default = pl.Series(name, [defaults.get(name)], dtype=column.dtype)
+            conformed[name] = default.new_from_index(0, frame.height)
+        else:
+            told = {"found": ", ".join(frame.columns) or "no columns", "expected": type_name(column)}
+            breaches.append(InputError("is missing", place=where, **told, remedy="Add the column."))
+    return pl.DataFrame(conformed)
 
 
 def type_name(column: dy.Column) -> str:
@@ -135,47 +116,37 @@ def _lossless(series: pl.Series, column: dy.Column, target: pl.DataType) -> pl.S
     return cast if whole else f"{series.dtype}{_LOSSES.get(type(column), '')}"
 
 
-def _check_values(series: pl.Series, column: dy.Column, where: str, breaches: list[InputError]) -> None:
+def _strange_values(series: pl.Series, column: dy.Column, where: str) -> Iterator[InputError]:
+    """One breach for each kind of value that the contract does not allow."""
     if not column.nullable and series.null_count():
-        rows = rows_text(series.is_null())
-        breaches.append(
-            InputError("has missing values", place=where, found=f"null in {rows}", expected="a value in every row")
-        )
+        found = f"null in {rows_text(series.is_null())}"
+        yield InputError("has missing values", place=where, found=found, expected="a value in every row")
     if isinstance(column, dy.Float64) and not all_finite(series):
         strange = ~series.is_finite().fill_null(True)
-        value = series.filter(strange)[0]
-        breaches.append(
-            InputError(
-                "has values that are not finite numbers",
-                place=where,
-                found=f"{value} in {rows_text(strange)}",
-                expected="finite numbers, null where unknown",
-                remedy="Write null where a value is not known.",
-            )
+        yield InputError(
+            "has values that are not finite numbers",
+            place=where,
+            found=f"{series.filter(strange)[0]} in {rows_text(strange)}",
+            expected="finite numbers, null where unknown",
+            remedy="Write null where a value is not known.",
         )
-    elif isinstance(column, dy.Float64 | dy.Int64):
-        _check_range(series, column, where, breaches)
+    elif isinstance(column, dy.Float64 | dy.Int64) and series.null_count() < len(series):
+        least = -_LARGEST if column.min is None else column.min
+        most = _LARGEST if column.max is None else column.max
+        over = getattr(column, "min_exclusive", None)
+        low, high = series.min(), series.max()
+        if low < least:  # type: ignore[operator]
+            yield _out_of_range(where, low, series < least, f"at least {least:g}")
+        if over is not None and low <= over:
+            yield _out_of_range(where, low, series <= over, f"more than {over:g}")
+        if high > most:  # type: ignore[operator]
+            yield _out_of_range(where, high, series > most, f"at most {most:g}")
 
 
 def all_finite(series: pl.Series) -> bool:
     """Whether no value is NaN or infinite (nulls are fine)."""
     total = series.sum()  # NaN and infinity survive a sum, so one pass says that all is well
     return total is None or math.isfinite(total) or bool(series.is_finite().all())
-
-
-def _check_range(series: pl.Series, column: dy.Float64 | dy.Int64, where: str, breaches: list[InputError]) -> None:
-    low, high = series.min(), series.max()
-    if low is None or high is None:
-        return
-    least = -_LARGEST if column.min is None else column.min
-    most = _LARGEST if column.max is None else column.max
-    over = getattr(column, "min_exclusive", None)
-    if low < least:  # type: ignore[operator]
-        breaches.append(_out_of_range(where, low, series < least, f"at least {least:g}"))
-    if over is not None and low <= over:
-        breaches.append(_out_of_range(where, low, series <= over, f"more than {over:g}"))
-    if high > most:  # type: ignore[operator]
-        breaches.append(_out_of_range(where, high, series > most, f"at most {most:g}"))
 
 
 def _out_of_range(where: str, value: object, mask: pl.Series, expected: str) -> InputError:
@@ -187,19 +158,3 @@ def rows_text(mask: pl.Series) -> str:
     """Which rows are meant: the first, and how many."""
     first, count = mask.arg_max(), int(mask.sum())
     return f"row {first}" if count == 1 else f"{count} rows, first {first}"
-
-
-def _check_odometer(frame: pl.DataFrame, place: str, breaches: list[InputError]) -> None:
-    if not {"distance_m", "speed_mps"} <= set(frame.columns):
-        return
-    neither = frame["distance_m"].is_null() & frame["speed_mps"].is_null()
-    if neither.any():
-        breaches.append(
-            InputError(
-                "are both empty",
-                place=f"{place}: columns distance_m, speed_mps",
-                found=f"null in {rows_text(neither)}",
-                expected="distance or speed in every row",
-                remedy="Record one of the two, or leave the stream out.",
-            )
-        )

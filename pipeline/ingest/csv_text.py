@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import polars as pl
+import polars.selectors as cs
 
 from schemas.errors import InputError
 
@@ -123,7 +124,8 @@ def _table(lines: list[str], infer: bool) -> pl.DataFrame:
     frame = pl.read_csv(io.StringIO(body), separator=separator, infer_schema=infer, infer_schema_length=length)
     frame.columns = _names(body, separator, frame.columns)
     frame = frame.with_columns(pl.col(pl.String).str.strip_chars())
-    return frame.filter(~pl.all_horizontal(_is_empty(name, dtype) for name, dtype in frame.schema.items()))
+    texts = cs.string()
+    return frame.filter(~pl.all_horizontal((texts.is_null() | (texts == "")), (~texts).is_null()))
 
 
 def _names(body: str, separator: str, given: list[str]) -> list[str]:
@@ -134,11 +136,6 @@ def _names(body: str, separator: str, given: list[str]) -> list[str]:
     if twice:
         raise ValueError(f"two columns have the same name: {', '.join(twice)}")
     return [name.strip() for name in given]
-
-
-def _is_empty(name: str, dtype: pl.DataType) -> pl.Expr:
-    empty = pl.col(name).is_null()
-    return empty | (pl.col(name) == "") if dtype == pl.String else empty
 
 
 def comments_of(data: bytes) -> str:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.clock import GAP_PERIODS
 from pipeline.ingest.clean import StreamCounts, stamp_counts
-from pipeline.ingest.generic import UndecodableError, decoder_for
+from pipeline.ingest.generic import UndecodableError, decoder_for, fields_of
 from pipeline.ingest.guesses import NAMES, columns_in, mapping_lines, word_of
-from pipeline.ingest.inventory import fields_of
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_run import LARGEST_MESSAGE, walk_log
-from pipeline.ingest.plan import Sample, candidates, source_of
+from pipeline.ingest.plan import Sample, sources_of
 from pipeline.ingest.run import read_run
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of
@@ -23,7 +23,6 @@ from schemas.config import IngestConfig
 from schemas.errors import BaliseError, InputError
 from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
-_GAP_PERIODS = 1.5
 _MOST_SAMPLES = 1000  # topics whose fields are looked for: each takes the time of parsing its schema
 
 
@@ -80,6 +79,7 @@ def describe_log(path: Address, config: IngestConfig) -> LogDescription:
     """Describe a run; a log that cannot be replayed is described as far as it can be read."""
     is_mcap = name_of(path).endswith(".mcap")
     topics = _topics(path, config) if is_mcap else ()
+    parts = [path] if is_mcap else [join(path, name) for name in files.list_dir(path) if name.endswith(".parquet")]
     run: RunLog | None = None
     problems: tuple[str, ...] = ()
     try:
@@ -92,7 +92,7 @@ def describe_log(path: Address, config: IngestConfig) -> LogDescription:
     return LogDescription(
         path=str(path),
         kind="mcap" if is_mcap else "parquet",
-        size_bytes=_size(path, is_mcap),
+        size_bytes=sum(files.size_of(file) for file in parts),
         streams=summaries,
         topics=topics,
         left_over=left,
@@ -103,38 +103,24 @@ def describe_log(path: Address, config: IngestConfig) -> LogDescription:
     )
 
 
-def _size(path: Address, is_file: bool) -> int:
-    if is_file:
-        return files.size_of(path)
-    names = [name for name in files.list_dir(path) if name.endswith(".parquet")]
-    return sum(files.size_of(join(path, name)) for name in names)
-
-
-def _summaries(run: RunLog) -> list[StreamSummary]:
-    summaries = []
+def _summaries(run: RunLog) -> Iterator[StreamSummary]:
     for stream in STREAMS:
-        frame = run.stream(stream)
-        if frame is None:
-            continue
-        if stream != "gnss":
-            summaries.append(_summary(stream, None, frame))
-            continue
-        names = frame["solution"].unique(maintain_order=True).to_list()
-        summaries += [_summary(stream, name, frame.filter(pl.col("solution") == name)) for name in names]
-    return summaries
+        if (frame := run.stream(stream)) is not None:
+            parts = frame.partition_by("solution", maintain_order=True) if stream == "gnss" else [frame]
+            yield from (_summary(stream, part) for part in parts)
 
 
-def _summary(stream: Stream, solution: str | None, frame: pl.DataFrame) -> StreamSummary:
+def _summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
     # Satellites share the time of their epoch: an epoch is one step.
     t_ns = frame.to_series(0).to_physical().drop_nulls().to_numpy()
     ordered = np.diff(np.unique(t_ns))
     step = float(np.median(ordered)) if len(ordered) else None
     stamps = stamp_counts(stream, frame) if stream != "faults" else StreamCounts()
-    late = ordered[ordered > _GAP_PERIODS * step] if step else ordered[:0]
+    late = ordered[ordered > GAP_PERIODS * step] if step else ordered[:0]
     mix = frame["fix"].value_counts().sort("fix") if stream == "gnss" else None
     return StreamSummary(
         stream=stream,
-        solution=solution,
+        solution=frame["solution"][0] if stream == "gnss" else None,
         rows=frame.height,
         t_start_ns=int(t_ns.min()) if len(t_ns) else None,
         t_end_ns=int(t_ns.max()) if len(t_ns) else None,
@@ -199,7 +185,7 @@ def _topics(path: Address, config: IngestConfig) -> tuple[TopicSummary, ...]:
 def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
     sample = Sample(met.channel, met.fields)
     span_s = (max(met.span_ns) - min(met.span_ns)) / 1e9
-    sources = [source_of(sample, candidate) for candidate in candidates(sample, config)] if met.fields else []
+    sources = sources_of(sample, config) if met.fields else []
     source = next((source for source in sources if not source.dropped), None)
     mapping = {}
     if source is not None:
@@ -213,7 +199,7 @@ def _topic(met: _Met, config: IngestConfig) -> TopicSummary:
         encoding=met.channel.encoding,
         messages=met.messages,
         rate_hz=(met.messages - 1) / span_s if span_s > 0 else None,
-        stream=source.stream if source else None,
+        stream=source.recipe.stream if source else None,
         mapping=mapping,
         fields=met.fields,
         remark=source.recipe.remark if source else "",

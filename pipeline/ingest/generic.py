@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from graphlib import TopologicalSorter
 from typing import Any
@@ -14,6 +14,9 @@ from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel, Schema
 from pipeline.ingest.ros_message import Definition, DefinitionError, RosWalk, parse_definitions, short_name
 from schemas.errors import InputError
+
+_LARGEST_LIST = 64  # elements of a list that are offered one by one
+_DEEPEST = 12
 
 Value = Any
 Decode = Callable[[bytes], Value]
@@ -27,15 +30,14 @@ def decoder_for(channel: Channel) -> Decode:
     """The decoder of a channel's messages: to dicts (json, cdr) or messages with attributes (protobuf)."""
     if channel.encoding == "json":
         return parse_json
-    makers = {"protobuf": _protobuf_decoder, "cdr": _cdr_decoder}
-    if channel.encoding not in makers:
+    if channel.encoding not in _DEFINITIONS:
         raise InputError(
             "has an encoding that this program does not read",
             place=channel.place,
             found=channel.encoding or "none",
             expected="json, protobuf or cdr",
         )
-    return makers[channel.encoding](channel)
+    return _protobuf_decoder(channel) if channel.encoding == "protobuf" else _cdr_decoder(channel)
 
 
 def parse_json(payload: bytes) -> Value:
@@ -61,7 +63,7 @@ def _refuse_literal(literal: str) -> Value:
 def _protobuf_decoder(channel: Channel) -> Decode:
     from google.protobuf.message import DecodeError
 
-    make = _made(_protobuf_class, channel)
+    make = definition_of(channel)
 
     def checked(payload: bytes) -> Value:
         message = make()
@@ -75,7 +77,7 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def _cdr_decoder(channel: Channel) -> Decode:
-    definitions, name = ros_definitions(channel)
+    definitions, name = definition_of(channel)
 
     def checked(payload: bytes) -> Value:
         try:
@@ -112,12 +114,20 @@ def _ros_definitions(schema: Schema) -> tuple[Mapping[str, Definition], str]:
     return definitions, name
 
 
-_SCHEMA_ENCODINGS = {"protobuf": "protobuf", "cdr": "ros2msg"}
+# By encoding of messages: that of their schemas, and what makes a definition of these.
+_DEFINITIONS: Mapping[str, tuple[str, Callable[[Schema], Any]]] = {
+    "protobuf": ("protobuf", _protobuf_class),
+    "cdr": ("ros2msg", _ros_definitions),
+}
 
 
-def _made(make: Callable[[Schema], Any], channel: Channel) -> Any:
-    """What `make` makes of the schema; parsers of schemas raise whatever they stumble over."""
-    if channel.schema is None or channel.schema.encoding != _SCHEMA_ENCODINGS[channel.encoding]:
+def definition_of(channel: Channel) -> Any:
+    """What a channel's messages are made of: the class of protobuf messages, or ROS 2 definitions and a name of them.
+
+    Parsers of schemas raise whatever they stumble over.
+    """
+    encoding, make = _DEFINITIONS[channel.encoding]
+    if channel.schema is None or channel.schema.encoding != encoding:
         raise InputError(
             "has a schema encoding that does not fit its message encoding",
             place=channel.place,
@@ -131,17 +141,6 @@ def _made(make: Callable[[Schema], Any], channel: Channel) -> Any:
         raise InputError(
             f"has a schema that cannot be parsed: {reason[:200]}", place=channel.place, found=channel.schema_name
         ) from None
-
-
-def protobuf_descriptor(channel: Channel) -> Any:
-    """The descriptor of a channel's messages."""
-    return _made(_protobuf_class, channel).DESCRIPTOR
-
-
-def ros_definitions(channel: Channel) -> tuple[Mapping[str, Definition], str]:
-    """The definitions that a channel's messages are made of, and the name of theirs."""
-    found: tuple[Mapping[str, Definition], str] = _made(_ros_definitions, channel)
-    return found
 
 
 def decode_columns(
@@ -241,3 +240,40 @@ def _fitting(value: Value, dtype: pl.DataType) -> Value:
     if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
         return int(value)
     raise UndecodableError(f"{_shown(value)} is not {name}")
+
+
+def fields_of(message: Any) -> dict[str, str]:
+    """Field paths of a decoded message with their kind: `int`, `float`, `text`, `flag`, `null`."""
+    return dict(_leaves(message, "", 0))
+
+
+def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, str]]:
+    if depth > _DEEPEST:
+        return
+    children = _children(value)
+    if children is None:
+        yield path, _kind(value)
+        return
+    for name, child in children:
+        joined = f"{path}{name}" if name.startswith("[") or not path else f"{path}.{name}"
+        yield from _leaves(child, joined, depth + 1)
+
+
+def _children(value: Any) -> list[tuple[str, Any]] | None:
+    """Named parts of a message or list; none for a plain value."""
+    if isinstance(value, dict):
+        return [(str(name), child) for name, child in value.items()]
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    if descriptor is not None:
+        # A message that is not set is shown with its defaults, down to one level of a type.
+        recursive = {field.name for field in descriptor.fields if field.message_type is descriptor}
+        names = [field.name for field in descriptor.fields]
+        return [(name, None if name in recursive else getattr(value, name)) for name in names]
+    if isinstance(value, str | bytes) or not hasattr(value, "__len__"):
+        return None
+    return [(f"[{index}]", child) for index, child in enumerate(list(value[:_LARGEST_LIST]))]
+
+
+def _kind(value: Any) -> str:
+    kinds = {bool: "flag", int: "int", float: "float", type(None): "null"}
+    return next((name for kind, name in kinds.items() if isinstance(value, kind)), "text")

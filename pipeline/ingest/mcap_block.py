@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,9 @@ OnRecord = Callable[[int, bytes, int], None]  # opcode, content, offset of its c
 # A message record: opcode, length, channel, sequence, log time, publish time, then the payload.
 MESSAGE_HEAD = np.dtype(
     {
-        "names": ["opcode", "length", "channel", "log_time", "publish_time"],
-        "formats": ["u1", "<u8", "<u2", "<i8", "<i8"],
-        "offsets": [0, 1, 9, 15, 23],
+        "names": ["length", "channel", "log_time"],
+        "formats": ["<u8", "<u2", "<i8"],
+        "offsets": [1, 9, 15],
         "itemsize": 31,
     }
 )
@@ -32,31 +32,54 @@ _FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
 
 @dataclass(frozen=True)
 class Messages:
-    """Messages of one channel in a block, in order of the file: where their payloads lie in `data`.
+    """Messages of one channel in a block, in order of the file.
 
-    `ordinal` orders messages of all channels of the log as they stand in the file; times are in nanoseconds.
+    `start` says where payloads lie in `pieces`, counted as if these followed each other; `bases` is where each begins.
+    Times are in nanoseconds; `before` is the size of all blocks before this one.
     """
 
-    data: Bytes
+    pieces: Sequence[Bytes]
+    bases: Ints
     start: Ints
     length: Ints
-    ordinal: Ints
     log_time: Ints
-    publish_time: Ints
+    before: int = 0
 
     def __len__(self) -> int:
         return len(self.start)
 
+    @property
+    def ordinal(self) -> Ints:
+        """What orders messages of all channels of the log as they stand in the file."""
+        return self.start + self.before
+
+    @property
+    def publish_time(self) -> Ints:
+        """The last field of the heads that stand before the payloads."""
+        return self.stretches(-8, 0).view("<i8")[:, 0]
+
+    def by_piece(self) -> Iterator[tuple[Bytes, Ints, Ints]]:
+        """Each piece that holds some, with the offsets in it from which and to which each payload goes."""
+        bounds = [*np.searchsorted(self.start, self.bases).tolist(), len(self)]
+        for piece, base, (first, end) in zip(self.pieces, self.bases, pairwise(bounds), strict=True):
+            if first < end:
+                starts = self.start[first:end] - base
+                yield piece, starts, starts + self.length[first:end]
+
+    def stretches(self, start: int, end: int) -> Bytes:
+        """From one byte to another of each payload, one row each; the payloads must be that long."""
+        parts = [stretches_of(piece, starts + start, end - start) for piece, starts, _ in self.by_piece()]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
     def payload(self, row: int) -> bytes:
-        first = int(self.start[row])
-        return self.data[first : first + int(self.length[row])].tobytes()
+        ((piece, (start,), (end,)),) = self.chosen(slice(row, row + 1)).by_piece()
+        return piece[start:end].tobytes()
 
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
         if isinstance(rows, np.ndarray) and rows.dtype == np.bool_:
             rows = np.flatnonzero(rows)
-        columns = (self.start, self.length, self.ordinal, self.log_time, self.publish_time)
-        return Messages(self.data, *(column[rows] for column in columns))
+        return replace(self, start=self.start[rows], length=self.length[rows], log_time=self.log_time[rows])
 
 
 Block = dict[int, Messages]  # by channel
@@ -73,38 +96,22 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
 
 @dataclass(frozen=True)
 class Piece:
-    """Records side by side, as of one chunk, and where messages begin among them; `offset`: its place in the file.
-
-    `proved` are message indexes, by channel, that its messages were found by.
-    """
+    """Records side by side, as of one chunk, and the messages among them; `offset`: its place in the file."""
 
     data: Bytes
     starts: Ints
+    channels: npt.NDArray[np.uint16]
+    lengths: Ints
+    log_times: Ints
     offset: int
-    proved: Mapping[int, bytes] = field(default_factory=dict)
 
-    @cached_property
-    def heads(self) -> npt.NDArray[Any]:
-        """The heads of the messages."""
-        if not len(self.starts):
-            return np.empty(0, dtype=MESSAGE_HEAD)
-        return stretches_of(self.data, self.starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
 
-    @cached_property
-    def entries(self) -> tuple[npt.NDArray[np.uint16], Ints]:
-        """What message indexes must say: channel, and pairs of log time and offset, by channel."""
-        order = np.argsort(self.heads["channel"], kind="stable")
-        return self.heads["channel"][order], np.column_stack([self.heads["log_time"], self.starts])[order]
-
-    def check_index(self, channel: int, entries: bytes) -> None:
-        """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
-        if self.proved.get(channel) == entries:
-            return
-        channels, found = self.entries
-        first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
-        told = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
-        if not np.array_equal(told[np.argsort(told[:, 1], kind="stable")], found[first:end]):
-            raise DamageError(self.offset, "a message index disagrees with its chunk")
+def _piece(data: Bytes, starts: Ints, offset: int) -> Piece:
+    if not len(starts):
+        return Piece(data, starts, starts.astype(np.uint16), starts, starts, offset)
+    heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
+    lengths, log_times = heads["length"].astype(np.int64), heads["log_time"].astype(np.int64)
+    return Piece(data, starts, heads["channel"].astype(np.uint16), lengths, log_times, offset)
 
 
 @dataclass
@@ -119,13 +126,15 @@ class Allowance:
 
 
 def piece_of_chunk(
-    content: Any, offset: int, on_record: OnRecord, allowance: Allowance, indexes: Mapping[int, bytes]
+    content: Any, offset: int, on_record: OnRecord, allowance: Allowance, indexes: Sequence[tuple[int, bytes]] = ()
 ) -> Piece:
     """The messages of a chunk, which its records must fill exactly; other records go to `on_record`.
 
-    Where all records from the first on that `indexes` name are the messages as they tell, they are not walked.
+    `indexes` are its message indexes, channel and entries. Where all records from the first on that they name are the
+    messages as they tell, these are not walked.
     """
     view, starts = memoryview(content), array("q")
+    indexes = [(channel, entries) for channel, entries in indexes if entries]  # recovered logs have empty ones
     named = _named(np.frombuffer(content, dtype=np.uint8), offset, indexes)
     end = int(named.starts[0]) if named else len(view)
     at = _walk(view, 0, end, starts, offset, on_record, allowance)
@@ -135,28 +144,38 @@ def piece_of_chunk(
     if at != len(view):
         how = "is cut off by" if at < len(view) else "runs past"
         raise DamageError(offset, f"a record {how} the end of its chunk")
-    return _piece(content, starts, offset)
+    piece = _found(content, starts, offset)
+    _check_indexes(piece, indexes)
+    return piece
 
 
-def _named(data: Bytes, offset: int, indexes: Mapping[int, bytes]) -> Piece | None:
+def _check_indexes(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> None:
+    """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
+    order = np.argsort(piece.channels, kind="stable")
+    channels, found = piece.channels[order], np.column_stack([piece.log_times, piece.starts])[order]
+    for channel, entries in indexes:
+        first, end = np.searchsorted(channels, np.array([channel, channel + 1]))
+        told = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
+        if not np.array_equal(told[np.argsort(told[:, 1], kind="stable")], found[first:end]):
+            raise DamageError(piece.offset, "a message index disagrees with its chunk")
+
+
+def _named(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> Piece | None:
     """The messages by their indexes; none unless they follow each other to the end and are as told."""
-    counts = [len(entries) // 16 for entries in indexes.values()]
-    told = np.frombuffer(b"".join(indexes.values()), dtype="<i8").reshape(-1, 2)
+    told = np.frombuffer(b"".join(entries for _, entries in indexes), dtype="<i8").reshape(-1, 2)
+    channels = np.repeat([channel for channel, _ in indexes], [len(entries) // 16 for _, entries in indexes])
     order = np.argsort(told[:, 1], kind="stable")
     starts = told[order, 1]
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - MESSAGE_HEAD.itemsize:
         return None
-    piece = Piece(data, starts, offset, indexes)
-    heads = piece.heads
-    lengths = heads["length"].astype(np.int64)
-    channels = np.repeat(np.array(list(indexes)), counts)[order]
-    ends = starts + HEAD_SIZE + lengths
+    piece = _piece(data, starts, offset)
+    ends = starts + HEAD_SIZE + piece.lengths
+    tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and piece.lengths.min() >= _FIXED_FIELDS
     as_told = (
-        (heads["opcode"] == int(Opcode.MESSAGE)).all()
-        and (heads["channel"] == channels).all()
-        and (heads["log_time"] == told[order, 0]).all()
+        (data[starts] == int(Opcode.MESSAGE)).all()
+        and (piece.channels == channels[order]).all()
+        and (piece.log_times == told[order, 0]).all()
     )
-    tiled = ends[-1] == len(data) and (ends[:-1] == starts[1:]).all() and lengths.min() >= _FIXED_FIELDS
     return piece if as_told and tiled else None
 
 
@@ -191,39 +210,32 @@ def piece_of_messages(content: bytes, offset: int) -> Piece:
             break
         starts.append(at)
         at += HEAD_SIZE + length
-    return _piece(memoryview(content)[:at], starts, offset)
+    return _found(memoryview(content)[:at], starts, offset)
 
 
-def _piece(content: Any, starts: array[int], offset: int) -> Piece:
+def _found(content: Any, starts: array[int], offset: int) -> Piece:
     data = np.frombuffer(content, dtype=np.uint8)
     found = np.frombuffer(starts, dtype=np.int64) if starts else np.empty(0, dtype=np.int64)
     lengths = stretches_of(data, found + 1, 8).view("<u8") if starts else found
     if (lengths < _FIXED_FIELDS).any():
         raise DamageError(offset, "a message is shorter than its header")
-    return Piece(data, found, offset)
+    return _piece(data, found, offset)
 
 
-def block_of(pieces: list[Piece], first_ordinal: int) -> Block:
-    """The messages of neighbouring pieces, by channel."""
-    sizes = [len(piece.data) for piece in pieces]
-    data = pieces[0].data if len(pieces) == 1 else np.concatenate([piece.data for piece in pieces])
-    bases = np.cumsum([0, *sizes[:-1]])
+def block_of(pieces: list[Piece], before: int) -> Block:
+    """The messages of neighbouring pieces, by channel; `before` is the size of the pieces before these."""
+    data = [piece.data for piece in pieces]
+    bases = np.cumsum([0, *map(len, data[:-1])])
     starts = np.concatenate([piece.starts + base for piece, base in zip(pieces, bases, strict=True)])
-    if not len(starts):
-        return {}
-    plain = f"V{MESSAGE_HEAD.itemsize}"  # numpy moves structured values five times slower, field by field
-    heads = np.concatenate([piece.heads.view(plain) for piece in pieces])
-    order = np.argsort(heads.view(MESSAGE_HEAD)["channel"], kind="stable")
-    starts, heads = starts[order], heads[order].view(MESSAGE_HEAD)
-    firsts = np.flatnonzero(np.diff(heads["channel"].astype(np.int64), prepend=-1)).tolist()
+    channels, lengths, log_times = (
+        np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("channels", "lengths", "log_times")
+    )
+    order = np.argsort(channels, kind="stable")
+    ordered = channels[order]
     return {
-        int(heads["channel"][first]): Messages(
-            data,
-            starts[first:end] + MESSAGE_HEAD.itemsize,
-            heads["length"][first:end].astype(np.int64) - _FIXED_FIELDS,
-            starts[first:end] + first_ordinal,
-            heads["log_time"][first:end].astype(np.int64),
-            heads["publish_time"][first:end].astype(np.int64),
+        int(channels[rows[0]]): Messages(
+            data, bases, starts[rows] + MESSAGE_HEAD.itemsize, lengths[rows] - _FIXED_FIELDS, log_times[rows], before
         )
-        for first, end in zip(firsts, [*firsts[1:], len(starts)], strict=True)
+        for rows in np.split(order, np.flatnonzero(ordered[1:] != ordered[:-1]) + 1)
+        if len(rows)
     }

@@ -12,17 +12,16 @@ import polars as pl
 
 from pipeline.ingest.assemble import Decoded, stream_frames
 from pipeline.ingest.breaches import refuse
-from pipeline.ingest.generic import UndecodableError, decoder_for, undecodable
-from pipeline.ingest.inventory import fields_of
+from pipeline.ingest.generic import UndecodableError, decoder_for, fields_of, undecodable
 from pipeline.ingest.mcap_block import Block, Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.mcap_records import DamageError
 from pipeline.ingest.mcap_walk import McapWalk
-from pipeline.ingest.plan import Sample, candidates, is_candidate, source_of
+from pipeline.ingest.plan import Sample, is_candidate, settle, solution_of, sources_of
 from pipeline.ingest.reader import SourceReader
-from pipeline.ingest.settle import settle
 from pipeline.storage import files
 from pipeline.storage.address import Address, stem_of
+from schemas.arrays import times_ns
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.run import IngestNotes, RunLog
@@ -62,8 +61,7 @@ class McapStreams:
                 remedy="Select topics with [ingest] in the configuration, or remove the others from the log.",
             )
         _check_sizes(messages, channel)
-        sample = sample_of(messages, channel)
-        return [SourceReader(source_of(sample, candidate)) for candidate in candidates(sample, self._config)]
+        return [SourceReader(source) for source in sources_of(_sample_of(messages, channel), self._config)]
 
 
 def _check_sizes(messages: Messages, channel: Channel) -> None:
@@ -85,7 +83,7 @@ def _pieces(messages: Messages) -> Iterator[Messages]:
     yield from (messages.chosen(rows) for rows in np.split(np.arange(len(messages)), cuts))
 
 
-def sample_of(messages: Messages, channel: Channel) -> Sample:
+def _sample_of(messages: Messages, channel: Channel) -> Sample:
     """The fields of the channel's first message."""
     try:
         return Sample(channel, fields_of(decoder_for(channel)(messages.payload(0))))
@@ -101,7 +99,7 @@ def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> 
     return RunLog(
         run_id=stem_of(path),
         notes=IngestNotes(
-            partial_until_ns=_last_ns(frames["gnss"]) if walk.cut_at is not None else None,
+            partial_until_ns=times_ns(frames["gnss"]).max().item() if walk.cut_at is not None else None,
             damage=f"cut off at byte {walk.cut_at}" if walk.cut_at is not None else None,
             slow_path_messages=slow_messages,
             chunks_without_crc=walk.without_crc,
@@ -146,13 +144,8 @@ def _frames(
     readers = [reader for found in streams.readers.values() for reader in found]
     met = [walk.channels[channel_id] for channel_id in streams.readers]
     settled = settle([reader.source for reader in readers], [c.topic for c in met], config, str(path))
-    by_key = {(source.channel.id, source.stream, id(source.recipe)): source for source in settled}
-    decoded, slow_messages = [], 0
-    for reader in readers:
-        source = by_key.get((reader.source.channel.id, reader.source.stream, id(reader.source.recipe)))
-        if source is not None:
-            decoded.append(Decoded(source, reader.frame()))
-            slow_messages += reader.slow_messages
+    chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
+    decoded = [Decoded(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
     used = {source.channel.topic for source in settled}
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
@@ -162,7 +155,7 @@ def _frames(
     if "gnss" not in frames:
         breaches.append(_no_gnss(path, walk, left_over))
     refuse(breaches)
-    return frames, slow_messages, (*left_over, *remarks)
+    return frames, sum(reader.slow_messages for reader in chosen), (*left_over, *remarks)
 
 
 def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> InputError:
@@ -179,8 +172,3 @@ def _no_gnss(path: Address, walk: McapWalk, left_over: tuple[str, ...]) -> Input
         expected="a topic of a known schema, or one mapped by [ingest.gnss]",
         remedy="Map a topic in the configuration; `balise inspect` prints one to start from.",
     )
-
-
-def _last_ns(gnss: pl.DataFrame) -> int:
-    """The latest epoch that was read."""
-    return int(gnss["t"].to_physical().max())  # type: ignore[arg-type]

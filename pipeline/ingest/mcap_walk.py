@@ -25,6 +25,7 @@ _AFTER_THE_DATA = (
     Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
 )  # fmt: skip
 _ONLY_THERE = _AFTER_THE_DATA[2:]
+_KNOWN = int(max(Opcode))  # unknown records, of higher ones, are skipped, by specification
 _TOGETHER = 8 * 1024 * 1024  # chunks of up to so many bytes are taken at once
 _LEAST_PIECE = 8 * 1024  # what a piece that waits takes itself
 _LOOSE = 64 * 1024  # of a log without chunks read at once
@@ -50,7 +51,6 @@ class McapWalk:
         self._known: set[bytes] = set()
         self._pieces: list[Piece] = []
         self._waiting = 0
-        self._last_chunk: Piece | None = None
         self._loose_until = 0
         self._ordinal = 0
         self._allowance = Allowance(_FREE_RECORDS + size)
@@ -128,25 +128,23 @@ class McapWalk:
     def _record(self, opcode: int, length: int, position: int) -> int:
         """Meet one record of the data section; the position of the next."""
         if opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(self._body(opcode, length, position), position)
-            return position + HEAD_SIZE + length
-        self._last_chunk = None
+            raise DamageError(position, "a message index does not follow a chunk")
         if opcode == Opcode.MESSAGE:
             return self._loose_messages(length, position)
+        if opcode == Opcode.CHUNK:
+            return self._chunk(self._body(opcode, length, position), position)
         if opcode in _ONLY_THERE:
             raise DamageError(position, f"a {Opcode(opcode).name} record is not allowed in the data section")
         if opcode == Opcode.ATTACHMENT:  # passed by
             self.met.attachments += 1
         elif opcode == Opcode.METADATA:
             self.met.metadata += 1
-        elif opcode <= max(Opcode):  # unknown ones are skipped, by specification
+        elif opcode <= _KNOWN:
             self._of_data(opcode, self._body(opcode, length, position), position)
         return position + HEAD_SIZE + length
 
     def _of_data(self, opcode: int, body: bytes, position: int) -> None:
-        if opcode == Opcode.CHUNK:
-            self._chunk(body, position)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._definition(opcode, body, position)
         elif opcode == Opcode.HEADER:
             if position != len(MAGIC):
@@ -192,7 +190,8 @@ class McapWalk:
         if record.id not in self.channels:
             self.channels[record.id] = Channel(record.id, record.topic, record.message_encoding, schema, self._file)
 
-    def _chunk(self, body: bytes, position: int) -> None:
+    def _chunk(self, body: bytes, position: int) -> int:
+        """The messages of a chunk; the position behind it and the message indexes that follow it."""
         chunk = parse(records.Chunk, body, position)
         if (size := chunk.uncompressed_size) > self._limit:
             told = f"a chunk declares {size} bytes, over the limit of {self._limit} ([ingest] chunk_limit_mib)"
@@ -202,39 +201,30 @@ class McapWalk:
             self._bare_chunks.extend((end - len(chunk.data), end))
             self.without_crc += 1
         self.met.add_chunk(chunk, position, HEAD_SIZE + len(body))
-        content, indexes = unpacked(chunk, position), self._indexes_behind(end, size)
-        self._last_chunk = piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes)
-        self._keep(self._last_chunk)
+        content, (indexes, end) = unpacked(chunk, position), self._indexes(end, position, size)
+        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes))
+        return end
 
-    def _indexes_behind(self, position: int, room: int) -> dict[int, bytes]:
-        """What the message indexes of a chunk name. They are met like all records, and held against it, later."""
-        indexes: dict[int, bytes] = {}
+    def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, bytes]], int]:
+        """Channel and entries of the message indexes of a chunk, and the position behind them or a cut in them."""
+        indexes: list[tuple[int, bytes]] = []
         while position + HEAD_SIZE <= self._size:
             opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
-            body, position = position + HEAD_SIZE, position + HEAD_SIZE + length
-            # A message takes more room in the chunk than its entry in the index.
-            if opcode != Opcode.MESSAGE_INDEX or length > room or position > self._size:
-                break
-            try:
-                channel, indexes[channel] = parse_message_index(self._read(body, length), body)
-            except DamageError:
+            if opcode != Opcode.MESSAGE_INDEX or position + HEAD_SIZE + length > self._size:
                 break
             room -= length
-        return indexes
+            if room < -_SLACK:  # a message takes more room in the chunk than its entry in an index
+                raise DamageError(chunk, "a message index disagrees with its chunk")
+            indexes.append(parse_message_index(self._read(position + HEAD_SIZE, length), position))
+            position += HEAD_SIZE + length
+        return indexes, position
 
     def _chunk_record(self, opcode: int, body: bytes, position: int) -> None:
         """A record inside a chunk that is no message."""
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._definition(opcode, body, position)
-        elif opcode <= max(Opcode):
+        elif opcode <= _KNOWN:
             raise DamageError(position, f"a record of opcode {opcode} is not allowed inside a chunk")
-
-    def _message_index(self, body: bytes, position: int) -> None:
-        if self._last_chunk is None:
-            raise DamageError(position, "a message index does not follow a chunk")
-        channel, entries = parse_message_index(body, position)
-        if entries:  # recovered logs have empty ones
-            self._last_chunk.check_index(channel, entries)
 
     def _loose_messages(self, length: int, position: int) -> int:
         """Messages outside of chunks, some at once; the position behind them."""
@@ -291,7 +281,7 @@ class McapWalk:
     def _summary_record(self, opcode: int, length: int, position: int) -> int | None:
         """A record behind the data; the position of the next, none after the closing magic."""
         assert self._summary is not None
-        if opcode <= max(Opcode) and opcode not in _AFTER_THE_DATA:
+        if opcode <= _KNOWN and opcode not in _AFTER_THE_DATA:
             raise DamageError(position, f"a {Opcode(opcode).name} record comes after the end of the data")
         body = self._body(opcode, length, position)
         whole = HEAD.pack(opcode, length) + body

@@ -1,21 +1,21 @@
-"""Which streams a channel of a log may feed, and how its messages make rows."""
+"""Which streams a channel of a log may feed, how its messages make rows, and which of the channels do feed them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.generic import protobuf_descriptor
-from pipeline.ingest.inventory import stamp_parts
+from pipeline.ingest.breaches import refuse
+from pipeline.ingest.generic import definition_of
 from pipeline.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.recipe import Recipe
 from pipeline.ingest.recipes import recipes_for
-from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, time_source
+from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME, TIME_KINDS, CivilTime, TimeSource, stamp_parts, time_source
 from schemas.config import IngestConfig, StreamMapping
-from schemas.errors import InputError
+from schemas.errors import ConfigError, InputError
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
 
@@ -41,43 +41,30 @@ class Source:
 
     channel: Channel
     recipe: Recipe
+    mapping: StreamMapping | None
     columns: Mapping[str, pl.Expr]
     times: Mapping[str, TimeSource | CivilTime]
     types: Mapping[str, pl.DataType]
-    solution: str | None = None
-    breaches: tuple[InputError, ...] = ()
-    mapped: bool = False
-    doubtful: Mapping[str, str] = field(default_factory=dict)
-    implicit: tuple[str, ...] = ()
+    breaches: Sequence[InputError]
+    doubtful: Mapping[str, str]
+    implicit: Sequence[str]
 
     @property
     def dropped(self) -> bool:
         """A driver's optional message that is not as its recipe knows it: left over, not an error."""
-        optional = self.stream == "satellites" or self.recipe.supplement
-        return bool(self.breaches) and optional and not self.mapped and not self.recipe.own
-
-    @property
-    def stream(self) -> Stream:
-        return self.recipe.stream
+        optional = self.recipe.stream == "satellites" or self.recipe.supplement
+        return bool(self.breaches) and optional and self.mapping is None and not self.recipe.own
 
 
-Candidate = tuple[Recipe, StreamMapping | None]
-
-
-def candidates(sample: Sample, config: IngestConfig) -> list[Candidate]:
-    """The streams that a channel may feed: by configuration, else by its schema."""
-    channel = sample.channel
-    known = _fitting(sample)
-    found: list[Candidate] = []
+def sources_of(sample: Sample, config: IngestConfig) -> list[Source]:
+    """What the channel may feed: by configuration, else by its schema."""
+    known = _by_schema(sample)
+    found: list[Source] = []
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
-        found += [
-            (mapped_recipe(known, sample.fields, stream, mapping), mapping)
-            for mapping in mappings
-            if mapping.topic == channel.topic
-        ]
-        if known is not None and known.stream == stream and (not mappings or known.supplement):
-            found.append((known, None))
+        found += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
+        if known is not None and known.recipe.stream == stream and (not mappings or known.recipe.supplement):
+            found.append(known)
     return found
 
 
@@ -87,23 +74,21 @@ def is_candidate(channel: Channel, config: IngestConfig) -> bool:
     return mapped or bool(recipes_for(channel.schema_name, channel.topic))
 
 
-def _fitting(sample: Sample) -> Recipe | None:
-    """The first recipe of the schema whose fields are all there, else the first at all."""
-    recipes = recipes_for(sample.channel.schema_name, sample.channel.topic)
-    if len(recipes) == 1:
-        return recipes[0]
-    whole = (recipe for recipe in recipes if not source_of(sample, (recipe, None)).breaches)
-    return next(whole, recipes[0] if recipes else None)
+def _by_schema(sample: Sample) -> Source | None:
+    """By the first recipe of the schema whose fields are all there, else by the first at all."""
+    known = [_source(sample, recipe) for recipe in recipes_for(sample.channel.schema_name, sample.channel.topic)]
+    return next((source for source in known if not source.breaches), known[0] if known else None)
 
 
 def mapped_source(sample: Sample, stream: Stream, mapping: StreamMapping) -> Source:
     """The source that the configuration makes of a channel."""
-    return source_of(sample, (mapped_recipe(_fitting(sample), sample.fields, stream, mapping), mapping))
+    known = _by_schema(sample)
+    recipe = mapped_recipe(known.recipe if known else None, sample.fields, stream, mapping)
+    return _source(sample, recipe, mapping)
 
 
-def source_of(sample: Sample, candidate: Candidate) -> Source:
+def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None) -> Source:
     """How the channel's messages make rows; `breaches` tells what they lack."""
-    recipe, mapping = candidate
     contract = STREAM_SCHEMAS[recipe.stream].columns()
     closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
     columns: dict[str, pl.Expr] = {}
@@ -123,26 +108,15 @@ def source_of(sample: Sample, candidate: Candidate) -> Source:
     types = {path: recipe.type_of(path) for path in paths}
     for time in times.values():
         types |= time.types
-    solution = mapping.solution if mapping else None
-    return Source(
-        sample.channel,
-        recipe,
-        columns,
-        times,
-        types,
-        solution,
-        tuple(breaches),
-        mapping is not None,
-        doubtful,
-        _without_presence(sample.channel, columns) if recipe.own else (),
-    )
+    implicit = _without_presence(sample.channel, columns) if recipe.own else ()
+    return Source(sample.channel, recipe, mapping, columns, times, types, breaches, doubtful, implicit)
 
 
 def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ...]:
     """Columns whose protobuf field has its default where it was not set (proto3 without `optional`)."""
     if channel.encoding != "protobuf":
         return ()
-    known = protobuf_descriptor(channel).fields_by_name
+    known = definition_of(channel).DESCRIPTOR.fields_by_name
     return tuple(name for name in columns if name in known and not known[name].has_presence)
 
 
@@ -186,7 +160,7 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
         return time_source((PUBLISH_TIME,), {PUBLISH_TIME: "int"}, mapping)
     named = wanted.removeprefix("field:") if wanted != "auto" else mapping.fields.get("t") if mapping else None
     for candidate in (named,) if named else (path, *_USUAL_STAMPS):
-        parts = stamp_parts(dict(sample.fields), candidate)
+        parts = stamp_parts(sample.fields, candidate)
         unfit = [sample.fields[part] for part in parts if sample.fields[part] not in TIME_KINDS]
         if parts and not unfit:
             return time_source(parts, sample.fields, mapping)
@@ -197,3 +171,85 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
     if named:
         breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
     return log_time
+
+
+def settle(sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str) -> list[Source]:
+    """The sources that stand, once all channels are known; raises for what is missing or in doubt."""
+    breaches = _absent_topics(topics, config, file)
+    kept: list[Source] = []
+    for stream in STREAMS:
+        chosen = _preferred([s for s in sources if s.recipe.stream == stream and not s.dropped])
+        if stream == "gnss":
+            _refuse_shared_solutions(chosen)
+        elif stream != "satellites":
+            breaches += _competing(stream, chosen, file)
+        breaches += [breach for source in chosen for breach in source.breaches]
+        kept += chosen
+    refuse(breaches)
+    return kept
+
+
+def _absent_topics(topics: Sequence[str], config: IngestConfig, file: str) -> list[InputError]:
+    return [
+        InputError(
+            f"is configured for {stream} but has no messages",
+            place=f"{file}: topic {mapping.topic}",
+            found=", ".join(sorted(set(topics))) or "no topics",
+            remedy="Correct [ingest] in the configuration; `balise inspect` lists the topics.",
+        )
+        for stream in STREAMS
+        for mapping in mappings_of(config, stream)
+        if mapping.topic not in topics
+    ]
+
+
+def _preferred(sources: Sequence[Source]) -> list[Source]:
+    """This project's own schema alone where it is present; a supplement only with what it adds to."""
+    own = [source for source in sources if source.recipe.own]
+    if own:
+        return own
+    whole = [source for source in sources if not source.recipe.supplement]
+    return list(sources) if whole else []
+
+
+def _refuse_shared_solutions(sources: Sequence[Source]) -> None:
+    """Two receivers under one name would be read as one that jumps between their positions."""
+    topics: dict[str, str] = {}
+    for source in sources:
+        name = source.mapping.solution if source.mapping and not source.recipe.supplement else None
+        if name is not None and topics.setdefault(name, source.channel.topic) != source.channel.topic:
+            raise ConfigError(
+                "several topics feed the same solution",
+                place=f"[ingest.gnss] solution {name}",
+                found=f"{topics[name]}, {source.channel.topic}",
+                expected="one name per topic",
+                remedy="Give each [[ingest.gnss]] a `solution` of its own.",
+            )
+
+
+def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
+    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
+    topics = list(dict.fromkeys(source.channel.topic for source in sources))
+    if len(topics) < 2:
+        return []
+    return [
+        InputError(
+            f"several topics could be the {stream}",
+            place=file,
+            found=", ".join(topics),
+            expected="one",
+            remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration.",
+        )
+    ]
+
+
+def solution_of(source: Source, settled: Sequence[Source]) -> str | None:
+    """The name of a solution: as configured, `primary` for the only topic, else after the topic."""
+    if source.recipe.stream not in ("gnss", "satellites"):
+        return None
+    if source.mapping and source.mapping.solution is not None:
+        return source.mapping.solution
+    whole = [other for other in settled if other.recipe.stream == "gnss" and not other.recipe.supplement]
+    if len({other.channel.topic for other in whole}) < 2:
+        return "primary"
+    return source.channel.topic.strip("/").replace("/", "_") or "primary"

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.ingest.generic import parse_path
-from pipeline.ingest.layout import Field, Layout, UnfitError, constant, fixed, flag, layout_of, text
+from pipeline.ingest.layout import Field, Layout, UnfitError, Values, constant, fixed, flag, layout_of, text
 from pipeline.ingest.mcap_block import Bytes
 
 # Wire types (protobuf encoding guide).
@@ -145,15 +145,15 @@ def _value(kind: int, wire: int, start: int, end: int) -> Field:
     if kind == _BOOL and wire == _VARINT and end - start == 1:
         return flag(start)
     if wire == _VARINT and (kind in _VARINTS or kind in _ZIGZAG):
-        return Field(pl.Int64, end, lambda rows: _numbers(rows[:, start:end], kind))
+        return Field(pl.Int64, start, end, lambda rows: _numbers(rows, kind))
     raise UnfitError("wire type")
 
 
-def _numbers(septets: Bytes, kind: int) -> pl.Series:
+def _numbers(septets: Bytes, kind: int) -> Values:
     """Varints of one width."""
     total = np.zeros(len(septets), dtype=np.uint64)
     for place in range(septets.shape[1]):
         total |= (septets[:, place] & 0x7F).astype(np.uint64) << np.uint64(7 * place)
     if kind in _ZIGZAG:
-        return pl.Series((total >> np.uint64(1)).astype(np.int64) ^ -(total & np.uint64(1)).astype(np.int64))
-    return pl.Series(total.astype(_VARINTS[kind]))
+        return (total >> np.uint64(1)).astype(np.int64) ^ -(total & np.uint64(1)).astype(np.int64)
+    return total.astype(_VARINTS[kind])

@@ -9,15 +9,16 @@ from typing import Protocol
 import numpy as np
 import polars as pl
 
-from pipeline.ingest.cdr import layout_of_cdr
-from pipeline.ingest.generic import decode_columns, protobuf_descriptor, ros_definitions
+from pipeline.ingest.generic import decode_columns, definition_of
 from pipeline.ingest.json_columns import JsonDecoder
-from pipeline.ingest.layout import Columns, LayoutDecoder
+from pipeline.ingest.layout import Columns, LayoutDecoder, Values
 from pipeline.ingest.mcap_block import Messages
 from pipeline.ingest.mcap_model import Channel
 from pipeline.ingest.plan import Source
 from pipeline.ingest.protobuf import layout_by
+from pipeline.ingest.ros_message import layout_of_cdr
 from pipeline.ingest.stamps import LOG_TIME, PUBLISH_TIME
+from schemas.arrays import Ints
 
 ORDINAL = "(ordinal)"  # place of a message in the file
 
@@ -32,8 +33,9 @@ def decoder_of(channel: Channel, types: Mapping[str, pl.DataType]) -> Decoder:
     if channel.encoding == "json":
         return JsonDecoder(types)
     if channel.encoding == "cdr":
-        return LayoutDecoder(partial(layout_of_cdr, *ros_definitions(channel), types), types)
-    return LayoutDecoder(layout_by(protobuf_descriptor(channel), types), types)
+        definitions, name = definition_of(channel)
+        return LayoutDecoder(partial(layout_of_cdr, definitions, name, types))
+    return LayoutDecoder(layout_by(definition_of(channel).DESCRIPTOR, types))
 
 
 class SourceReader:
@@ -45,8 +47,8 @@ class SourceReader:
         self._decoder = None if source.recipe.rows else decoder_of(source.channel, source.types)
         used = {name for time in source.times.values() for name in time.fields}
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
-        types = {name: pl.Int64() for name in (ORDINAL, *self._times)} | dict(source.types)
-        self._parts = [pl.DataFrame(schema=types)]
+        self._types = {name: pl.Int64() for name in (ORDINAL, *self._times)} | dict(source.types)
+        self._parts: dict[str, list[Values]] = {name: [] for name in self._types}
 
     def add(self, messages: Messages) -> None:
         """Decode these messages."""
@@ -59,12 +61,24 @@ class SourceReader:
             self._keep(rest.chosen(np.array(numbers, dtype=np.int64)), columns)
 
     def _keep(self, messages: Messages, columns: Columns) -> None:
-        times = {LOG_TIME: messages.log_time, PUBLISH_TIME: messages.publish_time}
-        records = {ORDINAL: messages.ordinal} | {name: times[name] for name in self._times}
-        self._parts.append(pl.DataFrame({**records, **columns}))
+        values: dict[str, Values] = {ORDINAL: messages.ordinal, **columns}
+        values |= {LOG_TIME: messages.log_time} if LOG_TIME in self._times else {}
+        values |= {PUBLISH_TIME: messages.publish_time} if PUBLISH_TIME in self._times else {}
+        for name, parts in self._parts.items():
+            parts.append(values[name])
 
     def frame(self) -> pl.DataFrame:
         """One row per message in order of the file; what was collected is given up."""
-        parts, self._parts = self._parts, []
-        whole = pl.concat(parts, rechunk=True)
-        return whole if whole[ORDINAL].is_sorted() else whole.sort(ORDINAL, maintain_order=True)
+        places = _joined(self._parts[ORDINAL], pl.Int64())
+        order = None if places.is_sorted() else np.argsort(places.to_numpy(), kind="stable")
+        return pl.DataFrame({name: _joined(self._parts.pop(name), dtype, order) for name, dtype in self._types.items()})
+
+
+def _joined(parts: list[Values], dtype: pl.DataType, order: Ints | None = None) -> pl.Series:
+    """The parts one after the other, or in this order."""
+    arrays = [part for part in parts if isinstance(part, np.ndarray)]
+    if parts and len(arrays) == len(parts):
+        values = np.concatenate(arrays)
+        return pl.Series(values if order is None else values[order], dtype=dtype)
+    whole = pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
+    return whole if order is None else whole.gather(order)

@@ -8,7 +8,7 @@ import dataframely as dy
 import polars as pl
 
 from pipeline.ingest import recipes_drivers
-from pipeline.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, position_unless_no_fix
+from pipeline.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, places_of
 from schemas.enums import Fix
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
@@ -22,18 +22,14 @@ _NAVSAT_FIX = {-1: Fix.NONE, 0: Fix.AUTONOMOUS, 1: Fix.SBAS, 2: Fix.DIFFERENTIAL
 def _navsatfix() -> Recipe:
     """sensor_msgs/msg/NavSatFix: altitude over the ellipsoid, NaN where there is none."""
     status = pl.col("status.status")
-
     return Recipe(
         stream="gnss",
-        stamps={"t": "header.stamp"},
         columns={
-            "latitude_deg": position_unless_no_fix("latitude", status),
-            "longitude_deg": position_unless_no_fix("longitude", status),
-            "height_m": pl.col("altitude").fill_nan(None),
+            **places_of(status),
             "fix": fix_from(status, _NAVSAT_FIX),
             **covariance_enu(pl.col("position_covariance_type") > 0),
         },
-        types={"status.status": pl.Int64(), "position_covariance_type": pl.Int64()},
+        whole=("status.status", "position_covariance_type"),
     )
 
 
@@ -53,13 +49,13 @@ def _location_fix() -> Recipe:
             "fix": pl.lit(Fix.AUTONOMOUS.value, dtype=FIX_TYPE),
             **covariance_enu(pl.col("position_covariance_type") > 0),
         },
-        types={"position_covariance_type": pl.Int64()},
+        whole=("position_covariance_type",),
         remark="the message has no fix status: every position is taken as an autonomous fix",
     )
 
 
 def _twist(path: str) -> Recipe:
-    return Recipe(stream="odometer", stamps={"t": "header.stamp"}, columns={"speed_mps": pl.col(path)})
+    return Recipe(stream="odometer", columns={"speed_mps": pl.col(path)})
 
 
 def own_recipe(stream: Stream) -> Recipe:

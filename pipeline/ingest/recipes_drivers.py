@@ -11,19 +11,11 @@ import math
 import polars as pl
 
 from pipeline.ingest import novatel
-from pipeline.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, position_unless_no_fix, unless
+from pipeline.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, deviations, fix_from, places_of, unless
 from pipeline.ingest.stamps import CivilTime
 from schemas.enums import Fix
 
 _RAD = 180.0 / math.pi
-
-
-def _kind(expression: pl.Expr) -> pl.Expr:
-    return expression.cast(FIX_TYPE)
-
-
-def _word(kind: Fix) -> pl.Expr:
-    return pl.lit(kind.value)
 
 
 # Septentrio SBF reference guide, block PVTGeodetic: Mode, bits 0-3.
@@ -32,7 +24,6 @@ SBF_FIXES = {
     7: Fix.RTK_FIXED, 8: Fix.RTK_FLOAT, 10: Fix.DIFFERENTIAL,
 }  # fmt: skip
 _SBF_KEY = ("block_header.wnc", "block_header.tow")
-_SBF_KEY_TYPES = {name: pl.Int64() for name in _SBF_KEY}
 
 
 def _sbf(path: str) -> pl.Expr:
@@ -42,11 +33,9 @@ def _sbf(path: str) -> pl.Expr:
 
 def _pvt_geodetic() -> Recipe:
     mode = pl.col("mode") & 0x0F
-    fix = pl.when(pl.col("error") == 0).then(fix_from(mode, SBF_FIXES)).otherwise(_kind(_word(Fix.NONE)))
     sbas = mode == 6
     return Recipe(
         stream="gnss",
-        stamps={"t": "header.stamp"},
         columns={
             "latitude_deg": _sbf("latitude") * _RAD,
             "longitude_deg": _sbf("longitude") * _RAD,
@@ -54,13 +43,12 @@ def _pvt_geodetic() -> Recipe:
             "vel_e_mps": _sbf("ve"),
             "vel_n_mps": _sbf("vn"),
             "vel_u_mps": _sbf("vu"),
-            "fix": fix,
+            "fix": fix_from(mode, SBF_FIXES, known=pl.col("error") == 0),
             "satellites": unless(pl.col("nr_sv") == 255, pl.col("nr_sv")),
             "sbas_prn": pl.when(sbas & (pl.col("reference_id") != 65535)).then(pl.col("reference_id")),
             "sbas_age_s": pl.when(sbas & (pl.col("mean_corr_age") != 65535)).then(pl.col("mean_corr_age") * 0.01),
         },
-        types=_SBF_KEY_TYPES
-        | {name: pl.Int64() for name in ("mode", "error", "nr_sv", "reference_id", "mean_corr_age")},
+        whole=(*_SBF_KEY, "mode", "error", "nr_sv", "reference_id", "mean_corr_age"),
         key=_SBF_KEY,
     )
 
@@ -71,9 +59,8 @@ def _pos_cov_geodetic() -> Recipe:
     }  # fmt: skip
     return Recipe(
         stream="gnss",
-        stamps={"t": "header.stamp"},
         columns={f"cov_{axes}_m2": _sbf(f"cov_{name}") for axes, name in names.items()},
-        types=_SBF_KEY_TYPES,
+        whole=_SBF_KEY,
         key=_SBF_KEY,
         supplement=True,
     )
@@ -81,19 +68,15 @@ def _pos_cov_geodetic() -> Recipe:
 
 def _ublox_fix(fix_type: pl.Expr, is_ok: pl.Expr, differential: pl.Expr, carrier: pl.Expr) -> pl.Expr:
     """u-blox interface description, UBX-NAV-PVT: fixType, flags. SBAS cannot be told from other corrections."""
-    return _kind(
-        pl.when(~is_ok | ~fix_type.is_in([1, 2, 3, 4]))
-        .then(_word(Fix.NONE))
-        .when(fix_type == 1)
-        .then(_word(Fix.ESTIMATED))
-        .when(carrier == 2)
-        .then(_word(Fix.RTK_FIXED))
-        .when(carrier == 1)
-        .then(_word(Fix.RTK_FLOAT))
-        .when(differential)
-        .then(_word(Fix.DIFFERENTIAL))
-        .otherwise(_word(Fix.AUTONOMOUS))
+    cases = (
+        (~is_ok | ~fix_type.is_in([1, 2, 3, 4]), Fix.NONE),
+        (fix_type == 1, Fix.ESTIMATED),
+        (carrier == 2, Fix.RTK_FIXED),
+        (carrier == 1, Fix.RTK_FLOAT),
+        (differential, Fix.DIFFERENTIAL),
     )
+    first = pl.coalesce(*(pl.when(case).then(pl.lit(fix.value)) for case, fix in cases), pl.lit(Fix.AUTONOMOUS.value))
+    return first.cast(FIX_TYPE)
 
 
 def _ublox_columns(h_acc: str, v_acc: str, velocity: tuple[str, str, str], satellites: str) -> dict[str, pl.Expr]:
@@ -120,13 +103,10 @@ def _ubx_nav_pvt() -> Recipe:
     fix = _ublox_fix(pl.col("gps_fix.fix_type"), pl.col("gnss_fix_ok"), pl.col("diff_soln"), pl.col("carr_soln.status"))
     return Recipe(
         stream="gnss",
-        stamps={"t": "header.stamp"},
         columns={"fix": fix} | _ublox_columns("h_acc", "v_acc", ("vel_e", "vel_n", "vel_d"), "num_sv"),
-        types={
-            "gps_fix.fix_type": pl.Int64(), "gnss_fix_ok": pl.Boolean(), "diff_soln": pl.Boolean(),
-            "carr_soln.status": pl.Int64(), "num_sv": pl.Int64(),
-        },
-    )  # fmt: skip
+        types={"gnss_fix_ok": pl.Boolean(), "diff_soln": pl.Boolean()},
+        whole=("gps_fix.fix_type", "carr_soln.status", "num_sv"),
+    )
 
 
 def _nav_pvt(h_acc: str, v_acc: str, velocity: tuple[str, str, str], satellites: str, fix_type: str) -> Recipe:
@@ -137,7 +117,7 @@ def _nav_pvt(h_acc: str, v_acc: str, velocity: tuple[str, str, str], satellites:
         stream="gnss",
         stamps={},
         columns={"fix": fix} | _ublox_columns(h_acc, v_acc, velocity, satellites),
-        types={fix_type: pl.Int64(), "flags": pl.Int64(), satellites: pl.Int64()},
+        whole=(fix_type, "flags", satellites),
         time=CivilTime(("year", "month", "day", "hour", "min", "sec"), "nano", "valid"),
     )
 
@@ -160,30 +140,25 @@ def _nav_sat(stamps: dict[str, str], rows: str, used: pl.Expr, types: dict[str, 
             "residual_m": pl.col("pr_res") * 0.1,
             "used": used,
         },
-        types={"gnss_id": pl.Int64(), "sv_id": pl.Int64()} | types,
+        types=types,
+        whole=("gnss_id", "sv_id", "flags"),
         rows=rows,
     )
 
 
 def _bestpos() -> Recipe:
     """novatel_oem7_msgs/msg/BESTPOS: height over mean sea level, so the undulation is added."""
-    computed = pl.col("sol_status.status") == 0
-    fix = fix_from(pl.col("pos_type.type"), novatel.FIX_BY_CODE)
     return Recipe(
         stream="gnss",
-        stamps={"t": "header.stamp"},
         columns={
             "latitude_deg": pl.col("lat"),
             "longitude_deg": pl.col("lon"),
             "height_m": pl.col("hgt") + pl.col("undulation"),
-            "cov_ee_m2": pl.col("lon_stdev") ** 2,
-            "cov_nn_m2": pl.col("lat_stdev") ** 2,
-            "cov_uu_m2": pl.col("hgt_stdev") ** 2,
-            **{f"cov_{axes}_m2": pl.when(pl.col("lat_stdev").is_not_null()).then(0.0) for axes in ("en", "eu", "nu")},
-            "fix": pl.when(computed).then(fix).otherwise(_kind(_word(Fix.NONE))),
+            **deviations("lon_stdev", "lat_stdev", "hgt_stdev"),
+            "fix": fix_from(pl.col("pos_type.type"), novatel.FIX_BY_CODE, known=pl.col("sol_status.status") == 0),
             "satellites": pl.col("num_sol_svs"),
         },
-        types={"sol_status.status": pl.Int64(), "pos_type.type": pl.Int64(), "num_sol_svs": pl.Int64()},
+        whole=("sol_status.status", "pos_type.type", "num_sol_svs"),
     )
 
 
@@ -200,11 +175,8 @@ def _gps_fix() -> Recipe:
     speed = pl.col("speed").fill_nan(None)
     return Recipe(
         stream="gnss",
-        stamps={"t": "header.stamp"},
         columns={
-            "latitude_deg": position_unless_no_fix("latitude", status),
-            "longitude_deg": position_unless_no_fix("longitude", status),
-            "height_m": pl.col("altitude").fill_nan(None),
+            **places_of(status),
             "vel_e_mps": speed * heading.sin(),
             "vel_n_mps": speed * heading.cos(),
             "vel_u_mps": pl.col("climb").fill_nan(None),
@@ -212,12 +184,9 @@ def _gps_fix() -> Recipe:
             "satellites": pl.col("status.satellites_used"),
             **covariance_enu(pl.col("position_covariance_type") > 0),
         },
-        types={
-            "status.status": pl.Int64(), "status.satellites_used": pl.Int64(),
-            "position_covariance_type": pl.Int64(),
-        },
+        whole=("status.status", "status.satellites_used", "position_covariance_type"),
         remark="the message does not say what its altitude refers to: it is taken as height over the ellipsoid",
-    )  # fmt: skip
+    )
 
 
 BY_SCHEMA: dict[str, tuple[Recipe, ...]] = {
@@ -231,7 +200,7 @@ BY_SCHEMA: dict[str, tuple[Recipe, ...]] = {
     "ublox_ubx_msgs/msg/UBXNavSat": (
         _nav_sat({"t": "header.stamp"}, "sv_info", pl.col("flags.sv_used"), {"flags.sv_used": pl.Boolean()}),
     ),
-    "ublox_msgs/msg/NavSAT": (_nav_sat({}, "sv", (pl.col("flags") & 8) == 8, {"flags": pl.Int64()}),),
+    "ublox_msgs/msg/NavSAT": (_nav_sat({}, "sv", (pl.col("flags") & 8) == 8, {}),),
     "novatel_oem7_msgs/msg/BESTPOS": (_bestpos(),),
     "gps_msgs/msg/GPSFix": (_gps_fix(),),
 }

@@ -19,6 +19,8 @@ _DAY_S = 86_400
 _EXCEL_TO_UNIX_NS = 25_569 * _DAY_S * NS_PER_S
 LOG_TIME = "(log time)"
 PUBLISH_TIME = "(publish time)"
+_SECONDS = ("sec", "secs", "seconds")
+_NANOSECONDS = ("nanosec", "nsec", "nsecs", "nanos")
 # How fields are read that may hold a time, by what their first value is.
 TIME_KINDS: Mapping[str, pl.DataType] = {"int": pl.Int64(), "float": pl.Float64(), "text": pl.String()}
 
@@ -78,6 +80,16 @@ class TimeSource:
 def _within(counts: pl.Series, unit_ns: int) -> pl.Series:
     """The counts of a unit since an epoch, null before it and after `_LATEST_NS`: nothing then overflows 64 bits."""
     return counts.set(~counts.is_between(0, _LATEST_NS // max(unit_ns, 1)), None)
+
+
+def stamp_parts(fields: Mapping[str, str], path: str) -> tuple[str, ...]:
+    """The fields of a stamp: seconds and nanoseconds, or the one field itself; empty if it is not there."""
+    for seconds in _SECONDS:
+        for nanoseconds in _NANOSECONDS:
+            parts = (f"{path}.{seconds}", f"{path}.{nanoseconds}")
+            if parts[0] in fields and parts[1] in fields:
+                return parts
+    return (path,) if path in fields and fields[path] != "null" else ()
 
 
 def time_source(parts: Sequence[str], kinds: Mapping[str, str], mapping: StreamMapping | None) -> TimeSource:

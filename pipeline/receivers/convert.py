@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import date
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,12 @@ from pipeline.receivers.adding import Purpose, Streams, added, assigned
 from pipeline.receivers.bags import is_bag, read_bag
 from pipeline.receivers.csv import TABLES, names_file, read_csv
 from pipeline.receivers.epochs import Epochs, Gathered
-from pipeline.receivers.frames import Frame, Protocol, frames
-from pipeline.receivers.names import name_of
+from pipeline.receivers.frames import Frame, Protocol, frames, name_of
 from pipeline.receivers.rtklib import is_solution, read_solution
 from pipeline.receivers.unpack import BAG_FOLDER, unpacked
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import InputError
 from schemas.run import STREAMS, RunLog, Stream
-
-Decode = Callable[[Gathered, Any, bytes], None]
 
 
 @dataclass(frozen=True)
@@ -96,12 +94,11 @@ def gather(logs: list[Path], config: IngestConfig | None = None, date: date | No
                     if plain == log:
                         raise
                     strangers.append(error)
-                    continue
                 except NoEpochError as error:
                     failures.append(error)
-                    continue
-                parts.append((log if plain == log else log / plain.name, streams))
-                dropped.update(counts)
+                else:
+                    parts.append((log if plain == log else log / plain.name, streams))
+                    dropped.update(counts)
     if failures and not any("gnss" in streams for _, streams in parts):
         raise failures[0]
     if strangers and not parts:
@@ -138,24 +135,21 @@ def _joined(parts: list[tuple[Path, Streams]]) -> Streams:
 
 def _refuse_overlaps(parts: list[tuple[Path, Streams]]) -> None:
     """Two receivers under one name would be read as one that jumps between their positions."""
-    spans: dict[str, list[tuple[Any, Any, Path]]] = {}
-    for log, streams in parts:
-        frame = streams.get("gnss", pl.DataFrame({"solution": [], "t": []})).drop_nulls("t")
-        for name, start, end in (
-            frame.group_by("solution", maintain_order=True)
-            .agg(pl.col("t").min().alias("start"), pl.col("t").max().alias("end"))
-            .rows()
-        ):
-            for other_start, other_end, other in spans.setdefault(name, []):
-                if other != log and start < other_end and other_start < end:
-                    raise InputError(
-                        "two logs hold positions of the same time under one solution",
-                        place=f"{other}, {log}",
-                        found=f"solution {name} in both, from {max(start, other_start)} on",
-                        expected="one receiver per call",
-                        remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
-                    )
-            spans[name].append((start, end, log))
+    spans: list[tuple[Any, Any, Any, Path]] = [
+        (name, fixes["t"].min(), fixes["t"].max(), log)
+        for log, streams in parts
+        if "gnss" in streams
+        for (name,), fixes in streams["gnss"].drop_nulls("t").group_by("solution", maintain_order=True)
+    ]
+    for (name, start, end, log), (of, since, until, other) in combinations(spans, 2):
+        if name == of and log != other and start < until and since < end:
+            raise InputError(
+                "two logs hold positions of the same time under one solution",
+                place=f"{log}, {other}",
+                found=f"solution {name} in both, from {max(start, since)} on",
+                expected="one receiver per call",
+                remedy="Convert the second log into the same run with --solution NAME, or --stream reference.",
+            )
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None) -> tuple[Streams, Mapping[str, int]]:
@@ -186,12 +180,11 @@ def _of_topics(config: IngestConfig) -> IngestConfig:
 def _read(content: bytes, log: Path, date: date | None) -> tuple[Streams, Mapping[str, int]]:
     """The epochs of the protocol that tells most; what is damaged or told twice is counted."""
     dropped: Counter[str] = Counter()
-    decoders = {protocol: make() for protocol, (_, make) in _PROTOCOLS.items()}
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
     for frame in frames(content, lambda: dropped.update(["damaged message"])):
-        if frame.protocol in decoders:
-            _decode(frame, decoders[frame.protocol], gathered[frame.protocol])
-    nmea.settle_first_day(gathered[Protocol.NMEA], date)
+        if frame.protocol in gathered:
+            _decode(frame, gathered[frame.protocol])
+    nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
     told = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
     best = max(told, key=lambda protocol: _worth(protocol, told[protocol]))
@@ -232,8 +225,8 @@ def _worth(protocol: Protocol, epochs: Epochs) -> int:
     return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
 
 
-def _decode(frame: Frame, decode: Decode, gathered: Gathered) -> None:
-    parse, _ = _PROTOCOLS[frame.protocol]
+def _decode(frame: Frame, gathered: Gathered) -> None:
+    parse, decode = _PROTOCOLS[frame.protocol]
     try:
         message = parse(frame.content)
     except ImportError as error:
@@ -264,10 +257,10 @@ _MOST_NAMES = 20
 _UNFIT = "message that does not fit its definition"
 
 
-# By protocol: what makes a message of a frame, and what makes a decoder of its messages. The first wins a tie.
-_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[], Decode]]] = {
-    Protocol.UBX: (ubx.parse, lambda: ubx.UbxDecoder().decode),
-    Protocol.SBF: (sbf.parse, lambda: sbf.decode),
-    Protocol.NOVATEL: (novatel.parse, lambda: novatel.decode),
-    Protocol.NMEA: (nmea.parse, lambda: nmea.NmeaDecoder().decode),
+# By protocol: what makes a message of a frame, and what adds it to its epoch. The first wins a tie.
+_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[Gathered, Any, bytes], None]]] = {
+    Protocol.UBX: (ubx.parse, ubx.decode),
+    Protocol.SBF: (sbf.parse, sbf.decode),
+    Protocol.NOVATEL: (novatel.parse, novatel.decode),
+    Protocol.NMEA: (nmea.parse, nmea.decode),
 }

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipeline.epochs.clock import GAP_PERIODS
 from pipeline.ingest.breaches import refuse
 from pipeline.ingest.csv_text import LogTable, read_log_table
 from pipeline.ingest.mapping import mappings_of
@@ -23,14 +24,14 @@ CUT_ROW = "row that breaks off at the end of the file"
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".log")
 _UNITS_ROW = "row of units"
 _SHORT_ROW = "end of a row, which is missing (taken as empty)"
-# What rows of a stream are for. Of positions, so few tell no usual step; a longer one than so many lacks an epoch.
+# What rows of a stream are for. Fewer positions tell no usual step.
 _VALUES: dict[Stream, tuple[str, ...]] = {
     "gnss": ("latitude_deg", "longitude_deg"),
     "odometer": ("distance_m", "speed_mps"),
     "reference": ("latitude_deg", "longitude_deg"),
     "balise_reads": ("balise_id",),
 }
-_FEWEST, _USUAL_STEPS = 3, 1.5
+_FEWEST = 3
 # Decimal mark, and what may separate thousands beside it.
 _MARKS = {",": "[.'\u2019 \u00a0\u202f]", ".": "[,'\u2019 \u00a0\u202f]"}
 
@@ -84,7 +85,7 @@ def _told(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
     at = np.sort(t_ns[told.to_numpy()])
     after = at.searchsorted(t_ns).clip(1, at.size - 1)
     steps = np.diff(at)
-    between = (t_ns > at[0]) & (t_ns < at[-1]) & (steps[after - 1] <= _USUAL_STEPS * np.median(steps))
+    between = (t_ns > at[0]) & (t_ns < at[-1]) & (steps[after - 1] <= GAP_PERIODS * np.median(steps))
     return told | has_fix | pl.Series(~between)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.ingest.csv_text import LogTable, read_log_table
+from pipeline.ingest.csv_text import read_log_table
 from pipeline.ingest.guesses import NAMES, columns_in, first, mapping_lines, one_line, unit_in, word_of
 from pipeline.receivers.csv import with_points
 from pipeline.receivers.csv_times import LEAST_DAY, MOST_DAY, orders_of
@@ -27,8 +27,11 @@ def draft_mapping(path: Path) -> str:
     """Configuration text for `balise convert`, to be saved and checked; what nothing tells is a comment."""
     log = read_log_table(path, infer=True)
     table = with_points(log)
-    time = _time_lines(table, log)
-    parts = [part for stream in NAMES for part in (_stream(stream, table, log, path.name, time),) if part]
+    pairs = zip(log.table.columns, log.units, strict=False)
+    units = {name: unit for name, told in pairs if (unit := told.strip("[]()<> ").lower())}
+    words = {name: word_of(name) for name in table.columns if name.strip()}
+    time = _time_lines(table, words, units)
+    parts = [part for stream in NAMES if (part := _stream(stream, table, words, path.name, time, units))]
     head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
     columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
     return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
@@ -43,25 +46,19 @@ _EMPTY = """
 """
 
 
-def _unit(name: str, log: LogTable) -> str | None:
-    """As the header has it, or the row of units."""
-    return unit_in(name) or _row_of_units(log).get(name)
+Words = Mapping[str, str]
 
 
-def _row_of_units(log: LogTable) -> dict[str, str]:
-    pairs = zip(log.table.columns, log.units, strict=False)
-    return {name: unit for name, told in pairs if (unit := told.strip("[]()<> ").lower())}
-
-
-def _stream(stream: Stream, table: pl.DataFrame, log: LogTable, file: str, time: tuple[list[str], float | None]) -> str:
-    named = {name: word_of(name) for name in table.columns if name.strip()}
-    numbers = {name: word for name, word in named.items() if table[name].dtype.is_numeric()}
-    lines = mapping_lines(stream, file, numbers, *time, _row_of_units(log))
-    unfit = _unfit(stream, table, {name: word for name, word in named.items() if name not in numbers})
+def _stream(
+    stream: Stream, table: pl.DataFrame, words: Words, file: str, time: tuple[list[str], float | None], units: Words
+) -> str:
+    numbers = {name: word for name, word in words.items() if table[name].dtype.is_numeric()}
+    lines = mapping_lines(stream, file, numbers, *time, units)
+    unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
 
 
-def _unfit(stream: Stream, table: pl.DataFrame, words: Mapping[str, str]) -> list[str]:
+def _unfit(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:
     """What is left out though its name fits, since it holds texts."""
     found = columns_in(stream, words)
     texts = {column: table[name].cast(pl.String).replace("", None).drop_nulls() for column, name in found.items()}
@@ -74,12 +71,11 @@ def _unfit(stream: Stream, table: pl.DataFrame, words: Mapping[str, str]) -> lis
     ]
 
 
-def _time_lines(table: pl.DataFrame, log: LogTable) -> tuple[list[str], float | None]:
+def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[str], float | None]:
     """The lines on time, and the seconds per unit of the times where they are not seconds."""
-    words = {name: word_of(name) for name in table.columns if name.strip()}
     week, seconds = first(words, _WEEKS), first(words, _SECONDS)
     if week and seconds:
-        milli = _unit(seconds, log) == "ms" or words[seconds] == "itow"
+        milli = (unit_in(seconds) or units.get(seconds)) == "ms" or words[seconds] == "itow"
         return [_field(week, seconds), 'time_epoch = "gps"'], 1e-3 if milli else None
     date, clock = first(words, _DATES), first(words, _CLOCKS)
     time = clock if date and clock else first(words, _TIMES) or date

@@ -74,10 +74,15 @@ class Gathered:
             or epoch.positions.get(position, content) != content
             or len(self.epochs) - epoch.number > _LATEST_MESSAGE
         ):
-            epoch = self._latest[key] = Epoch(key, len(self.epochs))
-            self.epochs.append(epoch)
+            return self.begin(key, position, content)
         if position:
             epoch.positions[position] = content
+        return epoch
+
+    def begin(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
+        """A new epoch of this key, whatever came before."""
+        epoch = self._latest[key] = Epoch(key, len(self.epochs), positions={position: content} if position else {})
+        self.epochs.append(epoch)
         return epoch
 
     def drop(self, reason: str, count: int = 1) -> None:

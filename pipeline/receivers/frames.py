@@ -38,6 +38,10 @@ _START = re.compile(
 _SENTENCE = re.compile(rb"\$([ -#%-)+-~]+)\*([0-9A-Fa-f]{2})\r?\n?")
 _NOVATEL_LINE = re.compile(rb"[#%]([ -)+-~]+)\*([0-9A-Fa-f]{8})\r?\n?")
 _NOVATEL_SHORT_HEAD, _NOVATEL_CRC = 12, 4
+# Of binary messages that are decoded.
+NOVATEL_NAMES = {
+    42: "BESTPOS", 47: "PSRPOS", 99: "BESTVEL", 507: "INSPVA", 508: "INSPVAS", 1429: "BESTGNSSPOS", 1465: "INSPVAX",
+}  # fmt: skip
 _UBX_OVERHEAD, _SBF_HEAD, _RTCM_OVERHEAD = 8, 8, 6
 
 
@@ -140,3 +144,25 @@ _ENDS: dict[Protocol, Callable[[bytes, int], int | None]] = {
     Protocol.RTCM: _rtcm_end,
     Protocol.NOVATEL: _novatel_end,
 }
+
+
+def name_of(frame: Frame) -> str:
+    """Protocol and name of a message, or its number where no list has its name."""
+    protocol, content = frame
+    if protocol is Protocol.NMEA or content[:1] in (b"#", b"%"):
+        name = content[1:].split(b",")[0].decode()
+    elif protocol is Protocol.UBX:
+        from pyubx2 import UBX_MSGIDS
+
+        name = str(UBX_MSGIDS.get(content[2:4], f"{content[2]:#04x} {content[3]:#04x}"))
+    elif protocol is Protocol.SBF:
+        from pysbf2 import SBF_MSGIDS
+
+        number = int.from_bytes(content[4:6], "little") & 0x1FFF
+        name = str(SBF_MSGIDS.get(number, (f"block {number}",))[0])
+    elif protocol is Protocol.RTCM:
+        name = str(int.from_bytes(content[3:5], "big") >> 4)
+    else:
+        number = int.from_bytes(content[4:6], "little")
+        name = NOVATEL_NAMES.get(number, f"message {number}")
+    return f"{protocol} {name}"

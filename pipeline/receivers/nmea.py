@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import UTC, date, datetime, time
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from pipeline.ingest.guesses import UNITS
 from pipeline.receivers.epochs import Epoch, Gathered
+from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
 
+# 9 is of NovAtel's receivers; 7 and 8 are typed in or simulated.
 _FIXES = {
-    0: Fix.NONE,
-    1: Fix.AUTONOMOUS,
-    2: Fix.DIFFERENTIAL,
-    3: Fix.AUTONOMOUS,
-    4: Fix.RTK_FIXED,
-    5: Fix.RTK_FLOAT,
-    6: Fix.ESTIMATED,
-    9: Fix.SBAS,  # of NovAtel's receivers; 7 and 8 are typed in or simulated
-}
+    0: Fix.NONE, 1: Fix.AUTONOMOUS, 2: Fix.DIFFERENTIAL, 3: Fix.AUTONOMOUS, 4: Fix.RTK_FIXED, 5: Fix.RTK_FLOAT,
+    6: Fix.ESTIMATED, 9: Fix.SBAS,
+}  # fmt: skip
 # Mode letters of RMC and GNS, the best first: a solution is as good as its best satellite system.
 _MODES = {
-    "R": Fix.RTK_FIXED,
-    "F": Fix.RTK_FLOAT,
-    "D": Fix.DIFFERENTIAL,
-    "P": Fix.AUTONOMOUS,
-    "A": Fix.AUTONOMOUS,
+    "R": Fix.RTK_FIXED, "F": Fix.RTK_FLOAT, "D": Fix.DIFFERENTIAL, "P": Fix.AUTONOMOUS, "A": Fix.AUTONOMOUS,
     "E": Fix.ESTIMATED,
-}
+}  # fmt: skip
 # Differential corrections whose station is an SBAS satellite: 120-158 as PRN, 33-64 as NMEA satellite number.
 _SBAS_PRNS, _SBAS_NUMBERS, _NUMBER_TO_PRN = range(120, 159), range(33, 65), 87
-_HALF_DAY_S = 43_200
+_DAY_NS = 86_400 * NS_PER_S
 
 
 def parse(raw: bytes) -> Any:
@@ -42,96 +35,52 @@ def parse(raw: bytes) -> Any:
     return NMEAReader.parse(raw) if raw[3:6] in _WANTED and raw[6:7] == b"," else None
 
 
-class NmeaDecoder:
-    """Keeps the day while sentences go by: most of them only tell the time of day."""
-
-    def __init__(self) -> None:
-        self._day: date | None = None
-        self._latest: time | None = None
-
-    def decode(self, gathered: Gathered, message: Any, raw: bytes) -> None:
-        """Add what this sentence says to its epoch."""
-        if not isinstance(message.time, time):
-            gathered.drop("time not valid")
-            return
-        self._follow(message)
-        position = message.identity if message.msgID in _POSITIONS else ""
-        epoch = gathered.at((self._day, message.time), position, raw)
-        if self._day is not None:
-            epoch.t_ns = _time_ns(self._day, message.time)
-        _DECODERS[message.msgID](epoch, message)
-
-    def _follow(self, message: Any) -> None:
-        """The day of this sentence: as it says itself, or the last one, past midnight the next."""
-        if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
-            self._day = message.date  # before its first position a receiver tells a date of its own making
-        elif message.msgID == "ZDA" and (day := _date_of(message)):
-            self._day = day
-        elif self._day is not None and self._latest is not None:
-            back_s = _seconds(self._latest) - _seconds(message.time)
-            self._day += timedelta(days=1) if back_s > _HALF_DAY_S else timedelta(0)
-        self._latest = message.time
-
-
-def settle_first_day(gathered: Gathered, told: date | None = None) -> None:
-    """Give the positions before the first date their day, counted back from it; without any, on from the day `told`.
-
-    Sentences of the same epoch as the first dated ones join them. A time with neither date nor position may be that of
-    a receiver just switched on, whose clock is not set yet: it is dropped.
-    """
-    undated = [epoch for epoch in gathered.epochs if _key_of(epoch)[0] is None]
-    gathered.epochs = [epoch for epoch in gathered.epochs if _key_of(epoch)[0] is not None]
-    if not gathered.epochs:
-        if told is None:
-            gathered.drop("time without a date", len(undated))
-        else:
-            gathered.epochs = undated
-            _count_on(undated, told)
+def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
+    """Add what this sentence says to its epoch, whose key is the time of day; most tell no more of the time."""
+    if not isinstance(message.time, time):
+        gathered.drop("time not valid")
         return
-    first = gathered.epochs[0]
-    day, following = _key_of(first)
-    kept: list[Epoch] = []
-    for early in reversed(undated):
-        _, moment = _key_of(early)
-        if moment == following and not early.positions.keys() & first.positions.keys():
-            _join(first, early)
-        elif early.gnss.get("fix", Fix.NONE.value) == Fix.NONE.value:
-            gathered.drop("time without a date")
-        else:
-            day -= timedelta(days=1) if _seconds(moment) - _seconds(following) > _HALF_DAY_S else timedelta(0)
-            early.t_ns, following = _time_ns(day, moment), moment
-            kept.append(early)
-    gathered.epochs = kept[::-1] + gathered.epochs
+    epoch = gathered.at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
+    # Before its first position a receiver tells a date of its own making.
+    if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
+        epoch.t_ns = _time_ns(message.date, message.time)
+    elif message.msgID == "ZDA" and (day := _date_of(message)):
+        epoch.t_ns = _time_ns(day, message.time)
+    _DECODERS[message.msgID](epoch, message)
 
 
-def _count_on(undated: list[Epoch], day: date) -> None:
-    """The first epoch is of this day, and past midnight comes the next."""
-    before_s = 0
-    for epoch in undated:
-        _, moment = _key_of(epoch)
-        day += timedelta(days=1) if before_s - _seconds(moment) > _HALF_DAY_S else timedelta(0)
-        epoch.t_ns, before_s = _time_ns(day, moment), _seconds(moment)
+def settle_days(gathered: Gathered, told: date | None = None) -> None:
+    """Give the epochs without a date theirs: past midnight the next, before the first date counted back from it.
+
+    Where no sentence tells a date, the first epoch is of the day `told`. A time with neither date nor position before
+    the first date may be that of a receiver just switched on, whose clock is not set yet: it is dropped.
+    """
+    epochs = gathered.epochs
+    first = next((number for number, epoch in enumerate(epochs) if epoch.t_ns is not None), None)
+    if first is None and told is not None and epochs:
+        first, epochs[0].t_ns = 0, _time_ns(told, epochs[0].key)
+    early = epochs[:first]
+    if first is not None:
+        early = [epoch for epoch in early if epoch.gnss.get("fix", Fix.NONE.value) == Fix.NONE.value]
+    gathered.drop("time without a date", len(early))
+    dropped = {epoch.number for epoch in early}
+    gathered.epochs = [epoch for epoch in epochs if epoch.number not in dropped]
+    for way in (1, -1):
+        for known, epoch in pairwise(gathered.epochs[::way]):
+            if epoch.t_ns is None and known.t_ns is not None:
+                epoch.t_ns = _beside(known.t_ns, epoch.key, way)
 
 
-def _join(dated: Epoch, early: Epoch) -> None:
-    """What GGA and GNS say goes before what an RMC says."""
-    dated.gnss = dated.gnss | early.gnss if "satellites" in early.gnss else early.gnss | dated.gnss
-    dated.positions |= early.positions
-
-
-def _key_of(epoch: Epoch) -> Any:
-    """Day (none before the first date) and time of day."""
-    return epoch.key
+def _beside(known_ns: int, moment: time, way: int) -> int:
+    """The time of an epoch after (1) or before (-1) one whose time is known: of the same day, or past midnight."""
+    t_ns = known_ns - known_ns % _DAY_NS + _time_ns(date(1970, 1, 1), moment)
+    return t_ns + way * _DAY_NS if way * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
 
 
 def _time_ns(day: date, moment: time) -> int:
     """UTC [ns since 1970]."""
     whole = datetime.combine(day, moment.replace(microsecond=0), tzinfo=UTC)
-    return int(whole.timestamp()) * 1_000_000_000 + moment.microsecond * 1000
-
-
-def _seconds(moment: time) -> int:
-    return moment.hour * 3600 + moment.minute * 60 + moment.second
+    return int(whole.timestamp()) * NS_PER_S + moment.microsecond * 1000
 
 
 def _date_of(m: Any) -> date | None:

@@ -14,20 +14,12 @@ import numpy as np
 from pipeline.ingest.novatel import FIX_BY_CODE
 from pipeline.ingest.timescale import utc_of_week
 from pipeline.receivers.epochs import Epoch, Gathered, covariance, velocity
+from pipeline.receivers.frames import NOVATEL_NAMES
 from schemas.enums import Fix
 
 # Messages with a position, by rank: that of the receiver before those of the inertial solution.
 _RANKS = {"INSPVAS": 0, "INSPVA": 0, "INSPVAX": 1, "PSRPOS": 2, "BESTGNSSPOS": 3, "BESTPOS": 4}
 _INERTIAL = ("INSPVAS", "INSPVA", "INSPVAX")
-BINARY_NAMES = {
-    42: "BESTPOS",
-    47: "PSRPOS",
-    99: "BESTVEL",
-    507: "INSPVA",
-    508: "INSPVAS",
-    1429: "BESTGNSSPOS",
-    1465: "INSPVAX",
-}
 _COARSE = 100  # "GPS reference time status": below it the time is approximate or not known
 _WGS84 = 61
 # "Inertial solution status": high variance, good, free, alignment complete. The others are no solution.
@@ -39,7 +31,7 @@ _LONGEST_BETWEEN_NS = 1_500_000_000
 
 def parse(raw: bytes) -> Any:
     """The message, none if it is of no interest."""
-    return _decoder().decode(raw) if _name(raw) in BINARY_NAMES.values() else None
+    return _decoder().decode(raw) if _name(raw) in NOVATEL_NAMES.values() else None
 
 
 @cache
@@ -52,7 +44,7 @@ def _decoder() -> Any:
 def _name(raw: bytes) -> str:
     if raw[:1] in (b"#", b"%"):
         return raw[1:].split(b",")[0].decode().removesuffix("A")
-    return BINARY_NAMES.get(struct.unpack_from("<H", raw, 4)[0], "")
+    return NOVATEL_NAMES.get(struct.unpack_from("<H", raw, 4)[0], "")
 
 
 def decode(gathered: Gathered, m: Any, raw: bytes) -> None:

@@ -16,7 +16,7 @@ import polars as pl
 
 from pipeline.ingest.timescale import GPS_EPOCH_NS, WEEK_NS, utc_from_gps
 from pipeline.receivers.earth_fixed import earth_fixed, east_north_up, geodetic
-from schemas.arrays import Floats, Ints
+from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
 from schemas.errors import InputError
 from schemas.inputs import Gnss
@@ -27,8 +27,7 @@ _QUALITY = {
     0: Fix.NONE, 1: Fix.RTK_FIXED, 2: Fix.RTK_FLOAT, 3: Fix.SBAS, 4: Fix.DIFFERENTIAL, 5: Fix.AUTONOMOUS,
     6: Fix.DIFFERENTIAL, 7: Fix.ESTIMATED,
 }  # fmt: skip
-_SCALES = ("GPST", "UTC", "JST")
-_JST_NS = 9 * 3600 * 1_000_000_000
+_AHEAD_NS = {"GPST": 0, "UTC": 0, "JST": 9 * 3600 * NS_PER_S}  # of UTC, GPS time beside its leap seconds
 _TOGETHER = (
     ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef"), ("e-baseline", "n-baseline", "u-baseline"),
     ("vx", "vy", "vz"),
@@ -84,7 +83,7 @@ def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame
 
 def _layout(comments: list[str], path: Path) -> _Layout:
     headers = [re.split(r"[\s,;]+", line.lstrip("% ").strip()) for line in comments]
-    headers = [words for words in headers if words[0] in _SCALES and {"Q", "ns"} <= set(words)]
+    headers = [words for words in headers if words[0] in _AHEAD_NS and {"Q", "ns"} <= set(words)]
     if not headers:
         raise InputError(
             "has no line that names its columns",
@@ -145,13 +144,9 @@ def _times(words: Any, layout: _Layout, path: Path) -> pl.Series:
             found=" ".join(words[row, :2]),
             expected=f"y/m/d h:m:s, or week and seconds, in {layout.scale}",
         )
-    return pl.Series(_utc(told.to_numpy(), layout.scale)).cast(pl.Datetime("ns", "UTC"))
-
-
-def _utc(told_ns: Ints, scale: str) -> Ints:
-    if scale == "GPST":
-        return utc_from_gps(told_ns)
-    return told_ns - (_JST_NS if scale == "JST" else 0)
+    t_ns = told.to_numpy()
+    utc = utc_from_gps(t_ns) if layout.scale == "GPST" else t_ns - _AHEAD_NS[layout.scale]
+    return pl.Series(utc).cast(pl.Datetime("ns", "UTC"))
 
 
 def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
@@ -162,11 +157,15 @@ def _numbers(words: Any, layout: _Layout, path: Path) -> dict[str, Floats]:
     except ValueError as error:
         raise InputError(f"holds a value that is no number: {error}", place=str(path)) from None
     if layout.sexagesimal:
-        signs = np.where(np.char.startswith(rest[:, [0, 3]], "-"), -1.0, 1.0)  # of -0 degrees as well
-        parts = np.abs(values[:, :6]).reshape(-1, 2, 3)
-        places = signs * (parts @ np.array([1.0, 1 / 60, 1 / 3600]))
-        values = np.hstack([places, values[:, 6:]])
+        values = np.hstack([_degrees(rest[:, :6]), values[:, 6:]])
     return dict(zip(layout.columns, values.T, strict=True))
+
+
+def _degrees(words: Any) -> Floats:
+    """Latitude and longitude of two times degrees, minutes and seconds; -0 degrees have a sign as well."""
+    signs = np.where(np.char.startswith(words[:, [0, 3]], "-"), -1.0, 1.0)
+    degrees: Floats = signs * (np.abs(words.astype(np.float64)).reshape(-1, 2, 3) @ np.array([1.0, 1 / 60, 1 / 3600]))
+    return degrees
 
 
 def _place(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
@@ -174,11 +173,8 @@ def _place(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str,
     if "Tokyo" in layout.comments:
         raise InputError("is in the Tokyo datum", place=str(path), expected="WGS 84", remedy="Set out-datum = wgs84.")
     if "latitude" in numbers:
-        place = {
-            "latitude_deg": numbers["latitude"],
-            "longitude_deg": numbers["longitude"],
-            "height_m": numbers["height"],
-        }
+        names = ("latitude_deg", "longitude_deg", "height_m")
+        place = {name: numbers[name.rpartition("_")[0]] for name in names}
     elif "x-ecef" in numbers:
         place = geodetic(*(numbers[f"{axis}-ecef"] for axis in "xyz"))
     elif "e-baseline" in numbers:
@@ -204,12 +200,10 @@ def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str,
 def _at_baseline(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dict[str, Any]:
     """Places from baselines: the reference stands in the header, in the form that places have."""
     told = re.search(r"^%\s*ref pos\s*:\s*(.*)$", layout.comments, re.MULTILINE)
-    values = [float(value) for value in re.split(r"[\s,;]+", told[1].strip())] if told else []
+    words = np.array(re.split(r"[\s,;]+", told[1].strip()) if told else [])
+    values = words.astype(np.float64)
     if len(values) == 7:  # degrees, minutes and seconds
-        signs = [-1.0 if word.startswith("-") else 1.0 for word in re.split(r"[\s,;]+", told[1].strip())]  # type: ignore[index]
-        values = [
-            sign * (abs(d) + m / 60 + s / 3600) for sign, d, m, s in ((signs[0], *values[:3]), (signs[3], *values[3:6]))
-        ] + values[6:]
+        values = np.append(_degrees(words[None, :6]), values[6:])
     if len(values) != 3:
         raise InputError(
             "holds baselines from a place that is not told",
@@ -217,7 +211,7 @@ def _at_baseline(numbers: dict[str, Floats], layout: _Layout, path: Path) -> dic
             expected="% ref pos : latitude longitude height in the header",
             remedy="Let RTKLIB write latitude, longitude and height (out-solformat = llh).",
         )
-    base = np.array(earth_fixed(values[0], values[1], values[2]))
+    base = np.array(earth_fixed(*values))
     baseline = np.array([numbers[f"{axis}-baseline"] for axis in "enu"])
     return geodetic(*(base[:, None] + east_north_up(values[0], values[1]).T @ baseline))
 

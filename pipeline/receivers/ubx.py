@@ -23,15 +23,9 @@ Columns = dict[str, Any]
 _SYSTEMS_BY_NAME = {"GPS": "G", "SBAS": "S", "Galileo": "E", "BeiDou": "C", "QZSS": "J", "GLONASS": "R", "NavIC": "I"}
 # Numbers of satellites in NAV-SVINFO: first of the system, last, letter, number of the first.
 _SVIDS = (
-    (1, 32, "G", 1),
-    (33, 64, "C", 6),
-    (65, 96, "R", 1),
-    (120, 158, "S", 20),
-    (159, 163, "C", 1),
-    (193, 202, "J", 1),
+    (1, 32, "G", 1), (33, 64, "C", 6), (65, 96, "R", 1), (120, 158, "S", 20), (159, 163, "C", 1), (193, 202, "J", 1),
     (211, 246, "E", 1),
-)
-_WEEK_MS = 7 * 86_400_000
+)  # fmt: skip
 # Messages of one epoch may round its time, and know another number of leap seconds before they have been received.
 _SAME_MOMENT_NS = 60 * NS_PER_S
 
@@ -43,34 +37,23 @@ def parse(raw: bytes) -> Any:
     return UBXReader.parse(raw) if raw[2:4] in _WANTED else None
 
 
-class UbxDecoder:
-    """Keeps count of the weeks while messages go by: most of them only tell the time of the week."""
-
-    def __init__(self) -> None:
-        self._week = 0
-        self._latest_ms = 0
-
-    def decode(self, gathered: Gathered, message: Any, raw: bytes) -> None:
-        """Add what this message says to its epoch."""
-        if self._latest_ms - message.iTOW > _WEEK_MS // 2:
-            self._week += 1
-        self._latest_ms = message.iTOW
-        rank, time_of = _TIMES.get(message.identity, (0, _no_time))
-        t_ns = time_of(message)
-        position = message.identity if message.identity in _POSITIONS else ""
-        epoch = gathered.at((self._week, message.iTOW), position, raw)
-        if epoch.t_ns is not None and t_ns is not None and abs(t_ns - epoch.t_ns) > _SAME_MOMENT_NS:
-            # The same moment of another week: the log was interrupted, or several were joined.
-            self._week += 1
-            epoch = gathered.at((self._week, message.iTOW), position, raw)
-        if t_ns is not None:
-            epoch.tell_time(rank, t_ns)
-        for what, rank, told_by in _TELLS.get(message.identity, ()):
-            if told := told_by(message):
-                epoch.tell(what, rank, told)
-        if message.identity == "NAV-PL" and not message.plPosValid:
-            gathered.drop("protection level not valid")
-        _see_satellites(epoch, message)
+def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
+    """Add what this message says to its epoch, whose key is the time of the week; most tell no more of the time."""
+    rank, time_of = _TIMES.get(message.identity, (0, _no_time))
+    t_ns = time_of(message)
+    position = message.identity if message.identity in _POSITIONS else ""
+    epoch = gathered.at(message.iTOW, position, raw)
+    if epoch.t_ns is not None and t_ns is not None and abs(t_ns - epoch.t_ns) > _SAME_MOMENT_NS:
+        # The same moment of another week: the log was interrupted, or several were joined.
+        epoch = gathered.begin(message.iTOW, position, raw)
+    if t_ns is not None:
+        epoch.tell_time(rank, t_ns)
+    for what, rank, told_by in _TELLS.get(message.identity, ()):
+        if told := told_by(message):
+            epoch.tell(what, rank, told)
+    if message.identity == "NAV-PL" and not message.plPosValid:
+        gathered.drop("protection level not valid")
+    _see_satellites(epoch, message)
 
 
 def _no_time(_: Any) -> int | None:

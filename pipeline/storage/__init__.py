@@ -12,7 +12,6 @@ from pipeline.storage.fetching import content_of, folders_in, glob_remote, local
 from pipeline.storage.identity import (
     FileDigest,
     FileState,
-    content_digest,
     digest_of_files,
     file_digests,
     signature,
@@ -43,7 +42,6 @@ __all__ = [
     "absolute",
     "as_output_error",
     "commit",
-    "content_digest",
     "content_of",
     "digest_of_files",
     "discard",

@@ -68,11 +68,6 @@ def digest_of_files(files: Iterable[FileDigest]) -> str:
     return hashlib.sha256("".join(f"{file.name} {file.sha256}\n" for file in files).encode()).hexdigest()
 
 
-def content_digest(path: Path, known: str = "") -> str:
-    """SHA-256 over names and contents of a file, or of the files directly in a folder; `known` as above."""
-    return digest_of_files(file_digests(path, known))
-
-
 def _file_digest(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -90,7 +90,7 @@ def test_a_log_is_known_by_what_its_files_hold(small_trial: SmallTrial, tmp_path
         plan = plan_of(small_trial, tmp_path / "out", [path])
         run_campaign(plan, force=True)
         known = store.completed_runs(tmp_path / "out")[path.stem]["files_digest"]
-        assert known == storage.content_digest(path)
+        assert known == storage.digest_of_files(storage.file_digests(path))
         assert run_campaign(plan).skipped == 1
 
 

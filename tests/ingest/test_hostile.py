@@ -16,7 +16,7 @@ import zstandard
 from pipeline.ingest import mcap_block, read_run
 from pipeline.ingest.clean import clean, of_the_journey
 from pipeline.ingest.describe import describe_log
-from pipeline.ingest.layout import LayoutDecoder, constant, layout_of
+from pipeline.ingest.layout import LayoutDecoder, UnfitError, constant, fixed, layout_of
 from pipeline.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig
@@ -103,10 +103,10 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
 def test_the_allowance_of_records_is_one_per_byte_of_the_file() -> None:
     spent = mcap_block.Allowance(3)
     records = definitions() + some_messages(1)
-    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {}).starts.tolist() == [len(definitions())]
+    assert mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent).starts.tolist() == [len(definitions())]
     assert spent.left == 0
     with pytest.raises(mcap_block.DamageError, match="more records"):
-        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent, {})
+        mcap_block.piece_of_chunk(records, 0, lambda *_: None, spent)
 
 
 def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
@@ -115,37 +115,49 @@ def test_messages_found_by_indexes_are_those_that_a_walk_finds() -> None:
     allowance = mcap_block.Allowance(1000)
 
     def piece(entries: bytes) -> mcap_block.Piece:
-        return mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, {1: entries})
+        return mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, [(1, entries)])
 
-    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance, {})
-    right = walked.entries[1].tobytes()
-    assert piece(right).proved == {1: right}
+    walked = mcap_block.piece_of_chunk(records, 0, lambda *_: None, allowance)
+    right = np.column_stack([walked.log_times, walked.starts]).tobytes()
     pairs = np.frombuffer(right, dtype="<i8").reshape(-1, 2)
     shifted, beyond, late = (pairs + np.array(change) for change in ([0, 1], [0, 1 << 40], [1, 0]))
-    for entries in (
-        right,
-        b"",
-        right[16:],
-        right[:-16],
-        right + right[:16],
-        *(a.tobytes() for a in (shifted, beyond, late)),
-    ):
-        assert piece(entries).starts.tolist() == walked.starts.tolist()
-        if entries not in (right, b""):
-            assert not piece(entries).proved
-            with pytest.raises(mcap_block.DamageError, match="disagrees"):
-                piece(entries).check_index(1, entries)
+    for entries in (right, b"", pairs[::-1].tobytes()):
+        found = piece(entries)
+        for name in ("starts", "channels", "lengths", "log_times"):
+            assert getattr(found, name).tolist() == getattr(walked, name).tolist()
+    for entries in (right[16:], right[:-16], right + right[:16], *(a.tobytes() for a in (shifted, beyond, late))):
+        with pytest.raises(mcap_block.DamageError, match="disagrees"):
+            piece(entries)
 
 
 def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
     """A protobuf message is empty where all its fields have their defaults."""
-    numbers = [np.array([number]) for number in (3, 0, 0, 0, 0)]
-    message = mcap_block.Messages(np.frombuffer(b"abc", dtype=np.uint8), *numbers)
+    numbers = [np.array([number]) for number in (0, 3, 0, 0)]
+    message = mcap_block.Messages([np.frombuffer(b"abc", dtype=np.uint8)], *numbers)
     fields = {"x": constant(0.0, pl.Float64())}
-    decoder = LayoutDecoder(lambda payload: layout_of(payload, bytearray(payload), fields), {"x": pl.Float64()})
+    decoder = LayoutDecoder(lambda payload: layout_of(payload, bytearray(payload), fields))
     ((_, columns),), left = decoder.decode(message)
     assert columns["x"].to_list() == [0.0]
     assert left == []
+
+
+def test_payloads_are_taken_from_the_piece_that_they_lie_in() -> None:
+    pieces = [np.frombuffer(content, dtype=np.uint8) for content in (b"-ab-cd", b"", b"--ef")]
+    start, length = np.array([1, 4, 8]), np.array([2, 2, 2])
+    messages = mcap_block.Messages(pieces, np.array([0, 6, 6]), start, length, start, before=100)
+    assert [messages.payload(row) for row in range(3)] == [b"ab", b"cd", b"ef"]
+    assert messages.stretches(0, 2).tobytes() == b"abcdef"
+    assert messages.chosen(np.array([False, False, True])).stretches(-1, 1).tobytes() == b"-e"
+    assert messages.ordinal.tolist() == [101, 104, 108]
+
+
+def test_a_number_beyond_64_bits_with_a_sign_is_left_to_the_ordinary_decoder() -> None:
+    rows = np.array([1, 2**63], dtype="<u8").view(np.uint8).reshape(2, 8)
+    whole, real = (fixed(0, "<u8").as_type(dtype) for dtype in (pl.Int64(), pl.Float64()))
+    assert list(whole.values(rows[:1])) == [1]
+    assert list(real.values(rows)) == [1.0, 2.0**63]
+    with pytest.raises(UnfitError):
+        whole.values(rows)
 
 
 LETTERS = "A" * 26

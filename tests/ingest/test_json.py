@@ -49,7 +49,7 @@ def messages_of(contents: list[bytes]) -> Messages:
     lengths = np.array([len(content) for content in contents], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths[:-1])]).astype(np.int64)
     data = np.frombuffer(b"".join(contents) + b" ", dtype=np.uint8)
-    return Messages(data, starts, lengths, starts, starts, starts)
+    return Messages([data], np.zeros(1, dtype=np.int64), starts, lengths, starts)
 
 
 def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
