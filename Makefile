@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 # Test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
 # One for each of two cores: each takes seconds to start. Compiled modules are kept, or each of the many processes
 # compiles the program and the tests again.
-TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLARS_MAX_THREADS=1 \
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
 .PHONY: install demo test quick check lint types bench mutations dictionary lock clean
