@@ -37,6 +37,13 @@ def clusters(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Cluster]
         cluster.stop()
 
 
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scheduler on a busy machine answers late; one that takes too long would count as lost."""
+    monkeypatch.setattr(WAITS, "scheduler_s", 120.0)
+    monkeypatch.setattr(WAITS, "scheduler_answer_s", 120.0)
+
+
 @pytest.fixture
 def cluster(clusters: list[Cluster], tmp_path_factory: pytest.TempPathFactory) -> Cluster:
     """A whole cluster: what the test before has killed is started again."""
@@ -95,7 +102,7 @@ def allow(failures: int, cluster: Cluster) -> None:
     """Set how often the scheduler itself hands out a task whose worker died."""
     from distributed import Client  # takes seconds to load, in each of the test processes
 
-    with Client(cluster.address, set_as_default=False) as client:
+    with Client(cluster.address, timeout=WAITS.scheduler_s, set_as_default=False) as client:
         client.run_on_scheduler(lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", failures))
 
 
