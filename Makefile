@@ -9,7 +9,7 @@ TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLAR
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test quick check lint types bench mutations dictionary lock clean
+.PHONY: install demo test quick stress check lint types bench mutations dictionary lock clean
 
 install: $(STAMP)
 
@@ -27,6 +27,11 @@ test: install
 
 quick: install
 	$(TESTS) -m "not slow"
+
+# The tests while two other processes keep two cores busy: none may fail because it has to wait.
+stress: install
+	for core in 1 2; do $(BIN)/python -c "while True: pass" & busy="$$busy $$!"; done; \
+	trap "kill $$busy" EXIT; trap "exit 130" INT TERM; $(TESTS)
 
 lint: install
 	$(BIN)/ruff check .
