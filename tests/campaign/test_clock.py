@@ -7,6 +7,9 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
+
+import cli
 from tests.campaign.compare import ROOT, campaign_bytes, command, result_bytes
 from tests.conftest import SmallTrial
 
@@ -66,7 +69,9 @@ def from_the_future(*folders: Path) -> None:
             os.utime(path, (_2100_S, _2100_S))
 
 
-def test_wrong_clock_and_files_from_the_future(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
+def test_wrong_clock_and_files_from_the_future(
+    small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     trial = SmallTrial(tmp_path / "site", tmp_path / "runs")
     shutil.copytree(small_trial.site, trial.site)
     shutil.copytree(small_trial.runs, trial.runs)
@@ -82,6 +87,7 @@ def test_wrong_clock_and_files_from_the_future(small_trial: SmallTrial, undistur
     assert not unfinished.exists()
     assert result_bytes(out) == result_bytes(undisturbed)
     assert campaign_bytes(out) == campaign_bytes(undisturbed)
-    assert "(4 of them complete before)" in replay(trial, out, 0.0, trial.paths, clock)
+    assert cli._guarded(command(trial, out)[3:], debug=False) == 0
+    assert "(4 of them complete before)" in capfd.readouterr().out
     times = [line.split("T")[0] for line in (out / "replay.log").read_text().splitlines()]
     assert times[0] > times[-1] > min(times), "the clocks were not wrong"
