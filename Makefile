@@ -5,10 +5,11 @@ BIN := $(VENV)/bin
 # Test processes with threads of linear algebra each wait for one another and spend twenty times the processor time.
 # One for each of two cores: each takes seconds to start. Compiled modules are kept, or each of the many processes
 # compiles the program and the tests again.
-TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+TESTS := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 POLARS_MAX_THREADS=1 \
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 STAMP := $(VENV)/.balise-installed
 
-.PHONY: install demo test quick check lint types bench mutations dictionary lock clean
+.PHONY: install demo test quick stress check lint types bench mutations dictionary lock clean
 
 install: $(STAMP)
 
@@ -26,6 +27,11 @@ test: install
 
 quick: install
 	$(TESTS) -m "not slow"
+
+# The tests while two other processes keep two cores busy: none may fail because it has to wait.
+stress: install
+	for core in 1 2; do $(BIN)/python -c "while True: pass" & busy="$$busy $$!"; done; \
+	trap "kill $$busy" EXIT; trap "exit 130" INT TERM; $(TESTS)
 
 lint: install
 	$(BIN)/ruff check .

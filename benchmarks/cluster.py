@@ -13,9 +13,11 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
-_START_S = 60.0
+# Each of the processes takes seconds of processor time to start: minutes on a machine that is busy otherwise.
+_START_S = 240.0
 
 
 class Cluster:
@@ -41,13 +43,14 @@ class Cluster:
         return self._dask("worker", *place, *arguments)
 
     def wait_for_workers(self) -> None:
-        """Until all workers have joined: a nanny gives up where one dies before."""
+        """Until all workers have joined, and their nanny knows it: of one that dies before, it starts no other."""
         if self.nanny.poll() is not None:
             self.nanny = self.start_workers()
         from distributed import Client  # takes seconds to load
 
-        with Client(self.address, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+        with Client(self.address, timeout=_START_S, set_as_default=False) as client:  # type: ignore[no-untyped-call]
             client.wait_for_workers(self._workers, timeout=_START_S)
+            wait_for(lambda: set(client.run(_state, nanny=True).values()) == {"running"})
 
     def kill_worker(self, chance: random.Random) -> bool:
         """One worker without warning; the nanny lives. Whether there was one."""
@@ -94,6 +97,11 @@ class Cluster:
             stderr=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": str(ROOT), "POLARS_MAX_THREADS": "1", **self._settings},
         )
+
+
+def _state(dask_worker: Any) -> str:
+    """Of a nanny, as Dask hands it to what runs there."""
+    return str(dask_worker.status.name)
 
 
 def workers_of(pid: int) -> list[int]:

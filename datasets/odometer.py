@@ -12,6 +12,7 @@ from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, odometer_inc
 from datasets.motion import Motion
 from datasets.scenario import OdometerSpec
 from schemas.arrays import Floats
+from schemas.conform import conform
 from schemas.inputs import Odometer
 
 
@@ -66,4 +67,4 @@ def _table(spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, 
         sigma_speed_mps=pl.lit(spec.speed_sigma_mps) if spec.speed else nothing,
         slip=pl.lit(None, pl.Boolean),
     )
-    return Odometer.validate(table, cast=True)
+    return conform(table, Odometer)

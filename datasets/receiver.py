@@ -19,6 +19,7 @@ from datasets.sky import Observed, observe_sky
 from datasets.solution import protection_levels
 from schemas.arrays import Floats
 from schemas.config import Vehicle
+from schemas.conform import conform
 from schemas.enums import Fix
 from schemas.inputs import Gnss, Reference
 
@@ -125,7 +126,7 @@ def reference_stream(spec: ReferenceSpec, journey: Journey, first_ns: int, rng: 
             "height_m": places.height_m,
         }
     ).with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")), sigma_m=pl.lit(spec.sigma_m))
-    return Reference.validate(table, cast=True)
+    return conform(table, Reference)
 
 
 def true_velocity(journey: Journey, t_s: Floats) -> Floats:
@@ -175,4 +176,4 @@ def _table(
         )
         .filter(~pl.col("lost") | pl.lit(spec.keep_lost))
     )
-    return Gnss.validate(table.select(Gnss.column_names()), cast=True)
+    return conform(table, Gnss)

@@ -14,6 +14,7 @@ from datasets.range_errors import range_errors_m, range_sigma_m
 from datasets.scenario import SkySpec
 from datasets.solution import Solution, protection_levels, solve
 from schemas.arrays import Bools, Floats, Ints
+from schemas.conform import conform
 from schemas.inputs import Satellites
 
 _SLOTS = {"gps": GPS, "galileo": GALILEO}
@@ -127,4 +128,4 @@ def _satellites_table(name: str, t_ns: Ints, ranges: Ranges, solution: Solution)
             "used": solution.used[epoch, satellite],
         }
     ).with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")), solution=pl.lit(name))
-    return Satellites.validate(table.select(Satellites.column_names()), cast=True)
+    return conform(table, Satellites)

@@ -48,8 +48,8 @@ def command(trial: SmallTrial, out: Path | str, *arguments: str, runs: Sequence[
 
 
 def start(arguments: Sequence[str]) -> subprocess.Popen[str]:
-    """A campaign in a process group of its own, as a terminal starts it, even where `nohup` started the tests."""
-    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    """A campaign in a process group of its own, as a terminal starts it: also where the tests ignore signals."""
+    inherited = {signum: signal.signal(signum, signal.SIG_DFL) for signum in (signal.SIGHUP, signal.SIGINT)}
     try:
         return subprocess.Popen(
             arguments,
@@ -61,18 +61,19 @@ def start(arguments: Sequence[str]) -> subprocess.Popen[str]:
             env={**os.environ, "NO_COLOR": "1"},
         )
     finally:
-        signal.signal(signal.SIGHUP, inherited)
+        for signum, handler in inherited.items():
+            signal.signal(signum, handler)
 
 
 def run(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(arguments, cwd=ROOT, text=True, capture_output=True, timeout=300, check=False)
 
 
-def wait_for(condition: Callable[[], bool], limit_s: float = 240.0) -> None:
+def wait_for(condition: Callable[[], bool], limit_s: float = 240.0, why: str = "waited in vain") -> None:
     """Wait until something is so; a test that waits in vain fails."""
     until = time.monotonic() + limit_s
     while not condition():
-        assert time.monotonic() < until, "waited in vain"
+        assert time.monotonic() < until, why
         time.sleep(0.02)
 
 

@@ -130,9 +130,12 @@ def test_dead_store_ends_the_command_soon(ill: str, small_trial: SmallTrial, tmp
     assert time.monotonic() - begun_s < _SOON_S
 
 
-@pytest.mark.parametrize("ill", ["busy", "silent", "broken"], indirect=True)
+# Each way of reading, and each ailment twice: what is ill is the store, whoever reads.
+READERS = [files.exists, files.is_dir, files.list_dir, files.open_binary, files.read_bytes, files.size_of]
+
+
 @pytest.mark.parametrize(
-    "read", [files.exists, files.is_dir, files.list_dir, files.open_binary, files.read_bytes, files.size_of]
+    ("ill", "read"), [*zip(["busy", "silent", "broken"] * 2, READERS, strict=True)], indirect=["ill"]
 )
 def test_reading_by_address_is_as_patient(
     ill: str, read: Callable[[str], object], monkeypatch: pytest.MonkeyPatch

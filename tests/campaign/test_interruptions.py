@@ -84,6 +84,17 @@ def test_progress_that_nobody_reads(small_trial: SmallTrial, tmp_path: Path) -> 
     assert len(store.run_ids(tmp_path)) == 2
 
 
+@pytest.fixture
+def _heard() -> Iterator[None]:
+    """Signals come through, also where the tests are told to ignore them: by `nohup`, or by `&` in a script."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    before = {signum: signal.signal(signum, handler) for signum, handler in usual.items()}
+    yield
+    for signum, handler in before.items():
+        signal.signal(signum, handler)
+
+
+@pytest.mark.usefixtures("_heard")
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_stop_on_request_at_the_very_end(
     small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signum: int
@@ -158,17 +169,22 @@ def test_swept_files_are_written_again(
     assert result_bytes(tmp_path) == wanted
 
 
-def test_orphaned_workers_go(small_trial: SmallTrial, tmp_path: Path) -> None:
+def test_one_campaign_at_a_time_and_orphaned_workers_go(
+    small_trial: SmallTrial, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     os.mkfifo(tmp_path / "never.mcap")
-    process = start(
-        command(small_trial, tmp_path / "out", "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths])
-    )
-    wait_for(lambda: bool(store.run_ids(tmp_path / "out")))
-    workers = children_of(process.pid)
-    assert workers
-    process.kill()
-    process.communicate(timeout=300)
-    wait_for(lambda: not any(alive(pid) for pid in workers))
+    out = tmp_path / "out"
+    process = start(command(small_trial, out, "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths]))
+    try:
+        wait_for(lambda: bool(store.run_ids(out)))
+        workers = children_of(process.pid)
+        assert of_this_process(command(small_trial, out)) == 2, "a second campaign writes into the same output"
+        assert "another campaign is writing here" in capfd.readouterr().err
+    finally:
+        process.kill()
+        process.communicate(timeout=300)
+    assert workers, "the campaign had no workers"
+    wait_for(lambda: not any(alive(pid) for pid in workers), why="workers live on without their campaign")
 
 
 def children_of(pid: int) -> list[int]:
@@ -181,21 +197,6 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def test_two_campaigns_on_one_output(
-    small_trial: SmallTrial, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    os.mkfifo(tmp_path / "never.mcap")
-    out = tmp_path / "out"
-    process = start(command(small_trial, out, "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths]))
-    try:
-        wait_for(lambda: bool(store.run_ids(out)))
-        assert of_this_process(command(small_trial, out)) == 2
-        assert "another campaign is writing here" in capfd.readouterr().err
-    finally:
-        process.kill()
-        process.communicate(timeout=300)
 
 
 def of_this_process(arguments: list[str]) -> int:

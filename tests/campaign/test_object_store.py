@@ -108,12 +108,13 @@ def of_two(result: dict[str, bytes]) -> dict[str, bytes]:
     return {name: data for name, data in result.items() if "run_id=run0" in name or "run_id=run1" in name}
 
 
-def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path) -> None:
+def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     plan = make_plan([f"{bucket}/runs/run0", f"{bucket}/runs/run1"], f"{bucket}/site", f"{bucket}/out")
     assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 2
     assert remote_bytes(f"{bucket}/out") == of_two(result_bytes(undisturbed))
     again = run_campaign(plan, jobs=1)
     assert (again.skipped, again.count(RunStatus.OK)) == (2, 2)
+    request.getfixturevalue("in_process")
     local = run_campaign(make_plan([f"{bucket}/runs/run0", f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
     assert local.count(RunStatus.OK) == 2
     remote, copied, on_disk = (read_manifest(out) or {} for out in (f"{bucket}/out", tmp_path, undisturbed))

@@ -373,7 +373,8 @@ def test_means_of_speed_call_no_accuracy_met() -> None:
     for speed_mps, finding in ((20.0, "not shown"), (20.0 + 2.0 / 3.6, "not met")):
         columns = {"speed_mps": speed_mps, "error_low_m": -0.1, "error_high_m": 0.1}
         found = front(seconds, **columns)
-        rides = [Ride(f"{number}", found, epochs(seconds), passages(), PROFILE) for number in range(300)]
+        frame, nothing = epochs(seconds), passages()
+        rides = [Ride(f"{number}", found, frame, nothing, PROFILE) for number in range(300)]
         counts = sum((asked.count(ride) for ride in rides), Tally())
         assert (counts.trials, counts.kept, counts.broken) in ((300, 300, 0), (300, 0, 300))
         assert asked.demand.shown(counts).finding == finding

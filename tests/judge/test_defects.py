@@ -188,7 +188,7 @@ def test_a_large_stated_sigma_hides_no_hazard() -> None:
     assert rung.row["verdict"] != "safe"
 
 
-@pytest.mark.parametrize("size_m", [40.0, -55.0, 100.0])
+@pytest.mark.parametrize("size_m", [40.0, -100.0])
 def test_with_the_odometer_alone_nothing_is_p0(size_m: float) -> None:
     """An error of 40 to 100 m, standing from the start or stepped, is never healthy by the odometer alone."""
     for name, fault in {

@@ -65,6 +65,7 @@ def test_the_route_of_a_run_without_doubt_is_marked_nowhere() -> None:
     assert route.select("netelement_id", "direction", "doubtful").rows() == [("s", "AB", False), ("d", "AB", False)]
 
 
+@pytest.mark.usefixtures("in_process")
 def test_one_run_of_two_is_corrected_and_nothing_of_it_is_in_doubt(tmp_path: Path) -> None:
     home, runs = on_disk(tmp_path, "one", "two")
     routes = tmp_path / "routes"

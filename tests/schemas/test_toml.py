@@ -16,4 +16,4 @@ def test_keys_of_thousands_of_parts_are_refused_at_once(part: str) -> None:
         toml_of((part + f".{part}" * 30_000 + " = 1").encode(), "a.toml")
     assert toml_of(("k" * 900_000 + " = 1").encode(), "a.toml")
     assert toml_of(("a = [" + "0.1, " * 10_000 + "]").encode(), "a.toml")
-    assert time.process_time() - begun < 1.0
+    assert time.process_time() - begun < 4.0

@@ -36,12 +36,13 @@ def train(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def out(small_trial: SmallTrial, train: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs of two calls, and a log that cannot be read."""
+    """Two runs and a log that cannot be read, each of a call: a single run needs no worker."""
     folder = tmp_path_factory.mktemp("result")
     bad = tmp_path_factory.mktemp("bad") / "bad.mcap"
     bad.write_bytes(b"no log")
     vehicle = load_settings(train, Vehicle)
-    run_campaign(make_plan([str(small_trial.paths[0]), str(bad)], small_trial.site, folder))
+    for log in (small_trial.paths[0], bad):
+        run_campaign(make_plan([str(log)], small_trial.site, folder))
     given = settings_files(None, train)
     run_campaign(make_plan([str(small_trial.paths[1])], small_trial.site, folder, vehicle=vehicle, given=given))
     return folder
