@@ -262,7 +262,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
         spacing=ride.spacing,
-        impossible=len(fit.impossible),
+        unproving=len(fit.unproving),
     )
 
 

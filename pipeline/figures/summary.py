@@ -29,10 +29,9 @@ Row = dict[str, object]
 class SolutionResults:
     """All that the stages found out about one solution; `epochs` as in `schemas.tables`.
 
-    `odometer_contradicted`: gaps between anchors that the odometer
-    does not close (DOMAIN section 5.1). `alignment`: latency and odometer scale at the end of the run.
-    `impossible`: misfits that no train can have, which were let pass. `spacing`: of physical balises, None where not
-    computed.
+    `odometer_contradicted`: gaps between anchors that the odometer does not close (DOMAIN section 5.1). `alignment`:
+    latency and odometer scale at the end of the run. `unproving`: misfits that leave nothing proved. `spacing`: of
+    physical balises, None where not computed.
     """
 
     solution: str
@@ -46,7 +45,7 @@ class SolutionResults:
     ambiguous_stretches: int = 0
     notes: Sequence[str] = ()
     spacing: Spacing | None = None
-    impossible: int = 0
+    unproving: int = 0
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
@@ -72,7 +71,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | _provenance(provenance)
     )
     verdict = verdict_of(row, config.hazards.unknown_share_limit)
-    if results.impossible and verdict is RunVerdict.SAFE:
+    if results.unproving and verdict is RunVerdict.SAFE:
         verdict = RunVerdict.UNPROVEN
     return _frame(row | {"verdict": verdict})
 

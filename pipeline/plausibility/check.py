@@ -22,7 +22,8 @@ class State(StrEnum):
 class Check:
     """One comparison: `found` in words with figures, its `cause`, and the lines that mend it.
 
-    `lines` is text for a file, `into` says what to do with it; `advice` is what to do where no line mends it.
+    `lines` is text for a file, `into` says what to do with it; `advice` is what to do where no line mends it. A misfit
+    `of_evidence` is one of the recorders that the judge believes: nothing is proved by them.
     """
 
     what: str
@@ -32,6 +33,7 @@ class Check:
     lines: str = ""
     into: str = CONFIGURATION
     advice: str = ""
+    of_evidence: bool = False
 
     @property
     def sentence(self) -> str:

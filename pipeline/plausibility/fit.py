@@ -29,6 +29,11 @@ class Fit:
         return tuple(check for check in self.checks if check.state is State.IMPOSSIBLE)
 
     @property
+    def unproving(self) -> tuple[Check, ...]:
+        """What leaves nothing proved: the impossible, where it was let pass, and evidence that contradicts itself."""
+        return tuple(check for check in self.checks if check.state is State.IMPOSSIBLE or check.of_evidence)
+
+    @property
     def misfits(self) -> tuple[Check, ...]:
         """What does not fit, the impossible first."""
         return (*self.impossible, *(check for check in self.checks if check.state is State.MISFIT))

@@ -39,7 +39,7 @@ SITE = Site(
 
 
 def gnss(error_m, way_m=WAY_M):
-    noise_m = 0.2 * np.random.default_rng(5).standard_normal(way_m.size)
+    noise_m = 0.3 * np.convolve(np.random.default_rng(5).standard_normal(way_m.size), np.ones(200) / 200.0**0.5, "same")
     return stream(Gnss, builders.run(way_m + error_m + noise_m, np.zeros(way_m.size), RATE_HZ))
 
 
@@ -158,3 +158,18 @@ class TestReadsThatNoTrainCanMake:
         assert set(between["judgement"].cast(pl.String)) == {"unknown"}
         assert (row(tables)["unsafe_accepted"], row(tables)["odometer_contradicted"]) == (0, 0)
         assert "no train can have come from one balise read" in tables.runs["notes"][0]
+
+
+def test_a_reference_with_another_clock_than_the_odometer_proves_nothing():
+    """At 35 m/s 0.4 s are 14 m: positions up to 34 m off could be called right."""
+    speed = np.interp(
+        np.arange(0.0, 240.0, 0.1), [0, 5, 40, 80, 110, 150, 180, 230, 240], [0, 0, 35, 35, 15, 35, 35, 0, 0]
+    )
+    way_m = 200.0 + np.cumsum(speed) / RATE_HZ
+    log = RunLog("clocks", gnss(np.zeros(way_m.size), way_m), odometer=counted(way_m - 200.0))
+    verdicts = {}
+    for late_s in (0.0, 0.4):
+        truth = reference(way_m=way_m).with_columns(pl.col("t") + pl.duration(milliseconds=round(1000 * late_s)))
+        found = row(replay(log.with_streams(reference=truth), SITE, KNOWN))
+        verdicts[late_s] = found["verdict"], "clock of the odometer against the reference" in (found["notes"] or "")
+    assert verdicts == {0.0: ("safe", False), 0.4: ("unproven", True)}
