@@ -79,21 +79,22 @@ def regressed(
 
 
 def _solved(design: Floats, target: Floats, floor: float, told: float, start: tuple[float, ...] | None) -> Regression:
-    weight = np.ones(len(target))
-    left = np.zeros(len(target)) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
+    count, each = target.shape
+    equations, goal = design.reshape(count * each, -1), target.ravel()
+    weight = np.ones(count)
+    left = np.zeros(count) if start is None else np.linalg.norm(target - design @ np.array(start), axis=1)
     for number in range(_ROUNDS):
         spread = max(1.4826 * float(np.median(left)), floor)
         if start is None and number < _ROUNDS // 2:
             weight = floor / np.maximum(left, floor)
         else:
             weight = np.clip(1.0 - (left / (_BIWEIGHT * spread)) ** 2, 0.0, None) ** 2
-        weighted = design * weight[:, None, None]
-        normal = np.einsum("nmk,nml->kl", weighted, design)
-        strengths, axes = np.linalg.eigh(normal)
+        weighted = (equations * np.repeat(weight, each)[:, None]).T
+        strengths, axes = np.linalg.eigh(weighted @ equations)
         known = strengths > told * strengths[-1]
         inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
-        estimate = inverse @ np.einsum("nmk,nm->k", weighted, target)
-        left = np.linalg.norm(target - design @ estimate, axis=1)
+        estimate = inverse @ (weighted @ goal)
+        left = np.linalg.norm((goal - equations @ estimate).reshape(count, each), axis=1)
     whole = bool(known.all())
     sigma = spread * np.sqrt(np.diag(inverse)) if whole else np.full(len(estimate), np.inf)
     return Regression(estimate, sigma, spread, whole)
