@@ -8,8 +8,11 @@ from schemas.enums import TRUTH
 
 
 def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
-    """Rows of `runs` with every recording once: a log under two names has one content (`input_digest`)."""
-    content = pl.struct("solution", "input_digest")
+    """Rows of `runs` with every recording once: a log under two names has one content and gives one journey.
+
+    The content alone (`input_digest`) is not known of runs that came from no file.
+    """
+    content = pl.struct("solution", "input_digest", "t_start", "t_end", "epochs", "distance_m")
     return runs.sort("run_id", "solution").filter(content.is_first_distinct() | pl.col("input_digest").is_null())
 
 

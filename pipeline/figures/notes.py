@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
-import numpy as np
 import polars as pl
 
 from pipeline.alignment.align import BEYOND_SPAN, INTERRUPTED
-from pipeline.epochs.clock import Clock, confident, may_move, met, unambiguous
+from pipeline.epochs.clock import Clock, met
 from pipeline.epochs.verdicts import NO_ODOMETER
 from pipeline.evidence import Evidence as TrainEvidence
+from pipeline.figures.lost_time import availability_words
 from pipeline.ingest.clean import StreamCounts
 from pipeline.lds.relink import UNLINKED
 from pipeline.lds.run import LdsResult
@@ -21,20 +21,15 @@ from pipeline.monitors.axis import most_scatter_m
 from pipeline.odometry import Odometry
 from pipeline.plausibility.fit import Fit
 from pipeline.site.checks import BALISE_PLACE
-from schemas.arrays import NS_PER_S, Bools, times_ns
+from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration, Vehicle
-from schemas.enums import BaliseKind, Evidence, LdsMode, PassageStatus, VehicleFigures
+from schemas.enums import BaliseKind, Evidence, PassageStatus, VehicleFigures
 from schemas.run import IngestNotes, RunLog, Site
 
-# When and how much a note says, no figure: so many names and reasons stand in one, and a scatter of less than the
-# positions themselves have is not worth a word. A healthy run loses some time at its start: below this availability the
-# reader asks why, and no reason is named for less than this share.
+# How much a note says, no figure: so many names stand in one, and a scatter of less than the positions themselves have
+# is not worth a word.
 _NAMED = 5
 _WORTH_M = 0.1
-_LOW = 0.9
-_SHOWN = 3
-_LEAST_SHARE = 0.02
-_REST = "of the moving time, the rest lost to: "
 
 
 def said(found: Mapping[str, object]) -> list[str]:
@@ -240,59 +235,6 @@ def time_notes(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> lis
         {
             "for {:.0f} s it is not known whether the train moved: availability counts this time as moving without a "
             "TVB": untold_s if round(untold_s) > 0 else None,
-            "available for {}": _lost(epochs, clock, config),
+            "available for {}": availability_words(epochs, clock, config),
         }
     )
-
-
-def _lost(epochs: pl.DataFrame, clock: Clock, config: Configuration) -> str:
-    """How much is left and the largest parts that were lost; nothing where that was little.
-
-    Each epoch counts for the first reason that applies.
-    """
-    moving = met(epochs, may_move())
-    whole_s = float(clock.held_s[moving].sum())
-    if whole_s <= 0.0 or not met(epochs, pl.col("moving")).any():
-        return ""
-    lost = moving & ~met(epochs, pl.col("tvb") & pl.col("moving").is_not_null())
-    lost_s = float(clock.held_s[lost].sum())
-    if lost_s <= (1.0 - _LOW) * whole_s:
-        return ""
-    parts: dict[str, float] = {}
-    for reason, applies in _reasons(epochs, config).items():
-        parts[reason] = float(clock.held_s[lost & applies].sum()) / whole_s
-        lost &= ~applies
-    shown = sorted(((share, reason) for reason, share in parts.items() if share > _LEAST_SHARE), reverse=True)[:_SHOWN]
-    told = ", ".join(f"{share:.0%} {reason}" for share, reason in shown) or "many short losses"
-    return f"{1.0 - lost_s / whole_s:.0%} {_REST}{told}"
-
-
-def lost_to() -> pl.Expr:
-    """The same reasons out of `notes` of a result; null where little was lost."""
-    return pl.col("notes").str.extract(f"{_REST}([^;]*)").alias("lost_to")
-
-
-def _reasons(epochs: pl.DataFrame, config: Configuration) -> dict[str, Bools]:
-    """Conditions by their words, in the order in which they apply."""
-    aside_m = epochs.filter(~pl.col("on_track"))["cross_track_m"].abs().median()
-    by = f", usually {aside_m:.0f} m beside it" if isinstance(aside_m, float) else ""
-    mode = pl.col("lds_mode").cast(pl.String)
-    reasons = {
-        "no fix": ~pl.col("fix_valid"),
-        f"positions off the track{by}": ~pl.col("on_track"),
-        f"a confidence interval over {config.lds.ci_limit_m:g} m": ~confident(config),
-        "positions that fit more than one track": ~unambiguous(config),
-        f"an alarm, or the wait for re-linking after it{_loudest(epochs)}": mode == LdsMode.FAIL_SAFE.value,
-        "no odometer": pl.col("odometer_reason").is_not_null(),
-        "initialisation": mode == LdsMode.INITIALISING.value,
-    }
-    applies = {reason: met(epochs, condition) for reason, condition in reasons.items()}
-    return applies | {"positions not validated": np.ones(epochs.height, dtype=np.bool_)}
-
-
-def _loudest(epochs: pl.DataFrame) -> str:
-    """The monitor that failed in most epochs."""
-    states = [name for name in epochs.columns if name.endswith("_state") and name != "lds_state"]
-    counts = {name: int((epochs[name].cast(pl.String) == "fail").sum() or 0) for name in states}
-    worst = max(counts, key=lambda name: counts[name], default="")
-    return f" (mostly {worst.removesuffix('_state')})" if worst and counts[worst] else ""

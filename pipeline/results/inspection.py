@@ -10,7 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.notes import lost_to
+from pipeline.figures.lost_time import lost_to
 from pipeline.figures.verdict import head_of, run_verdicts
 from pipeline.ingest.describe import StreamSummary, TopicSummary, describe_log
 from pipeline.receivers.csv_draft import draft_mapping

@@ -160,8 +160,28 @@ def test_one_journey_counts_once() -> None:
     )
     kept, said = distinct(runs)
     assert kept["run_id"].to_list() == ["b", "c"]
-    assert said
-    assert distinct(kept) == (kept, [])
+    assert [text.partition(" runs ")[0] for text in said] == ["1", "1"]
+    assert "begin and end with another one" in said[0]
+    assert "overlap in time" in said[1]
+    once, said = distinct(kept.filter(pl.col("run_id") != "c"))
+    assert (once["run_id"].to_list(), said) == (["b"], [])
+
+
+@pytest.mark.parametrize(("begin", "overlapping"), [(59, ["1"]), (60, []), (61, [])])
+def test_runs_that_overlap_in_time_are_remarked_on(begin: int, overlapping: list[str]) -> None:
+    """Pieces of one recording would be several journeys; two solutions of one run are not."""
+    runs = pl.DataFrame(
+        {
+            "run_id": ["a", "b", "a"],
+            "solution": ["primary", "primary", "gps"],
+            "verdict": "safe",
+            "t_start": [0, begin, 0],
+            "t_end": [60, 120, 60],
+        }
+    )
+    kept, said = distinct(runs)
+    assert kept.height == 3
+    assert [text.partition(" runs overlap")[0] for text in said] == overlapping
 
 
 def test_positions_whose_place_nobody_knows_say_nothing(site: Site) -> None:

@@ -35,6 +35,7 @@ def run_of(
         "notes": notes,
         "share_unknown": 0.0,
         "verdict": "safe",
+        "input_digest": run_id,
         "failure_hazardous_s": [[]] * len(solutions),
         "failure_hazardous_may_s": [[]] * len(solutions),
     } | (counted or {})
@@ -192,3 +193,10 @@ def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessmen
     assert all(row["source"] for row in by_name.values())
     bounds = [name for name in measured if "_low" in name or "_high" in name]
     assert len(by_name) == len(measured) - len(bounds) - 1
+
+
+def test_a_recording_under_two_names_counts_once(tmp_path: Path) -> None:
+    for run_id, digest in (("a", "x"), ("b", "x"), ("c", "y")):
+        write_run(run_of(run_id, counted={"input_digest": digest}), tmp_path, {})
+    figures = assess(tmp_path).tables["figures"]
+    assert figures.select("runs", "hours_with_truth").rows() == [(2, 2.0)]
