@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pipeline.plausibility.axes import velocity_checks
 from pipeline.plausibility.check import Check, State, not_checked
 from pipeline.plausibility.odometer import LATENCY, odometer_checks
-from pipeline.plausibility.places import reads_lag, reference_checks, survey_checks
+from pipeline.plausibility.places import read_stamp_checks, reads_lag, reference_checks, survey_checks
 from pipeline.plausibility.recording import recording_of
 from pipeline.plausibility.witnesses import Lag, clock_checks
 from pipeline.plausibility.written import reference_elsewhere, written_checks
@@ -57,6 +57,7 @@ def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityCo
     checks, lags = [*of_odometer, *checks], [*odometer_lags, *lags]
     if run.balise_reads is not None and run.balise_reads.height and site is not None:
         lags.append(reads_lag(of, run.balise_reads, site))
+        checks += read_stamp_checks(of, run.balise_reads)
     if of.line is not None:
         checks = survey_checks(of, of.line, beside_reference) + checks
     if of.fixes["vel_e_mps"].null_count() < of.fixes.height:

@@ -15,7 +15,7 @@ from pipeline.plausibility.shifts import Line, SurveyFit, common_lag, fit_places
 from pipeline.plausibility.witnesses import Lag
 from pipeline.track.geodesy import points_of
 from pipeline.track.survey import track_of
-from schemas.arrays import Floats
+from schemas.arrays import NS_PER_S, Floats, times_ns
 from schemas.config import PlausibilityConfig
 from schemas.run import Site
 
@@ -23,6 +23,8 @@ _REFERENCE = "places of the reference against the positions"
 _SURVEY = "positions against the survey"
 # The geoid lies up to so far from the ellipsoid.
 _GEOID_M = 107.0
+# Fewer tell nothing of the clock that stamps them.
+_FEWEST_READS = 3
 _HEIGHT_UNITS = ("feet", "cm", "mm")
 
 
@@ -65,7 +67,7 @@ def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
     config, places = of.config, _balise_places(site)
     names = reads["balise_id"].to_list()
     known = np.array([name in places for name in names], dtype=np.bool_)
-    if known.sum() < 3:
+    if known.sum() < _FEWEST_READS:
         return Lag("balise_reads", reason="fewer than three reads of balises of the site")
     at_deg = np.array([places[name] for name in names if name in places])
     number, passed_s = passes(of.gnss, points_of(*at_deg.T), config.read_m)
@@ -75,6 +77,25 @@ def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> Lag:
         return Lag("balise_reads", reason="no one lag explains the reads")
     # Antennas far from each other pass a balise at other times: what a train can have may be theirs.
     return Lag("balise_reads", lag_s, max(sigma_s, 0.2), sure=abs(lag_s) > 2.0 * config.lag_limit_s)
+
+
+def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
+    """Reads of a recorder that keeps whole seconds: the train may be a second of its way farther.
+
+    Where there is a reference it is what the judge looks at.
+    """
+    if of.reference is not None or reads.height < _FEWEST_READS or (times_ns(reads) % NS_PER_S).any():
+        return []
+    return [
+        Check(
+            "stamps of the balise reads",
+            State.MISFIT,
+            f"all {reads.height} are whole seconds",
+            "cut off or rounded by the recorder, so that at 40 m/s a balise may have been read 40 m away",
+            advice="Record the reads with finer stamps: until then nothing is proved.",
+            of_evidence=True,
+        )
+    ]
 
 
 def _balise_places(site: Site) -> dict[str, tuple[float, ...]]:

@@ -173,3 +173,20 @@ def test_a_reference_with_another_clock_than_the_odometer_proves_nothing():
         found = row(replay(log.with_streams(reference=truth), SITE, KNOWN))
         verdicts[late_s] = found["verdict"], "clock of the odometer against the reference" in (found["notes"] or "")
     assert verdicts == {0.0: ("safe", False), 0.4: ("unproven", True)}
+
+
+@pytest.mark.parametrize(("cut", "verdict"), [(False, "safe"), (True, "unproven")])
+def test_reads_cut_to_whole_seconds_prove_nothing(cut: bool, verdict: str):
+    """At 30 m/s a read stamped at the begin of its second lies up to 30 m behind the train."""
+    names = [f"P{number}" for number in range(18)]
+    places = [(name, "a", 250.0 + 217.0 * number, "physical") for number, name in enumerate(names)]
+    site = Site(SITE.track, SITE.links, balises=balises(("V", "a", 2000.0, "virtual"), *places))
+    stamps = np.array([5.0 + (measure_m - 200.0) / 30.0 for _, _, measure_m, _ in places])
+    t = pl.Series("t", np.round(1e9 * (np.floor(stamps) if cut else stamps)).astype(np.int64)).cast(
+        pl.Datetime("ns", "UTC")
+    )
+    reads = stream(BaliseReads, pl.DataFrame([t, pl.Series("balise_id", names)]))
+    log = RunLog("cut", gnss(np.zeros(WAY_M.size)), odometer=counted(WAY_M - 200.0), balise_reads=reads)
+    found = row(replay(log, site, KNOWN))
+    assert found["verdict"] == verdict
+    assert ("are whole seconds" in (found["notes"] or "")) == cut
