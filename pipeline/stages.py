@@ -262,7 +262,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
         spacing=ride.spacing,
-        unproving=len(fit.unproving),
+        unproving=len(fit.unproving) + counts.contradicting,
     )
 
 

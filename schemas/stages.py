@@ -6,7 +6,7 @@ import dataframely as dy
 import polars as pl
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, PassageStatus, SigmaSource
+from schemas.enums import BaliseKind, Judgement, PassageStatus, SigmaSource
 
 
 class Positions(dy.Schema):
@@ -114,6 +114,7 @@ class Failures(dy.Schema):
     t_end = instant("end of the episode")
     hazardous_s = real("s", "time judged wrong in use, over the whole episode", nullable=False, min=0)
     hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
+    accepted = one_of(Judgement, "worst judgement of the virtual balises accepted in it; right where none was")
     within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
     wrong_track = flag("the position was on a net element that the evidence excludes")
     hazard_id = dy.Int64(nullable=True, min=0, description="first hazard row of the episode; null where it hit no VB")

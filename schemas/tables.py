@@ -323,6 +323,11 @@ class Runs(dy.Schema):
     failures_beyond_budget = count("of these too late; of the rest it is unknown")
     failure_hazardous_s = reals("s", "hazardous time of each failure, in order of time", nullable=True)
     failure_hazardous_may_s = reals("s", "the same with the time that is unknown", nullable=True)
+    failure_accepted = ones_of(
+        Judgement,
+        "worst judgement of the balises accepted in each failure; right where none was",
+        nullable=True,
+    )
     service_levels = texts("service levels of the configuration, in order", nullable=True)
     level_allowed_s = reals("s", "allowed T_D of each of them (TVB eq. 7)", nullable=True)
     level_within = counts("failures within it, what is unknown included", nullable=True)

@@ -32,7 +32,7 @@ from pipeline.figures.undetected import spacing_of_runs
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import Configuration, SafetyConfig
 from schemas.conform import conform, dtypes
-from schemas.enums import TRUTH, RunStatus, RunVerdict
+from schemas.enums import TRUTH, Judgement, RunStatus, RunVerdict
 
 _STATES = ("p0", "p1", "p2", "p3")
 _ROUNDING = 1e-9
@@ -151,7 +151,9 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: Safety
     told = of_failures.join(of_episodes, on="solution", how="full", coalesce=True)
     levels = [(level, config.allowed_time_to_detect_s(level)) for level in config.service_levels]
     allowed = pl.DataFrame(levels, {"service_level": pl.String, "allowed_s": pl.Float64}, orient="row")
-    within, exceeded = may <= pl.col("allowed_s"), spent > pl.col("allowed_s")
+    accepted = pl.col("accepted").cast(pl.String)
+    within = (may <= pl.col("allowed_s")) & (accepted == Judgement.RIGHT.value)
+    exceeded = (spent > pl.col("allowed_s")) | (accepted == Judgement.WRONG.value)
     counts = {
         "within": within.sum(),
         "exceeded": exceeded.sum(),
@@ -168,7 +170,7 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, config: Safety
 
 
 def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
-    """One row per failure of all runs: `run_id, solution, by_truth, hazardous_s, hazardous_may_s`."""
+    """One row per failure of all runs: `run_id, solution, by_truth, hazardous_s, hazardous_may_s, accepted`."""
     by_truth = pl.col("evidence").is_in(TRUTH).fill_null(value=False)
     listed = runs.filter(pl.col("failures") > 0).select(
         "run_id",
@@ -176,8 +178,9 @@ def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
         by_truth=by_truth,
         hazardous_s="failure_hazardous_s",
         hazardous_may_s="failure_hazardous_may_s",
+        accepted="failure_accepted",
     )
-    return listed.explode("hazardous_s", "hazardous_may_s")
+    return listed.explode("hazardous_s", "hazardous_may_s", "accepted")
 
 
 def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:

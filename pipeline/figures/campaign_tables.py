@@ -11,7 +11,7 @@ from pipeline.figures.bounds import Estimator, clopper_pearson, poisson_rate, wi
 from pipeline.figures.independent import independent_episodes
 from pipeline.figures.run_figures import acceptances, accepted, is_passage, outcomes, spread
 from pipeline.figures.undetected import undetected_spread
-from pipeline.figures.verdict import level_rows
+from pipeline.figures.verdict import failures_in, level_rows
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
@@ -75,15 +75,14 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     reaction_s, period_s = config.hazards.reaction_s, 1.0 / pl.col("gnss_rate_hz")
     needed = runs.select(
         *(*RUN, "evidence", "failures", "hazardous_max_s", "share_unknown"),
-        spent_s=pl.col("failure_hazardous_s").fill_null([]),
-        may_s=pl.col("failure_hazardous_may_s").fill_null([]),
+        *("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted"),
         hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
         receiver_needs_s=period_s + (period_s if reaction_s is None else reaction_s),
     )
     rows = [
         run | level
         for run in needed.iter_rows(named=True)
-        for level in level_rows(run["spent_s"], run["may_s"], run["evidence"], run["share_unknown"], config)
+        for level in level_rows(failures_in(run), run["evidence"], run["share_unknown"], config)
     ]
     quick = pl.col("receiver_needs_s") <= pl.col("allowed_s")
     kinds = {name: kind for name, kind in dtypes(CampaignLevels).items() if name != "receiver_quick_enough"}

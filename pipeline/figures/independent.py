@@ -8,12 +8,14 @@ from schemas.enums import TRUTH
 
 
 def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
-    """Rows of `runs` with every recording once: a log under two names has one content and gives one journey.
+    """Rows of `runs` with every recording once, that of the worst verdict: a log under two names has one content.
 
     The content alone (`input_digest`) is not known of runs that came from no file.
     """
     content = pl.struct("solution", "input_digest", "t_start", "t_end", "epochs", "distance_m")
-    return runs.sort("run_id", "solution").filter(content.is_first_distinct() | pl.col("input_digest").is_null())
+    worst = ("unsafe", "unproven", "safe")
+    order = pl.col("verdict").cast(pl.String).replace_strict(worst, range(3), default=3)
+    return runs.sort("solution", order, "run_id").filter(content.is_first_distinct() | pl.col("input_digest").is_null())
 
 
 def missed_detection() -> pl.Expr:

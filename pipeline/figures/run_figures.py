@@ -152,6 +152,7 @@ def failure_counts(failures: pl.DataFrame) -> Row:
         "hazardous_max_s": failures["hazardous_s"].max(),
         "failure_hazardous_s": failures["hazardous_s"].to_list(),
         "failure_hazardous_may_s": failures["hazardous_may_s"].to_list(),
+        "failure_accepted": failures["accepted"].to_list(),
     }
 
 
@@ -159,8 +160,8 @@ def service_levels(
     failures: pl.DataFrame, evidence: Evidence | None, unknown: float | None, config: Configuration
 ) -> Row:
     """Whether the failures were within the allowed T_D of each service level (TVB eq. 7); `unknown`: share of time."""
-    hazardous_s, may_s = (failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s"))
-    rows = level_rows(hazardous_s, may_s, evidence, unknown, config)
+    told = failures.select("hazardous_s", "hazardous_may_s", "accepted").rows()
+    rows = level_rows(told, evidence, unknown, config)
     return {name: [row[part] for row in rows] for part, name in LEVEL_LISTS.items()}
 
 

@@ -9,9 +9,11 @@ from typing import Any
 import polars as pl
 
 from schemas.config import Configuration
-from schemas.enums import TRUTH, Evidence, RunStatus, RunVerdict, ThrVerdict
+from schemas.enums import TRUTH, Evidence, Judgement, RunStatus, RunVerdict, ThrVerdict
 
 Row = Mapping[str, Any]
+Failure = tuple[float, float, str]
+"""Hazardous time [s], the same with what is unknown, and the worst judgement of the VBs accepted meanwhile."""
 
 
 def verdict_of(run: Row, unknown_share_limit: float) -> RunVerdict:
@@ -113,8 +115,7 @@ LEVEL_LISTS = {
 
 
 def level_rows(
-    hazardous_s: Sequence[float],
-    hazardous_may_s: Sequence[float],
+    failures: Sequence[Failure],
     evidence: Evidence | str | None,
     share_unknown: float | None,
     config: Configuration,
@@ -124,16 +125,25 @@ def level_rows(
     rows: list[dict[str, object]] = []
     for level in config.safety.service_levels:
         allowed_s = config.safety.allowed_time_to_detect_s(level)
-        within, exceeded = level_counts(hazardous_s, hazardous_may_s, allowed_s)
-        verdict = _verdict(len(hazardous_s), within, exceeded, proven=proven).value
+        within, exceeded = level_counts(failures, allowed_s)
+        verdict = _verdict(len(failures), within, exceeded, proven=proven).value
         rows.append(dict(zip(LEVEL_LISTS, (level, allowed_s, within, exceeded, verdict), strict=True)))
     return rows
 
 
-def level_counts(hazardous_s: Sequence[float], hazardous_may_s: Sequence[float], allowed_s: float) -> tuple[int, int]:
-    """How many failures are within the allowed time whatever is unknown, and how many beyond it for certain."""
-    within = sum(may_s <= allowed_s for may_s in hazardous_may_s)
-    return within, sum(spent_s > allowed_s for spent_s in hazardous_s)
+def failures_in(run: Row) -> list[Failure]:
+    """The failures of one `runs` row, in order of time."""
+    lists = ("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted")
+    return list(zip(*(run[name] or [] for name in lists), strict=True))
+
+
+def level_counts(failures: Sequence[Failure], allowed_s: float) -> tuple[int, int]:
+    """How many failures kept the allowed time whatever is unknown, and how many did not for certain.
+
+    One in which a VB was accepted wrong did not, one with an unknown acceptance may not have (DOMAIN section 5.3).
+    """
+    within = sum(may_s <= allowed_s and accepted == Judgement.RIGHT for _, may_s, accepted in failures)
+    return within, sum(spent_s > allowed_s or accepted == Judgement.WRONG for spent_s, _, accepted in failures)
 
 
 def _verdict(failures: int, within: int, exceeded: int, *, proven: bool) -> ThrVerdict:

@@ -19,7 +19,7 @@ from pipeline.judge.suspect import suspect_of
 from schemas.arrays import NS_PER_S
 from schemas.config import HazardConfig
 from schemas.conform import dtypes
-from schemas.enums import Evidence, FailureMode, Hazard, Timing
+from schemas.enums import Evidence, FailureMode, Hazard, Judgement, Timing
 from schemas.stages import Failures
 from schemas.tables import Hazards
 
@@ -155,11 +155,18 @@ def rate_mps(draft: Draft, bench: Bench) -> float | None:
 
 def within_budget(episode: Episode, offers: Offers, budget_s: float) -> bool | None:
     """Whether an episode kept the allowed T_D: not where a VB was accepted wrong in it; null where nobody knows."""
-    accepted = offers.judged.code[offers.accepted & episode.holds(offers.number)]
-    if (accepted == WRONG).any() or episode.hazardous_s > budget_s:
+    accepted = accepted_in(episode, offers)
+    if accepted is Judgement.WRONG or episode.hazardous_s > budget_s:
         return False
-    proved = episode.hazardous_may_s <= budget_s and not (accepted == UNKNOWN).any()
+    proved = episode.hazardous_may_s <= budget_s and accepted is Judgement.RIGHT
     return True if proved else None
+
+
+def accepted_in(episode: Episode, offers: Offers) -> Judgement:
+    """The worst judgement of the VBs that were accepted in an episode; right where none was."""
+    codes = offers.judged.code[offers.accepted & episode.holds(offers.number)]
+    worst = {WRONG: Judgement.WRONG, UNKNOWN: Judgement.UNKNOWN}
+    return next((word for code, word in worst.items() if (codes == code).any()), Judgement.RIGHT)
 
 
 def failures_table(episodes: Sequence[Episode], drafts: Sequence[Draft], bench: Bench) -> pl.DataFrame:
@@ -173,6 +180,7 @@ def failures_table(episodes: Sequence[Episode], drafts: Sequence[Draft], bench: 
             "t_end": episode.end_ns,
             "hazardous_s": episode.hazardous_s,
             "hazardous_may_s": episode.hazardous_may_s,
+            "accepted": accepted_in(episode, bench.offers).value,
             "within_budget": within_budget(episode, bench.offers, budget_s),
             "wrong_track": bool(series.judged.wrong_track[episode.onset : episode.end].any()),
             "hazard_id": first_row.get(id(episode)),

@@ -72,7 +72,8 @@ def in_use_s(epochs: pl.DataFrame, config: Configuration) -> Floats:
     for from_s, until_s in _negated_spans(all_s, flags(epochs, "negated"), reaction_s(t_ns, config)):
         blocked += np.clip(np.minimum(end_s, until_s) - np.maximum(begin_s, from_s), 0.0, None)
     held = np.zeros(all_ns.size)
-    held[known] = np.clip(end_s - begin_s - blocked, 0.0, None)
+    left_s = end_s - begin_s - blocked
+    held[known] = np.where(left_s > 0.5 / NS_PER_S, left_s, 0.0)
     used: Floats = np.where(met(epochs, trusted(config)), held, 0.0)
     return used
 

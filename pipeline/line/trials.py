@@ -7,21 +7,28 @@ import polars as pl
 from pipeline.figures.bounds import CONFIDENCE, clopper_pearson
 from schemas.enums import RunVerdict
 
+# Share of the distance by which two records of one journey differ at most.
+_OTHER_JOURNEY = 0.01
+
 
 def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     """Rows of `runs` by run and solution without further recordings or replays of one journey, and a remark on them.
 
-    Runs of one solution that begin and end at the same nanoseconds are one journey: one log under two names, or in
-    two formats. The one with the worst verdict stays. Of runs that overlap in time otherwise nobody knows whether one
-    train made them: they stay, with a remark.
+    Runs of one solution that begin and end at the same nanoseconds and went as far are one journey: one log under two
+    names, or in two formats. The one with the worst verdict stays. Of runs that overlap in time otherwise nobody knows
+    whether one train made them: they stay, with a remark.
     """
     order = (
         pl.col("verdict")
         .cast(pl.String)
         .replace_strict({RunVerdict.UNSAFE.value: 0, RunVerdict.UNPROVEN.value: 1}, default=2)
     )
+    ends = ["solution", "t_start", "t_end"]
+    # Logs of two trains may be cut on the same hour; a vehicle file's scale changes the distance by less.
+    apart_m = (pl.col("distance_m") - pl.col("distance_m").first().over(ends)).abs()
+    another = (apart_m > _OTHER_JOURNEY * pl.col("distance_m").first().over(ends)).fill_null(value=False)
     kept = runs.sort("solution", order, "run_id").filter(
-        pl.struct("solution", "t_start", "t_end").is_first_distinct() | pl.col("t_start").is_null()
+        pl.struct(ends).is_first_distinct() | pl.col("t_start").is_null() | another
     )
     left = runs.height - kept.height
     ends_before = pl.col("t_end").shift().cum_max().over("solution")

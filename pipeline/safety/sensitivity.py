@@ -14,7 +14,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.campaign import make_plan, run_campaign
-from pipeline.figures.verdict import head_of, level_counts, run_verdicts, verdict_of
+from pipeline.figures.verdict import failures_in, head_of, level_counts, run_verdicts, verdict_of
 from pipeline.results import store
 from schemas.config import Configuration, Vehicle
 from schemas.enums import RunStatus
@@ -66,8 +66,7 @@ def at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.
 def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
     if row["status"] == RunStatus.FAILED:
         return row
-    spent, may = (row[name] or [] for name in ("failure_hazardous_s", "failure_hazardous_may_s"))
-    within, beyond = level_counts(spent, may, allowed_s)
+    within, beyond = level_counts(failures_in(row), allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
     return {**counted, "verdict": verdict_of(counted, config.hazards.unknown_share_limit).value}
 

@@ -156,6 +156,7 @@ def test_one_journey_counts_once() -> None:
             "verdict": ["safe", "unsafe", "safe"],
             "t_start": 0,
             "t_end": [60, 60, 61],
+            "distance_m": [1000.0, 1001.0, 1000.0],
         }
     )
     kept, said = distinct(runs)
@@ -165,6 +166,13 @@ def test_one_journey_counts_once() -> None:
     assert "overlap in time" in said[1]
     once, said = distinct(kept.filter(pl.col("run_id") != "c"))
     assert (once["run_id"].to_list(), said) == (["b"], [])
+
+
+def test_two_trains_logged_over_the_same_hour_are_two_journeys() -> None:
+    runs = pl.DataFrame(
+        {"run_id": ["a", "b"], "solution": "primary", "verdict": "safe", "t_start": 0, "t_end": 3600}
+    ).with_columns(distance_m=pl.Series([30_000.0, 24_000.0]))
+    assert distinct(runs)[0]["run_id"].to_list() == ["a", "b"]
 
 
 @pytest.mark.parametrize(("begin", "overlapping"), [(59, ["1"]), (60, []), (61, [])])
@@ -177,6 +185,7 @@ def test_runs_that_overlap_in_time_are_remarked_on(begin: int, overlapping: list
             "verdict": "safe",
             "t_start": [0, begin, 0],
             "t_end": [60, 120, 60],
+            "distance_m": 1000.0,
         }
     )
     kept, said = distinct(runs)

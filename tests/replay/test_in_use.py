@@ -190,3 +190,23 @@ def test_reads_cut_to_whole_seconds_prove_nothing(cut: bool, verdict: str):
     found = row(replay(log, site, KNOWN))
     assert found["verdict"] == verdict
     assert ("are whole seconds" in (found["notes"] or "")) == cut
+
+
+def test_a_balise_accepted_wrong_exceeds_every_service_level():
+    """30 m ahead for 0.35 s, over a balise: shorter than any allowed T_D, and accepted all the same."""
+    at_s = 5.0 + (3000.0 - 200.0) / 30.0 - 0.75
+    ahead = 30.0 * ((at_s <= TIME_S) & (at_s + 0.35 > TIME_S))
+    found = row(replay(RunLog("blip", gnss(ahead), reference=reference()), SITE))
+    assert (found["unsafe_accepted"], found["failure_accepted"], found["verdict"]) == (1, ["wrong"], "unsafe")
+    assert found["failure_hazardous_s"][0] < min(found["level_allowed_s"])
+    assert (set(found["level_within"]), set(found["level_verdict"])) == ({0}, {"exceeded"})
+
+
+def test_two_positions_of_one_stamp_prove_nothing():
+    """40 m apart for 4 s; which one the train would have used nobody knows."""
+    clean = gnss(np.zeros(TIME_S.size))
+    twice = gnss(np.full(TIME_S.size, 40.0)).filter(pl.Series((TIME_S > 60.0) & (TIME_S < 64.0)))
+    both = pl.concat([clean, twice]).sort("t", maintain_order=True)
+    log = RunLog("twice", both, odometer=counted(WAY_M - 200.0), reference=reference())
+    assert row(replay(log.with_streams(gnss=clean), SITE, KNOWN))["verdict"] == "safe"
+    assert row(replay(log, SITE, KNOWN))["verdict"] == "unproven"

@@ -31,7 +31,8 @@ UNSAFE = {
 def run_of(run_id: str, counts: dict[str, Any], failed_s: list[float]) -> RunTables:
     levels = {"service_levels": [["lpv200"]], "level_allowed_s": [[0.5025]], "level_within": [[1]]}
     levels |= {"level_exceeded": [[1 if failed_s else 0]], "level_verdict": [["exceeded" if failed_s else "kept"]]}
-    spent = {"failure_hazardous_s": [failed_s], "failure_hazardous_may_s": [failed_s]}
+    spent: dict[str, Any] = {"failure_hazardous_s": [failed_s], "failure_hazardous_may_s": [failed_s]}
+    spent["failure_accepted"] = [["right"] * len(failed_s)]
     plain = {"solution": "primary", "evidence": "balise", "vehicle": "file", "duration_s": 60.0, "evidence_s": 60.0}
     judgement = ["right", "unknown", "wrong"]
     errors_m, hit_by = ([0.5, None, 500.0], [None, None, 0]) if failed_s else ([0.5], [None])

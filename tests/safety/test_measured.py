@@ -45,7 +45,8 @@ def failed(spent: list[list[tuple[float, float]]], **columns: Any) -> pl.DataFra
         name: pl.Series([[pair[part] for pair in one] for one in spent], dtype=pl.List(pl.Float64))
         for part, name in enumerate(("failure_hazardous_s", "failure_hazardous_may_s"))
     }
-    return frame.with_columns(**lists)
+    accepted = pl.Series([["right"] * len(one) for one in spent], dtype=frame.schema["failure_accepted"])
+    return frame.with_columns(**lists, failure_accepted=accepted)
 
 
 def fault(height: int, **columns: Any) -> pl.DataFrame:

@@ -27,6 +27,7 @@ def runs(**changed: Any) -> pl.DataFrame:
         "failures_beyond_budget": 1,
         "failure_hazardous_s": [[1.0, 0.2]],
         "failure_hazardous_may_s": [[1.0, 2.0]],
+        "failure_accepted": [["right", "right"]],
     }
     return table(Runs, 1, **(plain | changed)).insert_column(0, pl.Series("run_id", ["r"]))
 

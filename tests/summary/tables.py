@@ -71,5 +71,9 @@ def alarms(height: int = 0, **columns: Any) -> pl.DataFrame:
 
 
 def failures(height: int = 0, **columns: Any) -> pl.DataFrame:
-    plain: dict[str, Any] = {"hazardous_s": 0.0, "hazardous_may_s": columns.get("hazardous_s", 0.0)}
+    plain: dict[str, Any] = {
+        "hazardous_s": 0.0,
+        "hazardous_may_s": columns.get("hazardous_s", 0.0),
+        "accepted": "right",
+    }
     return table(Failures, height, **(plain | columns))

@@ -38,6 +38,7 @@ def run_of(
         "input_digest": run_id,
         "failure_hazardous_s": [[]] * len(solutions),
         "failure_hazardous_may_s": [[]] * len(solutions),
+        "failure_accepted": [[]] * len(solutions),
     } | (counted or {})
     points = [20.0 * k for k in range(3)]
     stand = {"netelement_id": "A", "measure_m": points, "path_m": points, "sigma_along_m": 1.0}
@@ -65,6 +66,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Assessment:
         "failures_beyond_budget": 1,
         "failure_hazardous_s": [[1.0]],
         "failure_hazardous_may_s": [[1.0]],
+        "failure_accepted": [["right"]],
     }
     across = alarms(1, solution="primary", measure_m=500.0, **ACROSS)
     write_run(run_of("a", notes="faults were injected: ramp", counted=failed, hazards=fault, alarms=across), out, {})
@@ -196,7 +198,8 @@ def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessmen
 
 
 def test_a_recording_under_two_names_counts_once(tmp_path: Path) -> None:
-    for run_id, digest in (("a", "x"), ("b", "x"), ("c", "y")):
-        write_run(run_of(run_id, counted={"input_digest": digest}), tmp_path, {})
+    """Replayed with two vehicle files: the worse one counts."""
+    for run_id, digest, verdict in (("a", "x", "safe"), ("b", "x", "unsafe"), ("c", "y", "safe")):
+        write_run(run_of(run_id, counted={"input_digest": digest, "verdict": verdict}), tmp_path, {})
     figures = assess(tmp_path).tables["figures"]
-    assert figures.select("runs", "hours_with_truth").rows() == [(2, 2.0)]
+    assert figures.select("runs", "hours_with_truth", "runs_unsafe").rows() == [(2, 2.0, 1)]

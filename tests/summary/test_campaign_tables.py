@@ -6,6 +6,7 @@ import polars as pl
 import pytest
 
 from pipeline.figures.bounds import clopper_pearson, poisson_rate
+from pipeline.figures.campaign_figures import detection_by_level
 from pipeline.figures.campaign_tables import (
     campaign_accuracy,
     campaign_balises,
@@ -19,6 +20,7 @@ from schemas.tables import Runs
 from tests.summary.tables import NS, hazards, passages, table
 
 CONFIG = Configuration()
+ACCEPTED = table(Runs, 0).schema["failure_accepted"]
 
 
 def runs(ids: list[str], **columns: Any) -> pl.DataFrame:
@@ -73,6 +75,7 @@ class TestRuns:
                 failures_beyond_budget=pl.Series([1, 0, 0, 0]),
                 failure_hazardous_s=pl.Series([[0.1, 1.0, 0.2], [], [], None]),
                 failure_hazardous_may_s=pl.Series([[0.1, 1.0, 9.0], [], [], None]),
+                failure_accepted=pl.Series([["right"] * 3, [], [], None], dtype=ACCEPTED),
             ),
             faults(["b", "b"], t_failure=[NS, 2 * NS], t_detected=[2 * NS, None], time_since_failure_s=[1.0, None]),
             CONFIG,
@@ -108,7 +111,9 @@ class TestRuns:
 
     def test_a_failure_without_evidence_for_the_rest_is_still_a_failure(self) -> None:
         lost = runs(["a"], evidence=None, failures=1).with_columns(
-            failure_hazardous_s=pl.Series([[200.0]]), failure_hazardous_may_s=pl.Series([[200.0]])
+            failure_hazardous_s=pl.Series([[200.0]]),
+            failure_hazardous_may_s=pl.Series([[200.0]]),
+            failure_accepted=pl.Series([["right"]], dtype=ACCEPTED),
         )
         assert campaign_runs(lost, faults([]), CONFIG)["verdict_npa"].to_list() == ["exceeded"]
 
@@ -226,10 +231,29 @@ class TestAccuracy:
 
 
 class TestLevels:
+    @pytest.mark.parametrize(
+        ("accepted", "expected"),
+        [("right", (1, 0, "kept")), ("unknown", (0, 0, "unknown")), ("wrong", (0, 1, "exceeded"))],
+    )
+    def test_what_was_accepted_meanwhile_counts_at_every_level(
+        self, accepted: str, expected: tuple[int, int, str]
+    ) -> None:
+        """0.1 s are within all levels; a balise accepted wrong in them is not (DOMAIN section 5.3)."""
+        catalogue = runs(["a"], failures=1).with_columns(
+            failure_hazardous_s=pl.Series([[0.1]]),
+            failure_hazardous_may_s=pl.Series([[0.1]]),
+            failure_accepted=pl.Series([[accepted]], dtype=ACCEPTED),
+        )
+        levels = campaign_levels(catalogue, CONFIG).select("within", "exceeded", "verdict").rows()
+        assert set(levels) == {expected}
+        detection = detection_by_level(catalogue, faults([]), CONFIG.safety).select("within", "exceeded").rows()
+        assert set(detection) == {expected[:2]}
+
     def test_every_run_against_every_level(self) -> None:
         catalogue = runs(["a", "b", "c"], evidence=["reference", "reference", None], failures=[2, 0, 0]).with_columns(
             failure_hazardous_s=pl.Series([[1.0, 0.2], [], []], dtype=pl.List(pl.Float64)),
             failure_hazardous_may_s=pl.Series([[1.0, 3.0], [], []], dtype=pl.List(pl.Float64)),
+            failure_accepted=pl.Series([["right"] * 2, [], []], dtype=ACCEPTED),
             hazardous_max_s=pl.Series([1.0, None, None]),
         )
         found = campaign_levels(campaign_runs(catalogue, faults([]), CONFIG), CONFIG)
