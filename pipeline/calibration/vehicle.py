@@ -68,7 +68,7 @@ def estimate_run(
     blocks = _blocks(seen, odometry, config)
     if not blocks:
         return None
-    factors = [np.linalg.cholesky(_covariance(block, odometry, shares, taus_s, config)) for block in blocks]
+    factors = [_factor(_covariance(block, odometry, shares, taus_s, config)) for block in blocks]
     by_chance = sum(_chance_information(block, one, odometry) for block, one in zip(blocks, factors, strict=True))
     estimate = np.array([1.0, latency_s])
     for _ in range(_ITERATIONS):
@@ -122,6 +122,11 @@ def _covariance(
     walk = odometry.noise.white_m2_per_s * np.minimum(since[:, None], since[None, :])
     result: Floats = gnss + walk + np.diag(config.white_share * block.sigma_m**2)
     return result + _of_rows(odometry, block.t_s, block.t_s) if odometry.noise.quantisation else result
+
+
+def _factor(covariance: Floats) -> Floats:
+    """The lower triangle of Cholesky; made once, as it takes longer than all that is solved with it."""
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
 def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
