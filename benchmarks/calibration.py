@@ -20,6 +20,7 @@ from pipeline.matching import match
 from pipeline.odometry import odometry_of
 from schemas.arrays import floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
+from schemas.conform import conform
 from schemas.inputs import Links, Track
 from schemas.run import Site
 
@@ -113,7 +114,7 @@ def parallel(rng: np.random.Generator, tracks: dict[str, float], survey_m: float
     height, sigma = pl.lit(None, dtype=pl.Float64).alias("height_m"), pl.lit(survey_m).alias("sigma_m")
     relations = pl.DataFrame(links, schema=list(Links.columns()), orient="row")
     track_table = pl.concat(frames).with_columns(height, sigma)
-    return Site(Track.validate(track_table, cast=True), Links.validate(relations, cast=True))
+    return Site(conform(track_table, Track), conform(relations, Links))
 
 
 def fixes_at(x: np.ndarray, y: np.ndarray, t_s: np.ndarray, sigma_m: float | None) -> pl.DataFrame:

@@ -21,6 +21,7 @@ from pipeline.matching import match
 from pipeline.odometry import odometry_of
 from schemas.arrays import floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
+from schemas.conform import conform
 from schemas.inputs import Links, Track
 from schemas.run import Site
 
@@ -304,7 +305,7 @@ def site_of(world: World, survey_m: float, rng: np.random.Generator) -> Site:
         frame = pl.DataFrame({"netelement_id": [name] * len(points), **columns, "height_m": points[:, 2] + 300.0})
         frames.append(frame.with_columns(sigma_m=pl.lit(survey_m)))
     relations = pl.DataFrame(world.links, schema=list(Links.columns()), orient="row")
-    return Site(Track.validate(pl.concat(frames), cast=True), Links.validate(relations, cast=True))
+    return Site(conform(pl.concat(frames), Track), conform(relations, Links))
 
 
 def judge(name: str, seed: int) -> Verdict:

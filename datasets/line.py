@@ -15,6 +15,7 @@ from scipy.ndimage import uniform_filter1d
 from datasets.scenario import LineSpec, ParallelSpec, SurveySpec
 from pipeline.track.geodesy import curvature_radii_m, moved_deg
 from schemas.arrays import Floats
+from schemas.conform import conform
 from schemas.errors import ConfigError
 from schemas.inputs import Balises, Links, Track
 
@@ -106,15 +107,13 @@ def track_table(line: Line, rng: np.random.Generator) -> pl.DataFrame:
         survey.bias_up_m + noise[2],
     )
     height = pl.lit(None, pl.Float64) if survey.flat else pl.Series(moved.height_m)
-    return Track.validate(
-        table.with_columns(
-            latitude_deg=pl.Series(moved.latitude_deg),
-            longitude_deg=pl.Series(moved.longitude_deg),
-            height_m=height,
-            sigma_m=pl.lit(survey.sigma_m, pl.Float64),
-        ).select(Track.column_names()),
-        cast=True,
+    surveyed = table.with_columns(
+        latitude_deg=pl.Series(moved.latitude_deg),
+        longitude_deg=pl.Series(moved.longitude_deg),
+        height_m=height,
+        sigma_m=pl.lit(survey.sigma_m, pl.Float64),
     )
+    return conform(surveyed, Track)
 
 
 def links_table(spec: LineSpec) -> pl.DataFrame:
@@ -122,7 +121,7 @@ def links_table(spec: LineSpec) -> pl.DataFrame:
     rows = []
     for before, after in zip(spec.elements, spec.elements[1:], strict=False):
         rows.append((before.id, 0 if before.reversed else 1, after.id, 1 if after.reversed else 0, "both"))
-    return Links.validate(pl.DataFrame(rows, schema=Links.column_names(), orient="row"), cast=True)
+    return conform(pl.DataFrame(rows, schema=Links.column_names(), orient="row"), Links)
 
 
 def balises_table(spec: LineSpec) -> pl.DataFrame:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.monitors.sight import clock_columns, line_of_sight_rows
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
 
 # DO-229 J.1: horizontal factor for precision approach and for non-precision approach, vertical factor.
 K_H_PA = 6.0
@@ -83,14 +83,14 @@ def solve(
     epochs = usable.shape[0]
     error, covariance = np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
     residual, solved = np.full(usable.shape, np.nan), np.zeros(epochs, dtype=np.bool_)
-    patterns, of_epoch = np.unique(np.concatenate([usable, visible], axis=1), axis=0, return_inverse=True)
-    for number, pattern in enumerate(patterns):
-        taken, shown = (np.flatnonzero(half) for half in np.split(pattern, 2))
+    patterns, of_epoch = _patterns(usable, visible)
+    for number, first in enumerate(patterns):
+        taken, shown = np.flatnonzero(usable[first]), np.flatnonzero(visible[first])
         names = [svs[int(i)] for i in taken]
         systems = {sv[:1] for sv in names}
         if taken.size < 3 + len(systems):
             continue
-        rows = np.flatnonzero(of_epoch.ravel() == number)
+        rows = np.flatnonzero(of_epoch == number)
         used = np.ix_(rows, taken)
         design = design_rows(names, azimuth_deg[used], elevation_deg[used])
         variance, gain = least_squares(design, sigma_m[used])
@@ -101,3 +101,12 @@ def solve(
         residual[cells] = range_error_m[cells] - np.einsum("tij,tj->ti", all_rows, state)
         error[rows], covariance[rows], solved[rows] = state[:, :3], variance[:, :3, :3], True
     return Solution(error, covariance, residual, usable & solved[:, None], solved)
+
+
+def _patterns(usable: Bools, visible: Bools) -> tuple[Ints, Ints]:
+    """Epochs that differ in which satellites they have: the first epoch of each kind, and the kind of every epoch."""
+    packed = np.packbits(np.concatenate([usable, visible], axis=1), axis=1)
+    # As bytes they are compared at once; as rows of an array it takes longer than all the positions.
+    kinds = packed.view(f"S{packed.shape[1]}").ravel()
+    _, firsts, of_epoch = np.unique(kinds, return_index=True, return_inverse=True)
+    return firsts, of_epoch

@@ -25,7 +25,7 @@ def ints(series: pl.Series, unknown: int = -1) -> Ints:
 
 def times_ns(frame: pl.DataFrame, column: str = "t") -> Ints:
     """A time column without nulls as int64 nanoseconds."""
-    return frame[column].dt.timestamp("ns").to_numpy()
+    return frame[column].cast(pl.Datetime("ns")).cast(pl.Int64).to_numpy()
 
 
 def flags(frame: pl.DataFrame, column: str) -> Bools:

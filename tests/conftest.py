@@ -25,6 +25,11 @@ settings.register_profile(
 )
 settings.load_profile("suite")
 
+# While everything is loaded there is no garbage, and afterwards little: looking for it each 700 objects takes longer
+# than what it finds.
+gc.disable()
+_GARBAGE_AFTER = 50_000
+
 _LENGTH_S = 40
 
 # Not part of `make quick`: tests that start processes, draw many random numbers, or replay one journey after the other.
@@ -110,6 +115,8 @@ def pytest_collection_finish() -> None:
     """What is loaded now stays until the end: nobody needs to look through it for garbage again."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(_GARBAGE_AFTER)
+    gc.enable()
 
 
 @pytest.fixture

@@ -68,12 +68,10 @@ def _replayed(
     """One journey with one noise, and each of the faults that go into it."""
     journey, number = task
     ready = stage(JOURNEYS[journey], 1_000 * seed + number, RATE_HZ)
-    healthy_run, site = with_fault(ready, CatalogueFault("healthy", 0.0, ""))
-    healthy = replay(healthy_run, site, ready.vehicle, config)
+    healthy = replay(*with_fault(ready, CatalogueFault("healthy", 0.0, "")), ready.vehicle, config)
     rows = []
     for fault in (one for one in faults if one.journey == journey):
-        run, site = with_fault(ready, fault)
-        tables = replay(run, site, ready.vehicle, config)
+        tables = healthy if fault.is_healthy else replay(*with_fault(ready, fault), ready.vehicle, config)
         rows.append(
             {"fault": fault.name, "kind": fault.kind, "size": fault.size, "unit": fault.unit}
             | {"journey": journey, "repetition": number}

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import cho_solve, solve_triangular
 
 from pipeline.odometry import Odometry
 from schemas.arrays import Floats
@@ -67,11 +68,11 @@ def estimate_run(
     blocks = _blocks(seen, odometry, config)
     if not blocks:
         return None
-    covariances = [_covariance(block, odometry, shares, taus_s, config) for block in blocks]
-    by_chance = sum(_chance_information(block, c, odometry) for block, c in zip(blocks, covariances, strict=True))
+    factors = [_factor(_covariance(block, odometry, shares, taus_s, config)) for block in blocks]
+    by_chance = sum(_chance_information(block, one, odometry) for block, one in zip(blocks, factors, strict=True))
     estimate = np.array([1.0, latency_s])
     for _ in range(_ITERATIONS):
-        normal, right, left_over, freedom = _accumulate(blocks, covariances, odometry, estimate)
+        normal, right, left_over, freedom = _accumulate(blocks, factors, odometry, estimate)
         if np.linalg.matrix_rank(normal) < normal.shape[0]:
             return None
         estimate = estimate + np.linalg.solve(normal, right)
@@ -123,6 +124,11 @@ def _covariance(
     return result + _of_rows(odometry, block.t_s, block.t_s) if odometry.noise.quantisation else result
 
 
+def _factor(covariance: Floats) -> Floats:
+    """The lower triangle of Cholesky; made once, as it takes longer than all that is solved with it."""
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+
+
 def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
     """Covariance of the noise of the odometer's rows between two sets of times [m^2] (`QuantisationNoise`).
 
@@ -141,15 +147,17 @@ def _of_rows(odometry: Odometry, one_s: Floats, other_s: Floats) -> Floats:
 
 
 def _accumulate(
-    blocks: list[Observations], covariances: list[Floats], odometry: Odometry, estimate: Floats
+    blocks: list[Observations], factors: list[Floats], odometry: Odometry, estimate: Floats
 ) -> tuple[Floats, Floats, float, int]:
-    """Normal equations of (scale, latency), offsets eliminated; remaining chi-square before the step, its freedom."""
+    """Normal equations of (scale, latency), offsets eliminated; remaining chi-square before the step, its freedom.
+
+    `factors`: of the covariance of each block, by Cholesky.
+    """
     normal, right = np.zeros((2, 2)), np.zeros(2)
     left_over, freedom = 0.0, -2
-    for block, covariance in zip(blocks, covariances, strict=True):
+    for block, factor in zip(blocks, factors, strict=True):
         design, miss = _linearised(block, odometry, estimate)
-        factor = np.linalg.cholesky(covariance)
-        white = np.linalg.solve(factor, np.column_stack([np.ones(miss.size), design, miss]))
+        white = solve_triangular(factor, np.column_stack([np.ones(miss.size), design, miss]), lower=True)
         offset = white[:, 0] / np.linalg.norm(white[:, 0])
         free = white[:, 1:] - np.outer(offset, offset @ white[:, 1:])
         normal += free[:, :2].T @ free[:, :2]
@@ -161,7 +169,7 @@ def _accumulate(
     return normal, right, left_over, freedom
 
 
-def _chance_information(block: Observations, covariance: Floats, odometry: Odometry) -> float:
+def _chance_information(block: Observations, factor: Floats, odometry: Odometry) -> float:
     """What the odometer's noise alone, taken for changes of speed, seems to tell of the latency [1/s^2], on average.
 
     The noise in a speed over 2 S seconds has covariance r (2 S - lag) / (2 S)^2, r the variance of its walk per second,
@@ -175,7 +183,7 @@ def _chance_information(block: Observations, covariance: Floats, odometry: Odome
         across = _of_rows(odometry, begin_s, end_s)
         rows = _of_rows(odometry, begin_s, begin_s) + _of_rows(odometry, end_s, end_s) - across - across.T
         noise = noise + rows / span_s**2
-    solved = np.linalg.solve(covariance, np.column_stack([noise, np.ones(block.t_s.size)]))
+    solved = cho_solve((factor, True), np.column_stack([noise, np.ones(block.t_s.size)]))
     inverse_ones = solved[:, -1]
     return float(np.trace(solved[:, :-1]) - inverse_ones @ noise @ inverse_ones / inverse_ones.sum())
 

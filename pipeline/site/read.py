@@ -18,6 +18,7 @@ from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
 from pipeline.track.survey import geometric_measures_m, track_of
 from schemas.config import SiteConfig
+from schemas.conform import conform
 from schemas.errors import InputError, SiteError, listed
 from schemas.inputs import Balises, Links, Route, Track
 from schemas.run import Finding, Site
@@ -60,10 +61,10 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
     if found.breaches:
         raise _refusal(path, found.breaches)
     return Site(
-        track=Track.validate(track, cast=True),
-        links=Links.validate(found.links, cast=True),
-        balises=None if balises is None else Balises.validate(balises, cast=True),
-        route=None if route is None else Route.validate(route, cast=True),
+        track=conform(track, Track),
+        links=conform(found.links, Links),
+        balises=None if balises is None else conform(balises, Balises),
+        route=None if route is None else conform(route, Route),
         findings=tuple(notes + found.findings),
         digest=_digest(files),
         files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),

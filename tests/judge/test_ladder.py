@@ -14,7 +14,7 @@ from tests.judge.sensors import Counter, Receiver
 from tests.judge.world import World, make_journey
 
 SEEDS_EACH = 8
-FIRST_SEEDS = (0, 100, 300, 400)
+FIRST_SEEDS = (0, 400)
 
 
 @pytest.mark.parametrize("first", FIRST_SEEDS)

@@ -11,6 +11,7 @@ from pipeline.matching import Match, match
 from pipeline.odometry import odometry_of
 from schemas.arrays import Floats
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
+from schemas.conform import conform
 from schemas.inputs import Links, Track
 from schemas.run import Site
 from tests.matching.ladder import degrees
@@ -51,7 +52,7 @@ def site(
         )
     relations = pl.DataFrame(list(links), schema=list(Links.columns()), orient="row")
     frame = None if route is None else pl.DataFrame(list(route), schema=["netelement_id", "direction"], orient="row")
-    return Site(Track.validate(pl.concat(parts), cast=True), Links.validate(relations, cast=True), route=frame)
+    return Site(conform(pl.concat(parts), Track), conform(relations, Links), route=frame)
 
 
 def run(x_m: Floats, y_m: Floats, rate_hz: float = 1.0, sigma_m: float | None = 1.0, **columns: object) -> pl.DataFrame:

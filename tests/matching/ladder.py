@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from schemas.arrays import Floats
+from schemas.conform import conform
 from schemas.enums import Fix
 from schemas.inputs import Links, Track
 from schemas.run import Site
@@ -57,7 +58,7 @@ def ladder(sigma_m: float | None = 0.02) -> Site:
     track = pl.concat(frames).with_columns(blank.alias("height_m"), pl.lit(sigma_m, dtype=pl.Float64).alias("sigma_m"))
     rows = [("A1", 1, "A2", 0), ("A1", 1, "X", 0), ("X", 1, "B2", 0), ("B1", 1, "B2", 0)]
     links = pl.DataFrame([(*row, "both") for row in rows], schema=list(Links.columns()), orient="row")
-    return Site(Track.validate(track, cast=True), Links.validate(links, cast=True))
+    return Site(conform(track, Track), conform(links, Links))
 
 
 def journey(seed: int, sigma_m: float = 1.0, tau_s: float = 100.0, rate_hz: float = 2.0) -> Journey:
