@@ -87,6 +87,8 @@ def _joined(messages: Messages) -> bytes | None:
 
 def _payloads(piece: Bytes, starts: Ints, ends: Ints) -> memoryview:
     """Those of one piece, joined."""
+    if len(starts) == 1:
+        return piece[starts[0] : ends[0]].data
     bounds = np.column_stack([starts, ends]).reshape(-1)
     buffers = [None, pa.py_buffer(np.append(bounds, bounds[-1])), pa.py_buffer(piece)]
     parts = pa.LargeBinaryArray.from_buffers(pa.large_binary(), len(bounds), buffers)

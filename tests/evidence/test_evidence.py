@@ -9,10 +9,10 @@ import polars as pl
 import pytest
 
 from pipeline.evidence import Evidence, evidence_of
-from pipeline.evidence.anchors import Coverage, ReferencePlaces, coverages
+from pipeline.evidence.anchors import Coverage, ReferencePlaces, coverages, facing_of
 from pipeline.evidence.carrying import Anchor
-from pipeline.evidence.evidence import KINDS, NOTHING
-from pipeline.evidence.gaps import gaps_of
+from pipeline.evidence.evidence import KINDS, NOTHING, _after_standing
+from pipeline.evidence.gaps import Gap, gaps_of
 from pipeline.odometry import Odometry, odometry_of
 from pipeline.track.path import Place, Route
 from schemas.arrays import NS_PER_S, Floats, Ints
@@ -149,3 +149,33 @@ def test_reads_are_anchors_where_the_reference_does_not_tell() -> None:
     kinds = [[(one.t_ns // NS_PER_S, one.kind) for one in gap.anchors] for gap in known.gaps]
     begin, end, read = (0, Kind.REFERENCE), (2, Kind.REFERENCE), (6, Kind.BALISE)
     assert kinds == [[begin], [end, read], [read]]
+
+
+@pytest.mark.parametrize(
+    ("counts", "least_m", "expected"), [(10.0, 15.0, {0}), (-10.0, 15.0, {1}), (10.0, 25.0, set())]
+)
+def test_the_reference_tells_which_way_the_odometer_counts(counts: float, least_m: float, expected: set[int]) -> None:
+    """20 m along growing path from 0 to 2 s: element 0 is run forward as the odometer counts up, or backward."""
+    known = by_reference()
+    assert known.reference is not None
+    odometer = counting(100.0 + counts * np.arange(0.0, 5.0))
+    assert facing_of(known.reference, list(known.covered), odometer, least_m) == expected
+
+
+@pytest.mark.parametrize(
+    ("stood_s", "ahead", "behind"),
+    [
+        ((3, 4), [True, True, True, True], [True, False, False, False]),
+        ((6, 7), [False, False, True, True], [True, True, True, False]),
+        ((0, 1), [False, False, False, False], [False, False, False, False]),
+    ],
+)
+def test_nothing_is_carried_over_a_stand_of_the_odometer(
+    stood_s: tuple[int, int], ahead: list[bool], behind: list[bool]
+) -> None:
+    """From 2 s on, and back from 8 s: what lies beyond the stand, as seen from the anchor, is void."""
+    at_ns, stood = seconds(3, 5, 7, 8), [(stood_s[0] * NS_PER_S, stood_s[1] * NS_PER_S)]
+    begin, end = 2 * NS_PER_S, 8 * NS_PER_S
+    from_begin = _after_standing(at_ns, Gap(begin, end, anchor(2, 0.0), None, []), stood)
+    from_end = _after_standing(at_ns, Gap(begin, end, None, anchor(8, 0.0), []), stood)
+    assert (from_begin.tolist(), from_end.tolist()) == (ahead, behind)

@@ -1,40 +1,56 @@
-"""Alarm episodes of one solution, worked out by hand: recovery after 10 s without a fail."""
+"""What failed first and since when, on a log of three fails worked out by hand; and shares of time."""
 
 from __future__ import annotations
 
-import polars as pl
+import numpy as np
 import pytest
 
-from pipeline.epochs.failure_log import failure_log
-from tests.summary.tables import NS
+from pipeline.epochs.clock import share_of_time
+from pipeline.epochs.failure_log import AlarmEpisode, FailureLog
 
-FAILS_S = (0, 1, 11, 20)
-
-
-def epochs(**ratios: dict[int, float]) -> pl.DataFrame:
-    """25 s; of each monitor the ratio of value and threshold at its fails; it is 5 at all other epochs."""
-    columns: dict[str, list[object]] = {}
-    for name, found in ratios.items():
-        columns[f"{name}_value"] = [-2.0 * found.get(t, 5.0) for t in range(25)]
-        columns[f"{name}_threshold"] = [2.0] * 25
-        columns[f"{name}_state"] = ["fail" if t in found else "pass" for t in range(25)]
-    t = pl.Series("t", [second * NS for second in range(25)], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
-    return pl.DataFrame({"t": t, "negated": [False] * 25, **columns})
+ALARMS = (AlarmEpisode(1, 2, 10, 20, ("raw", "slow"), 2.0), AlarmEpisode(4, 4, 40, 40, ("fast",), 1.5))
+LOG = FailureLog(
+    np.arange(0, 60, 10), np.zeros(6, dtype=np.bool_), np.array([1, 2, 4]), ("raw", "slow", "fast"), ALARMS
+)
 
 
 @pytest.mark.parametrize(
-    ("recovery_s", "found_s"),
-    [(10.0, [(0, 1), (11, 20)]), (10.1, [(0, 20)]), (9.0, [(0, 1), (11, 11), (20, 20)])],
+    ("begin", "end", "first"),
+    [
+        (0, 60, (10, "raw")),
+        (10, 11, (10, "raw")),
+        (0, 10, None),
+        (11, 30, (20, "slow")),
+        (21, 40, None),
+        (41, 99, None),
+    ],
 )
-def test_an_alarm_ends_where_nothing_fails_for_the_recovery_time(
-    recovery_s: float, found_s: list[tuple[int, int]]
+def test_the_first_fail_from_the_begin_on_and_before_the_end(
+    begin: int, end: int, first: tuple[int, str] | None
 ) -> None:
-    found = failure_log(epochs(along_raw=dict.fromkeys(FAILS_S, 1.5)), recovery_s).alarms
-    assert [(alarm.start_ns // NS, alarm.end_ns // NS) for alarm in found] == found_s
+    assert LOG.first_in(begin, end) == first
 
 
-def test_the_peak_is_the_largest_ratio_at_a_fail() -> None:
-    """What stands beside a pass says nothing of the alarm, however large it is."""
-    (alarm,) = failure_log(epochs(along_raw={3: 1.5, 4: 1.2}, up_raw={4: 1.7}), 10.0).alarms
-    assert alarm.monitors == ("along_raw", "up_raw")
-    assert alarm.peak_ratio == pytest.approx(1.7)
+@pytest.mark.parametrize(
+    ("begin", "end", "start"), [(0, 60, 10), (10, 40, 10), (0, 10, None), (11, 40, None), (11, 41, 40)]
+)
+def test_the_first_alarm_that_began_from_the_begin_on_and_before_the_end(
+    begin: int, end: int, start: int | None
+) -> None:
+    assert LOG.start_within(begin, end) == start
+
+
+@pytest.mark.parametrize(("instant", "monitor"), [(10, None), (11, "raw"), (20, "raw"), (21, None), (41, None)])
+def test_an_alarm_stands_after_its_first_fail_until_its_last(instant: int, monitor: str | None) -> None:
+    assert LOG.standing_at(instant) == monitor
+
+
+def test_a_negation_stands_until_the_position_returns() -> None:
+    negated = FailureLog(LOG.t_ns, np.array([0, 1, 1, 1, 0, 0], dtype=np.bool_), LOG.failing, LOG.first_monitor, ALARMS)
+    assert [negated.standing_at(instant) for instant in (31, 40)] == ["raw", "raw"]
+
+
+def test_shares_of_less_than_a_second_and_of_no_time() -> None:
+    where = np.array([True, False])
+    assert share_of_time(np.array([0.1, 0.3]), where) == pytest.approx(0.25)
+    assert share_of_time(np.zeros(2), where) is None
