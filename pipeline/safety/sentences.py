@@ -37,6 +37,12 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     if partial:
         said.append(f"{partial} of {runs['run_id'].n_unique()} runs are partial: only what was read of them counts.")
+    kinds = runs.filter(pl.col("status") != RunStatus.FAILED)["config_digest"].n_unique()
+    if kinds > 1:
+        said.append(
+            f"The runs were replayed with {kinds} settings or vehicle files: each verdict is by its own limits; those"
+            " shown are the last ones."
+        )
     return [*said, *_unjudged(runs, alarms)]
 
 
