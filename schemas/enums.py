@@ -88,6 +88,50 @@ class RunVerdict(StrEnum):
     SAFE = "safe"
 
 
+class Reason(StrEnum):
+    """Why a run has its verdict (DOMAIN section 5.4). `CLOCK_ASSUMED` stands beside a verdict and changes none."""
+
+    ACCEPTED_WRONG = "accepted_wrong"
+    FAILURE_BEYOND_BUDGET = "failure_beyond_budget"
+    HAZARDOUS_SUM = "hazardous_sum"
+    ACCEPTED_UNKNOWN = "accepted_unknown"
+    BUDGET_UNKNOWN = "budget_unknown"
+    UNKNOWN_IN_USE = "unknown_in_use"
+    NOT_DIAGNOSED = "not_diagnosed"
+    NOTHING_ACCEPTED = "nothing_accepted"
+    EVIDENCE_DISPUTED = "evidence_disputed"
+    INPUT_DOUBTFUL = "input_doubtful"
+    CLOCK_ASSUMED = "clock_assumed"
+
+
+class Remedy(StrEnum):
+    """What would mend a verdict or a low availability (DOMAIN section 5.4)."""
+
+    CALIBRATE = "calibrate"
+    VEHICLE_FILE = "vehicle_file"
+    REFERENCE = "reference"
+    READS_AT_ENDS = "reads_at_ends"
+    READS_CLOSER = "reads_closer"
+    ROUTE = "route"
+    CLOCK = "clock"
+    ODOMETER = "odometer"
+    FASTER_LOG = "faster_log"
+    SURVEY_SIGMA = "survey_sigma"
+
+
+class LostTo(StrEnum):
+    """What moving time without a valid TVB was lost to (CONTRACT section 3, `runs.lost_to`)."""
+
+    NO_POSITION = "no_position"
+    NO_ODOMETER = "no_odometer"
+    TRACK_AMBIGUOUS = "track_ambiguous"
+    CONFIDENCE = "confidence"
+    ALARM = "alarm"
+    NOISE = "noise"
+    SLIP = "slip"
+    RELINK = "relink"
+
+
 class VehicleFigures(StrEnum):
     """Where scale and latency come from: the vehicle file, the run itself, or nowhere (no odometer)."""
 

@@ -57,6 +57,9 @@ def run_lds(
 ) -> LdsResult:
     """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
 
+    `withheld` of the result: nothing is in use, and no VB is accepted, because the noise is not known yet, the
+    odometer says itself that it slips, or the bank has just restarted (DOMAIN section 5.2).
+
     `epochs`: in order of time, one row per GNSS epoch: `t, leg, path_m, on_track, fix_valid,
     gate_probability, position_sigma_m, confidence_m, odometer_m` (along growing path, cumulative; null
     where unknown)`, travelled_m, odometer_segment, direction` (+1/-1, used where there is no odometer).
@@ -97,6 +100,7 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
         pl.Series("doubt_under_m", doubt_m).fill_nan(None),
         pl.Series("exposure_s", _exposure_s(system, journey)).fill_nan(None),
         pl.Series("negated", system.negated, dtype=pl.Boolean),
+        pl.Series("withheld", np.zeros(journey.t_ns.size, dtype=np.bool_)),
         pl.Series("diagnosis_faulty", ~np.array(system.evaluated, dtype=bool)),
         pl.Series("alarm", system.alarm, dtype=pl.Boolean),
     ]
