@@ -29,6 +29,7 @@ class ScriptedBank:
         self.fails, self.rings, self.blind = set(fails), set(rings), set(blind)
         self.fast = self.fails if fast is None else set(fast)
         self.started = 0
+        self.frozen: list[int] = []
         self.restarted: list[int] = []
 
     def failed(self, epoch: int) -> bool:
@@ -45,6 +46,9 @@ class ScriptedBank:
 
     def along_evaluated_between(self, epoch: int, end: int) -> np.ndarray:
         return np.array([self.along_evaluated(k) for k in range(epoch, end)], dtype=bool)
+
+    def freeze(self, epoch: int) -> None:
+        self.frozen.append(epoch)
 
     def restart(self, epoch: int) -> None:
         self.restarted.append(epoch)
