@@ -50,7 +50,7 @@ class NoiseMeter:
         self._config = config.monitors
         self._limit_m2 = config.noise_limit_m**2
         self._given_m2 = None if given_m is None else np.square(np.array(given_m))
-        t_s = np.cumsum(series.dt_s)
+        t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
         self._renewal = (t_s // self._config.noise_renewal_s).astype(np.int64)
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in self._config.ewma_alphas)])
         self._lags_s: list[float] = []
@@ -105,32 +105,44 @@ class NoiseMeter:
         What grows from lag to lag goes on as the model does: it is smooth noise of a sigma larger than stated. What
         does not is white. (The shortest lag has none before it: all its noise is taken for smooth.)
         """
-        known = np.full((renewals.size, len(self._lags_s)), np.nan)
-        before_m2 = before_model_m2 = grows = np.zeros(renewals.size)
+        by_lag = np.full((renewals.size, len(self._lags_s)), np.nan)
         first = np.searchsorted(self._renewal, renewals)
+        nothing = np.zeros(renewals.size)
+        before_m2, before_model_m2, grows = by_lag[:, 0], nothing, nothing
         for index, lag_s in enumerate(self._lags_s):
             model_m2 = _smooth_m2(self._series, first, lag_s, self._config)
             model_m2 = model_m2 + 2.0 * lag_s * (self._series.white_m2 / self._series.dt_s)[first]
             more_m2 = model_m2 - before_model_m2
-            if index:  # What is only expected does not make an axis blind.
-                known[:, index] = np.minimum(before_m2 + grows * more_m2, np.maximum(before_m2, self._limit_m2))
+            noise_m2 = self._no_limit_by(before_m2, before_m2 + grows * more_m2)
             if index < len(self._samples):
-                measured_m2, ready = _measured(self._samples[index], self._entering[index], renewals, self._config)
-                known[ready, index] = measured_m2[ready]
-            grew, growth = grows, np.maximum(known[:, index] - before_m2, 0.0)
-            grows = np.divide(growth, more_m2, out=np.zeros(renewals.size), where=more_m2 > 0.0)
-            if index:
-                grows *= np.minimum(1.0, np.divide(grows, grew, out=np.ones(renewals.size), where=grew > 0.0))
-            before_m2 = known[:, index]
+                measured_m2, doubt, ready = self._measured(index, renewals)
+                doubted_m2 = measured_m2 * (1.0 + self._config.noise_doubt * doubt)
+                noise_m2 = np.where(ready, self._no_limit_by(measured_m2, doubted_m2), noise_m2)
+            grew = grows
+            grows = _ratio(np.maximum(noise_m2 - (before_m2 if index else nothing), 0.0), more_m2)
+            if index:  # It may grow ever less, as noise does beyond its memory, but never more.
+                grows = grows * np.minimum(1.0, _ratio(grows, grew))
+            by_lag[:, index] = before_m2 = noise_m2
             before_model_m2 = model_m2
-        return known
+        return by_lag
+
+    def _measured(self, index: int, renewals: Ints) -> tuple[Floats, Floats, Bools]:
+        return _measured(self._samples[index], self._entering[index], renewals, self._config.noise_wait_spans)
+
+    def _no_limit_by(self, known_m2: Floats, more_m2: Floats) -> Floats:
+        """With what is expected, or in doubt: that alone does not make an axis blind."""
+        return np.minimum(more_m2, np.maximum(known_m2, self._limit_m2))
 
 
-def _measured(samples: _Samples, entering: Ints, renewals: Ints, config: MonitorConfig) -> tuple[Floats, Bools]:
-    """M of one lag from the samples before each renewal, and whether they are enough."""
+def _ratio(part: Floats, whole: Floats) -> Floats:
+    return np.divide(part, whole, out=np.zeros_like(part), where=whole > 0.0)
+
+
+def _measured(samples: _Samples, entering: Ints, renewals: Ints, wait_spans: float) -> tuple[Floats, Floats, Bools]:
+    """M of one lag from the samples before each renewal; its standard error in parts of it; whether they are enough."""
     before = np.searchsorted(samples.renewal[entering], renewals)
     # The onset of a drift touches samples over 2 L. They wait so long again: the thresholds it meets are those before.
-    end = np.maximum(before - round(config.noise_wait_spans * samples.span), np.minimum(before, samples.ready))
+    end = np.maximum(before - round(wait_spans * samples.span), np.minimum(before, samples.ready))
     begin = np.maximum(end - samples.window, 0)
     cuts = np.unique(np.concatenate([begin, end]))
     inside = entering[cuts[0] : cuts[-1]]
@@ -142,9 +154,8 @@ def _measured(samples: _Samples, entering: Ints, renewals: Ints, config: Monitor
         up_to = np.concatenate([np.zeros((1, _BINS), np.int64), np.cumsum(counts, axis=0)])
         below = np.cumsum(up_to[high] - up_to[low], axis=1)
         largest = np.maximum(largest, (below >= quantile * (end - begin)[:, None]).argmax(axis=1))
-    # A variance from n pieces is known to sqrt(2 / n) of itself.
     pieces = np.maximum((end - begin) / samples.span, 1.0)
-    return _EDGES_M2[largest] * (1.0 + config.noise_doubt * np.sqrt(2.0 / pieces)), end >= samples.ready
+    return _EDGES_M2[largest], np.sqrt(2.0 / pieces), end >= samples.ready
 
 
 def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
