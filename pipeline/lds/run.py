@@ -106,10 +106,20 @@ def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config
         pl.Series("negated", system.negated, dtype=pl.Boolean),
         withheld,
         withheld_for,
-        pl.Series("diagnosis_faulty", ~np.array(system.evaluated, dtype=bool)) & ~withheld,
+        pl.Series("diagnosis_faulty", _diagnosis_faulty(system, journey, withheld.to_numpy())),
         pl.Series("alarm", system.alarm, dtype=pl.Boolean),
     ]
     return pl.DataFrame(columns).with_columns(*system.balises.order.columns(), *system.distance.columns())
+
+
+def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
+    """P3 (DOMAIN section 4): `along_raw` has no verdict. A position withheld for that is availability lost instead.
+
+    A run without an odometer has no diagnosis along the track at all.
+    """
+    undiagnosed = ~np.array(system.evaluated, dtype=bool)
+    faulty: Bools = undiagnosed & ~withheld if journey.has_odometer else undiagnosed
+    return faulty
 
 
 def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld: Bools) -> pl.Series:
