@@ -27,6 +27,22 @@ class BaliseKind(StrEnum):
     PHYSICAL = "physical"
 
 
+class BaliseDirection(StrEnum):
+    """In which direction along its net element a virtual balise is valid; AB is growing measure."""
+
+    AB = "AB"
+    BA = "BA"
+    BOTH = "both"
+
+
+class TravelAlong(StrEnum):
+    """For which travel balises are placed: away from the start of the survey or of a way, back to it, or both."""
+
+    BOTH = "both"
+    AHEAD = "ahead"
+    BACK = "back"
+
+
 class AreaType(StrEnum):
     """Types of area of 22E126: traffic on a main line, on a dense line, in a node, and precise positioning."""
 

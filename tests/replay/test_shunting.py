@@ -50,6 +50,7 @@ def shunting():
         location_accuracy_m=pl.lit(12.0),
         linked=pl.lit(True),
         link_reaction=pl.lit("service_brake"),
+        direction=pl.lit("both"),
     )
     way, x, y = zigzag()
     noise = np.random.default_rng(3).standard_normal((3, way.size))
