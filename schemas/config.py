@@ -442,6 +442,8 @@ class MonitorConfig(Settings):
 class LdsConfig(Settings):
     """Virtual and travelling virtual balises (DOMAIN section 4)."""
 
+    # Of several odometers the one that the LDS uses; all of them are evidence (DOMAIN section 5.1).
+    odometer_sensor: str = "primary"
     # 3InSat's requirement for the most demanding operation (LOC section I).
     ci_limit_m: Positive = 14.0
     # HPL of NPA: K_H 6.18 (RTCA DO-229); few receivers give a protection level themselves.

@@ -38,6 +38,7 @@ class Odometer(dy.Schema):
     """Distance or speed from the train's odometry; at least one of the two in each row."""
 
     t = instant("time of validity")
+    sensor = text("which of the train's odometers; `primary` where the log names none")
     distance_m = real("m", "cumulative distance, falling when reversing")
     speed_mps = real("m/s", "signed speed")
     sigma_speed_mps = real("m/s", "standard deviation of the speed", min=0)

@@ -174,6 +174,10 @@ class _EpochsBeforeMonitors(dy.Schema):
     error_low_m = real("m", "least error along the track that the evidence leaves")
     error_high_m = real("m", "largest error along the track that the evidence leaves")
     judgement = one_of(Judgement, "what the evidence says of the position")
+    evidence = one_of(Evidence, "evidence of the judgement; null where there is none", nullable=True)
+    true_netelement_ids = texts("net elements on which the train may have been, by the evidence", nullable=True)
+    true_measure_low_m = real("m", "least measure of the train; null unless it was on one net element for sure")
+    true_measure_high_m = real("m", "largest measure of the train; null unless it was on one net element for sure")
 
 
 class _EpochsAfterMonitors(dy.Schema):

@@ -9,12 +9,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import failure_log
+from pipeline.evidence import true_places
 from pipeline.evidence.evidence import KINDS, NOTHING, within_spans
 from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import find_episodes
 from pipeline.judge.hazards import drafts_of, failures_table, hazards_table
-from pipeline.judge.judgement import judgement_words
+from pipeline.judge.judgement import evidence_words, judgement_words
 from pipeline.judge.passages import passages_table
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.states import lds_states
@@ -102,6 +103,8 @@ def _epochs(bench: Bench, spans: Sequence[tuple[int, int]], across: tuple[Floats
         .fill_nan(None)
         .with_columns(
             judgement_words(judged.code),
+            evidence_words(judged.kind),
+            *true_places(bench.evidence.at(bench.at_ns, bench.stood), bench.evidence.network.track),
             pl.Series("in_use", bench.used_s > 0.0),
             pl.Series("direction", bench.positions.direction, dtype=pl.Int8),
             lds_states(bench.epochs, judged, bench.odometer_wrong),
