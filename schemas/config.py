@@ -664,6 +664,15 @@ class SafetyConfig(Settings):
         return self.thr_vb_per_h / rate * 3600.0
 
 
+class AdviceConfig(Settings):
+    """From which loss on `runs.remedies` names a cure (DOMAIN section 5.4)."""
+
+    # A healthy run loses some time at its start. Ours.
+    low_availability: Probability = 0.9
+    # Of the moving time; a smaller loss is not worth a cure of its own. Ours.
+    lost_share: Probability = 0.02
+
+
 class Configuration(Settings):
     """The whole of a replay's configuration."""
 
@@ -680,6 +689,7 @@ class Configuration(Settings):
     site: SiteConfig = SiteConfig()
     survey: SurveyConfig = SurveyConfig()
     calibration: CalibrationConfig = CalibrationConfig()
+    advice: AdviceConfig = AdviceConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:

@@ -22,6 +22,7 @@ from schemas.enums import (
     MonitorState,
     PassageStatus,
     Reaction,
+    Remedy,
     RunStatus,
     RunVerdict,
     SigmaSource,
@@ -326,6 +327,13 @@ class Runs(dy.Schema):
     stanford_hpl_hazardous = count("as stanford_hazardous, with the receiver's HPL", nullable=True)
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
+    remedies = ones_of(Remedy, "what would mend verdict or availability, see DOMAIN section 5.4", nullable=True)
+    faults_injected = flag("the log says that faults were injected: rates are those of a trial", nullable=True)
+    lost_to = ones_of(
+        LostTo, "what moving time without a valid TVB was lost to, the largest share first", nullable=True
+    )
+    lost_to_share = reals("1", "share of the moving time lost to each of these", nullable=True)
+    lost_to_monitor = text("monitor that failed in most of the time lost to alarms", nullable=True)
     notes = text("remarks on the run: data left out, weak evidence, causes of low availability", nullable=True)
     failures = count("faults with time judged wrong in use, whether they hit a VB or not")
     failures_within_budget = count("of these in time: within the allowed T_D of the configured level")

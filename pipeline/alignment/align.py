@@ -13,9 +13,10 @@ from pipeline.odometry.driven import hysteresis_m, with_hysteresis
 from pipeline.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, LdsConfig, MonitorConfig, Vehicle
+from schemas.enums import NotEvaluated
 
-BEYOND_SPAN = "outside the odometer's time span"
-INTERRUPTED = "odometer interrupted or slipping"
+BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
+INTERRUPTED = NotEvaluated.INTERRUPTED
 _OF_ODOMETER = (
     *("along_m", "odometer_m", "travelled_m", "stamp_jitter_s", "odometer_white_m2_per_s", "odometer_rows_m"),
     *("odometer_period_s", "odometer_scale", "scale_sigma"),

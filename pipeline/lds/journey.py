@@ -73,10 +73,8 @@ class Journey:
         unplaced = self.placed_nowhere[epochs].any()
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
 
-    def direction_at(self, t_ns: int, otherwise: int) -> int:
-        """Direction of travel at a time, turns as they were; `otherwise` where there is no odometer."""
-        if not self.has_odometer:
-            return otherwise
+    def direction_at(self, t_ns: int) -> int:
+        """Direction of travel at a time, turns as they were."""
         return int(self.travel[max(int(np.searchsorted(self.t_ns, t_ns)) - 1, 0)])
 
 

@@ -22,14 +22,13 @@ from pipeline.monitors.bank import MonitorBank
 from pipeline.odometry.drift import drift_m2, relink_bound_m
 from schemas.arrays import NS_PER_S
 from schemas.config import AlignConfig, Configuration, LdsConfig
-from schemas.enums import BaliseKind
+from schemas.enums import BaliseKind, NotEvaluated
 
-UNLINKED = "no re-link: "
-SWITCHED_OFF = UNLINKED + "switched off"
-NO_ANCHOR = UNLINKED + "no validated position or telegram before"
-LOST = UNLINKED + "the odometer lost its distance since the anchor"
-SLIPPED = UNLINKED + "the odometer slipped too far since the anchor"
-NO_VEHICLE = UNLINKED + "without scale and its sigma in a vehicle file only at a telegram"
+SWITCHED_OFF = NotEvaluated.RELINK_OFF
+NO_ANCHOR = NotEvaluated.RELINK_NO_ANCHOR
+LOST = NotEvaluated.RELINK_DISTANCE_LOST
+SLIPPED = NotEvaluated.RELINK_SLIPPED
+NO_VEHICLE = NotEvaluated.RELINK_NO_VEHICLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +87,7 @@ class Comparison:
 
     moved_m: float = np.nan
     bound_m: float = np.nan
-    reason: str | None = None
+    reason: NotEvaluated | None = None
 
     @property
     def holds(self) -> bool:

@@ -191,7 +191,7 @@ def passage_rows(
 
 def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
     balise, window, crossing = passage.balise, passage.window, passage.crossing
-    direction = journey.direction_at(passage.t_ns, passage.direction)
+    direction = journey.direction_at(passage.t_ns)
     return {
         "solution": solution,
         "balise_id": balise.balise_id,

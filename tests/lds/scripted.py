@@ -110,6 +110,7 @@ def balises_at(places: dict[str, float], **columns: Any) -> pl.DataFrame:
         "location_accuracy_m": 12.0,
         "linked": True,
         "link_reaction": "service_brake",
+        "valid_direction": 0,
     } | columns
     spread = {name: value if isinstance(value, list) else [value] * size for name, value in values.items()}
     frame = pl.DataFrame({"balise_id": list(places), "path_m": list(places.values())} | spread)
