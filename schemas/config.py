@@ -337,6 +337,11 @@ class AlignConfig(Settings):
     # is an emergency brake.
     straight_s: Positive = 1.5
     braking_mps2: Positive = 1.8
+    # An odometer with a larger sigma says itself that it slips: three of these are the 2 km/h to which SUBSET-041
+    # 5.3.1.2 holds it at low speed.
+    slip_sigma_mps: Positive = 0.185
+    # By what share of the way a wheel that slips or slides may miscount: anti-slip control keeps it below, ours.
+    slip_way_share: Probability = 0.1
     # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of

@@ -27,6 +27,22 @@ class BaliseKind(StrEnum):
     PHYSICAL = "physical"
 
 
+class BaliseDirection(StrEnum):
+    """In which direction along its net element a virtual balise is valid; AB is growing measure."""
+
+    AB = "AB"
+    BA = "BA"
+    BOTH = "both"
+
+
+class TravelAlong(StrEnum):
+    """For which travel balises are placed: away from the start of the survey or of a way, back to it, or both."""
+
+    BOTH = "both"
+    AHEAD = "ahead"
+    BACK = "back"
+
+
 class AreaType(StrEnum):
     """Types of area of 22E126: traffic on a main line, on a dense line, in a node, and precise positioning."""
 
@@ -336,6 +352,7 @@ class NotEvaluated(StrEnum):
     RELINK_OFF = "no re-link: switched off"
     RELINK_NO_ANCHOR = "no re-link: no validated position or telegram before"
     RELINK_DISTANCE_LOST = "no re-link: the odometer lost its distance since the anchor"
+    RELINK_SLIPPED = "no re-link: the odometer slipped too far since the anchor"
     RELINK_NO_VEHICLE = "no re-link: without scale and its sigma in a vehicle file only at a telegram"
 
 
@@ -343,6 +360,7 @@ NO_RELINK = (
     NotEvaluated.RELINK_OFF,
     NotEvaluated.RELINK_NO_ANCHOR,
     NotEvaluated.RELINK_DISTANCE_LOST,
+    NotEvaluated.RELINK_SLIPPED,
     NotEvaluated.RELINK_NO_VEHICLE,
 )
 """Why a position could not be re-linked after an outage, and was not used."""

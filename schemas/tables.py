@@ -120,6 +120,7 @@ class Passages(dy.Schema):
     failure_mode = one_of(FailureMode, "ETCS failure mode")
     cause = one_of(Cause, "wrong position or no position")
     suspect_after_the_fact = flag("accepted between a fault's onset and its detection")
+    initialising = flag("accepted before any VB or TVB was validated: the most demanding case (TVB section 5)")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
     judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
@@ -186,6 +187,9 @@ class _EpochsAfterMonitors(dy.Schema):
     lds_mode = one_of(LdsMode, "mode of the location determination system")
     lds_state = one_of(
         LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
+    )
+    withheld_for = one_of(
+        LostTo, "noise, slip or relink: why the position is withheld though no monitor fails", nullable=True
     )
     tvb = flag("the epoch is a valid travelling virtual balise")
     lrvb_id = text("last relevant virtual balise", nullable=True)
