@@ -9,12 +9,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.failure_log import failure_log
+from pipeline.evidence import true_places
 from pipeline.evidence.evidence import KINDS, NOTHING, within_spans
 from pipeline.judge.alarms import alarms_table
 from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import find_episodes
 from pipeline.judge.hazards import drafts_of, failures_table, hazards_table
-from pipeline.judge.judgement import judgement_words
+from pipeline.judge.judgement import evidence_words, judgement_words
 from pipeline.judge.passages import passages_table
 from pipeline.judge.passings import Passing, train_passings
 from pipeline.judge.states import lds_states
@@ -64,15 +65,18 @@ def judge(bench: Bench, reference: pl.DataFrame | None, faults: pl.DataFrame | N
 
 
 def _train_passings(bench: Bench) -> tuple[dict[str, list[Passing]], dict[str, int]]:
-    """When the train passed each balise of the path, and how the path runs over its net element."""
+    """When the train passed each balise of the path, in a direction in which it is valid; how the path runs there."""
     index, balises = bench.evidence.network.track.index, bench.solution.balises.unique("balise_id", keep="first")
-    rows = balises.select("balise_id", "netelement_id", "measure_m", "sense").rows()
-    places = {name: Place(index[element], measure) for name, element, measure, _ in rows}
-    forward = {name: sense for name, _, _, sense in rows}
+    rows = balises.select("balise_id", "netelement_id", "measure_m", "sense", "valid_direction").rows()
+    places = {name: Place(index[element], measure) for name, element, measure, _, _ in rows}
+    forward = {name: sense for name, _, _, sense, _ in rows}
+    # Along the measure, as the passings are.
+    valid = {name: direction * sense for name, _, _, sense, direction in rows}
     at_ns = _look_at(bench)
     evidence = bench.evidence.at(at_ns, bench.stood)
     hazards = bench.config.hazards
-    return train_passings(at_ns, evidence, places, hazards.known_error_m, bench.config.lds.rearm_m), forward
+    passed = train_passings(at_ns, evidence, places, hazards.known_error_m, bench.config.lds.rearm_m)
+    return {name: [one for one in found if valid[name] in (0, one.sense)] for name, found in passed.items()}, forward
 
 
 def _look_at(bench: Bench) -> Ints:
@@ -102,6 +106,8 @@ def _epochs(bench: Bench, spans: Sequence[tuple[int, int]], across: tuple[Floats
         .fill_nan(None)
         .with_columns(
             judgement_words(judged.code),
+            evidence_words(judged.kind),
+            *true_places(bench.evidence.at(bench.at_ns, bench.stood), bench.evidence.network.track),
             pl.Series("in_use", bench.used_s > 0.0),
             pl.Series("direction", bench.positions.direction, dtype=pl.Int8),
             lds_states(bench.epochs, judged, bench.odometer_wrong),

@@ -98,6 +98,12 @@ def judgement_words(code: Ints) -> pl.Series:
     return pl.Series("judgement", kinds, dtype=pl.Enum(kinds)).gather(code)
 
 
+def evidence_words(kind: Ints) -> pl.Series:
+    """Null where there is no evidence."""
+    kinds = [*(one.value for one in KINDS), None]
+    return pl.Series("evidence", kinds, dtype=pl.Enum([one.value for one in KINDS])).gather(kind % len(kinds))
+
+
 @dataclass(frozen=True)
 class _Relative:
     """Positions against one alternative: error interval (NaN: not known), and on another track than it."""
