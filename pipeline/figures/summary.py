@@ -20,7 +20,7 @@ from pipeline.judge.judge import Judged
 from pipeline.results.provenance import Provenance
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Note, Remedy, RunStatus, RunVerdict, VehicleFigures
+from schemas.enums import MisfitCause, Note, Remedy, RunStatus, RunVerdict, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark, notes_text, remedy_words
@@ -48,6 +48,7 @@ class SolutionResults:
     ambiguous_stretches: int = 0
     notes: Sequence[Remark] = ()
     faults_injected: bool = False
+    misfits: Sequence[MisfitCause] = ()
     spacing: Spacing | None = None
     unproving: int = 0
 
@@ -117,6 +118,7 @@ def _identity(results: SolutionResults) -> Row:
         "evidence": results.judged.evidence,
         "vehicle": results.vehicle,
         "faults_injected": results.faults_injected,
+        "misfits": list(results.misfits),
         "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
         **results.alignment,
