@@ -77,6 +77,13 @@ class Evidence:
         """Pairs of anchors that no train can have passed one after the other."""
         return len(unreachable(self.gaps))
 
+    @property
+    def anchored_ns(self) -> Span | None:
+        """First and last instant at which a read or a sample of the reference says where the train was."""
+        anchors = [anchor.t_ns for gap in self.gaps for anchor in gap.anchors]
+        anchors += [border.t_ns for coverage in self.covered for border in (coverage.begin, coverage.end)]
+        return (min(anchors), max(anchors)) if anchors else None
+
     def at(self, t_ns: Ints, stood: Sequence[Span] = ()) -> EvidenceSet:
         """Evidence at these instants.
 

@@ -183,10 +183,12 @@ def judged_notes(
     odometer_contradicted: int,
     config: Configuration,
 ) -> list[str]:
-    """What stands behind the judgements of one solution, and what would prove more (DOMAIN sections 5.1 and 5.4)."""
+    """What stands behind the judgements of one solution, and what would prove more (DOMAIN sections 5.1 and 5.4).
+
+    `share_unknown`: where that keeps the run from being proved.
+    """
     # On one side of an anchor the odometer's confidence reaches the failure limit there (SUBSET-041 5.3.1.1).
     end_m = (config.hazards.failure_limit_m - config.lds.odometer_fixed_m) / config.lds.odometer_share
-    unknown = share_unknown is not None and share_unknown > config.hazards.unknown_share_limit
     return said(
         {
             "no evidence: no stream can show whether a position was right or wrong": evidence is None,
@@ -197,7 +199,7 @@ def judged_notes(
             "that it was right": evidence is Evidence.ODOMETER,
             "{:.1%} of the moving time in use could not be judged: to judge more, record a reference, or balise reads "
             f"every 2 km and within {end_m:.0f} m of both ends of the run, and give the odometer's scale in the "
-            "vehicle file": share_unknown if unknown else None,
+            "vehicle file": share_unknown,
             "the odometer's distance does not fit {} gaps between known places: odometer or vehicle file is wrong "
             "there": odometer_contradicted,
             "no odometer scale in a vehicle file: scale and latency are learned in the run and widen the thresholds, "

@@ -81,7 +81,7 @@ def copy_check(of: Recording) -> Check | None:
     )
     cause = "it is a copy of the solution, which would judge itself"
     advice = "Leave the reference out of the run, or record one with another, better instrument."
-    return Check(_WHAT, State.IMPOSSIBLE, found, cause, advice=advice)
+    return Check(_WHAT, State.IMPOSSIBLE, found, cause, advice=advice, of_evidence=True)
 
 
 def _track(frame: pl.DataFrame, t_s: Floats) -> _Track:
