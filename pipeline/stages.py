@@ -31,7 +31,7 @@ from pipeline.undetected.watched import fixes_ns
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.conform import conform, shaped
-from schemas.enums import Reason, VehicleFigures
+from schemas.enums import NotEvaluated, Reason, VehicleFigures
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
 from schemas.tables import TABLES
@@ -267,9 +267,9 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
+        faults_injected=context.run.faults is not None and context.run.faults.height > 0,
         spacing=ride.spacing,
         reasons=_reasons(context, name),
-        faults_injected=context.run.faults is not None,
         anchored_ns=context.evidence.anchored_ns,
     )
 
@@ -280,6 +280,7 @@ def _reasons(context: _Context, solution: str) -> list[Reason]:
     applies = {
         Reason.EVIDENCE_DISPUTED: context.evidence.disputed > 0,
         Reason.INPUT_DOUBTFUL: bool(doubtful),
+        Reason.CLOCK_ASSUMED: context.evidence.clock_assumed,
     }
     return [reason for reason, applied in applies.items() if applied]
 
@@ -289,7 +290,7 @@ def _single_monitors(
 ) -> dict[str, pl.DataFrame]:
     other = context.config.monitors.channel_reference
     ranges = context.ranges(solution)
-    absent = NO_OTHER_SOLUTION if other in (None, solution) else f"the run has no solution {other!r} to compare with"
+    absent = NO_OTHER_SOLUTION if other in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
     return {
         "along_doppler": doppler_monitor(aligned, context.config),
         "channel": channel_monitor(aligned, compared, context.config, absent),

@@ -337,6 +337,11 @@ class AlignConfig(Settings):
     # is an emergency brake.
     straight_s: Positive = 1.5
     braking_mps2: Positive = 1.8
+    # An odometer with a larger sigma says itself that it slips: three of these are the 2 km/h to which SUBSET-041
+    # 5.3.1.2 holds it at low speed.
+    slip_sigma_mps: Positive = 0.185
+    # By what share of the way a wheel that slips or slides may miscount: anti-slip control keeps it below, ours.
+    slip_way_share: Probability = 0.1
     # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
@@ -442,6 +447,8 @@ class MonitorConfig(Settings):
 class LdsConfig(Settings):
     """Virtual and travelling virtual balises (DOMAIN section 4)."""
 
+    # Of several odometers the one that the LDS uses; all of them are evidence (DOMAIN section 5.1).
+    odometer_sensor: str = "primary"
     # 3InSat's requirement for the most demanding operation (LOC section I).
     ci_limit_m: Positive = 14.0
     # HPL of NPA: K_H 6.18 (RTCA DO-229); few receivers give a protection level themselves.
@@ -657,6 +664,15 @@ class SafetyConfig(Settings):
         return self.thr_vb_per_h / rate * 3600.0
 
 
+class AdviceConfig(Settings):
+    """From which loss on `runs.remedies` names a cure (DOMAIN section 5.4)."""
+
+    # A healthy run loses some time at its start. Ours.
+    low_availability: Probability = 0.9
+    # Of the moving time; a smaller loss is not worth a cure of its own. Ours.
+    lost_share: Probability = 0.02
+
+
 class Configuration(Settings):
     """The whole of a replay's configuration."""
 
@@ -673,6 +689,7 @@ class Configuration(Settings):
     site: SiteConfig = SiteConfig()
     survey: SurveyConfig = SurveyConfig()
     calibration: CalibrationConfig = CalibrationConfig()
+    advice: AdviceConfig = AdviceConfig()
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:

@@ -27,6 +27,22 @@ class BaliseKind(StrEnum):
     PHYSICAL = "physical"
 
 
+class BaliseDirection(StrEnum):
+    """In which direction along its net element a virtual balise is valid; AB is growing measure."""
+
+    AB = "AB"
+    BA = "BA"
+    BOTH = "both"
+
+
+class TravelAlong(StrEnum):
+    """For which travel balises are placed: away from the start of the survey or of a way, back to it, or both."""
+
+    BOTH = "both"
+    AHEAD = "ahead"
+    BACK = "back"
+
+
 class AreaType(StrEnum):
     """Types of area of 22E126: traffic on a main line, on a dense line, in a node, and precise positioning."""
 
@@ -132,6 +148,49 @@ class LostTo(StrEnum):
     RELINK = "relink"
 
 
+class Note(StrEnum):
+    """What the notes of a run say; their words are in `schemas/words.py`."""
+
+    CORRECTED = "corrected"
+    CHUNKS_WITHOUT_CRC = "chunks_without_crc"
+    FILES_WITHOUT_CRC = "files_without_crc"
+    TOPICS_NOT_USED = "topics_not_used"
+    MISFIT = "misfit"
+    MISFIT_MENDED = "misfit_mended"
+    FAULTS_INJECTED = "faults_injected"
+    BALISES_OFF = "balises_off"
+    FAR_OFF = "far_off"
+    PLACEHOLDERS = "placeholders"
+    CONTRADICTING = "contradicting"
+    ODOMETER_ENDS_FIRST = "odometer_ends_first"
+    ODOMETER_BEGINS_LATE = "odometer_begins_late"
+    GNSS_ENDS_FIRST = "gnss_ends_first"
+    GNSS_BEGINS_LATE = "gnss_begins_late"
+    ODOMETER_LEAPS = "odometer_leaps"
+    ODOMETER_SLOW = "odometer_slow"
+    ODOMETER_REVERSED = "odometer_reversed"
+    COVARIANCE = "covariance"
+    AMBIGUOUS = "ambiguous"
+    UNLINKED = "unlinked"
+    UNKNOWN_TELEGRAMS = "unknown_telegrams"
+    ROWS_SCATTER = "rows_scatter"
+    ROWS_SCATTER_TOO_MUCH = "rows_scatter_too_much"
+    DIGITS = "digits"
+    READS_DISPUTED = "reads_disputed"
+    READS_UNREACHABLE = "reads_unreachable"
+    NO_EVIDENCE = "no_evidence"
+    EVIDENCE_BALISE = "evidence_balise"
+    EVIDENCE_ODOMETER = "evidence_odometer"
+    UNKNOWN_SHARE = "unknown_share"
+    ODOMETER_CONTRADICTED = "odometer_contradicted"
+    LEARNED = "learned"
+    UNDIAGNOSED = "undiagnosed"
+    MOVING_UNKNOWN = "moving_unknown"
+    AVAILABLE = "available"
+    OFF_TRACK = "off_track"
+    REMEDY = "remedy"
+
+
 class VehicleFigures(StrEnum):
     """Where scale and latency come from: the vehicle file, the run itself, or nowhere (no odometer)."""
 
@@ -202,6 +261,50 @@ class MonitorState(StrEnum):
     PASS = "pass"
     FAIL = "fail"
     NOT_EVALUATED = "not_evaluated"
+
+
+class NotEvaluated(StrEnum):
+    """Why a monitor is not evaluated at an epoch: the values of `M_reason` in `epochs`."""
+
+    DISABLED = "disabled by configuration"
+    NO_ODOMETER = "no odometer"
+    BEYOND_SPAN = "outside the odometer's time span"
+    INTERRUPTED = "odometer interrupted or slipping"
+    NOISE_UNKNOWN = "noise not yet known"
+    NOISE_TOO_LARGE = "noise too large"
+    NO_POSITION = "no position"
+    OFF_TRACK = "off track"
+    NO_SIGMA = "no standard deviation of the position"
+    NO_HEIGHT = "no height in the position or the survey"
+    NO_VELOCITY = "no GNSS velocity"
+    NO_VALUE = "nothing to compute it from"
+    FIRST_EPOCH = "first epoch after a restart"
+    NO_EPOCH_BEFORE = "no epoch before"
+    AMBIGUOUS_OR_OFF = "match ambiguous or off track"
+    AMBIGUOUS = "the track is ambiguous"
+    NO_RANGES = "no satellites stream"
+    NO_RANGES_AT_EPOCH = "no satellite residuals at this epoch"
+    TOO_FEW_RANGES = "too few satellites to test the ranges"
+    NO_OTHER_SOLUTION = "no other solution configured to compare with"
+    OTHER_NOT_RECORDED = "the run does not hold the solution to compare with"
+    NO_OTHER_EPOCH = "the other solution has no position at this epoch"
+    NEVER_VALIDATED = "no balise or validated position to measure from"
+    DISTANCE_LOST = "odometer distance lost since the last validated position"
+    RELINK_OFF = "no re-link: switched off"
+    RELINK_NO_ANCHOR = "no re-link: no validated position or telegram before"
+    RELINK_DISTANCE_LOST = "no re-link: the odometer lost its distance since the anchor"
+    RELINK_SLIPPED = "no re-link: the odometer slipped too far since the anchor"
+    RELINK_NO_VEHICLE = "no re-link: without scale and its sigma in a vehicle file only at a telegram"
+
+
+NO_RELINK = (
+    NotEvaluated.RELINK_OFF,
+    NotEvaluated.RELINK_NO_ANCHOR,
+    NotEvaluated.RELINK_DISTANCE_LOST,
+    NotEvaluated.RELINK_SLIPPED,
+    NotEvaluated.RELINK_NO_VEHICLE,
+)
+"""Why a position could not be re-linked after an outage, and was not used."""
 
 
 class LdsMode(StrEnum):

@@ -18,10 +18,12 @@ from schemas.enums import (
     LdsMode,
     LdsState,
     LinkingError,
+    LostTo,
     MonitorState,
     PassageStatus,
     Reaction,
     Reason,
+    Remedy,
     RunStatus,
     RunVerdict,
     SigmaSource,
@@ -120,13 +122,13 @@ class Passages(dy.Schema):
     failure_mode = one_of(FailureMode, "ETCS failure mode")
     cause = one_of(Cause, "wrong position or no position")
     suspect_after_the_fact = flag("accepted between a fault's onset and its detection")
+    initialising = flag("accepted before any VB or TVB was validated: the most demanding case (TVB section 5)")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
     judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
     error_low_m = real("m", "least error of the offer that the evidence leaves, in the direction of travel")
     error_high_m = real("m", "largest error of the offer that the evidence leaves")
     evidence = one_of(Evidence, "what the judgement of the offer rests on", nullable=True)
     proof_margin_m = real("m", "by how much the evidence may be wrong before a right offer is no longer", min=0)
-    initialising = flag("accepted before anything was validated: the most demanding case")
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
     crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
@@ -180,7 +182,10 @@ class _EpochsBeforeMonitors(dy.Schema):
     error_low_m = real("m", "least error along the track that the evidence leaves")
     error_high_m = real("m", "largest error along the track that the evidence leaves")
     judgement = one_of(Judgement, "what the evidence says of the position")
-    evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
+    evidence = one_of(Evidence, "evidence of the judgement; null where there is none", nullable=True)
+    true_netelement_ids = texts("net elements on which the train may have been, by the evidence", nullable=True)
+    true_measure_low_m = real("m", "least measure of the train; null unless it was on one net element for sure")
+    true_measure_high_m = real("m", "largest measure of the train; null unless it was on one net element for sure")
 
 
 class _EpochsAfterMonitors(dy.Schema):
@@ -188,6 +193,9 @@ class _EpochsAfterMonitors(dy.Schema):
     lds_mode = one_of(LdsMode, "mode of the location determination system")
     lds_state = one_of(
         LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
+    )
+    withheld_for = one_of(
+        LostTo, "noise, slip or relink: why the position is withheld though no monitor fails", nullable=True
     )
     tvb = flag("the epoch is a valid travelling virtual balise")
     lrvb_id = text("last relevant virtual balise", nullable=True)
@@ -250,7 +258,6 @@ class Runs(dy.Schema):
     part_from = instant("first anchor: a read, or a sample of the reference", nullable=True)
     part_to = instant("last anchor", nullable=True)
     part_share = real("1", "share of the moving time that lies between them", min=0, max=1)
-    faults_injected = flag("faults were injected: rates are those of the trial", nullable=True)
     status = one_of(RunStatus, "ok, partial (damaged input read up to the damage) or failed")
     error = text("what went wrong", nullable=True)
     vehicle = one_of(VehicleFigures, "where odometer scale and latency come from", nullable=True)
@@ -338,6 +345,13 @@ class Runs(dy.Schema):
     stanford_hpl_hazardous = count("as stanford_hazardous, with the receiver's HPL", nullable=True)
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
+    remedies = ones_of(Remedy, "what would mend verdict or availability, see DOMAIN section 5.4", nullable=True)
+    faults_injected = flag("the log says that faults were injected: rates are those of a trial", nullable=True)
+    lost_to = ones_of(
+        LostTo, "what moving time without a valid TVB was lost to, the largest share first", nullable=True
+    )
+    lost_to_share = reals("1", "share of the moving time lost to each of these", nullable=True)
+    lost_to_monitor = text("monitor that failed in most of the time lost to alarms", nullable=True)
     notes = text("remarks on the run: data left out, weak evidence, causes of low availability", nullable=True)
     failures = count("faults with time judged wrong in use, whether they hit a VB or not")
     failures_within_budget = count("of these in time: within the allowed T_D of the configured level")

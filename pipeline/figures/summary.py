@@ -11,7 +11,9 @@ import polars as pl
 
 from pipeline.epochs.clock import Clock, may_move
 from pipeline.figures import run_figures as figures
+from pipeline.figures.lost_time import LostTime, lost_time
 from pipeline.figures.notes import ingest_notes, judged_notes, time_notes, undiagnosed_notes
+from pipeline.figures.remedies import remedies, unknown_parts
 from pipeline.figures.undetected import Spacing, undetected_figures
 from pipeline.figures.verdict import reasons_of, verdict_of
 from pipeline.ingest.clean import StreamCounts
@@ -21,9 +23,10 @@ from pipeline.results.provenance import Provenance
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Reason, RunStatus, VehicleFigures
+from schemas.enums import Note, Reason, Remedy, RunStatus, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
+from schemas.words import Remark, notes_text, remedy_words
 
 Row = dict[str, Any]
 
@@ -47,21 +50,23 @@ class SolutionResults:
     counts: StreamCounts = field(default_factory=StreamCounts)
     ingest: IngestNotes = field(default_factory=IngestNotes)
     ambiguous_stretches: int = 0
-    notes: Sequence[str] = ()
+    notes: Sequence[Remark] = ()
+    faults_injected: bool = False
     spacing: Spacing | None = None
     reasons: Sequence[Reason] = ()
-    faults_injected: bool = False
     anchored_ns: tuple[int, int] | None = None
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
     """One row of the `runs` table (CONTRACT section 3)."""
     epochs, clock, judged = results.epochs, Clock.of(results.epochs, config), results.judged
+    lost = lost_time(epochs, judged.alarms, clock, config)
     row = (
         _identity(results)
         | _decisive(epochs, judged.passages, judged.failures, config)
         | ({} if judged.evidence else {"hazardous_s": None})
-        | {"duration_s": clock.duration_s, "reasons": results.reasons, "faults_injected": results.faults_injected}
+        | {"duration_s": clock.duration_s, "reasons": results.reasons}
+        | lost.columns()
         | _extent(epochs, clock, judged.distance_m)
         | figures.positions(epochs, clock, config)
         | figures.accuracy(epochs)
@@ -76,7 +81,9 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     )
     row |= _part(results, row, config) | figures.service_levels(row, config) | _verdict(row, config)
     unknown = row["share_unknown"] if Reason.UNKNOWN_IN_USE in row["reasons"] else None
-    return _frame(row | {"notes": _notes(results, unknown, clock, config)})
+    stated = epochs["survey_sigma_m"].is_not_null().any()
+    cures = remedies(row, lost, unknown_parts(epochs, config), stated, config)
+    return _frame(row | {"remedies": cures, "notes": _notes(results, unknown, lost, cures, clock, config)})
 
 
 def _decisive(epochs: pl.DataFrame, passages: pl.DataFrame, failures: pl.DataFrame, config: Configuration) -> Row:
@@ -144,22 +151,31 @@ def _identity(results: SolutionResults) -> Row:
         "out_of_order": results.counts.out_of_order,
         "evidence": results.judged.evidence,
         "vehicle": results.vehicle,
+        "faults_injected": results.faults_injected,
         "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
         **results.alignment,
     }
 
 
-def _notes(results: SolutionResults, unknown: float | None, clock: Clock, config: Configuration) -> str | None:
+def _notes(
+    results: SolutionResults,
+    unknown: float | None,
+    lost: LostTime,
+    cures: Sequence[Remedy],
+    clock: Clock,
+    config: Configuration,
+) -> str | None:
     """What the reader should know beside the figures."""
     found = (
         *ingest_notes(results.ingest),
         *results.notes,
         *judged_notes(results.judged.evidence, unknown, results.vehicle, results.odometer_contradicted, config),
         *undiagnosed_notes(results.epochs, results.judged.passages),
-        *time_notes(results.epochs, clock, config),
+        *time_notes(results.epochs, clock, lost, config),
+        *(Remark(Note.REMEDY, (remedy_words(cure),)) for cure in cures),
     )
-    return "; ".join(found) or None
+    return notes_text(found)
 
 
 def _extent(epochs: pl.DataFrame, clock: Clock, distance_m: float | None) -> Row:

@@ -85,14 +85,17 @@ def _across(case: Case, epochs: pl.DataFrame) -> list[pl.Series]:
 
 
 def _true_crossings(case: Case, stood: list[Span]) -> dict[str, list[TrueCrossing]]:
-    """When the train passed each balise of the path."""
+    """When the train passed each balise of the path, in a direction in which it is valid."""
     config, balises = case.config, case.solution.balises.unique("balise_id", keep="first")
     elements = case.element_numbers(balises["netelement_id"]).tolist()
     spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
     places = {name: Place(element, measure_m) for name, element, measure_m in spots}
     at_ns = between_far_epochs(case.instants_of_epochs(), config.align.speed_window_s)
     evidence = case.evidence.at(at_ns, stood)
-    return true_crossings(at_ns, evidence, places, config.hazards.known_error_m, config.lds.rearm_m)
+    found = true_crossings(at_ns, evidence, places, config.hazards.known_error_m, config.lds.rearm_m)
+    # Along the measure, as the crossings are; 0 is both ways.
+    valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).rows())
+    return {name: [one for one in several if valid[name] in (0, one.sense)] for name, several in found.items()}
 
 
 def _suspect_after(epochs: pl.DataFrame, spans: Sequence[Span]) -> pl.Series:

@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.epochs.clock import met, unambiguous
+from pipeline.evidence import true_places
 from pipeline.evidence.carrying import carried_forward
 from pipeline.evidence.evidence import KINDS, EvidenceSet, within_spans
 from pipeline.judge.case import Case
@@ -14,7 +15,7 @@ from pipeline.judge.movement import Span, moving, odometer_steps, stood_spans, t
 from pipeline.judge.use import lds_states, odometer_beyond_confidence, time_in_use, undiagnosed_epochs
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
-from schemas.enums import BaliseKind, Evidence, LdsMode, PassageStatus
+from schemas.enums import BaliseKind, Evidence, PassageStatus
 
 _REFERENCE = KINDS.index(Evidence.REFERENCE)
 
@@ -36,7 +37,8 @@ def epochs_judged(case: Case, stood: list[Span]) -> pl.DataFrame:
         path_m=path_m,
         unambiguous=met(epochs, unambiguous(config)),
     )
-    along = _judge(case, positions, at_ns, case.evidence.at(at_ns, stood), stood)
+    evidence = case.evidence.at(at_ns, stood)
+    along = _judge(case, positions, at_ns, evidence, stood)
     given = ints(epochs["direction"], 1)
     direction = travel_direction(given, along, at_ns, path_m, case.odometry is not None, config.hazards)
     train_m = path_m - along.known_m(config.hazards.known_error_m)
@@ -53,6 +55,7 @@ def epochs_judged(case: Case, stood: list[Span]) -> pl.DataFrame:
         pl.Series("at", at_ns).cast(pl.Datetime("ns", "UTC")),
         pl.Series("direction", direction, dtype=pl.Int8),
         *judged.columns(),
+        *true_places(evidence, case.evidence.network.track),
         pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
         *use,
         lds_states(epochs, along.code, flags(use, "in_use"), undiagnosed),
@@ -85,15 +88,12 @@ def offers_judged(case: Case, epochs: pl.DataFrame, stood: list[Span]) -> pl.Dat
     at_ns = np.where(flags(offered, "virtual"), case.instants(t_ns), t_ns)
     along = _judge(case, positions, at_ns, case.evidence.at(at_ns, stood), stood)
     late = case.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
-    # Accepted before anything was validated: TVB's most demanding case (DOMAIN section 4, initialisation).
-    unchecked = (epochs["lds_mode"].cast(pl.String) == LdsMode.INITIALISING.value).gather(before)
     judged = along.turned(ints(epochs["direction"].gather(before)))
     known_m = pl.Series("location_error_m", judged.known_m(case.config.hazards.known_error_m), nan_to_null=True)
     return offered.select(
         *("crossing_id", "balise_id", "t", "epoch", "path_m", "virtual", "accepted"),
         offered=pl.col("virtual") & pl.col("offered"),
         beyond_window=pl.col("crossing_id").is_in(late.drop_nulls().implode()),
-        initialising=pl.col("accepted") & unchecked,
     ).with_columns(known_m, *judged.columns(), proof_margin(judged, case.config.hazards))
 
 

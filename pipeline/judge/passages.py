@@ -61,7 +61,7 @@ def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[Haza
     of_virtual = ("judgement", "error_low_m", "error_high_m", "evidence", "proof_margin_m")
     joined = passages.select("crossing_id").join(
         offers.select(
-            *("crossing_id", "location_error_m", "initialising"),
+            *("crossing_id", "location_error_m"),
             *(pl.when("virtual").then(pl.col(name)).alias(name) for name in of_virtual),
             hazard_id=pl.Series(hazard).replace(NOTHING, None),
             _inserted=pl.Series(jumped | early),
@@ -70,7 +70,7 @@ def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[Haza
         how="left",
         maintain_order="left",
     )
-    return joined.drop("crossing_id").with_columns(pl.col("initialising", "_inserted").fill_null(value=False))
+    return joined.drop("crossing_id").with_columns(pl.col("_inserted").fill_null(value=False))
 
 
 def _assigned(passages: pl.DataFrame, crossings: dict[str, list[TrueCrossing]]) -> pl.Series:
@@ -178,6 +178,7 @@ def _unoffered(balise: dict[str, Any], instant: int, direction: int, seen: bool,
         "status": (PassageStatus.MISSED if seen else PassageStatus.NOT_AVAILABLE).value,
         "linking_error": LinkingError.NONE.value,
         "reaction": Reaction.NONE.value,
+        "initialising": False,
         "t_reckoned": instant,
         "t_true": instant,
     }

@@ -14,6 +14,7 @@ from pipeline.track.leg import Leg, nearest_on_leg, path_at, segments_at
 from pipeline.track.segments import Feet, no_feet
 from pipeline.track.survey import MEASURE_TOLERANCE_M, Track
 from schemas.arrays import Bools, Floats, Ints, floats
+from schemas.enums import BaliseDirection, BaliseKind
 
 Objects = npt.NDArray[np.object_]
 BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
@@ -27,8 +28,23 @@ BALISE_COLUMNS: dict[str, type[pl.DataType]] = {
     "location_accuracy_m": pl.Float64,
     "linked": pl.Boolean,
     "link_reaction": pl.String,
+    "valid_direction": pl.Int64,
 }
 
+
+def valid_along_measure(balises: pl.DataFrame) -> pl.Series:
+    """The direction along its net element in which each balise is valid (DOMAIN section 4): +1 growing, -1 falling.
+
+    0 both: a physical one, which every train reads, and one of a table that does not say (CONTRACT section 2).
+    """
+    both = pl.Series([BaliseDirection.BOTH.value]).new_from_index(0, balises.height)
+    said = balises.get_column("direction", default=both).cast(pl.String)
+    along = said.replace_strict(_ALONG_MEASURE, return_dtype=pl.Int64)
+    virtual = balises["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value
+    return along * virtual.cast(pl.Int64)
+
+
+_ALONG_MEASURE = {BaliseDirection.AB.value: 1, BaliseDirection.BA.value: -1, BaliseDirection.BOTH.value: 0}
 
 # Of two visits of one element the one that holds the measure comes first, however near the other is:
 # an order of two costs, not a limit.
@@ -190,6 +206,7 @@ class TravelledPath:
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with path position and `sense` (of the measure along it), in order of leg and position.
 
+        `valid_direction`: the direction of travel along growing path in which a virtual one is valid, +1 or -1; 0 both.
         A place that two legs share is given on each of them, for a train may pass it on each; an element passed
         twice on one leg gives its balises twice. A balise off its element is on no path (the site's findings
         name it).
@@ -200,7 +217,9 @@ class TravelledPath:
         parts = []
         for leg, route in enumerate(self.routes(self.track.index)):
             place, path_m, sense = route.places(element.to_numpy(), floats(balises, "measure_m"))
-            parts.append(balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense))
+            along_path = valid_along_measure(balises)[place] * pl.Series(sense)
+            on_leg = balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense)
+            parts.append(on_leg.with_columns(valid_direction=along_path))
         whole = pl.concat(parts).select(pl.col(name).cast(kind) for name, kind in BALISE_COLUMNS.items())
         # Where two pieces of an element meet they share a place.
         once = whole.unique(["leg", "balise_id", pl.col("path_m").round(3)], keep="first", maintain_order=True)

@@ -108,6 +108,7 @@ def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says(
             "location_accuracy_m": 5.0,
             "linked": True,
             "link_reaction": "none",
+            "direction": "both",
         }
     )
     fixes = run(np.arange(400.0, 50.0, -10.0), np.zeros(35))

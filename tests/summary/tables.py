@@ -57,18 +57,22 @@ def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
         "moving": True,
     }
     # Between stages an epoch has columns that no table has.
-    plain = {"undiagnosed": [False] * len(t_s), "negated": [False] * len(t_s)}
-    between = {name: columns.pop(name, values) for name, values in plain.items()}
+    between = {"fix_valid": True, "odometer_reason": None, "withheld": False, "survey_sigma_m": 1.0}
+    between |= {"undiagnosed": False, "negated": False}
+    of_stages = {name: columns.pop(name, value) for name, value in between.items()}
+    kinds = {"odometer_reason": pl.String, "survey_sigma_m": pl.Float64}
     since_s = np.diff(np.array(t_s), prepend=t_s[:1])
-    frame = table(Epochs, len(t_s), **(good | columns)).with_columns(
-        *(pl.Series(name, values, pl.Boolean) for name, values in between.items()),
-        pl.Series("counted_s", columns.pop("counted_s", np.where(since_s <= 1.5, since_s, 0.0)), pl.Float64),
-        fix_valid=pl.lit(value=True),
-        odometer_reason=pl.lit(None, pl.String),
+    rows = table(Epochs, len(t_s), **(good | columns)).with_columns(
+        *(pl.Series(name, _each(value, len(t_s)), kinds.get(name, pl.Boolean)) for name, value in of_stages.items()),
+        pl.Series("counted_s", np.where(since_s <= 1.5, since_s, 0.0), pl.Float64),
         epoch=pl.Series(range(len(t_s)), dtype=pl.Int64),
         at=pl.col("t"),
     )
-    return frame.with_columns(used_s=pl.when("in_use").then(pl.Series(since_s)).otherwise(0.0))
+    return rows.with_columns(used_s=pl.when("in_use").then(pl.Series(since_s)).otherwise(0.0))
+
+
+def _each(value: Any, height: int) -> list[Any]:
+    return value if isinstance(value, list) else [value] * height
 
 
 def passages(height: int = 0, **columns: Any) -> pl.DataFrame:
