@@ -267,6 +267,7 @@ def _results(context: _Context, ride: _Ride, judged: Judged, epochs: pl.DataFram
         ingest=context.run.notes,
         ambiguous_stretches=ride.found.ambiguous.height,
         notes=notes,
+        misfits=[cause.code for check in fit.misfits for cause in check.causes],
         faults_injected=context.run.faults is not None and context.run.faults.height > 0,
         spacing=ride.spacing,
         reasons=_reasons(context, name),

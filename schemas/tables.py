@@ -19,6 +19,7 @@ from schemas.enums import (
     LdsState,
     LinkingError,
     LostTo,
+    MisfitCause,
     MonitorState,
     PassageStatus,
     Reaction,
@@ -346,6 +347,7 @@ class Runs(dy.Schema):
     stanford_hpl_unavailable = count("as stanford_unavailable, with the receiver's HPL", nullable=True)
     ambiguous_stretches = count("stretches where a parallel path is as likely")
     remedies = ones_of(Remedy, "what would mend verdict or availability, see DOMAIN section 5.4", nullable=True)
+    misfits = ones_of(MisfitCause, "why streams of the run do not fit each other, the impossible first", nullable=True)
     faults_injected = flag("the log says that faults were injected: rates are those of a trial", nullable=True)
     lost_to = ones_of(
         LostTo, "what moving time without a valid TVB was lost to, the largest share first", nullable=True

@@ -23,7 +23,7 @@ from pipeline.results.provenance import Provenance
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration
 from schemas.conform import conform, dtypes
-from schemas.enums import Note, Reason, Remedy, RunStatus, VehicleFigures
+from schemas.enums import MisfitCause, Note, Reason, Remedy, RunStatus, VehicleFigures
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark, notes_text, remedy_words
@@ -52,6 +52,7 @@ class SolutionResults:
     ambiguous_stretches: int = 0
     notes: Sequence[Remark] = ()
     faults_injected: bool = False
+    misfits: Sequence[MisfitCause] = ()
     spacing: Spacing | None = None
     reasons: Sequence[Reason] = ()
     anchored_ns: tuple[int, int] | None = None
@@ -152,6 +153,7 @@ def _identity(results: SolutionResults) -> Row:
         "evidence": results.judged.evidence,
         "vehicle": results.vehicle,
         "faults_injected": results.faults_injected,
+        "misfits": list(results.misfits),
         "odometer_contradicted": results.odometer_contradicted,
         "ambiguous_stretches": results.ambiguous_stretches,
         **results.alignment,

@@ -64,11 +64,13 @@ def test_after_an_alarm_the_recovery_is_the_alarms_and_the_wait_is_the_re_links(
     ("columns", "cause"),
     [
         ({"confidence_m": 20.0}, LostTo.CONFIDENCE),
-        ({"along_raw_reason": "noise not yet known", "withheld": True}, LostTo.NOISE),
+        ({"along_raw_reason": "no position", "withheld_for": "noise"}, LostTo.NOISE),
         ({"along_raw_reason": "noise too large"}, LostTo.NOISE),
-        ({"withheld": True}, LostTo.SLIP),
+        ({"withheld_for": "slip"}, LostTo.SLIP),
         ({"odometer_reason": "no odometer"}, LostTo.NO_ODOMETER),
         ({"lds_mode": "fail_safe"}, LostTo.RELINK),
+        ({"lds_mode": "fail_safe", "alarm": True}, LostTo.ALARM),
+        ({"lds_mode": "fail_safe", "alarm": True, "withheld_for": "relink"}, LostTo.RELINK),
     ],
 )
 def test_one_cause(columns: dict[str, Any], cause: LostTo) -> None:
