@@ -356,7 +356,7 @@ def test_a_wrong_position_after_a_gap_counts_one_period_and_an_unknown_one_too()
 
 
 def test_a_withheld_position_is_not_in_use_nor_what_follows_upon_its_alarm() -> None:
-    """The bank restarts at 2 s, and fails at once: the reaction is of nothing that was in use. Back at 5 s, in use from then."""
+    """The bank restarts at 2 s, and fails at once: nothing was in use in its reaction. Back at 5 s."""
     negated = [t in (2, 3, 4) for t in range(7)]
     found = used(range(7), WRONG, negated=negated, withheld=[t == 2 for t in range(7)])
     assert found["in_use"].to_list() == [True, True, False, False, False, False, True]
