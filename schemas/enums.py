@@ -148,6 +148,65 @@ class LostTo(StrEnum):
     RELINK = "relink"
 
 
+class MisfitCause(StrEnum):
+    """Why streams of a run do not fit each other; the words are in `schemas/words.py`."""
+
+    UNIT = "unit"
+    WHEEL = "wheel"
+    PULSES = "pulses"
+    SCALE_OF_FILE = "scale_of_file"
+    LATENCY_OF_FILE = "latency_of_file"
+    IMPOSSIBLE_SCALE = "impossible_scale"
+    COUNTS_BACKWARDS = "counts_backwards"
+    SPEED_WITHOUT_SIGN = "speed_without_sign"
+    COUNTER_WITHOUT_SIGN = "counter_without_sign"
+    SIGN_OF_SOMETHING_ELSE = "sign_of_something_else"
+    EVIDENCE_CLOCKS = "evidence_clocks"
+    OFFSET_OF_REFERENCE = "offset_of_reference"
+    WHOLE_SECONDS = "whole_seconds"
+    DATUM = "datum"
+    DATUM_LIKELY = "datum_likely"
+    MAP_SHIFT = "map_shift"
+    MAP_SHIFT_BY_REFERENCE = "map_shift_by_reference"
+    HEIGHT_UNIT = "height_unit"
+    HEIGHT_ZERO = "height_zero"
+    HEIGHT_UNKNOWN = "height_unknown"
+    COPY = "copy"
+    OTHER_PLACE = "other_place"
+    VELOCITY_EXCHANGED = "velocity_exchanged"
+    VELOCITY_SIGN = "velocity_sign"
+    VELOCITY_FRAME = "velocity_frame"
+    VELOCITY_DOWN = "velocity_down"
+    GPS_AS_UTC = "gps_as_utc"
+    TAI_AS_GPS = "tai_as_gps"
+    TAI_AS_UTC = "tai_as_utc"
+    TIME_ZONE = "time_zone"
+    GPS_WEEK = "gps_week"
+    WRONG_WEEK = "wrong_week"
+    WRONG_DAY = "wrong_day"
+    DAY_AND_MONTH = "day_and_month"
+    CONSTANT_LAG = "constant_lag"
+    LATENCY = "latency"
+    STAMPED_LATE = "stamped_late"
+    STAMPED_EARLY = "stamped_early"
+    AXES_EXCHANGED = "axes_exchanged"
+    LONGITUDE_SIGN = "longitude_sign"
+    LATITUDE_SIGN = "latitude_sign"
+    BOTH_SIGNS = "both_signs"
+    RADIANS = "radians"
+    MINUTES = "minutes"
+
+
+class MisfitPlace(StrEnum):
+    """Where the cause of a misfit lies, as far as that is known."""
+
+    IN_STREAM = "in_stream"
+    RATHER_IN_STREAM = "rather_in_stream"
+    IN_SURVEY = "in_survey"
+    IN_REFERENCE = "in_reference"
+    OR_VELOCITY = "or_velocity"
+
+
 class Note(StrEnum):
     """What the notes of a run say; their words are in `schemas/words.py`."""
 
@@ -293,6 +352,7 @@ class NotEvaluated(StrEnum):
     RELINK_OFF = "no re-link: switched off"
     RELINK_NO_ANCHOR = "no re-link: no validated position or telegram before"
     RELINK_DISTANCE_LOST = "no re-link: the odometer lost its distance since the anchor"
+    RELINK_SLIPPED = "no re-link: the odometer slipped too far since the anchor"
     RELINK_NO_VEHICLE = "no re-link: without scale and its sigma in a vehicle file only at a telegram"
 
 
@@ -300,6 +360,7 @@ NO_RELINK = (
     NotEvaluated.RELINK_OFF,
     NotEvaluated.RELINK_NO_ANCHOR,
     NotEvaluated.RELINK_DISTANCE_LOST,
+    NotEvaluated.RELINK_SLIPPED,
     NotEvaluated.RELINK_NO_VEHICLE,
 )
 """Why a position could not be re-linked after an outage, and was not used."""

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.enums import LostTo, Note, Remedy
+from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, Remedy
 
 BETWEEN = "; "
 """What stands between the notes of a run; no note holds it itself."""
@@ -75,6 +75,64 @@ NOTES: dict[Note, str] = {
     Note.AVAILABLE: "available for {:.0%} of the moving time, the rest lost to: {}",
     Note.OFF_TRACK: "positions off the track, usually {:.0f} m beside it",
     Note.REMEDY: "to mend it: {}",
+}
+
+CAUSES: dict[MisfitCause, str] = {
+    MisfitCause.UNIT: "in {}",
+    MisfitCause.WHEEL: "a wheel diameter that is set wrongly",
+    MisfitCause.PULSES: "pulses, or a unit that this program does not know",
+    MisfitCause.SCALE_OF_FILE: "the vehicle file is of another vehicle or out of date, or the GNSS drifts over the "
+    "whole run",
+    MisfitCause.LATENCY_OF_FILE: "the vehicle file is of another vehicle or out of date, or the GNSS drifts over the "
+    "whole run",
+    MisfitCause.IMPOSSIBLE_SCALE: "no odometer has such a scale",
+    MisfitCause.COUNTS_BACKWARDS: "the {} counts backwards",
+    MisfitCause.SPEED_WITHOUT_SIGN: "it stays positive where the distance falls",
+    MisfitCause.COUNTER_WITHOUT_SIGN: "a counter without sign",
+    MisfitCause.SIGN_OF_SOMETHING_ELSE: "the sign follows something else than the movement",
+    MisfitCause.EVIDENCE_CLOCKS: "one of the two is wrong, and with it the true position",
+    MisfitCause.OFFSET_OF_REFERENCE: "another datum, or a fixed offset between the two antennas",
+    MisfitCause.WHOLE_SECONDS: "cut off or rounded by the recorder, so that at 40 m/s a balise may have been read 40 m "
+    "away",
+    MisfitCause.DATUM: "the survey is in {}, EPSG:{}, not in WGS 84",
+    MisfitCause.DATUM_LIKELY: "the survey may be in {}, EPSG:{}, not in WGS 84",
+    MisfitCause.MAP_SHIFT: "a datum or map shift, or an antenna far from the track's middle",
+    MisfitCause.MAP_SHIFT_BY_REFERENCE: "the reference lies where they do: a datum or map shift",
+    MisfitCause.HEIGHT_UNIT: "heights of the {} are in {}",
+    MisfitCause.HEIGHT_ZERO: "one of the two is above the sea (geoid), the other above the ellipsoid",
+    MisfitCause.HEIGHT_UNKNOWN: "another unit or another zero of the heights",
+    MisfitCause.COPY: "it is a copy of the solution, which would judge itself",
+    MisfitCause.OTHER_PLACE: "run and site of different places",
+    MisfitCause.VELOCITY_EXCHANGED: "east and north are exchanged",
+    MisfitCause.VELOCITY_SIGN: "{} of the wrong sign",
+    MisfitCause.VELOCITY_FRAME: "latitude and longitude may be exchanged, or the axes are of the train",
+    MisfitCause.VELOCITY_DOWN: "the vertical velocity counts down",
+    MisfitCause.GPS_AS_UTC: "GPS time taken as UTC",
+    MisfitCause.TAI_AS_GPS: "TAI taken as GPS time",
+    MisfitCause.TAI_AS_UTC: "TAI taken as UTC",
+    MisfitCause.TIME_ZONE: "a time zone or summer time: {}",
+    MisfitCause.GPS_WEEK: "a roll-over of the GPS week: {}",
+    MisfitCause.WRONG_WEEK: "a wrong week: {}",
+    MisfitCause.WRONG_DAY: "a wrong day, or a roll-over of it: {}",
+    MisfitCause.DAY_AND_MONTH: "day and month exchanged",
+    MisfitCause.CONSTANT_LAG: "a constant lag: a clock that was not set",
+    MisfitCause.LATENCY: "positions arrive too old",
+    MisfitCause.STAMPED_LATE: "one of the two is stamped too late, or the positions are off",
+    MisfitCause.STAMPED_EARLY: "one of the two is stamped too early, or the positions are off",
+    MisfitCause.AXES_EXCHANGED: "latitude and longitude are exchanged",
+    MisfitCause.LONGITUDE_SIGN: "longitude has the wrong sign",
+    MisfitCause.LATITUDE_SIGN: "latitude has the wrong sign",
+    MisfitCause.BOTH_SIGNS: "latitude and longitude have the wrong sign",
+    MisfitCause.RADIANS: "positions are in radians",
+    MisfitCause.MINUTES: "positions are degrees and minutes (ddmm.mm of NMEA), written as decimal degrees",
+}
+
+MISFIT_PLACES: dict[MisfitPlace, str] = {
+    MisfitPlace.IN_STREAM: "in the {}",
+    MisfitPlace.RATHER_IN_STREAM: "rather in the {} than in the {}",
+    MisfitPlace.IN_SURVEY: "in the survey: odometer, velocity or reference fit the positions as they are",
+    MisfitPlace.IN_REFERENCE: "in the reference",
+    MisfitPlace.OR_VELOCITY: "or the velocity has exchanged axes or signs",
 }
 
 LOST: dict[LostTo, str] = {

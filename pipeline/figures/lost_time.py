@@ -73,15 +73,17 @@ def lost_time(epochs: pl.DataFrame, alarms: pl.DataFrame, clock: Clock, config: 
 def _causes(epochs: pl.DataFrame, gap: Bools, t_ns: Ints, config: Configuration) -> dict[LostTo, Bools]:
     """Conditions in the order in which they apply."""
     negated = met(epochs, pl.col("lds_mode").cast(pl.String) == LdsMode.FAIL_SAFE.value)
-    noise = pl.col("along_raw_reason").is_in(_NOISE)
+    withheld = pl.col("withheld_for").cast(pl.String)
+    noise = (withheld == LostTo.NOISE.value) | pl.col("along_raw_reason").is_in(_NOISE)
+    waiting = met(epochs, withheld == LostTo.RELINK.value)
     return {
         LostTo.NO_POSITION: gap | ~met(epochs, usable()),
         LostTo.CONFIDENCE: ~met(epochs, confident(config)),
         LostTo.TRACK_AMBIGUOUS: ~met(epochs, unambiguous(config)),
         LostTo.NOISE: met(epochs, noise),
-        LostTo.SLIP: met(epochs, pl.col("withheld")),
-        LostTo.ALARM: negated & _alarmed(epochs, t_ns, config.lds.recovery_s),
-        LostTo.RELINK: negated,
+        LostTo.SLIP: met(epochs, withheld == LostTo.SLIP.value),
+        LostTo.RELINK: waiting | (negated & ~_alarmed(epochs, t_ns, config.lds.recovery_s)),
+        LostTo.ALARM: negated,
         LostTo.NO_ODOMETER: met(epochs, pl.col("odometer_reason").is_not_null()),
     }
 

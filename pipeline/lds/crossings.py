@@ -49,7 +49,7 @@ class Crossing:
     `before`, `epoch`: rows of the epochs around it. `sense`: +1 where the position passes the balise along growing
     path; `direction`: direction of travel as known at `epoch`. Time, odometer and way run are interpolated; after a
     gap they are those of `epoch`. `absence`: what to say of it in a gap, None between near epochs and of telegrams.
-    `offered`, `status`: what became of it, as in `Crossings`.
+    `offered`, `status`: what became of it, as in `Crossings`; `initialising`: accepted before anything was validated.
     """
 
     balise: Balise
@@ -64,6 +64,7 @@ class Crossing:
     absence: PassageStatus | None = None
     offered: bool = False
     status: PassageStatus | None = None
+    initialising: bool = False
 
 
 _SEVERITY = (Reaction.NONE, Reaction.SERVICE_BRAKE, Reaction.TRIP)

@@ -64,11 +64,13 @@ def test_after_an_alarm_the_recovery_is_the_alarms_and_the_wait_is_the_re_links(
     ("columns", "cause"),
     [
         ({"confidence_m": 20.0}, LostTo.CONFIDENCE),
-        ({"along_raw_reason": "noise not yet known", "withheld": True}, LostTo.NOISE),
+        ({"along_raw_reason": "no position", "withheld_for": "noise"}, LostTo.NOISE),
         ({"along_raw_reason": "noise too large"}, LostTo.NOISE),
-        ({"withheld": True}, LostTo.SLIP),
+        ({"withheld_for": "slip"}, LostTo.SLIP),
         ({"odometer_reason": "no odometer"}, LostTo.NO_ODOMETER),
         ({"lds_mode": "fail_safe"}, LostTo.RELINK),
+        ({"lds_mode": "fail_safe", "alarm": True}, LostTo.ALARM),
+        ({"lds_mode": "fail_safe", "alarm": True, "withheld_for": "relink"}, LostTo.RELINK),
     ],
 )
 def test_one_cause(columns: dict[str, Any], cause: LostTo) -> None:
@@ -100,6 +102,7 @@ ONE_LATE = {
     "failure_hazardous_may_s": [2.0],
     "failure_accepted": ["right"],
 }
+CHECKED_LITTLE = {"evidence": "balise", "reasons": ["unknown_in_use"]}
 NOTHING = Unknown(at_ends=False, between=False)
 
 
@@ -133,11 +136,11 @@ def test_alarms_that_nothing_explains_are_mended_by_calibration_and_not_by_more_
 @pytest.mark.parametrize(
     ("run", "unknown", "cure"),
     [
-        ({"evidence": "odometer", "share_unknown": 1.0}, NOTHING, [Remedy.REFERENCE]),
-        ({"evidence": None, "unproven_accepted": 3}, NOTHING, [Remedy.REFERENCE]),
-        ({"evidence": "balise", "share_unknown": 0.1}, Unknown(at_ends=True, between=False), [Remedy.READS_AT_ENDS]),
-        ({"evidence": "balise", "share_unknown": 0.1}, Unknown(at_ends=False, between=True), [Remedy.READS_CLOSER]),
-        ({"evidence": "balise", "share_unknown": 0.0}, Unknown(at_ends=True, between=True), []),
+        ({"evidence": "odometer", "reasons": ["unknown_in_use"]}, NOTHING, [Remedy.REFERENCE]),
+        ({"evidence": None, "reasons": ["accepted_unknown"]}, NOTHING, [Remedy.REFERENCE]),
+        (CHECKED_LITTLE, Unknown(at_ends=True, between=False), [Remedy.READS_AT_ENDS]),
+        (CHECKED_LITTLE, Unknown(at_ends=False, between=True), [Remedy.READS_CLOSER]),
+        ({"evidence": "balise", "reasons": []}, Unknown(at_ends=True, between=True), []),
         ({"vehicle": "learned"}, NOTHING, [Remedy.VEHICLE_FILE]),
         ({"vehicle": "none"}, NOTHING, [Remedy.ODOMETER]),
         ({"reasons": ["clock_assumed"]}, NOTHING, [Remedy.CLOCK]),
