@@ -135,8 +135,8 @@ class SurveyFit(Shift):
     """How positions lie to the track; the shift is the survey's place minus the positions'.
 
     `aside_m`: usual distance beside the track as recorded; `constant`: one shift explains most of it, in both halves of
-    the run, and puts the positions on the track: a drift of them is no shift, nor is a run beside the network. `one_heading`: the shift along the track is not known. `up_m`: the
-    survey's height minus the positions', one by one.
+    the run, and puts the positions on the track: a drift of them is no shift, nor is a run beside the network.
+    `one_heading`: the shift along the track is not known. `up_m`: the survey's height minus the positions', one by one.
     """
 
     aside_m: float
