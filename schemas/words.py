@@ -152,12 +152,12 @@ REMEDIES: dict[Remedy, str] = {
     "`balise calibrate OTHER_RUNS --site {site} --out VEHICLE.toml`",
     Remedy.VEHICLE_FILE: "measure the odometer on other runs: "
     "`balise calibrate OTHER_RUNS --site {site} --out VEHICLE.toml`, then "
-    "`balise replay {run} --site {site} --out {out} --vehicle VEHICLE.toml`",
+    "`balise replay {run} --site {site} --out {out}{options} --vehicle VEHICLE.toml`",
     Remedy.REFERENCE: "add a reference to the run: `balise convert REFERENCE --to {run} --stream reference`",
     Remedy.READS_AT_ENDS: "record balise reads near both ends of the run, within 300 m of them",
     Remedy.READS_CLOSER: "record balise reads closer to each other, every 2 km",
     Remedy.ROUTE: "name the track that the train took: "
-    "`balise replay {run} --site {site} --out {out} --route ROUTE.csv`",
+    "`balise replay {run} --site {site} --out {out}{options} --route ROUTE.csv`",
     Remedy.CLOCK: "set the recorders to one clock: `balise inspect {run} --site {site}` shows their lags",
     Remedy.ODOMETER: "record an odometer: without one nothing along the track is monitored",
     Remedy.FASTER_LOG: "log positions more often, at 10 Hz",
@@ -210,7 +210,16 @@ def lost_words(
     return ", ".join([*named, *([f"{rest:.0%} {LOST_OTHERWISE}"] if rest >= _LEAST_SHARE else [])])
 
 
-PLACES: dict[str, Any] = {"run": "RUN", "site": "SITE", "out": "OUT"}
+def beside_words(run: Mapping[str, Any]) -> str:
+    """What stands beside every verdict: balises accepted of those on the path, availability, proof margin."""
+    accepted = f"{run['balises_accepted']} of {run['balises_on_path']} balises accepted"
+    available = run["availability"]
+    margin_m = run.get("proof_margin_m")
+    told = "the train did not move" if available is None else f"available for {available:.0%} of the moving time"
+    return ", ".join([accepted, told, *([] if margin_m is None else [f"proof margin {margin_m:.1f} m"])])
+
+
+PLACES: dict[str, str] = {"run": "RUN", "site": "SITE", "out": "OUT", "options": ""}
 """What a command names where nobody knows the paths."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import traceback
 from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
@@ -27,7 +28,8 @@ class RunOutcome:
 
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
-    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved.
+    `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
+    replayed. The figures beside the verdict and `remedies` are of the solution that heads the run.
     """
 
     run_id: str
@@ -43,6 +45,12 @@ class RunOutcome:
     why: str = ""
     faults: tuple[str, ...] = ()
     proof: str = ""
+    log: str = ""
+    balises_accepted: int | None = None
+    balises_on_path: int | None = None
+    availability: float | None = None
+    proof_margin_m: float | None = None
+    remedies: tuple[str, ...] = ()
 
     @property
     def defect(self) -> bool:
@@ -115,8 +123,8 @@ def worst(runs: pl.DataFrame) -> RunStatus:
     return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in found), RunStatus.OK)
 
 
-def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOutcome:
-    """The outcome that a run's own tables tell."""
+def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> RunOutcome:
+    """The outcome that a run's own tables show."""
     errors = runs["error"].drop_nulls().to_list()
     judged = known_counts(runs).drop_nulls("missed_detections")
     *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
@@ -129,8 +137,19 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOut
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
         why=_why(runs, verdict, job.config.hazards.unknown_share_limit),
-        faults=tuple(hazard_words(hazards)),
+        faults=tuple(hazard_words(hazards, passages)),
+        log=redacted(job.address),
+        **_beside(runs, verdict),
     )
+
+
+def _beside(runs: pl.DataFrame, verdict: RunVerdict | None) -> dict[str, Any]:
+    """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
+    if verdict is None:
+        return {}
+    row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
+    names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m")
+    return {name: row.get(name) for name in names} | {"remedies": tuple(row["remedies"] or ())}
 
 
 def _why(runs: pl.DataFrame, verdict: RunVerdict | None, unknown_share_limit: float) -> str:

@@ -72,7 +72,7 @@ _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunV
 def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
-    head, named = campaign_headline(campaign.runs, campaign.hazards, made.config)
+    head, named = campaign_headline(campaign.runs, campaign.hazards, campaign.passages, made.config)
     # Each run counts once, by the worst of its solutions.
     counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
@@ -93,7 +93,7 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     }
     way = "" if named is None else f'<p class="ways">{link(campaign.hrefs[named], f"Open run {named}")}</p>'
     count = plural(campaign.runs["run_id"].n_unique(), "run")
-    heading = verdict_head(head.word, head.worst, head.reasons) + way + f"<h1>Campaign of {count}</h1>"
+    heading = verdict_head(head.word, head.worst, head.reasons, head.beside) + way + f"<h1>Campaign of {count}</h1>"
     foot = ", ".join(campaign.runs["software"].unique().sort().to_list())
     title = f"Campaign · balise: {head.word}"
     return page(title, heading, "\n".join(body), script_json(data), "campaign.js", foot)
@@ -160,13 +160,15 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
 
 def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
     """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
-    faults, none = campaign.hazards.partition_by("run_id", as_dict=True), campaign.hazards.clear()
-    return {
-        (row["run_id"], row["solution"]): ""
-        if row["verdict"] == RunVerdict.SAFE
-        else run_headline([row], faults.get((row["run_id"],), none), made.config).worst
-        for row in campaign.runs.iter_rows(named=True)
-    }
+    faults = campaign.hazards.partition_by("run_id", as_dict=True)
+    offers = campaign.passages.filter(pl.col("hazard_id").is_not_null()).partition_by("run_id", as_dict=True)
+    whys = {}
+    for row in campaign.runs.iter_rows(named=True):
+        run = (row["run_id"],)
+        of_run = faults.get(run, campaign.hazards.clear()), offers.get(run, campaign.passages.clear())
+        safe = row["verdict"] == RunVerdict.SAFE
+        whys[row["run_id"], row["solution"]] = "" if safe else run_headline([row], *of_run, made.config).worst
+    return whys
 
 
 def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
