@@ -12,7 +12,7 @@ import polars as pl
 from pipeline.campaign.plan import RunJob
 from pipeline.figures.hazard_words import hazard_words
 from pipeline.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.figures.verdict import verdict_reasons, worst_verdict
+from pipeline.figures.verdict import worst_verdict
 from pipeline.results.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -20,6 +20,7 @@ from schemas.errors import BaliseError, InputError
 from schemas.run import RunTables
 from schemas.tables import TABLES
 from schemas.version import SOFTWARE
+from schemas.words import reason_words
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame, passages:
         verdict=verdict,
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        why=_why(runs, verdict, job.config.hazards.unknown_share_limit),
+        why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(job.address),
         **_beside(runs, verdict),
@@ -149,18 +150,17 @@ def _beside(runs: pl.DataFrame, verdict: RunVerdict | None) -> dict[str, Any]:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
     names = ("balises_accepted", "balises_on_path", "availability", "proof_margin_m")
-    return {name: row.get(name) for name in names} | {"remedies": tuple(row["remedies"] or ())}
+    return {name: row[name] for name in names} | {"remedies": tuple(row["remedies"] or ())}
 
 
-def _why(runs: pl.DataFrame, verdict: RunVerdict | None, unknown_share_limit: float) -> str:
+def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
     """What decides the verdict, of each solution that has it."""
     if verdict is None:
         return ""
     rows = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value)
     several = runs.height > 1
     return "; ".join(
-        (f"{row['solution']}: " if several else "") + verdict_reasons(row, unknown_share_limit)
-        for row in rows.iter_rows(named=True)
+        (f"{row['solution']}: " if several else "") + reason_words(row) for row in rows.iter_rows(named=True)
     )
 
 

@@ -72,7 +72,7 @@ _RANK = {RunVerdict.UNSAFE.value: 0, None: 1, RunVerdict.UNPROVEN.value: 2, RunV
 def campaign_page(campaign: Campaign, made: Made) -> str:
     """HTML of the campaign."""
     solutions = [name for name in dict.fromkeys(sorted(campaign.runs["solution"].to_list())) if name]
-    head, named = campaign_headline(campaign.runs, campaign.hazards, campaign.passages, made.config)
+    head, named = campaign_headline(campaign.runs, campaign.hazards, campaign.passages)
     # Each run counts once, by the worst of its solutions.
     counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
@@ -138,7 +138,7 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
             nulls_last=True,
         )
     )
-    why = _whys(campaign, made)
+    why = _whys(campaign)
 
     def digest(row: Row) -> Cell:
         whole = row["input_digest"]
@@ -158,7 +158,7 @@ def _runs_table(campaign: Campaign, made: Made) -> str:
     return frame_table("table-runs", caption, runs, RUN_COLUMNS, CampaignRuns, special)
 
 
-def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
+def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
     """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
     faults = campaign.hazards.partition_by("run_id", as_dict=True)
     offers = campaign.passages.filter(pl.col("hazard_id").is_not_null()).partition_by("run_id", as_dict=True)
@@ -167,7 +167,7 @@ def _whys(campaign: Campaign, made: Made) -> dict[tuple[str, str], str]:
         run = (row["run_id"],)
         of_run = faults.get(run, campaign.hazards.clear()), offers.get(run, campaign.passages.clear())
         safe = row["verdict"] == RunVerdict.SAFE
-        whys[row["run_id"], row["solution"]] = "" if safe else run_headline([row], *of_run, made.config).worst
+        whys[row["run_id"], row["solution"]] = "" if safe else run_headline([row], *of_run).worst
     return whys
 
 

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.figures.hazard_words import hazard_words, withstood
-from pipeline.figures.verdict import head_of, run_verdicts, verdict_reasons, word_of, worst_verdict
+from pipeline.figures.verdict import head_of, run_verdicts, word_of, worst_verdict
 from pipeline.report.columns import Row
 from pipeline.report.markup import Cell, cell, number, table
 from pipeline.report.words import WORDS, plural, some_of
-from schemas.config import Configuration
-from schemas.enums import RunVerdict
+from schemas.enums import Reason, RunVerdict
 from schemas.run import RunTables
-from schemas.words import beside_words
+from schemas.words import beside_words, part_words, reason_words
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
@@ -31,29 +30,28 @@ class Headline:
     beside: str = ""
 
 
-def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFrame, config: Configuration) -> Headline:
+def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFrame) -> Headline:
     """Of one run with all its solutions, headed by the worst of them."""
     listed = list(rows)
     verdict = worst_verdict(row["verdict"] for row in listed)
     heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
     if verdict is None:
         return Headline(word_of(verdict), heading["error"] or "the run failed", "")
-    limit = config.hazards.unknown_share_limit
-    worst = _worst(heading, hazards, passages, limit)
-    beside = beside_words(heading)
+    worst = _worst(heading, hazards, passages)
+    beside = ". ".join(filter(None, (beside_words(heading), part_words(heading))))
     if len(listed) > 1:
-        told = " ".join(_told(row, limit) for row in listed)
+        told = " ".join(_told(row) for row in listed)
         return Headline(word_of(verdict), f"{heading['solution']}: {worst}", told, beside)
-    told = f"{verdict_reasons(heading, limit)}." if verdict == RunVerdict.UNSAFE else ""
+    told = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
     return Headline(word_of(verdict), worst, told, beside)
 
 
-def _told(row: Row, limit: float) -> str:
-    why = "" if row["verdict"] is None else f", {verdict_reasons(row, limit)}, {beside_words(row)}"
+def _told(row: Row) -> str:
+    why = "" if row["verdict"] is None else f", {reason_words(row)}, {beside_words(row)}"
     return f"{row['solution']}: {word_of(row['verdict'])}{why}."
 
 
-def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame, limit: float) -> str:
+def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
     """What made the verdict, in the fewest words that name it: the worst of the faults that did, else the counts.
 
     Of a safe run with faults: what it withstood.
@@ -63,12 +61,10 @@ def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame, limit: float
         return met
     accepted, late = pl.col("accepted_ids").list.len() > 0, pl.col("within_budget").eq(other=False)
     guilty = hazards.filter(own, accepted | late)
-    return next(iter(hazard_words(guilty, passages)), verdict_reasons(run, limit))
+    return next(iter(hazard_words(guilty, passages)), reason_words(run))
 
 
-def campaign_headline(
-    runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, config: Configuration
-) -> tuple[Headline, str | None]:
+def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> tuple[Headline, str | None]:
     """Of all runs, and the run that it names; frames with `run_id`."""
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
@@ -87,7 +83,7 @@ def campaign_headline(
         return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", said, beside), None
     row = worst.row(0, named=True)
     of_run = pl.col("run_id") == row["run_id"]
-    reason = _worst(row, hazards.filter(of_run), passages.filter(of_run), config.hazards.unknown_share_limit)
+    reason = _worst(row, hazards.filter(of_run), passages.filter(of_run))
     return Headline(head.word, f"{reason} (run {row['run_id']})", said, beside), row["run_id"]
 
 
@@ -95,14 +91,12 @@ def _over_all(runs: pl.DataFrame) -> Row:
     """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
     weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
     available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
-    figures = {
-        "balises_accepted": pl.col("balises_accepted").sum(),
-        "balises_on_path": pl.col("balises_on_path").sum(),
-        "availability": pl.when(weight_s > 0.0).then(available),
-    }
-    if "proof_margin_m" in runs.columns:
-        figures["proof_margin_m"] = pl.col("proof_margin_m").min()
-    return runs.select(**figures).row(0, named=True)
+    figures = runs.select(
+        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("proof_margin_m").min(),
+        availability=pl.when(weight_s > 0.0).then(available),
+    )
+    return figures.row(0, named=True)
 
 
 _TRAINS = {
@@ -160,10 +154,10 @@ def _reading(row: Row) -> str:
     return f"{row['status']}: {WORDS[row['status']]}{until}"
 
 
-def tile_figures(run: Row, balises: pl.DataFrame, unknown_limit: float) -> list[tuple[str, str, str]]:
+def tile_figures(run: Row, balises: pl.DataFrame) -> list[tuple[str, str, str]]:
     """What a reader must not miss; a tile that is bad looks bad. `balises`: as `lost_shares`."""
     share = run["share_unknown"]
-    checked = share is not None and share <= unknown_limit
+    checked = share is not None and Reason.UNKNOWN_IN_USE not in (run["reasons"] or ())
     lost, passed = (int(balises[name].sum()) for name in ("lost", "passages"))
     return [
         *((words, number(run[name]), _tone(run[name], tone)) for words, name, tone in _COUNTED),

@@ -8,10 +8,12 @@ from typing import Any, cast
 import numpy as np
 import polars as pl
 import pytest
+from pipeline.judge.bench import Bench
+from pipeline.judge.passings import Passing, train_passings
+from pipeline.judge.states import in_use_s, odometer_beyond_confidence
 
 from pipeline.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.judge.alarms import verdict_within
-from pipeline.judge.bench import Bench
 from pipeline.judge.episodes import Episode, _failure, _is_back, _named_onset_ns
 from pipeline.judge.hazards import _instants, crossed_by, drafts_of, rate_mps, size_m, within_budget
 from pipeline.judge.judge import _look_at, errors_across
@@ -26,8 +28,6 @@ from pipeline.judge.judgement import (
     with_own_anchors,
 )
 from pipeline.judge.jumps import Jump, find_jumps, steps_of
-from pipeline.judge.passings import Passing, train_passings
-from pipeline.judge.states import in_use_s, odometer_beyond_confidence
 from pipeline.judge.suspect import suspect_of
 from pipeline.track.path import Place, Route
 from schemas.config import Configuration, HazardConfig, LdsConfig
