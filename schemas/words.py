@@ -163,11 +163,10 @@ LOST: dict[LostTo, str] = {
 LOST_OTHERWISE = "not validated (initialisation, short losses, monitors switched off)"
 
 REMEDIES: dict[Remedy, str] = {
-    Remedy.CALIBRATE: "measure the receiver's noise on other runs of this vehicle: "
-    "`balise calibrate OTHER_RUNS --site {site} --out VEHICLE.toml`",
-    Remedy.VEHICLE_FILE: "measure the odometer on other runs: "
-    "`balise calibrate OTHER_RUNS --site {site} --out VEHICLE.toml`, then "
-    "`balise replay {run} --site {site} --out {out}{options} --vehicle VEHICLE.toml`",
+    Remedy.CALIBRATE: "measure noise and odometer on two or more other fault-free runs of this vehicle: "
+    "`balise replay {run} --site {site} --out {out}{options} --calibrate 'OTHER_RUNS/*'`",
+    Remedy.VEHICLE_FILE: "measure the odometer on two or more other fault-free runs of this vehicle: "
+    "`balise replay {run} --site {site} --out {out}{options} --calibrate 'OTHER_RUNS/*'`",
     Remedy.REFERENCE: "add a reference to the run: `balise convert REFERENCE --to {run} --stream reference`",
     Remedy.READS_AT_ENDS: "record balise reads near both ends of the run, within 300 m of them",
     Remedy.READS_CLOSER: "record balise reads closer to each other, every 2 km",

@@ -187,9 +187,8 @@ def test_each_remedy_stands_once_with_its_command_and_the_worst_run() -> None:
     assert lines == [
         "2 of 2 runs: name the track that the train took: "
         "`balise replay logs/a.mcap --site line9 --out week --config c.toml --route ROUTE.csv`",
-        "1 of 2 runs: measure the odometer on other runs: "
-        "`balise calibrate OTHER_RUNS --site line9 --out VEHICLE.toml`, "
-        "then `balise replay logs/a.mcap --site line9 --out week --config c.toml --vehicle VEHICLE.toml`",
+        "1 of 2 runs: measure the odometer on two or more other fault-free runs of this vehicle: "
+        "`balise replay logs/a.mcap --site line9 --out week --config c.toml --calibrate 'OTHER_RUNS/*'`",
     ]
 
 
