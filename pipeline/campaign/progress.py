@@ -69,7 +69,10 @@ class JsonWatch(LineWatch):
         self._say("progress", **self.figures(under_way))
 
     def told(self, outcome: RunOutcome) -> None:
-        names = ("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections")
+        names = (
+            *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
+            *("balises_accepted", "balises_on_path", "availability", "proof_margin_m", "remedies"),
+        )
         told = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
         self._say("run", **told | {"seconds": round(outcome.seconds, 3)} | self.figures())
 

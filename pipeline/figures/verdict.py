@@ -113,6 +113,18 @@ def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
     return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
 
 
+def figures_beside(runs: pl.DataFrame) -> Row:
+    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
+    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
+    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
+    figures = runs.select(
+        pl.col("balises_accepted", "balises_on_path").sum(),
+        pl.col("proof_margin_m").min(),
+        availability=pl.when(weight_s > 0.0).then(available),
+    )
+    return figures.row(0, named=True)
+
+
 LEVEL_LISTS = {
     "service_level": "service_levels",
     "allowed_s": "level_allowed_s",

@@ -54,9 +54,10 @@ class Campaign:
 
 
 RUN_COLUMNS = (
-    *("verdict", "run_id", "why", "unsafe_accepted", "failures_beyond_budget", "missed_detections"),
-    *("unproven_accepted", "share_unknown", "balises_accepted", "balises_on_path", "location_error_max_m"),
-    *("hazards", "hazardous_max_s", "time_to_detect_max_s", "alarms", "false_alarms", "availability", "outages"),
+    *("verdict", "run_id", "balises_accepted", "balises_on_path", "availability", "proof_margin_m", "why", "remedies"),
+    *("unsafe_accepted", "failures_beyond_budget", "missed_detections", "unproven_accepted", "share_unknown"),
+    *("part_verdict", "part_share", "location_error_max_m", "hazards", "hazardous_max_s", "time_to_detect_max_s"),
+    *("alarms", "false_alarms", "lost_to", "lost_to_share", "lost_to_monitor", "outages"),
     *("evidence", "solution", "t_start", "duration_s", "distance_m", "status", "notes", "input_digest"),
 )
 _HAZARD_COLUMNS = (

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.figures.hazard_words import hazard_words, withstood
-from pipeline.figures.verdict import head_of, run_verdicts, word_of, worst_verdict
+from pipeline.figures.verdict import figures_beside, head_of, run_verdicts, word_of, worst_verdict
 from pipeline.report.columns import Row
 from pipeline.report.markup import Cell, cell, number, table
 from pipeline.report.words import WORDS, plural, some_of
@@ -72,7 +72,7 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.Da
     said = f"{plural(total, 'run')}: {counts}."
     if head.verdict is None:
         return Headline(head.word, "no run could be replayed", said), None
-    beside = beside_words(_over_all(runs))
+    beside = beside_words(figures_beside(runs))
     if head.verdict == RunVerdict.SAFE:
         met = withstood(hazards)
         return Headline(head.word, _ALL_SAFE + (f": {met}" if met else ""), said, beside), None
@@ -85,18 +85,6 @@ def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.Da
     of_run = pl.col("run_id") == row["run_id"]
     reason = _worst(row, hazards.filter(of_run), passages.filter(of_run))
     return Headline(head.word, f"{reason} (run {row['run_id']})", said, beside), row["run_id"]
-
-
-def _over_all(runs: pl.DataFrame) -> Row:
-    """The figures beside a campaign's verdict: sums, availability by time, and the least margin."""
-    weight_s = pl.col("held_s").filter(pl.col("availability").is_not_null()).sum()
-    available = (pl.col("availability") * pl.col("held_s")).sum() / weight_s
-    figures = runs.select(
-        pl.col("balises_accepted", "balises_on_path").sum(),
-        pl.col("proof_margin_m").min(),
-        availability=pl.when(weight_s > 0.0).then(available),
-    )
-    return figures.row(0, named=True)
 
 
 _TRAINS = {
