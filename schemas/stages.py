@@ -129,7 +129,7 @@ class JudgedEpochs(dy.Schema):
     moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
     stood = flag("the odometer stood while positions left their place by more than the failure limit")
     odometer_wrong = flag("the distance since the last accepted VB is beyond 5 m + 5 % by the evidence")
-    undiagnosed = flag("state P3: `along_raw` not evaluated, or `odometer_wrong`")
+    undiagnosed = flag("state P3: no verdict of `along_raw`, by the LDS, or `odometer_wrong`")
     in_use = flag("fix valid, unambiguous, confident, not negated, not withheld")
     used_s = real("s", "time in use that the epoch stands for", nullable=False, min=0)
     wrong_s = real("s", "the same where it was wrong", nullable=False, min=0)

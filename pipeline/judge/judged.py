@@ -12,7 +12,7 @@ from pipeline.evidence.evidence import KINDS, EvidenceSet, within_spans
 from pipeline.judge.case import Case
 from pipeline.judge.judgement import Judgements, Positions, judge_positions, with_own_anchors
 from pipeline.judge.movement import Span, moving, odometer_steps, stood_spans, travel_direction
-from pipeline.judge.use import lds_states, odometer_beyond_confidence, time_in_use, undiagnosed_epochs
+from pipeline.judge.use import lds_states, odometer_beyond_confidence, time_in_use
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
 from schemas.config import HazardConfig
 from schemas.enums import BaliseKind, Evidence, PassageStatus
@@ -47,7 +47,7 @@ def epochs_judged(case: Case, stood: list[Span]) -> pl.DataFrame:
     steps = odometer_steps(case.odometry, at_ns)
     moved, sure = moving(at_ns, by_reference_m, along.half_m, *steps, standing_still, config)
     counted_wrong = _odometer_wrong(case, train_m, along.half_m)
-    undiagnosed = undiagnosed_epochs(epochs, counted_wrong)
+    undiagnosed = flags(epochs, "diagnosis_faulty") | counted_wrong
     use = time_in_use(epochs, along.code, config)
     judged = along.turned(direction)
     return epochs.drop("direction").with_columns(

@@ -11,7 +11,7 @@ from pipeline.epochs.clock import crossing_gap_ns, met, nominal_period_s, truste
 from pipeline.judge.judgement import RIGHT, WRONG
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, runs_of, times_ns
 from schemas.config import Configuration, LdsConfig
-from schemas.enums import LdsState, MonitorState
+from schemas.enums import LdsState
 
 _STATES = tuple(LdsState)
 _LEAST_S = 0.5 / NS_PER_S
@@ -125,12 +125,6 @@ def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Boo
     state[(code == WRONG) & in_use] = _STATES.index(LdsState.P1)
     words = pl.Series("lds_state", [*(one.value for one in _STATES), None], dtype=pl.Enum(LdsState))
     return words.gather(state)
-
-
-def undiagnosed_epochs(epochs: pl.DataFrame, odometer_wrong: Bools) -> Bools:
-    """P3: nothing would have seen a jump along the track, or the odometer is beyond its confidence."""
-    blind: Bools = (epochs["along_raw_state"] == MonitorState.NOT_EVALUATED.value).to_numpy()
-    return blind | odometer_wrong
 
 
 def odometer_beyond_confidence(

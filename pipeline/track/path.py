@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -125,6 +126,23 @@ class Route:
         return inside
 
 
+def routes_of(track: Track, legs: Sequence[Leg]) -> list[Route]:
+    """Legs as routes whose coordinate is `path_m`; net elements by their numbers in the track."""
+    routes = []
+    for leg in legs:
+        own = np.array([visit.element for visit in leg.visits])
+        routes.append(
+            Route(
+                element=own,
+                forward=np.array([visit.forward for visit in leg.visits]),
+                entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
+                low_m=track.begin_m[own],
+                high_m=track.end_m[own],
+            )
+        )
+    return routes
+
+
 @dataclass(frozen=True)
 class TravelledPath:
     """The legs of a run in order of time; `path_m` is 0 at the start of the first net element."""
@@ -189,19 +207,8 @@ class TravelledPath:
 
     def routes(self, numbers: dict[str, int]) -> list[Route]:
         """The legs as routes whose coordinate is `path_m`; `numbers`: net elements as the caller counts them."""
-        routes = []
-        for leg in self.legs:
-            own = np.array([visit.element for visit in leg.visits])
-            routes.append(
-                Route(
-                    element=np.array([numbers[self.track.ids[element]] for element in own.tolist()], dtype=np.int64),
-                    forward=np.array([visit.forward for visit in leg.visits]),
-                    entry_m=np.array([leg.entry_m(number) for number in range(len(own))]),
-                    low_m=self.track.begin_m[own],
-                    high_m=self.track.end_m[own],
-                )
-            )
-        return routes
+        number = np.array([numbers[name] for name in self.track.ids], dtype=np.int64)
+        return [replace(one, element=number[one.element]) for one in routes_of(self.track, self.legs)]
 
     def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with path position and `sense` (of the measure along it), in order of leg and position.

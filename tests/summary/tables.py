@@ -57,7 +57,8 @@ def epochs(t_s: list[float], **columns: Any) -> pl.DataFrame:
         "moving": True,
     }
     # Between stages an epoch has columns that no table has.
-    between = {"fix_valid": True, "odometer_reason": None, "withheld": False, "survey_sigma_m": 1.0}
+    between = {"fix_valid": True, "odometer_reason": None, "survey_sigma_m": 1.0}
+    between |= {"undiagnosed": False, "negated": False}
     of_stages = {name: columns.pop(name, value) for name, value in between.items()}
     kinds = {"odometer_reason": pl.String, "survey_sigma_m": pl.Float64}
     since_s = np.diff(np.array(t_s), prepend=t_s[:1])
