@@ -170,7 +170,7 @@ def failed_tables(job: RunJob, error: str) -> RunTables:
     from pipeline.figures.summary import failed_row
 
     folder = job.address.rstrip("/").rpartition("/")[0]
-    made = Provenance(job.config_digest, "", SOFTWARE)
+    made = Provenance(job.config_digest, "", SOFTWARE, job.config.calibration.runs)
     row = failed_row(error.replace(f"{redacted(folder)}/", ""), made)
     empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
     return RunTables(run_id=job.run_id, runs=row, **empty)
