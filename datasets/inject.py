@@ -186,7 +186,11 @@ def _late(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
 def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
     if run.odometer is None:
         raise InputError("has no odometer for this fault", place=run.run_id, expected="an odometer stream")
-    odometer = run.odometer.sort("t", maintain_order=True)
+    sensors = run.odometer.sort("t", maintain_order=True).partition_by("sensor", maintain_order=True)
+    return pl.concat([_faulty_sensor(sensor, fault, first_ns) for sensor in sensors])
+
+
+def _faulty_sensor(odometer: pl.DataFrame, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
     t_s = _seconds(odometer, first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return odometer.filter(pl.Series(~active(fault, t_s)))

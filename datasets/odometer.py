@@ -62,6 +62,7 @@ def _table(spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, 
     nothing = pl.lit(None, pl.Float64)
     table = pl.DataFrame({"t": t_ns}).with_columns(
         t=pl.col("t").cast(pl.Datetime("ns", "UTC")),
+        sensor=pl.lit("primary"),
         distance_m=pl.Series(spec.polarity * distance_m) if spec.distance else nothing,
         speed_mps=pl.Series(spec.polarity * speed_mps) if spec.speed else nothing,
         sigma_speed_mps=pl.lit(spec.speed_sigma_mps) if spec.speed else nothing,

@@ -144,7 +144,8 @@ def _odometer_m(run: RunLog, t_ns: Ints) -> Floats | None:
     """Odometer distance at instants, growing in the first direction of travel."""
     if run.odometer is None:
         return None
-    moves = run.odometer.filter(pl.col("distance_m").is_not_null()).sort("t", maintain_order=True)
+    counting = run.odometer.filter(pl.col("distance_m").is_not_null()).sort("t", maintain_order=True)
+    moves = counting.filter(pl.col("sensor") == pl.col("sensor").min())
     if moves.is_empty():
         return None
     distance = moves["distance_m"].to_numpy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataframely as dy
 
 from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import AreaType, BaliseKind, Fix, Navigability, Reaction
+from schemas.enums import AreaType, BaliseDirection, BaliseKind, Fix, Navigability, Reaction
 from schemas.run import Stream
 
 
@@ -38,6 +38,7 @@ class Odometer(dy.Schema):
     """Distance or speed from the train's odometry; at least one of the two in each row."""
 
     t = instant("time of validity")
+    sensor = text("which of the train's odometers; `primary` where the log names none")
     distance_m = real("m", "cumulative distance, falling when reversing")
     speed_mps = real("m/s", "signed speed")
     sigma_speed_mps = real("m/s", "standard deviation of the speed", min=0)
@@ -120,6 +121,7 @@ class Balises(dy.Schema):
     location_accuracy_m = real("m", "location accuracy Q (SUBSET-026 3.6.4.1)", nullable=False, min=0, max=63)
     linked = flag("announced by linking information")
     link_reaction = one_of(Reaction, "reaction on a linking error")
+    direction = one_of(BaliseDirection, "in which direction along its net element a virtual balise is valid")
 
 
 class Route(dy.Schema):

@@ -37,7 +37,10 @@ class IngestNotes:
 
 @dataclass(frozen=True)
 class RunLog:
-    """One recorded journey, one frame per stream as in `schemas.inputs`."""
+    """One recorded journey, one frame per stream as in `schemas.inputs`.
+
+    Once cleaned, `odometer` is the sensor that the LDS uses, and `other_odometers` are the others, one each.
+    """
 
     run_id: str
     gnss: pl.DataFrame
@@ -48,6 +51,7 @@ class RunLog:
     faults: pl.DataFrame | None = None
     notes: IngestNotes = field(default_factory=IngestNotes)
     input_digest: str = ""
+    other_odometers: tuple[pl.DataFrame, ...] = ()
 
     def stream(self, name: Stream) -> pl.DataFrame | None:
         frame: pl.DataFrame | None = getattr(self, name)
@@ -59,6 +63,11 @@ class RunLog:
     def solutions(self) -> list[str]:
         """Names of the run's solutions, sorted."""
         return sorted(self.gnss["solution"].unique().to_list())
+
+    def main_solution(self) -> str:
+        """The one that speaks for the run where only one can: `primary`, else the first by name."""
+        solutions = self.solutions()
+        return solutions[0] if solutions and "primary" not in solutions else "primary"
 
 
 @dataclass(frozen=True)

@@ -5,5 +5,6 @@ Nothing that came from GNSS is known here, and nothing of matching, alignment, m
 """
 
 from pipeline.evidence.evidence import Evidence, EvidenceSet, evidence_of
+from pipeline.evidence.places import true_places
 
-__all__ = ["Evidence", "EvidenceSet", "evidence_of"]
+__all__ = ["Evidence", "EvidenceSet", "evidence_of", "true_places"]

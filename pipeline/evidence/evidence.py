@@ -73,6 +73,18 @@ class Evidence:
     disputed: int
 
     @property
+    def clock_assumed(self) -> bool:
+        """The clock of reference or reads against the odometer's could not be measured, and is taken as close."""
+        return False
+
+    @property
+    def anchored_ns(self) -> Span | None:
+        """First and last anchor: beyond them nothing holds the train from the other side; none without anchors."""
+        times = [anchor.t_ns for gap in self.gaps for anchor in gap.anchors]
+        times += [anchor.t_ns for coverage in self.covered for anchor in (coverage.begin, coverage.end)]
+        return (min(times), max(times)) if times else None
+
+    @property
     def unreachable(self) -> int:
         """Pairs of anchors that no train can have passed one after the other."""
         return len(unreachable(self.gaps))

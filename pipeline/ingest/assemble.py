@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.ingest.conform import conform
+from pipeline.ingest.conform import DEFAULTS, conform
 from pipeline.ingest.plan import Source, missing_field
 from pipeline.ingest.reader import ORDINAL
 from schemas.errors import InputError
@@ -134,7 +134,7 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
         for name in names
         if name in _NEVER_ZERO and name not in silent
     ]
-    text = [pl.col("solution").replace("", None)] if "solution" in source.implicit else []
+    text = [pl.col(name).replace("", None) for name in DEFAULTS if name in source.implicit]
     return frame.with_columns(*empty, *zero, *text)
 
 

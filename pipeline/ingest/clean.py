@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.ingest.conform import DEFAULTS
 from pipeline.ingest.placeholders import without_placeholders
 from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration, PlausibilityConfig, Vehicle
@@ -17,6 +19,7 @@ from schemas.run import STREAMS, IngestNotes, RunLog, Stream
 
 _KEYS: dict[Stream, list[str]] = {
     "gnss": ["solution", "t"],
+    "odometer": ["sensor", "t"],
     "satellites": ["solution", "t", "sv"],
     "balise_reads": ["t", "balise_id"],
 }
@@ -75,6 +78,9 @@ def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog,
             far, recorded = frame.filter(stray), frame.filter(~stray)
         kept, found = _in_order(frame.filter(~stray) if stray.any() else frame, _KEYS.get(name, ["t"]))
         streams[name], counts[name] = kept, replace(found, far_off=int(stray.sum()))
+    others: tuple[pl.DataFrame, ...] = ()
+    if "odometer" in streams:
+        streams["odometer"], others = _by_sensor(streams["odometer"], config.lds.odometer_sensor, run.run_id)
     streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
     parts = recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True)
     names = [part["solution"][0] for part in parts]
@@ -90,7 +96,7 @@ def clean(run: RunLog, config: Configuration = Configuration()) -> tuple[RunLog,
     if odometer is not None:
         require_two_times(odometer, f"{run.run_id}: odometer")
         _require_common_time(run.with_streams(**streams))
-    cleaned = replace(run, notes=_noted(run.notes, counts))
+    cleaned = replace(run, notes=_noted(run.notes, counts), other_odometers=others or run.other_odometers)
     return cleaned.with_streams(**streams), CleanCounts(solutions, counts)
 
 
@@ -110,6 +116,22 @@ def of_the_journey(run: RunLog) -> RunLog:
     notes = replace(run.notes, skipped_topics=(*run.notes.skipped_topics, *told))
     satellites, reference, reads = (None if name in away else run.stream(name) for name in _OF_POSITIONS)
     return replace(run, notes=notes, satellites=satellites, reference=reference, balise_reads=reads)
+
+
+def _by_sensor(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.DataFrame, tuple[pl.DataFrame, ...]]:
+    """The odometer that the LDS uses, and the others in the order of their names."""
+    if "sensor" not in odometer.columns:
+        return odometer, ()
+    sensors = {str(key[0]): part for key, part in odometer.partition_by("sensor", as_dict=True).items()}
+    if odometer.height and used not in sensors:
+        raise InputError(
+            "has no such sensor",
+            place=f"{run_id}: odometer, column sensor",
+            found=", ".join(sorted(sensors)),
+            expected=used,
+            remedy=f"Name the odometer that the LDS uses: [lds] odometer_sensor = {json.dumps(min(sensors))}",
+        )
+    return sensors.pop(used, odometer), tuple(sensors[name] for name in sorted(sensors))
 
 
 def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame, dict[str, int]]:
@@ -204,7 +226,9 @@ def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, Strea
     if (np.diff(frame["t"].to_physical().to_numpy()) > 0).all():
         return frame, StreamCounts()
     latest = pl.col("t").cum_max()  # of those recorded so far
-    late = frame.select((pl.col("t") < (latest.over("solution") if "solution" in keys else latest)).sum()).item()
+    keys = [key for key in keys if key in frame.columns]
+    sources = [key for key in keys if key in DEFAULTS]
+    late = frame.select((pl.col("t") < (latest.over(sources) if sources else latest)).sum()).item()
     ordered = frame if late == 0 and frame["t"].is_sorted() else frame.sort("t", maintain_order=True)
     unique = ordered.unique(subset=keys, keep="first", maintain_order=True)
     return unique, StreamCounts(frame.height - unique.height, late)

@@ -13,7 +13,7 @@ from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import Stream
 
 Defaults = Mapping[str, str | float | bool]
-DEFAULTS: Defaults = {"solution": "primary"}
+DEFAULTS: Defaults = {"solution": "primary", "sensor": "primary"}
 NEVER_EMPTY: tuple[Stream, ...] = ("gnss", "odometer")
 # Numbers of no stream are larger, in whatever unit (receivers write variances up to 1e13 m2 for "not known"); their
 # squares and products stay finite.

@@ -106,8 +106,8 @@ def read_mcap(path: Address, config: IngestConfig, with_digest: bool = True) -> 
             skipped_topics=left_over,
         ),
         input_digest=digest,
-        **frames,
-    )
+        gnss=frames["gnss"],
+    ).with_streams(**frames)
 
 
 class BlockSink(Protocol):

@@ -46,8 +46,8 @@ def read_folder(path: Address, with_digest: bool = True) -> RunLog:
         run_id=stem_of(path),
         notes=IngestNotes(skipped_topics=tuple(skipped), files_without_crc=tuple(unproved)),
         input_digest=digest.hexdigest() if with_digest else "",
-        **frames,
-    )
+        gnss=frames["gnss"],
+    ).with_streams(**frames)
 
 
 def _no_gnss(path: Address, present: set[str]) -> InputError:

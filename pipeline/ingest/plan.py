@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from pipeline.ingest.breaches import refuse
+from pipeline.ingest.conform import DEFAULTS
 from pipeline.ingest.generic import definition_of
 from pipeline.ingest.mapping import mapped_recipe, mappings_of
 from pipeline.ingest.mcap_model import Channel
@@ -101,7 +102,7 @@ def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None
             columns[name] = expression
             if absent and (wanted or (name in _POSITION and not recipe.own)):
                 doubtful[name] = absent[0]
-        elif wanted or not (contract[name].nullable or name == "solution"):
+        elif wanted or not (contract[name].nullable or name in DEFAULTS):
             breaches.append(missing_field(sample.channel, sample.fields, name, absent))
     times = _times(sample, recipe, mapping, breaches)
     paths = dict.fromkeys([*recipe.key, *(path for name in columns for path in recipe.fields_of(name))])
@@ -228,9 +229,10 @@ def _refuse_shared_solutions(sources: Sequence[Source]) -> None:
 
 
 def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
-    """Only GNSS may come from several topics: the other streams have no solution to tell them apart."""
+    """GNSS may come from several topics, and odometers of which each names its sensor; nothing tells others apart."""
     topics = list(dict.fromkeys(source.channel.topic for source in sources))
-    if len(topics) < 2:
+    sensors = {source.mapping.constants.get("sensor") for source in sources if source.mapping}
+    if len(topics) < 2 or (stream == "odometer" and None not in sensors and len(sensors) == len(topics)):
         return []
     return [
         InputError(
@@ -238,7 +240,8 @@ def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[Inp
             place=file,
             found=", ".join(topics),
             expected="one",
-            remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration.",
+            remedy=f"Choose one with `topic` in [ingest.{stream}] of the configuration"
+            + (", or give each topic `constants = {sensor = ...}` of its own." if stream == "odometer" else "."),
         )
     ]
 

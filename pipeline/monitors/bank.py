@@ -63,6 +63,8 @@ class _AxisBank:
         self.threshold = np.full((epochs, width), np.nan, order="F")
         self.state = np.full((epochs, width), NOT_EVALUATED, dtype=np.int8, order="F")
         self.noise_m = np.full((epochs, width), np.nan, order="F")
+        self.begins = np.zeros(epochs, dtype=np.bool_)
+        self._quiet = np.ones(epochs, dtype=np.bool_)
         self._series = axis.series
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
         self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
@@ -86,12 +88,14 @@ class _AxisBank:
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
         present = ~part.fresh[:, None] & self._enabled[None, :]
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
-        quiet: Bools = np.all(noise_m <= self._limit_m, axis=1)
+        quiet: Bools = np.all((noise_m <= self._limit_m) | ~self._enabled.any(), axis=1)
         judged = present & quiet[:, None]
         self.state[part.epoch] = states_of(value, threshold, judged)
         self.value[part.epoch] = np.where(present, value, np.nan)
         self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
         self.noise_m[part.epoch] = noise_m
+        self.begins[part.epoch] = part.fresh
+        self._quiet[part.epoch] = quiet
 
     def freeze(self, epoch: int) -> None:
         """Nothing from this epoch on tells of the noise, until a restart. Evaluated anew from the last block on.
@@ -103,6 +107,10 @@ class _AxisBank:
             self._meter.freeze(int(np.searchsorted(self._series.epoch, epoch)))
             self._done, self._carry = self._begun
             self._block = FIRST_BLOCK
+
+    def noise_known(self, part: slice) -> Bools:
+        """Per epoch whether the fast noise is known and no failure can hide in it; true where the axis has no row."""
+        return self._quiet[part]
 
     def restart(self, epoch: int) -> None:
         """Forget all before this epoch but the noise; the first increment is from the first usable epoch on."""
@@ -116,6 +124,11 @@ class _AxisBank:
         self._carry = None
         self._begun = row, None
         self._block = FIRST_BLOCK
+
+    @property
+    def has_rows(self) -> bool:
+        """There is an epoch that the axis can evaluate, or begin at."""
+        return self._series.epoch.size > 0
 
     def record(self) -> AxisRecord:
         return AxisRecord(self._series, self.value, self.threshold, self._enabled)
@@ -157,8 +170,10 @@ class MonitorBank:
         for frame in self._single.values():
             self._single_fails |= (frame["state"] == MonitorState.FAIL.value).to_numpy()
         self._any = np.zeros(count, dtype=np.bool_)
+        self._stops = np.zeros(count, dtype=np.bool_)
         self._fast = np.zeros(count, dtype=np.bool_)
         self._along = np.zeros(count, dtype=np.bool_)
+        self._noise_known = np.zeros(count, dtype=np.bool_)
         self._known_to = -1
 
     def _look(self, epoch: int) -> None:
@@ -169,9 +184,11 @@ class MonitorBank:
         part = slice(begin, self._known_to + 1)
         fails = [axis.state[part] == FAIL for axis in self._axes]
         self._any[part] = np.logical_or.reduce([fail.any(axis=1) for fail in fails]) | self._single_fails[part]
+        self._noise_known[part] = self._axes[0].noise_known(part)
+        self._stops[part] = self._any[part] | self._watching.begins[part] | ~self._noise_known[part]
         fast = np.logical_or.reduce([fail[:, :2].any(axis=1) for fail in fails])
         self._fast[part] = fast | self._single_fails[part]
-        self._along[part] = (self._axes[0].state[part] != NOT_EVALUATED).any(axis=1)
+        self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
 
     def failed(self, epoch: int) -> bool:
         """Any monitor of the bank fails at this epoch."""
@@ -188,14 +205,17 @@ class MonitorBank:
         return bool(self._fast[epoch])
 
     def along_evaluated(self, epoch: int) -> bool:
-        """The along-track monitors have a verdict (pass or fail) at this epoch."""
+        """`along_raw` has a verdict (pass or fail) at this epoch; an average alone says nothing of a step."""
         self._look(epoch)
         return bool(self._along[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
-        """The first epoch from `epoch` on at which a monitor fails, or that is not looked at yet; at most `end`."""
+        """The first epoch from `epoch` on at which a monitor fails, the bank begins or the noise is not known.
+
+        At most `end`, and the first epoch that is not looked at yet.
+        """
         self._look(epoch)
-        ahead = self._any[epoch : min(self._known_to + 1, end)]
+        ahead = self._stops[epoch : min(self._known_to + 1, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
@@ -205,13 +225,29 @@ class MonitorBank:
 
     @property
     def noise_known(self) -> Bools:
-        """Per epoch: the fast noise along the track is known, and lets a failure be seen; causal.
+        """Per epoch whether the fast noise along the track is known and no failure can hide in it.
 
-        True as well where there is no odometer to measure it against.
+        To be asked once the LDS has walked to the end of the run.
         """
         if self._any.size:
             self._look(self._any.size - 1)
-        return self._axes[0].noise_reasons().is_null().to_numpy()
+        return self._noise_known
+
+    def noise_known_at(self, epoch: int) -> bool:
+        """The fast noise along the track is known at this epoch, by what was before it."""
+        self._look(epoch)
+        return bool(self._noise_known[epoch])
+
+    def begins_at(self, epoch: int) -> bool:
+        """The bank begins here: at the start, after a gap, after lost distance or at a restart; nothing leads here."""
+        self._look(epoch)
+        return bool(self._watching.begins[epoch])
+
+    @property
+    def _watching(self) -> _AxisBank:
+        """The axis along the track, or, in a run without an odometer, the one across it."""
+        along, across, _ = self._axes
+        return along if along.has_rows else across
 
     def freeze(self, epoch: int) -> None:
         """The position is negated from this epoch on: until the next restart nothing enters the measured noise."""

@@ -37,6 +37,7 @@ from schemas.config import Configuration
 from schemas.enums import TRUTH
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
+from schemas.words import notes_apart
 
 _HAZARDS = (
     *("hazard_id", "accepted_ids", "within_budget", "monitor", "time_to_detect_s", "time_since_failure_s"),
@@ -103,8 +104,8 @@ def run_page(
         "order": [row["solution"] for row in rows],
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
-    head = run_headline(rows, tables.hazards, made.config)
-    verdict, ways = verdict_head(head.word, head.worst, head.reasons), _ways(neighbours)
+    head = run_headline(rows, tables.hazards, tables.passages)
+    verdict, ways = verdict_head(head.word, head.worst, head.reasons, head.beside), _ways(neighbours)
     heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
@@ -185,7 +186,7 @@ def _navigation(names: list[str]) -> str:
 
 def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
     """All sections of one solution; of one that failed what reading and matching found out."""
-    name, told = row["solution"], [text for text in (row["error"], *(row["notes"] or "").split("; ")) if text]
+    name, told = row["solution"], [text for text in (row["error"], *notes_apart(row["notes"])) if text]
     items = "".join(f"<li>{escape(text)}</li>" for text in told)
     notes = f'<ul class="notice {row["status"]}">{items}</ul>' if items else ""
     if not name:
@@ -206,7 +207,7 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
         return frame_table(f"table-{part_name}-{key}", caption, frame, *given)
 
     in_order = "Passages of balises, in order of time"
-    shown = tiles(tile_figures(known, balises, made.config.hazards.unknown_share_limit))
+    shown = tiles(tile_figures(known, balises))
     parts = [
         part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
         part("hazards", "Hazards", _hazards(key, row, hazards)),

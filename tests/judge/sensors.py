@@ -175,6 +175,7 @@ def odometer(rng: np.random.Generator, ride: Ride, of: Counter) -> pl.DataFrame:
     frame = pl.DataFrame(
         {
             "t": stamps(time),
+            "sensor": ["primary"] * len(time),
             "distance_m": of.polarity * distance[rows],
             "speed_mps": of.polarity * told,
             "sigma_speed_mps": [None] * len(time),

@@ -18,9 +18,7 @@ from tests.summary.tables import NS, alarms, epochs, hazards, passages, table
 ACROSS = {"monitors": [["cross_raw"]], "verdict": "false", "suspect": "unknown", "netelement_id": "A"}
 
 
-def run_of(
-    run_id: str, solutions: tuple[str, ...] = ("primary",), notes: str | None = None, counted: Any = None, **found: Any
-) -> RunTables:
+def run_of(run_id: str, solutions: tuple[str, ...] = ("primary",), counted: Any = None, **found: Any) -> RunTables:
     rows: dict[str, Any] = {
         "solution": list(solutions),
         "status": "ok",
@@ -32,8 +30,10 @@ def run_of(
         "gnss_rate_hz": 10.0,
         "false_alarms": 0,
         "false_alarm_rate_per_h": 0.0,
-        "notes": notes,
-        "share_unknown": 0.0,
+        "in_use_s": 3600.0,
+        "in_use_judged_s": 3600.0,
+        "balises_accepted": 1,
+        "reasons": [[]] * len(solutions),
         "verdict": "safe",
         "input_digest": run_id,
         "failure_hazardous_s": [[]] * len(solutions),
@@ -69,7 +69,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Assessment:
         "failure_accepted": [["right"]],
     }
     across = alarms(1, solution="primary", measure_m=500.0, **ACROSS)
-    write_run(run_of("a", notes="faults were injected: ramp", counted=failed, hazards=fault, alarms=across), out, {})
+    write_run(run_of("a", counted=failed | {"faults_injected": True}, hazards=fault, alarms=across), out, {})
     write_run(run_of("b", alarms=across.with_columns(measure_m=540.0)), out, {})
     write_run(run_of("c", ("gps", "primary")), out, {})
     return assess(out)
@@ -109,7 +109,7 @@ def test_the_map_is_the_suspect_where_runs_agree(found: Assessment) -> None:
 
 def test_statements_say_what_the_figures_are_not(found: Assessment) -> None:
     said = found.statements
-    assert said[0] == "unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed."
+    assert said[0].startswith("unsafe: 1 unsafe, 0 unproven, 2 safe, 0 failed; ")
     assert said[1].startswith("Faults were injected into 1 of 3 runs")
     assert any(text.startswith("primary: 1 position failures in use, at a virtual balise or not: 0") for text in said)
     assert "0 in time for 0.5025 s (lpv200; 95 %: 0.0% to 97.5%)" in said[-1]
@@ -120,7 +120,9 @@ def test_what_nobody_can_judge_is_said(tmp_path: Path) -> None:
     assert not any("could not be checked" in text or "partial" in text for text in assess(tmp_path).statements)
     blind = run_of("blind", alarms=alarms(1, solution="primary", verdict="unknown"))
     evidence = pl.lit(None, blind.runs.schema["evidence"])
-    rows = blind.runs.with_columns(evidence=evidence, evidence_s=0.0, false_alarm_rate_per_h=pl.lit(None, pl.Float64))
+    rows = blind.runs.with_columns(
+        evidence=evidence, evidence_s=0.0, balises_accepted=0, false_alarm_rate_per_h=pl.lit(None, pl.Float64)
+    )
     write_run(RunTables(**{**vars(blind), "runs": rows}), tmp_path, {})
     cut = run_of("cut")
     rows = cut.runs.with_columns(status=pl.lit("partial", cut.runs.schema["status"]))
@@ -144,7 +146,7 @@ def test_a_solution_that_failed_alone_is_named_as_such(tmp_path: Path) -> None:
     failed = lost.runs.with_columns(status=pl.lit("failed", lost.runs.schema["status"]), verdict=nothing)
     write_run(RunTables(**{**vars(lost), "runs": failed}), tmp_path, {})
     said = assess(tmp_path).statements
-    assert said[0] == "unproven: 0 unsafe, 1 unproven, 0 safe, 1 failed."
+    assert said[0].startswith("unproven: 0 unsafe, 1 unproven, 0 safe, 1 failed; ")
     assert said[1] == "1 of 2 runs failed and count nowhere."
     assert said[2].startswith("gps: 1 of 2 runs failed with this solution alone and count nowhere")
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import polars as pl
-
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob
 from pipeline.figures.known_counts import known_counts
@@ -13,7 +11,7 @@ from pipeline.results.inspection import inspect_result
 from pipeline.results.store import write_run
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables
-from schemas.tables import TABLES, Hazards, Runs
+from schemas.tables import TABLES, Hazards, Passages, Runs
 from tests.summary.tables import table
 
 ROWS = table(
@@ -23,6 +21,8 @@ ROWS = table(
     evidence=["odometer", None, None],
     balises_accepted=[8, 7, 0],
     hazards_1b=[1, 0, 0],
+    lost_to=[None, ["no_position", "no_odometer"], None],
+    lost_to_share=[None, [0.6, 0.4], None],
 )
 
 
@@ -40,19 +40,21 @@ def test_outcome_of_a_run() -> None:
     job = RunJob("r", "r", "site", "", Configuration(), Vehicle(), "out", "")
     told = [
         (found.hazards, found.missed_detections)
-        for found in (outcome_of(job, rows, Hazards.create_empty()) for rows in (ROWS, ROWS[1:2], ROWS[2:]))
+        for found in (
+            outcome_of(job, rows, Hazards.create_empty(), Passages.create_empty())
+            for rows in (ROWS, ROWS[1:2], ROWS[2:])
+        )
     ]
     assert told == [(1, 0), (None, None), (None, None)]
 
 
 def test_inspected_result(tmp_path: Path) -> None:
     empty = {name: schema.create_empty() for name, schema in TABLES.items()}
-    notes = pl.lit("one; available for 0% of the moving time, the rest lost to: 60% no fix, 40% no odometer; two")
-    for run_id, row in (("blind", ROWS[1:2].with_columns(notes=notes)), ("seen", ROWS[:1])):
+    for run_id, row in (("blind", ROWS[1:2]), ("seen", ROWS[:1])):
         write_run(RunTables(run_id, **(empty | {"runs": row})), tmp_path, {})
     inspected = inspect_result(tmp_path)
     assert inspected["Verdict"].rows() == [
         ("verdict", "failed"), ("unsafe", "0"), ("unproven", "0"), ("safe", "0"), ("failed", "2")
     ]  # fmt: skip
-    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted", "lost_to")
-    assert runs.rows() == [("blind", None, None, 7, "60% no fix, 40% no odometer"), ("seen", 0, 1, 8, None)]
+    runs = inspected["Runs"].select("run_id", "unsafe_accepted", "hazards_1b", "balises_accepted", "lost_to_share")
+    assert runs.rows() == [("blind", None, None, 7, [0.6, 0.4]), ("seen", 0, 1, 8, None)]
