@@ -16,7 +16,7 @@ def counted_over_slip(odometry: Odometry, others: Sequence[Odometry], config: Al
     """The odometer, with its way over slip from the first of the others that knew it throughout.
 
     Slip stays reported: nothing is in use meanwhile. But the re-link after it compares with a way that was counted, in
-    doubt by `other_way_share` of it: nobody has measured the other's scale. Elsewhere the first odometer's own count stays.
+    doubt by `other_way_share` of it: nobody has measured the other's scale. Elsewhere the odometer's own count stays.
     """
     if not others or not odometry.slip.any():
         return odometry
