@@ -114,7 +114,7 @@ def test_a_returned_fault_counts_its_whole_time() -> None:
     rung = rungs["reference"]
     surely, at_most = rung.in_use
     wrong = rung.epochs.judgement == "wrong"
-    counted, most = float(rung.span_s[wrong & surely].sum()), float(rung.span_s[wrong & at_most].sum())
+    counted, most = float(rung.counted_s(wrong & surely).sum()), float(rung.counted_s(wrong & at_most).sum())
     assert counted > 0 or most > 0, "the fault was never in use: nothing is tested"
     hazardous = float(rung.tables.hazards["hazardous_s"].sum())
     assert max(hazardous, rung.number("hazardous_max_s")) >= counted - 1e-6
@@ -207,5 +207,5 @@ def test_a_drift_is_counted_from_its_failure() -> None:
     fault = Fault("ramp", 150.0, 210.0, rate_mps=1.0)
     rung = _judged(_faulty(fault, rate_hz=5.0), 32, "drift")["reference"]
     surely, _ = rung.in_use
-    used_s = float(rung.span_s[surely & (np.abs(rung.epochs.error_m) > LIMIT_M + 1.0)].sum())
+    used_s = float(rung.counted_s(surely & (np.abs(rung.epochs.error_m) > LIMIT_M + 1.0)).sum())
     assert (rung.row["verdict"] == "unsafe") == (used_s > BUDGET_S) or _accepted_wrong_by_truth(rung) > 0
