@@ -79,12 +79,19 @@ def _share_p1(rung: Rung) -> list[str]:
 def _share_unknown(rung: Rung, surely: Bools, at_most: Bools) -> list[str]:
     moving = rung.tables.epochs["moving"].fill_null(True).to_numpy()
     unknown = (rung.epochs.judgement == "unknown") & moving
-    total = [float(rung.counted_s(use & moving).sum()) for use in (surely, at_most)]
+    right = (rung.epochs.judgement == "right") & moving
+    found_s = [float(rung.counted_s(unknown & use).sum()) for use in (surely, at_most)]
+    # What was right on both sides of a gap was not in use in it.
+    near_s = np.minimum(np.diff(rung.epochs.time_s, prepend=-1.0), 1.0)
+    right_s = [float(np.minimum(rung.counted_s(right & use), near_s).sum()) for use in (surely, at_most)]
+    wrong = moving & ~right & ~unknown
+    total = [
+        own_s + more_s + float(rung.counted_s(wrong & use).sum())
+        for own_s, more_s, use in zip(found_s, right_s, (surely, at_most), strict=True)
+    ]
     if min(total) == 0:
         return []
-    shares = [
-        float(rung.counted_s(unknown & use).sum()) / all_s for use, all_s in zip((surely, at_most), total, strict=True)
-    ]
+    shares = [own_s / all_s for own_s, all_s in zip(found_s, total, strict=True)]
     low, high, told = min(shares), max(shares), rung.row["share_unknown"]
     # To which of its two epochs a span belongs is not fixed for a share: one epoch at each end and at each gap.
     period = float(np.median(np.diff(rung.epochs.time_s)))
