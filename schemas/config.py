@@ -558,6 +558,12 @@ class CalibrationConfig(Settings):
     left_out_pieces: Annotated[int, Field(strict=True, ge=2)] = 8
     # With a sigma that varies by a smaller share, intercept and slope cannot be told apart.
     sigma_spread_share: Probability = 0.05
+    # `balise replay --calibrate`: with fewer runs nobody knows how far a further one may lie from them.
+    least_runs: Annotated[int, Field(strict=True, ge=2)] = 2
+    # A wheel wears by a tenth of this in a campaign of weeks; two vehicles mostly differ by more.
+    same_vehicle_scale: Positive = 0.01
+    # The runs that the monitors and the vehicle were calibrated by: filled in by `balise replay --calibrate`.
+    runs: tuple[str, ...] = ()
 
 
 class SiteConfig(Settings):
