@@ -154,6 +154,7 @@ ALONE = {
         "withheld_for": "noise and slip: tests/lds",
     },
     "runs": {
+        "calibrated_by": "replays by `--calibrate`: tests/campaign",
         "status": "failed and partial runs: tests/campaign, tests/ingest",
         "error": "the same",
         "partial_until": "the same",
