@@ -508,8 +508,8 @@ class HazardConfig(Settings):
     balise_read_sigma_m: Positive = 1.0
     # An error known less closely is not given as a number (DOMAIN section 5.2).
     known_error_m: Positive = 5.0
-    # More of the moving time in use unknown is `unproven` (DOMAIN section 5.4).
-    unknown_share_limit: Probability = 0.01
+    # Without diagnosis (P3) for more of the moving time in use a run is `unproven` (DOMAIN section 5.4).
+    undiagnosed_share: Probability = 0.01
     # Ours: alarms across the track of several runs that begin so near each other are of one place of the map.
     map_reach_m: Positive = 100.0
     # LPV-200 is the guaranteed service (LOC uses no other).

@@ -23,6 +23,7 @@ from schemas.enums import (
     MonitorState,
     PassageStatus,
     Reaction,
+    Reason,
     Remedy,
     RunStatus,
     RunVerdict,
@@ -75,6 +76,7 @@ class Hazards(dy.Schema):
     t_onset = instant("begin of the fault", nullable=True)
     t_hazard = instant("the step, or the offered crossing of the first VB hit")
     t_failure = instant("begin of the position failure", nullable=True)
+    t_failure_may = instant("since when it may have been one; null where the evidence is silent then", nullable=True)
     t_detected = instant("first failing monitor from onset to the end of the episode", nullable=True)
     t_negated = instant("position blocked: detection plus reaction", nullable=True)
     t_end = instant("end of the episode", nullable=True)
@@ -82,8 +84,9 @@ class Hazards(dy.Schema):
     detected = flag("a monitor failed within the episode")
     alarm_before_onset = flag("an alarm was already active at the onset")
     time_to_detect_s = real("s", "T_D = t_detected - t_onset")
-    time_since_failure_s = real("s", "T_dsf = t_detected - t_failure; negative = in time")
-    hazardous_s = real("s", "time judged wrong in use, over the whole episode", min=0)
+    time_since_failure_s = real("s", "T_dsf, least = t_detected - t_failure; negative = in time")
+    time_since_failure_may_s = real("s", "T_dsf, largest = t_detected - t_failure_may: a bound, not a measurement")
+    hazardous_s = real("s", "time judged wrong in use, over the whole failure that the row belongs to", min=0)
     hazardous_may_s = real("s", "the same with the time that is unknown", min=0)
     size_m = real("m", "largest error along the track, signed, + = ahead of the train; of a jump back, its step")
     rate_mps = real("m/s", "slope of the error from onset to failure; null for a step")
@@ -123,6 +126,10 @@ class Passages(dy.Schema):
     initialising = flag("accepted before any VB or TVB was validated: the most demanding case (TVB section 5)")
     hazard_id = dy.Int64(nullable=True, min=0, description="hazard that this passage belongs to")
     judgement = one_of(Judgement, "what the evidence says of the offer; null where not offered", nullable=True)
+    error_low_m = real("m", "least error of the offer that the evidence leaves, in the direction of travel")
+    error_high_m = real("m", "largest error of the offer that the evidence leaves")
+    evidence = one_of(Evidence, "what the judgement of the offer rests on", nullable=True)
+    proof_margin_m = real("m", "by how much the evidence may be wrong before a right offer is no longer", min=0)
     location_accuracy_m = real("m", "location accuracy of the balise (Q_LOCACC)", min=0)
     speed_mps = real("m/s", "speed of the train at the offer, else where it passes the balise", min=0)
     crossing_id = dy.Int64(nullable=True, min=0, description="crossing of the offer; null where not offered")
@@ -213,7 +220,7 @@ class _EpochsAfterMonitors(dy.Schema):
     satellites = dy.Int64(nullable=True, min=0, description="satellites used, as recorded", metadata={"unit": "1"})
     suspect_after_the_fact = flag("a TVB between a fault's onset and its detection")
     moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
-    in_use = flag("fix valid, unambiguous, confident, not blocked (DOMAIN section 5.2)")
+    in_use = flag("fix valid, unambiguous, confident, not negated, not withheld (DOMAIN section 5.2)")
     undetected_ahead_m = real(
         "m", "largest fault ahead of the train that no monitor would have noticed; not proved on curves", min=0
     )
@@ -246,6 +253,12 @@ class Runs(dy.Schema):
 
     solution = text("solution of the run; empty where the run failed before any was known")
     verdict = one_of(RunVerdict, "unsafe, unproven or safe; null where the run failed", nullable=True)
+    reasons = ones_of(Reason, "why the verdict is what it is; null where the run failed", nullable=True)
+    proof_margin_m = real("m", "least proof margin of what was accepted or in use and is right", min=0)
+    part_verdict = one_of(RunVerdict, "verdict between first and last anchor; null where that is all", nullable=True)
+    part_from = instant("first anchor: a read, or a sample of the reference", nullable=True)
+    part_to = instant("last anchor", nullable=True)
+    part_share = real("1", "share of the moving time that lies between them", min=0, max=1)
     status = one_of(RunStatus, "ok, partial (damaged input read up to the damage) or failed")
     error = text("what went wrong", nullable=True)
     vehicle = one_of(VehicleFigures, "where odometer scale and latency come from", nullable=True)
@@ -288,6 +301,7 @@ class Runs(dy.Schema):
     balises_not_available = count("of these without a position")
     unsafe_accepted = count("VBs accepted despite a wrong position")
     unproven_accepted = count("VBs accepted whose position could not be checked")
+    initialising_accepted = count("VBs accepted before anything was validated")
     location_error_mean_m = real("m", "mean location error of accepted VBs")
     location_error_p95_m = real("m", "95 % of |location error| of accepted VBs")
     location_error_max_m = real("m", "largest |location error| of accepted VBs")
@@ -298,10 +312,14 @@ class Runs(dy.Schema):
     hazards_wrong_track = count("hazards VB_WRONG_TRACK")
     hazards_detected = count("hazards that a monitor detected")
     hazards_within_budget = count("hazards in use no longer than the time allowed")
-    missed_detections = count("hazards with a failure that no monitor found by t_failure + time allowed")
+    missed_detections = count("hazards with a failure that no monitor found for certain by t_failure + time allowed")
     time_to_detect_max_s = real("s", "largest T_D")
     time_since_failure_max_s = real("s", "largest T_dsf")
+    time_since_failure_may_max_s = real("s", "largest T_dsf that the evidence leaves")
     hazardous_max_s = real("s", "longest hazardous time of a failure, whether it hit a VB or not")
+    hazardous_s = real("s", "hazardous time of all failures", min=0)
+    unknown_in_use_s = real("s", "longest unknown moving time in use; stretches near each other taken together", min=0)
+    share_undiagnosed = real("1", "share of the moving time in use without diagnosis (P3)", min=0, max=1)
     alarms = count("alarm episodes")
     false_alarms = count("of these false", nullable=True)
     false_alarm_rate_per_h = real("1/h", "false alarms per hour", min=0)
@@ -359,7 +377,10 @@ class Runs(dy.Schema):
     held_s = real("s", "time of the epochs, without gaps", min=0)
     monitored_s = real("s", "of this with a verdict of the along-track bank", min=0)
     evidence_s = real("s", "of this judged right or wrong", min=0)
-    judged_s = real("s", "of this with both: what the false alarm rate counts", min=0)
+    judged_s = real("s", "of this with both, in use: what the false alarm rate counts", min=0)
+    in_use_s = real("s", "time with a position in use", min=0)
+    in_use_judged_s = real("s", "of this judged right or wrong: what rates of hazards and failures count", min=0)
+    negated_s = real("s", "time negated", min=0)
     trusted_s = real("s", "time with a valid, confident, unambiguous position", min=0)
     trusted_losses = count("how often that was lost")
     accepted_judged = count("accepted VBs judged right or wrong")

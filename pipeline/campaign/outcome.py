@@ -128,20 +128,19 @@ def outcome_of(job: RunJob, runs: pl.DataFrame, hazards: pl.DataFrame) -> RunOut
         verdict=verdict,
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        why=_why(runs, verdict, job.config.hazards.unknown_share_limit),
+        why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards)),
     )
 
 
-def _why(runs: pl.DataFrame, verdict: RunVerdict | None, unknown_share_limit: float) -> str:
+def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
     """What decides the verdict, of each solution that has it."""
     if verdict is None:
         return ""
     rows = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value)
     several = runs.height > 1
     return "; ".join(
-        (f"{row['solution']}: " if several else "") + verdict_reasons(row, unknown_share_limit)
-        for row in rows.iter_rows(named=True)
+        (f"{row['solution']}: " if several else "") + verdict_reasons(row) for row in rows.iter_rows(named=True)
     )
 
 
