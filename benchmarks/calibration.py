@@ -85,7 +85,7 @@ class Claim:
 
 def trial(seed: int, family: Family = FAMILIES["cut alike"]) -> Trial:
     """One run by chance; the same seed gives the same run."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, *repr(family).encode()])
     spacing = rng.uniform(3.4, 6.0)
     # A third track beside two that are cut alike; else two, of which either is the train's as often.
     lateral = spacing * np.arange(3 if family.cuts == "alike" and rng.random() < 0.25 else 2)
@@ -142,7 +142,7 @@ def tracks(rng: np.random.Generator, lateral: dict[str, float], survey_m: float,
     links: list[tuple[str, int, str, int, str]] = []
     for track, y in lateral.items():
         cuts = even if family.cuts == "alike" else crooked if track == "a" else np.zeros(0)
-        error = wrong(rng, law, survey_m)
+        error = survey_error(rng, law, survey_m)
         ends = [0.0, *cuts.tolist(), LENGTH_M]
         for number, (start, end) in enumerate(itertools.pairwise(ends)):
             name, x = f"{track}{number}", np.linspace(start, end, max(2, round((end - start) / 50.0) + 1))
@@ -156,7 +156,7 @@ def tracks(rng: np.random.Generator, lateral: dict[str, float], survey_m: float,
     return survey_of(pieces, links, survey_m)
 
 
-def wrong(rng: np.random.Generator, law: str, survey_m: float) -> Callable[[np.ndarray, int], np.ndarray]:
+def survey_error(rng: np.random.Generator, law: str, survey_m: float) -> Callable[[np.ndarray, int], np.ndarray]:
     """Errors of the survey of one track at places x, by its element's number [m]."""
     if law == "track":
         constant = survey_m * rng.normal()
@@ -230,13 +230,15 @@ def claim(one: Trial) -> Claim:
     found = match(one.fixes, odometry, one.site, Vehicle(), MatchingConfig(), FixSigma()).epochs
     right = (found["netelement_id"].str.head(1) == one.track).fill_null(False).to_numpy()
     known = found["netelement_id"].is_not_null().to_numpy()
-    each = []
-    for name in ("gate", "path"):
-        claimed = np.nan_to_num(floats(found, f"{name}_probability"))
-        best = claimed[right].max(initial=0.0)
-        worst = claimed[~right & known].max(initial=0.0)
-        each += [float(max(best, worst)), bool(worst < min(best, LIKELY))]
-    return Claim(one.track, *each)
+    gate, gate_right = largest(floats(found, "gate_probability"), right, known & ~right)
+    path, path_right = largest(floats(found, "path_probability"), right, known & ~right)
+    return Claim(one.track, gate, gate_right, path, path_right)
+
+
+def largest(claimed: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> tuple[float, bool]:
+    """The largest claim of a run, and whether none of a wrong track was likely, or as large as the right one's."""
+    best, worst = (float(np.nan_to_num(claimed[rows]).max(initial=0.0)) for rows in (right, wrong))
+    return max(best, worst), worst < min(best, LIKELY)
 
 
 def claims(runs: int, seed: int, family: Family = FAMILIES["cut alike"]) -> list[Claim]:
