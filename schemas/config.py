@@ -331,6 +331,8 @@ class AlignConfig(Settings):
     slip_sigma_mps: Positive = 0.185
     # By what share of the way a wheel that slips or slides may miscount: anti-slip control keeps it below, ours.
     slip_way_share: Probability = 0.1
+    # The same of another odometer that does not slip: 0.8 % of scale was seen in recorded runs (DOMAIN section 3).
+    other_way_share: Probability = 0.01
     # Smaller steps of a counter do not count: they scatter less than the white noise of one second.
     counter_step_m: Positive = 0.05
     # Scatter of rows is quantisation noise where it is beyond so many times what white noise explains: the median of
@@ -558,6 +560,12 @@ class CalibrationConfig(Settings):
     left_out_pieces: Annotated[int, Field(strict=True, ge=2)] = 8
     # With a sigma that varies by a smaller share, intercept and slope cannot be told apart.
     sigma_spread_share: Probability = 0.05
+    # `balise replay --calibrate`: with fewer runs nobody knows how far a further one may lie from them.
+    least_runs: Annotated[int, Field(strict=True, ge=2)] = 2
+    # A wheel wears by a tenth of this in a campaign of weeks; two vehicles mostly differ by more.
+    same_vehicle_scale: Positive = 0.01
+    # The runs that the monitors and the vehicle were calibrated by: filled in by `balise replay --calibrate`.
+    runs: tuple[str, ...] = ()
 
 
 class SiteConfig(Settings):

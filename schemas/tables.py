@@ -337,6 +337,7 @@ class Runs(dy.Schema):
     stanford_unavailable = count("epochs: confidence > limit")
     mtbf_h = real("h", "mean time between outages of valid, confident, unambiguous positions", min=0)
     continuity_15s = real("1", "exp(-15 s / MTBF) (LOC eq. 8)", min=0, max=1)
+    calibrated_by = texts("runs that vehicle and noise were calibrated by (`replay --calibrate`)")
     config_digest = text("SHA-256 of configuration and vehicle")
     input_digest = text("SHA-256 of log and site")
     software = text("name and version of the program")

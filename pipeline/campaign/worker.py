@@ -53,7 +53,7 @@ def replay_one(job: RunJob) -> RunOutcome:
 
 def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     _same_software(job)
-    site = _site(job.site, job.site_digest, job.config.site)
+    site = site_of(job.site, job.site_digest, job.config.site)
     if (known := log.known_digest()) and _is_done(job, known):
         return _earlier(job, log)
     with log.here() as path:
@@ -65,7 +65,7 @@ def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
         if job.write_route:
             _write_found_route(job, run, site)
     _write(job, tables, _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest})
-    return _proved(job, log, outcome_of(job, tables.runs, tables.hazards))
+    return _proved(job, log, outcome_of(job, tables.runs, tables.hazards, tables.passages))
 
 
 def fail_run(job: RunJob, failure: Failure, log: RecordedLog | None = None) -> RunOutcome:
@@ -99,7 +99,7 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
 
 
 @lru_cache(maxsize=2)
-def _site(address: str, digest: str, config: SiteConfig) -> Site:
+def site_of(address: str, digest: str, config: SiteConfig) -> Site:
     """The site, read once per worker."""
     storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
     site = read_site(address, config)
@@ -129,8 +129,9 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 
 def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
     """The outcome of a run that is complete already."""
-    runs, hazards = (store.tables_of(job.out, name, [job.run_id]) for name in ("runs", "hazards"))
-    return _proved(job, log, replace(outcome_of(job, runs, hazards), skipped=True))
+    names = ("runs", "hazards", "passages")
+    runs, hazards, passages = (store.tables_of(job.out, name, [job.run_id]) for name in names)
+    return _proved(job, log, replace(outcome_of(job, runs, hazards, passages), skipped=True))
 
 
 def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
@@ -149,8 +150,8 @@ def _write_found_route(job: RunJob, run: RunLog, site: Site) -> None:
     from pipeline.odometry import odometry_of
 
     cleaned, _ = clean(run, job.config)
-    solutions, matching = cleaned.solutions(), job.config.matching
-    fixes = cleaned.gnss.filter(pl.col("solution") == ("primary" if "primary" in solutions else solutions[0]))
+    matching = job.config.matching
+    fixes = cleaned.gnss.filter(pl.col("solution") == cleaned.main_solution())
     odometry = odometry_of(cleaned.odometer, job.vehicle, job.config)
     found = match(fixes, odometry, site, job.vehicle, matching, job.config.fix_sigma, cleaned.balise_reads)
     route = found_route(found, matching.ambiguity_probability)

@@ -196,5 +196,6 @@ def _provenance(provenance: Provenance) -> Row:
         "config_digest": provenance.config_digest,
         "input_digest": provenance.input_digest,
         "software": provenance.software,
+        "calibrated_by": list(provenance.calibrated_by),
         "contract": CONTRACT_VERSION,
     }
