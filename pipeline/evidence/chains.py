@@ -17,11 +17,13 @@ class Chain:
     oriented: tuple[int, ...]
     entry_m: tuple[float, ...]
 
-    def route(self, network: Network) -> Route:
+    def route(self, network: Network, numbers: dict[str, int] | None = None) -> Route:
+        """`numbers`: net elements as the caller counts them, where the network has them in pieces."""
         oriented = np.array(self.oriented, dtype=np.int64)
         element, track = oriented // 2, network.track
+        own = element if numbers is None else np.array([numbers[track.ids[one]] for one in element.tolist()])
         return Route(
-            element=element,
+            element=own,
             forward=oriented % 2 == 0,
             entry_m=np.array(self.entry_m),
             low_m=track.begin_m[element],

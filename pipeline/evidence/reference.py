@@ -1,0 +1,326 @@
+"""The tracks that a reference may have run along: a set by distance, without a favourite (DOMAIN section 5.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import dist
+
+import numpy as np
+import polars as pl
+
+from pipeline.evidence.chains import Chain
+from pipeline.evidence.near import Foot, Near, near_elements
+from pipeline.evidence.visits import Move, Node, Stay, nodes_of, pieces_of, ways_over
+from pipeline.track.geodesy import Points, points_of
+from pipeline.track.network import Network
+from pipeline.track.path import Route
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
+from schemas.config import Configuration
+
+# Numerics: between steps so far apart the search asks where the train may have gone [m].
+_STEP_M = 10.0
+# A way along the track is at most so many times the straight line between two steps: no railway curve is sharper.
+_CURVED = 1.5
+
+
+@dataclass(frozen=True)
+class ReferencePath:
+    """One way that the samples of a stretch may have taken: per sample its leg and the coordinate on it [m]."""
+
+    leg: Ints
+    at_m: Floats
+    legs: tuple[Route, ...]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Reference samples from gap to gap, and every way that they may have taken: the train was on one of them."""
+
+    t_ns: Ints
+    sigma_m: Floats
+    paths: tuple[ReferencePath, ...]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of a run in order of time."""
+
+    t_ns: Ints
+    points: Points
+    sigma_m: Floats
+
+    def take(self, rows: Ints) -> Samples:
+        return Samples(self.t_ns[rows], self.points.take(rows), self.sigma_m[rows])
+
+
+def reference_stretches(
+    reference: pl.DataFrame | None, network: Network, numbers: dict[str, int], config: Configuration
+) -> tuple[list[Stretch], list[tuple[int, int]]]:
+    """Stretches of the reference with their ways, and the times at which it was heard and lay nowhere [ns].
+
+    `network`: with elements that turn round in pieces; `numbers`: net elements as the caller counts them. An element is
+    in the set if a navigable way through the whole stretch runs over it, whose median distance from the samples is
+    within k roots on each piece between places where ways part.
+    """
+    if reference is None or reference.is_empty():
+        return [], []
+    stated = reference["sigma_m"].fill_null(config.hazards.reference_sigma_m).to_numpy()
+    points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
+    samples = Samples(times_ns(reference), points, stated)
+    # A sample beyond k_T roots of every track is no sample of the track.
+    factor = config.align.sure_sigmas
+    near = near_elements(samples.points, samples.sigma_m, network.track, factor, config.hazards.survey_sigma_m)
+    placed = np.flatnonzero(near.any_near)
+    placed = placed[_reachable(samples.take(placed), config)] if placed.size else placed
+    found: list[Stretch] = []
+    used = np.zeros(samples.t_ns.size, dtype=np.bool_)
+    for rows in _between_gaps(samples.t_ns, placed, config.hazards.reference_gap_s):
+        way = _placed(samples, near, rows, network, numbers, config)
+        if way is not None:
+            found.append(way)
+            used[np.searchsorted(samples.t_ns, way.t_ns)] = True
+    return found, _silent_spans(samples.t_ns, used, config.hazards.reference_gap_s)
+
+
+def _reachable(samples: Samples, config: Configuration) -> Ints:
+    """Samples that a train can have come to from one another: outward from the longest piece without a leap."""
+    t_ns, surface, sigma_m = samples.t_ns, samples.points.surface, samples.sigma_m
+
+    def leaps(a: Ints, b: Ints) -> Bools:
+        """Steps that no train can drive and no noise explains."""
+        noise_m = config.align.sure_sigmas * (sigma_m[a] + sigma_m[b])
+        most_m = config.align.fastest_mps * (t_ns[b] - t_ns[a]) / NS_PER_S + noise_m
+        beyond: Bools = np.linalg.norm(surface[b] - surface[a], axis=1) > most_m
+        return beyond
+
+    number = np.arange(t_ns.size)
+    pieces = np.split(number, np.flatnonzero(leaps(number[:-1], number[1:])) + 1)
+    longest = int(np.argmax([piece.size for piece in pieces]))
+    kept = [pieces[longest]]
+    for ahead in pieces[longest + 1 :]:
+        if not leaps(kept[-1][-1:], ahead[:1]).any():
+            kept.append(ahead)
+    for before in pieces[:longest][::-1]:
+        if not leaps(before[-1:], kept[0][:1]).any():
+            kept.insert(0, before)
+    return np.concatenate(kept)
+
+
+def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
+    """Samples without a pause or a lost sample among them."""
+    if rows.size == 0:
+        return []
+    broken = (np.diff(t_ns[rows]) > gap_s * NS_PER_S) | (np.diff(rows) > 1)
+    return np.split(rows, np.flatnonzero(broken) + 1)
+
+
+def _silent_spans(t_ns: Ints, used: Bools, gap_s: float) -> list[tuple[int, int]]:
+    """Times beside samples that lie nowhere, up to the next one that does: nobody knows where the train was."""
+    gap_ns = round(gap_s * NS_PER_S)
+    known_ns = t_ns[used]
+    spans: list[tuple[int, int]] = []
+    for at_ns in t_ns[~used].tolist():
+        after = int(np.searchsorted(known_ns, at_ns))
+        before_ns = int(known_ns[after - 1]) if after else at_ns - gap_ns
+        after_ns = int(known_ns[after]) if after < known_ns.size else at_ns + gap_ns
+        begin_ns, end_ns = max(before_ns, at_ns - gap_ns) + 1, min(after_ns, at_ns + gap_ns)
+        if spans and begin_ns <= spans[-1][1]:
+            begin_ns = spans.pop()[0]
+        spans.append((begin_ns, end_ns))
+    return spans
+
+
+def _placed(
+    samples: Samples, near: Near, rows: Ints, network: Network, numbers: dict[str, int], config: Configuration
+) -> Stretch | None:
+    """The ways of one stretch; None where no way passes, or more do than can be weighed.
+
+    Where no way leads through all of its samples, those of its longest part that has one.
+    """
+    own = samples.take(rows)
+    steps = _steps(own)
+    first, starts, layers = max(_parts(own, near.feet(rows[steps]), steps, network), key=lambda part: len(part[2]))
+    steps = steps[first : first + len(layers) + 1]
+    nodes = nodes_of(starts, layers)
+    failed = _failed(nodes, near, rows, own.sigma_m, steps, config)
+    ways = ways_over(nodes, len(layers), failed, config.hazards.routes_limit)
+    if not ways:
+        return None
+    paths = tuple(_path(way.stays(len(layers)), near, rows, steps, network, numbers) for way in ways)
+    part = slice(int(steps[0]), int(steps[-1]) + 1)
+    return Stretch(own.t_ns[part], own.sigma_m[part], paths)
+
+
+def _steps(samples: Samples) -> Ints:
+    """Samples some metres apart, those where the train turned, the first and the last."""
+    surface = samples.points.surface
+    apart_m = np.maximum(_STEP_M, 6.0 * samples.sigma_m).tolist()
+    places = surface.tolist()
+    steps = [0]
+    far, far_m = 0, 0.0
+    for number, place in enumerate(places):
+        away_m = dist(place, places[steps[-1]])
+        turned = far_m - away_m > 0.5 * apart_m[number]
+        if turned or away_m >= apart_m[number]:
+            steps.append(far if turned else number)
+            far, far_m = number, dist(place, places[steps[-1]])
+        elif away_m > far_m:
+            far, far_m = number, away_m
+    if steps[-1] != len(places) - 1:
+        steps.append(len(places) - 1)
+    return np.array(steps, dtype=np.int64)
+
+
+_Part = tuple[int, set[int], list[list[Move]]]
+
+
+def _parts(samples: Samples, feet: Sequence[Sequence[Foot]], steps: Ints, network: Network) -> Iterator[_Part]:
+    """Parts of the steps with a way through: first step, oriented elements there, and the moves to each next step."""
+    at_m = samples.points.surface[steps]
+    limits_m = _CURVED * np.linalg.norm(np.diff(at_m, axis=0), axis=1)
+    limits_m += np.maximum(_STEP_M, 6.0 * samples.sigma_m[steps[1:]])
+    onward = _Onward(network, float(limits_m.max(initial=0.0)))
+    places = [_inside(one, network) for one in feet]
+    first, starts = 0, {2 * element for element in places[0]}
+    alive, layers = starts, list[list[Move]]()
+    for step, limit_m in enumerate(limits_m.tolist()):
+        moves = [move for one in sorted(alive) for move in onward.moves(one, places[step], places[step + 1], limit_m)]
+        if moves:
+            layers.append(moves)
+            alive = {move.to for move in moves}
+        else:
+            yield first, starts, layers
+            first, starts, layers = step + 1, {2 * element for element in places[step + 1]}, []
+            alive = starts
+    yield first, starts, layers
+
+
+def _inside(feet: Sequence[Foot], network: Network) -> dict[int, float]:
+    """Net elements and measures of one sample, without those that it lies beyond the end of and on the next one."""
+    distances = {foot.element: foot.distance_m for foot in feet}
+
+    def beyond(foot: Foot) -> bool:
+        following = () if foot.end is None else network.successors[2 * foot.element + 1 - foot.end]
+        return any(distances.get(edge.to // 2, np.inf) < foot.distance_m for edge in following)
+
+    return {foot.element: foot.measure_m for foot in feet if not beyond(foot)}
+
+
+class _Onward:
+    """Moves over the network, of a length up to a limit."""
+
+    def __init__(self, network: Network, limit_m: float) -> None:
+        self.network = network
+        self.limit_m = limit_m
+        self.known: dict[int, list[tuple[int, float, tuple[int, ...]]]] = {}
+
+    def moves(self, start: int, here: dict[int, float], there: dict[int, float], limit_m: float) -> Iterator[Move]:
+        """From an oriented element at one step to those near the next, forward or back."""
+        element, along_m = start // 2, self.network.track.along_m
+        if element in there and abs(there[element] - here[element]) <= limit_m:
+            yield Move(start, start)
+        for back in (0, 1):
+            left_m = self.network.length_m(start) - along_m(start ^ back, here[element])
+            for to, gap_m, between in self._from(start ^ back):
+                if to // 2 in there and left_m + gap_m + along_m(to, there[to // 2]) <= limit_m:
+                    yield Move(start, to ^ back, tuple(one ^ back for one in between), bool(back))
+
+    def _from(self, side: int) -> list[tuple[int, float, tuple[int, ...]]]:
+        """What can be entered beyond the end of an oriented element, how far beyond, and over which elements."""
+        if side not in self.known:
+            found: list[tuple[int, float, tuple[int, ...]]] = []
+            growing = [(side, 0.0, tuple[int, ...]())]
+            while growing:
+                last, gone_m, between = growing.pop()
+                for edge in self.network.successors[last]:
+                    if edge.forward and gone_m + edge.gap_m <= self.limit_m:
+                        found.append((edge.to, gone_m + edge.gap_m, between))
+                        length_m = self.network.length_m(edge.to)
+                        growing.append((edge.to, gone_m + edge.gap_m + length_m, (*between, edge.to)))
+            self.known[side] = found
+        return self.known[side]
+
+
+def _failed(
+    nodes: Sequence[Node], near: Near, rows: Ints, sigma_m: Floats, steps: Ints, config: Configuration
+) -> set[Node]:
+    """Visits of pieces that lie farther from the samples than k roots, by the median; without samples none does.
+
+    The root is that of the sample and of the survey, of all elements compared the one that is known worst.
+    """
+    survey_m = np.zeros(rows.size)
+    for node in nodes:
+        pairs = near.of(node.oriented // 2, int(rows[steps[node.first]]), int(rows[steps[node.last]]))
+        own = near.sample[pairs] - rows[0]
+        survey_m[own] = np.maximum(survey_m[own], near.survey_sigma_m[pairs])
+    root_m = config.hazards.evidence_factor * np.hypot(sigma_m, survey_m)
+    failed: set[Node] = set()
+    for piece in pieces_of(nodes):
+        sampled = [node for node in piece if node.sampled]
+        if not sampled:
+            continue
+        begin = int(steps[min(node.first for node in sampled)])
+        end = int(steps[max(node.last for node in sampled)])
+        distance_m = np.full(end - begin + 1, np.inf)
+        for element in {node.oriented // 2 for node in piece}:
+            pairs = near.of(element, int(rows[begin]), int(rows[end]))
+            own = near.sample[pairs] - rows[begin]
+            distance_m[own] = np.minimum(distance_m[own], near.distance_m[pairs])
+        if np.median(distance_m / root_m[begin : end + 1]) > 1.0:
+            failed |= set(piece)
+    return failed
+
+
+def _path(
+    stays: Sequence[Stay], near: Near, rows: Ints, steps: Ints, network: Network, numbers: dict[str, int]
+) -> ReferencePath:
+    """A way with coordinates: each sample on the nearest of the elements that the way visits about then."""
+    begin, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
+    nearest_m, at_m, leg = np.full(count, np.inf), np.full(count, np.nan), np.full(count, -1)
+    legs, placed = _legs(stays, network)
+    for stay, (number, entry_m) in zip(stays, placed, strict=True):
+        low, high = max(stay.first - 1, 0), min(stay.last + 1, steps.size - 1)
+        pairs = near.of(stay.oriented // 2, int(rows[steps[low]]), int(rows[steps[high]]))
+        own = near.sample[pairs] - rows[begin]
+        nearer = near.distance_m[pairs] < nearest_m[own]
+        own, pair = own[nearer], np.arange(pairs.start, pairs.stop)[nearer]
+        measure_m, element = near.measure_m[pair], stay.oriented // 2
+        along_m = measure_m - network.track.begin_m[element]
+        against_m = network.track.end_m[element] - measure_m
+        nearest_m[own], leg[own] = near.distance_m[pair], number
+        at_m[own] = entry_m + (against_m if stay.oriented % 2 else along_m)
+    known = np.flatnonzero(leg >= 0)
+    every = np.arange(count)
+    leg = leg[known[np.maximum(np.searchsorted(known, every, side="right") - 1, 0)]]
+    routes = tuple(chain.route(network, numbers) for chain in legs)
+    return ReferencePath(leg, np.interp(every, known, at_m[known]), routes)
+
+
+def _legs(stays: Sequence[Stay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
+    """The way as chains of one coordinate, and of each visit its chain and where it is entered [m].
+
+    A new chain begins where the train, having turned, takes another branch than that which it came from.
+    """
+    chains = [Chain((stays[0].oriented,), (0.0,))]
+    placed = [(0, 0.0)]
+    here = 0
+    for stay in stays[1:]:
+        chain, last = chains[-1], chains[-1].oriented[here]
+        onward = here + (-1 if stay.back else 1)
+        if 0 <= onward < len(chain.oriented) and chain.oriented[onward] == stay.oriented:
+            here = onward
+        elif stay.back:
+            gap_m = next(edge.gap_m for edge in network.successors[stay.oriented] if edge.to == last)
+            entry_m = chain.entry_m[here] - gap_m - network.length_m(stay.oriented)
+            grown = Chain((stay.oriented, *chain.oriented[here:]), (entry_m, *chain.entry_m[here:]))
+            chains = [*chains[: None if here else -1], grown]
+            here = 0
+        else:
+            gap_m = next(edge.gap_m for edge in network.successors[last] if edge.to == stay.oriented)
+            entry_m = chain.entry_m[here] + network.length_m(last) + gap_m
+            grown = Chain((*chain.oriented[:onward], stay.oriented), (*chain.entry_m[:onward], entry_m))
+            chains = [*chains[: None if onward < len(chain.oriented) else -1], grown]
+            here = onward
+        placed.append((len(chains) - 1, chains[-1].entry_m[here]))
+    return chains, placed
